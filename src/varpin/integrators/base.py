@@ -23,7 +23,7 @@ from varpin.trajectory import Bytes, StepStatistics, Trajectory, joined
 
 Floats = NDArray[np.float64]
 
-# Of a segment.
+# Fields of a segment with one row for each node.
 _ARRAYS = ("q", "p", "v", "u", "energy")
 
 
@@ -32,7 +32,7 @@ class Failure:
     """Why a rollout stopped before its end.
 
     Attributes:
-        reason: In words.
+        reason: The reason as text.
         residual: The last residual, in units of its rounding error.
     """
 
@@ -42,17 +42,17 @@ class Failure:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Some steps of a rollout: the node after each, and what it took.
+    """Consecutive steps of a rollout: the node after each step, and solver statistics.
 
     Attributes:
         q: Configurations (k, n) [rad or m].
         p: Momenta (k, n).
         v: Velocities (k, n) [rad/s or m/s].
         u: Controls applied (k, m).
-        energy: (k,) [J].
-        statistics: Of the k steps.
-        failure: Why the step after them failed, or None.
-        impulses: Of the constraints over each step (k, c) [N s or N m s], or None where there are none.
+        energy: Energies (k,) [J].
+        statistics: Statistics of the k steps.
+        failure: Why the next step failed, or None.
+        impulses: Constraint impulses over each step (k, c) [N s or N m s], or None without constraints.
     """
 
     q: Floats
@@ -75,37 +75,37 @@ class Segment:
 class Integrator(ABC):
     """A one-step method.
 
-    Whoever adds one provides
+    A subclass provides
 
-    1. ``start``, which makes the state of a rollout at (q0, v0) and returns it with the first node, and ``fork``, which
-       copies it;
-    2. ``rollout_compiled`` and ``step_in_python``, which move a state on: many steps of many paths in the core, and one
-       step of one path with noise that only Python can evaluate;
-    3. ``linearize``, the derivatives of its steps, and ``quiet_ends`` if it kicks after a step too;
-    4. ``variational``, which says whether it maps (q, p) or (q, v), and ``order``.
+    1. ``start``, which returns the state of a rollout at (q0, v0) and the first node, and ``fork``, which copies a
+       state;
+    2. ``rollout_compiled``, many steps of many paths in the core, and ``step_in_python``, one step of one path with
+       noise that only Python can evaluate; both advance a state;
+    3. ``linearize``, the derivatives of its steps, and ``quiet_ends`` if it applies noise after a step too;
+    4. ``variational``, True if it maps (q, p) and False if it maps (q, v), and ``order``.
     """
 
     variational: bool
-    # Whether what dampers stop within a step is at rest after it.
+    # Whether fast damped modes are at rest after one step.
     l_stable: ClassVar[bool] = False
-    # Options that its text names even where they are the default.
+    # Options that the text names even at their defaults.
     named: ClassVar[tuple[str, ...]] = ()
 
     def __str__(self) -> str:
-        """Its name and options, without those that are the default: :func:`varpin.integrators.integrator_of` reads it.
+        """Name and options that are not the default, in the form of :func:`varpin.integrators.integrator_of`.
 
-        A trajectory keeps it as what made it.
+        A trajectory stores it.
         """
         return written(self, self.named)
 
     def same_map(self, other: Integrator) -> bool:
-        """Whether ``other`` takes the same steps, wherever both take them whole."""
+        """Whether ``other`` has the same step map for undivided steps."""
         return str(self) == str(other)
 
     @property
     @abstractmethod
     def order(self) -> int:
-        """The order of its error in dt where nothing is noisy and controls are constant over each step."""
+        """The order of the error in dt without noise and with controls that are constant over each step."""
 
     @property
     def keeps_constraints(self) -> bool:
@@ -114,29 +114,29 @@ class Integrator(ABC):
 
     @property
     def stage_times(self) -> tuple[float, ...]:
-        """Where in a step of unit length it looks at controls that change within it; none where it holds their mean.
+        """Times in a unit step at which controls that change within it are evaluated; empty if their mean is held.
 
-        A method with one stage holds the control from the middle of the step.
+        A method with one stage holds the control at the middle of the step.
         """
         return ()
 
     def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128] | None:  # noqa: ARG002 - as others'
-        """By what a step of h multiplies modes exp(lambda t) of a linear system, (k,) of z = h lambda.
+        """The factor (k,) of one step of h on the mode exp(lambda t) of a linear system, at z = h lambda (k,).
 
-        The motion itself multiplies them by exp(z). None where nobody has worked it out.
+        The exact factor is exp(z). None where it is unknown.
         """
         return None
 
     @property
     def left(self) -> float:
-        """The part of a step's kick that comes before the step; the rest comes after it."""
+        """The share of a step's noise impulse that acts before the step; the rest acts after it."""
         return 1.0
 
     @property
     def drift_share(self) -> float:
-        """The part of the drift from Stratonovich to Ito that is left to add.
+        """The share of the Ito correction that has to be added as a drift.
 
-        A second part of the kick, at the velocity that the first has left, brings the rest by itself.
+        The part of the noise impulse after the step sees the velocity after the first part, which gives the rest.
         """
         return 1.0 - 2.0 * self.left * (1.0 - self.left)
 
@@ -150,13 +150,13 @@ class Integrator(ABC):
 
     @abstractmethod
     def fork(self, state: Any) -> Any:
-        """A copy of a state, which moves on by itself under this integrator's guard; work arrays are shared."""
+        """An independent copy of a state, with this integrator's guard and shared work arrays."""
 
     def rollout(self, scene: Scene, state: Any, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
-        """The steps of length ``dt`` [s] that the commands are for; ``state`` moves along.
+        """Advance ``state`` by the N steps of ``commands``, each of length ``dt`` [s].
 
-        ``increments`` are those of the Wiener processes (P, N, k) [s^0.5], or (0, 0, k) for none. Returns a segment for
-        each path; with diffusion fields that only Python can evaluate there is one path.
+        ``increments`` are the Wiener increments (P, N, k) [s^0.5], or (0, 0, k) for none. Returns a segment for each
+        path; with diffusion fields that only Python can evaluate there is one path.
         """
         if scene.noise.diffusion is not None:
             commands = contiguous(commands)
@@ -181,15 +181,15 @@ class Integrator(ABC):
         watch: Watch,
         impulses: Floats | None = None,
     ) -> tuple[Failure | None, Bytes]:
-        """:meth:`rollout` of one path without noise into ``nodes``, which ends where the ``watch`` ends it.
+        """:meth:`rollout` of one path without noise into ``nodes``, until the ``watch`` stops it.
 
-        Those of constraints (N, c) go into ``impulses``, if it is given.
+        Constraint impulses (N, c) are written to ``impulses``, if given.
 
-        Returns why it failed, if it did, and the halvings of the steps that were not taken whole.
+        Returns the failure, if any, and the halvings of the divided steps.
         """
         decisions, done = len(commands.u), 0
         halvings = [np.zeros(0, dtype=np.uint8)]
-        # A third at a time, as the watch may end it.
+        # In thirds, since the watch may stop it early.
         ends = sorted({decisions // 3, 2 * decisions // 3, decisions} - {0})
         for begin, end in zip([0, *ends], ends, strict=False):
             block = rows(commands, begin, end, nodes.u[0, done - 1 : done] if done else None)
@@ -232,8 +232,8 @@ class Integrator(ABC):
     ) -> tuple[Floats, Floats] | None:
         """Configurations and velocities (P, N, n) after each step of P motions from (q0, v0) (P, n), without noise.
 
-        ``commands`` and ``drift`` are as for :meth:`rollout_compiled`; ``impulses`` jump the momenta before and after
-        each step (P, N, 2, n). None where one of the motions stops, and for an integrator that takes no impulses.
+        ``commands`` and ``drift`` are as for :meth:`rollout_compiled`; ``impulses`` (P, N, 2, n) are added to the
+        momenta before and after each step. Returns None if a motion fails, or if the integrator takes no impulses.
         """
         if impulses is not None:
             return None
@@ -251,7 +251,7 @@ class Integrator(ABC):
         """One step of one path with diffusion fields that are evaluated in Python."""
 
     def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
-        """Where each step ends at dw = 0, q and v (N, n): for integrators that kick there too.
+        """The ends of the steps at dw = 0, q and v (N, n), for integrators that apply noise after the step.
 
         Raises:
             LinearizationError: A step has no solution at dw = 0.
@@ -262,20 +262,20 @@ class Integrator(ABC):
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """Derivatives of each step at dw = 0.
 
-        In the state (N, 2n, 2n), in a constant force (N, 2n, n), and in a jump of the momentum, or of the velocity for
-        integrators on (q, v), where noise makes it jump (N, 2n, n).
+        They are taken in the state (N, 2n, 2n), in a constant force (N, 2n, n), and in the noise impulse (N, 2n, n), a
+        jump of the momentum, or of the velocity for integrators on (q, v).
 
         Raises:
             LinearizationError: A step has no solution at dw = 0.
         """
 
     def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
-        """Derivatives (N, 2n, n) in a force that grows over each step from 0, at its start, to it at its end.
+        """Derivatives (N, 2n, n) in a force at the end of each step that grows linearly from 0 at its start.
 
         Raises:
             LinearizationError: A step has no solution at dw = 0.
         """
-        # Of what is held over the step, half.
+        # Methods that hold the mean force take half of it.
         return 0.5 * self.linearize(scene, trajectory)[1]
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:  # noqa: ARG002
@@ -286,12 +286,12 @@ class Integrator(ABC):
             LinearizationError: A step has no solution at dw = 0.
         """
         raise InputError(
-            f"{self} has no second-order linearization; variational integrators have, varpin.Gauss(...) for one"
+            f"{self} has no second-order linearization; variational integrators have, such as varpin.Gauss(...)"
         )
 
 
 def written(made: object, named: Sequence[str] = ()) -> str:
-    """A dataclass as the call that makes it, with the options in ``named`` and those that are not the default."""
+    """A dataclass as the text of its constructor call, with the options in ``named`` and those not at their default."""
     given: dict[str, Any] = {item.name: item.default for item in fields(made)} if is_dataclass(made) else {}
     options = [
         f"{option}={_text(getattr(made, option))}"
@@ -303,7 +303,7 @@ def written(made: object, named: Sequence[str] = ()) -> str:
 
 
 def _text(value: object) -> str:
-    """A number in as few digits as tell it from others; a word as it is."""
+    """A number with as few digits as restore it exactly; a string without quotes."""
     if isinstance(value, str):
         return value
     if isinstance(value, (float, np.floating)):
@@ -314,7 +314,7 @@ def _text(value: object) -> str:
 
 
 def join(segments: Sequence[Segment]) -> Segment:
-    """Segments that follow each other as one."""
+    """Consecutive segments as one."""
     statistics = joined([segment.statistics for segment in segments])
     nodes = {name: np.concatenate([getattr(s, name) for s in segments]) for name in _ARRAYS}
     parts = [s.impulses for s in segments if s.impulses is not None]
@@ -323,10 +323,10 @@ def join(segments: Sequence[Segment]) -> Segment:
 
 
 def check_functions(scene: Scene, q0: Floats, v0: Floats) -> None:
-    """Hold derivatives of custom forces against differences, once for a scene, where its first motion starts (P, n).
+    """Compare derivatives of custom forces with differences, once for a scene, at the first start (P, n).
 
     Raises:
-        CustomForceError: They are wrong.
+        CustomForceError: The derivatives are wrong.
     """
     if scene.custom is not None and len(q0):
         scene.custom.check(q0[0], v0[0])
@@ -335,7 +335,7 @@ def check_functions(scene: Scene, q0: Floats, v0: Floats) -> None:
 def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
     """Diffusion fields F (n, k) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
 
-    The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N]: it vanishes where no field depends on the velocity.
+    The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N]; it is zero if no field depends on the velocity.
     """
     diffusion = scene.noise.fields(q[None], v[None], u[None], start)
     F = diffusion.F[0]
@@ -354,7 +354,7 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
 
 
 def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) -> Floats:
-    """Forces of the controls (N, 1, n), or (N, s, n) at stages where they change within steps, with a drift (N, n)."""
+    """Forces of the controls plus a drift (N, n): (N, 1, n), or (N, s, n) for controls that change within steps."""
     drift = drift[:, None] if isinstance(drift, np.ndarray) else drift
     if trajectory.u_stages.shape[1]:
         return np.ascontiguousarray(trajectory.u_stages @ scene.actuation.T + drift)
@@ -364,9 +364,9 @@ def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) ->
 def segments_of(
     nodes: Nodes, reasons: Mapping[int, str], halvings: Callable[[int], Bytes] | None = None
 ) -> list[Segment]:
-    """What the core wrote, path by path, without copies.
+    """A segment for each path, with views of the arrays that the core wrote.
 
-    ``halvings`` gives those of the parts of a path's steps; it is asked where steps were not taken whole.
+    ``halvings`` returns the halvings of a path's steps; it is called only for paths with divided steps.
     """
     segments = []
     for i, done in enumerate(nodes.done.tolist()):
@@ -387,7 +387,7 @@ def segments_of(
 
 
 def statistics_of(nodes: Nodes, path: int, done: int, halvings: Bytes) -> StepStatistics:
-    """What the steps of a path took, as views."""
+    """The statistics of a path's steps, as views."""
     tally, quality = nodes.tally[path, :done], nodes.quality[path, :done]
     return StepStatistics(
         newton_iterations=tally[:, 0],
@@ -402,7 +402,7 @@ def statistics_of(nodes: Nodes, path: int, done: int, halvings: Bytes) -> StepSt
 
 
 def parts_of(nodes: Nodes, path: int, done: int, halvings: Callable[[int], Bytes]) -> Bytes:
-    """The halvings of a path's steps; ``halvings`` is asked where steps were not taken whole."""
+    """The halvings of a path's steps; ``halvings`` is called only if a step was divided."""
     split = done > 0 and nodes.tally[path, :done, 3].max() > 1
     return halvings(path) if split else np.zeros(0, dtype=np.uint8)
 
@@ -414,7 +414,7 @@ def failure_of(nodes: Nodes, path: int, done: int, reasons: Mapping[int, str]) -
 
 
 def first_nodes(q: Floats, p: Floats, v: Floats, energy: Floats, controls: int) -> list[Segment]:
-    """A segment of the node alone that each of P paths starts at, from q, p and v (P, n) and energies (P,)."""
+    """A segment of one node for each of P paths, from q, p and v (P, n) and energies (P,) at their starts."""
     none, zero, u = np.zeros(1, dtype=np.int64), np.zeros(1), np.zeros((1, controls))
     statistics = StepStatistics(none, none, none, none, np.zeros(0, dtype=np.uint8), zero, zero, zero)
     rows = (slice(i, i + 1) for i in range(len(q)))
@@ -435,7 +435,7 @@ def open_line(u: Floats, times: Sequence[float]) -> Commands:
 
 @functools.cache
 def no_limits(controls: int) -> Floats:
-    """The limits (2, m) of controls that have none; not to be written to."""
+    """Infinite limits (2, m) for controls without limits, read-only."""
     limits = np.outer([-np.inf, np.inf], np.ones(controls))
     limits.setflags(write=False)
     return limits
@@ -450,9 +450,10 @@ class Lines(NamedTuple):
 
 
 def lines(commands: Commands, ends: Floats, times: Sequence[float]) -> Lines:
-    """The controls of steps on the lines of ``commands``, from what a rollout wrote of them.
+    """The controls within each step of ``commands`` that are linear between nodes.
 
-    ``ends`` (N, m) are the controls at the end of each step's decision, ``times`` are :attr:`Integrator.stage_times`.
+    ``ends`` (N, m) are the recorded controls at the end of each step's decision, ``times`` are
+    :attr:`Integrator.stage_times`.
     """
     steps = np.arange(len(ends))
     begins = np.vstack([commands.before[:1], ends])[steps - steps % commands.hold]
@@ -467,9 +468,9 @@ def lines(commands: Commands, ends: Floats, times: Sequence[float]) -> Lines:
 
 
 def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> Floats:
-    """The control (m,) of a decision at a state x (2n,), as the core finds it.
+    """The control (m,) of a decision at a state x (2n,), by the formula of the core.
 
-    ``before`` is the control before (1, m), or (0, m) for what the reference has.
+    ``before`` is the previous control (1, m), or (0, m) for that of the reference.
     """
     u = commands.u[decision]
     if len(commands.gains):
@@ -482,7 +483,7 @@ def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> 
 
 
 def contiguous(commands: Commands) -> Commands:
-    """Commands as the core takes them: rows of numbers one after another."""
+    """Commands with C-contiguous arrays, as the core requires."""
     arrays = commands.u, commands.gains, commands.reference, commands.limits, commands.within
     if all(array.flags.c_contiguous for array in arrays):
         return commands
@@ -496,12 +497,12 @@ def contiguous(commands: Commands) -> Commands:
 
 
 def steps_of(commands: Commands) -> int:
-    """How many steps the commands are for."""
+    """Number of steps of the commands."""
     return len(commands.u) * commands.hold
 
 
 def rows(commands: Commands, begin: int, end: int, before: Floats | None = None) -> Commands:
-    """The commands of decisions begin .. end; with the control ``before`` of each path (P, m), if it is known."""
+    """The commands of decisions begin, ..., end - 1; ``before`` (P, m) replaces the previous control of each path."""
     part = slice(begin, end)
     return commands._replace(
         u=commands.u[part],

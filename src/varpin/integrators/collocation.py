@@ -1,4 +1,4 @@
-"""What collocation methods of several stages share: their options."""
+"""The base class of collocation methods with several stages."""
 
 from __future__ import annotations
 

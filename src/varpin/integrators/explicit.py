@@ -1,4 +1,4 @@
-"""Explicit integrators on (q, v), for comparison: they keep no structure, and where they are good is measured."""
+"""Explicit integrators on (q, v), for comparison: they do not preserve the symplectic structure."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ REASONS: dict[int, str] = {
 
 @dataclass(frozen=True)
 class ExplicitRun:
-    """Where a rollout stands.
+    """State of a rollout.
 
     Attributes:
-        paths: On their way, with their work arrays.
-        start: Configurations at which the rollout started (P, n) [rad or m].
+        paths: The paths and work arrays in the core.
+        start: Initial configurations (P, n) [rad or m].
     """
 
     paths: core.ExplicitRollout
@@ -55,7 +55,7 @@ class ExplicitRun:
 
 @dataclass(frozen=True)
 class _Explicit(Integrator):
-    """What the explicit methods share."""
+    """The base class of explicit methods."""
 
     method: ClassVar[ExplicitMethod]
     variational = False
@@ -81,8 +81,8 @@ class _Explicit(Integrator):
     ) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python.
 
-        The impulse is handed over as the drift of a constant force is: spread over the step for explicit Euler, which
-        is the same there, and as a jump of the velocity before the step for the others.
+        The noise impulse is a constant force over the step for explicit Euler, where this is equivalent, and a jump of
+        the velocity before the step for the other methods.
         """
         q, v = state.paths.q[0], state.paths.v[0]
         control = control_of(command, 0, np.concatenate([q, v]), command.before)
@@ -178,26 +178,26 @@ def accelerations(scene: Scene, q: Floats, v: Floats, force: Floats) -> tuple[Fl
 
 @dataclass(frozen=True)
 class ExplicitEuler(_Explicit):
-    """q1 = q0 + h v0, v1 = v0 + h a(q0, v0): of first order, and the paper's comparison."""
+    """q1 = q0 + h v0, v1 = v0 + h a(q0, v0), of first order; the comparison of the paper."""
 
     method: ClassVar[ExplicitMethod] = ExplicitMethod.euler
     order = 1
 
     def _jump(self, in_v: Floats) -> Floats:
-        # Noise acts beside the step: what it adds to the velocity stays as it is.
+        # Noise adds to the velocity after the step.
         n = in_v.shape[2]
         return np.tile(np.eye(2 * n, n, -n), (len(in_v), 1, 1))
 
 
 @dataclass(frozen=True)
 class SemiImplicitEuler(_Explicit):
-    """v1 = v0 + h a(q0, v0), q1 = q0 + h v1: of first order; most physics engines step so."""
+    """v1 = v0 + h a(q0, v0), q1 = q0 + h v1, of first order; the method of most physics engines."""
 
     method: ClassVar[ExplicitMethod] = ExplicitMethod.semi_implicit
     order = 1
 
     def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """See :meth:`Integrator.amplification`; of the modes z of v' = (z + z~) v - z z~ q, the one next to exp(z)."""
+        """See :meth:`Integrator.amplification`; of v' = (z + z~) v - z z~ q, the root that is closest to exp(z)."""
         damped, pulled = 2.0 * z.real, np.abs(z) ** 2
         half = 0.5 * (2.0 + damped - pulled)
         root = np.sqrt((half**2 - 1.0 - damped).astype(np.complex128))
@@ -208,7 +208,7 @@ class SemiImplicitEuler(_Explicit):
 
 @dataclass(frozen=True)
 class RungeKutta4(_Explicit):
-    """The classical method of Runge and Kutta: of fourth order without noise."""
+    """The classical Runge-Kutta method, of fourth order without noise."""
 
     method: ClassVar[ExplicitMethod] = ExplicitMethod.runge_kutta
     order = 4

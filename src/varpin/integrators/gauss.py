@@ -13,7 +13,7 @@ from varpin.integrators.tableau import gauss, gauss_coefficients, lobatto_places
 
 Floats = NDArray[np.float64]
 
-# Of the energy errors that one stage is allowed, what is enough for more: steps of high order seldom need it.
+# Shares of the guard's energy balance and energy budget for methods with more than one stage.
 BALANCE_SHARE, BUDGET_SHARE = 1 / 25, 1 / 100
 
 
@@ -22,25 +22,25 @@ class Gauss(Collocation):
     """Variational Gauss-Legendre collocation with s stages, in position-momentum form.
 
     Solves L_v(Q_i, V_i) = p0 + dt sum_j a_ij (L_q + F)(Q_j, V_j) with Q_i = q0 + dt sum_j a_ij V_j for the stage
-    velocities V_i. Of order 2 s, symmetric, and symplectic where nothing is forced; one stage is ``Midpoint()``.
+    velocities V_i. The method is symmetric, has order 2 s, and is symplectic for conservative motions. One stage is
+    ``Midpoint()``.
 
-    Dampers and springs of the scene act at every stage and keep the order, and so do controls that are a function of
-    time (:class:`varpin.OpenLoop`). Other controls are constant over a step, and so the motion under a digital
-    controller (a control law, a :class:`varpin.LinearPolicy`) is of order 2 s, too. As an approximation of a law in
-    continuous time it is of first order in the law's period. So put viscous friction into the scene, not into a
-    control law.
+    Dampers and springs of the scene act at every stage and keep the order, as do controls as a function of time
+    (:class:`varpin.OpenLoop`). Other controls are constant over a step, so motions under a digital controller (a
+    control law, a :class:`varpin.LinearPolicy`) have order 2 s, too. As an approximation of a law in continuous time,
+    they have order 1 in the law's period. So put viscous friction into the scene, not into a control law.
 
-    Steps are accepted or taken in parts as :class:`Midpoint` does.
+    Steps are accepted or divided as in :class:`Midpoint`.
 
     Main args:
         stages: s, from 1 to 6.
 
     Other Args:
-        guard: As of :class:`Midpoint`, and so are the others; of more than one stage 1/25 of its ``energy_balance`` is
-            asked, and 1/100 of its ``energy_budget``. That costs few substeps and keeps fifty times the energy: a
-            chaotic motion gathers its energy error in a few violent moments.
-        tolerance: On the residual, in units of the rounding error of the terms that cancel in it.
-        kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
+        guard: As in :class:`Midpoint`. With more than one stage, its ``energy_balance`` is multiplied by 1/25 and its
+            ``energy_budget`` by 1/100. That costs few substeps and reduces the energy error by a factor of fifty: in
+            chaotic motions, most of it comes from a few violent moments.
+        tolerance: Tolerance of the residual, in units of the rounding error of its cancelling terms.
+        kick: When the noise impulse acts: ``"left"`` or ``"split"``, as in :class:`Midpoint`.
     """
 
     @property

@@ -21,13 +21,13 @@ Floats = NDArray[np.float64]
 
 
 def largest_step(M: Floats, Lqq: Floats, margin: float) -> float:
-    """The dt [s] up to which the branch guard of alpha = 1/2 accepts a step around a state with these M and L_qq.
+    """The largest dt [s] of steps that the branch guard accepts with alpha = 1/2 near a state with these M and L_qq.
 
-    Where M - dt^2 / (4 (1 - margin)) L_qq ceases to be positive definite; infinite where no direction is unstable. It
-    says nothing of accuracy.
+    At this dt, M - dt^2 / (4 (1 - margin)) L_qq ceases to be positive definite. It is infinite if no direction is
+    unstable. It is no measure of accuracy.
     """
     rates = scipy.linalg.eigh(Lqq, M, eigvals_only=True)
-    # Of a direction without curvature rounding leaves a tiny one, of either sign.
+    # Zero curvature gives tiny eigenvalues of either sign by rounding.
     rounding = 1e-12 * float(np.abs(rates).max())
     return 2.0 * float(np.sqrt((1.0 - margin) / rates[-1])) if rates[-1] > rounding else np.inf
 
@@ -37,23 +37,23 @@ class Midpoint(Variational):
     """The forced midpoint variational integrator in position-momentum form.
 
     Solves the discrete Euler-Lagrange equations p0 + D1 Ld + F- = 0, p1 = D2 Ld + F+ with the generalized midpoint
-    rule (Johnson and Murphey 2009); each half-step carries half of the impulse of controls and friction. Symplectic
-    where nothing is forced, of second order for alpha = 1/2 and of first order otherwise.
+    rule (Johnson and Murphey 2009); each half-step has half of the impulse of controls and friction. The method is
+    symplectic for conservative motions, of second order for alpha = 1/2 and of first order otherwise.
 
-    A whole step is accepted if Newton contracts from the start, if its root lies on the branch of solutions that is
-    connected to dt -> 0, and if its energy balance closes; else it is taken in halves, and halves of halves, which
-    ``Trajectory.statistics.substeps`` counts.
+    A step is accepted if Newton's method contracts from the start, if its root lies on the branch of solutions that is
+    connected to dt -> 0, and if its energy balance closes. Otherwise it is halved, repeatedly if need be;
+    ``Trajectory.statistics.substeps`` counts the parts.
 
     Main args:
-        alpha: Where in the step the Lagrangian is taken, in [0, 1]. Of second order at 1/2; elsewhere of first, and the
-            energy at nodes swings by as much.
+        alpha: Evaluation point of the Lagrangian in a unit step, in [0, 1]. At 1/2 the order is 2; elsewhere it is 1,
+            and the energy at the nodes oscillates with an amplitude of first order in dt.
 
     Other Args:
-        guard: When a step is accepted; None takes every root that Newton's method finds, and cuts no step.
-        tolerance: On the residual, in units of the rounding error of the terms that cancel in it.
-        kick: When noise kicks the momentum: ``"left"``, before the step (the paper's scheme); or ``"split"``, half
-            of it before and half after, at the state then reached, which for constant mass and additive noise is of
-            weak order 2 instead of 1.
+        guard: Conditions on accepted steps; None accepts every root that Newton's method finds, and divides no step.
+        tolerance: Tolerance of the residual, in units of the rounding error of its cancelling terms.
+        kick: When the noise impulse acts on the momentum. ``"left"``: before the step (the paper's scheme).
+            ``"split"``: one half before the step and one half after it, evaluated at the state there; for constant mass
+            and additive noise the weak order is then 2 instead of 1.
     """
 
     alpha: float = 0.5
@@ -69,7 +69,7 @@ class Midpoint(Variational):
 
     @property
     def order(self) -> int:
-        """See :meth:`Integrator.order`; 2 for alpha = 1/2, and 1 elsewhere."""
+        """See :meth:`Integrator.order`; 2 for alpha = 1/2, otherwise 1."""
         return 2 if self.alpha == 0.5 else 1
 
     def _tableau(self) -> Tableau:
@@ -82,5 +82,5 @@ class Midpoint(Variational):
         return np.array([float(self.alpha)])
 
     def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128] | None:
-        """See :meth:`Integrator.amplification`; for alpha = 1/2 alone."""
+        """See :meth:`Integrator.amplification`; None unless alpha = 1/2."""
         return (1.0 + 0.5 * z) / (1.0 - 0.5 * z) if self.alpha == 0.5 else None

@@ -1,4 +1,4 @@
-"""Collocation at the Radau points: for damping that is faster than the step."""
+"""Collocation at the Radau points, for damping that is faster than the step."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ Floats = NDArray[np.float64]
 class Radau(Collocation):
     """Radau IIA collocation with s stages, in position-momentum form, for damping and springs faster than the step.
 
-    The stage equations of :class:`Gauss` with other points, the last of them the end of the step. Of order 2 s - 1 and
-    L-stable: what a control that jumps excites in a fast damper dies out within the step, where Gauss, which is
-    A-stable only, rings on. It is not symplectic: where nothing is damped, energy decays slowly, and Gauss is better.
+    The stage equations of :class:`Gauss` at other points, the last of which is the end of the step. The method has
+    order 2 s - 1 and is L-stable: transients of fast dampers after a jump of the control decay within the step, where
+    Gauss, which is only A-stable, oscillates. It is not symplectic: without damping, energy decays slowly, and Gauss is
+    better.
 
-    Steps are accepted or taken in parts as :class:`Midpoint` does.
+    Steps are accepted or divided as in :class:`Midpoint`.
 
     Main args:
-        stages: s, from 1 to 6. One is the implicit Euler method, whose error is in percents of the motion.
+        stages: s, from 1 to 6. One stage is the implicit Euler method, with errors of several percent.
 
     Other Args:
-        guard: As of :class:`Midpoint`, and so are the others; with two stages or more 1/100 of its ``energy_budget``
-            is allowed, so that oscillations that nothing damps keep their energy beside dampers.
-        tolerance: On the residual, in units of the rounding error of the terms that cancel in it.
-        kick: When noise kicks the momentum, ``"left"`` or ``"split"``.
+        guard: As in :class:`Midpoint`. With more than one stage, its ``energy_budget`` is multiplied by 1/100, so that
+            undamped oscillations beside dampers keep their energy.
+        tolerance: Tolerance of the residual, in units of the rounding error of its cancelling terms.
+        kick: When the noise impulse acts: ``"left"`` or ``"split"``, as in :class:`Midpoint`.
     """
 
     l_stable = True
@@ -43,7 +44,7 @@ class Radau(Collocation):
         return 2 * int(self.stages) - 1
 
     def _shares(self) -> tuple[float, float]:
-        # The budget alone: a step's own balance is off where it damps what it does not resolve, and is to.
+        # Only the budget: the balance of a step has a large error, as intended, where it damps unresolved modes.
         return (1.0, BUDGET_SHARE) if self.stages > 1 else (1.0, 1.0)
 
     def _tableau(self) -> Tableau:

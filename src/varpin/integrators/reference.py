@@ -1,4 +1,4 @@
-"""SciPy's DOP853 under the contract of an integrator: slow and exact, to hold the others against."""
+"""SciPy's DOP853 as an integrator: a slow and accurate reference for the others."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ Floats = NDArray[np.float64]
 Rate = Callable[[float, Floats], Floats]
 Force = Callable[[float], Floats]
 
-# SciPy raises a smaller rtol to this by itself, with a warning.
+# Smallest rtol that SciPy accepts.
 TIGHTEST = 100.0 * float(np.finfo(np.float64).eps)
-# Points at which a control that changes within a step is taken: the polynomial through them is of order 16.
+# Points of the polynomial for a control that changes within a step; its order is 16.
 _POINTS = 8
-# Speeds below this count as it [rad/s or m/s]: what rounding leaves of a robot in equilibrium is not to be resolved.
+# Lower bound of the speed in tolerances [rad/s or m/s], so that rounding in an equilibrium is not resolved.
 _SLOWEST = 1e-3
 TOO_STEEP = "the adaptive method cannot go on: the motion runs away, or its tolerance is beyond rounding"
 
 
 @dataclass
 class ReferenceRun:
-    """Where the paths of a rollout stand.
+    """State of a rollout.
 
     Attributes:
         x: (q, v) of each path (P, 2n).
-        dynamics: At one state of them after another.
-        tried: The last length of a step inside [s], 0 for none: the next begins with it.
+        dynamics: Forward dynamics at a single state.
+        tried: Length of the last internal step [s], the first trial of the next; 0 for none.
     """
 
     x: Floats
@@ -65,15 +65,15 @@ class _RunsAway(ArithmeticError):
 class Reference(Integrator):
     """The explicit Runge-Kutta method of order 8 by Dormand and Prince with its own step control, through SciPy.
 
-    Each step of the trajectory is integrated with as many steps inside as the tolerances take. The control is held, or
-    if it changes within the step taken as the polynomial through eight points of it.
-    Its error does not depend on ``dt``. It shares no equation with the variational integrators but the robot's: it
-    integrates q' = v, v' = M^-1 (f - bias). Noise is refused.
+    The tolerances determine the internal steps in each step of the trajectory, so the error does not depend on ``dt``.
+    The control is held over a step; if it changes within the step, the polynomial through eight points replaces it. The
+    method integrates q' = v, v' = M^-1 (f - bias); it shares only the robot's equations with the variational
+    integrators. Scenes with noise are refused.
 
     Main args:
-        rtol: Relative tolerance on q and v in each step inside, from 2.3e-14 on.
-        atol: Absolute tolerance on q [rad or m]; ``rtol`` if left out. That on v is as much larger as the robot is
-            faster than one unit of q per second, or as much smaller as it is slower.
+        rtol: Relative tolerance on q and v in each internal step, at least 2.3e-14.
+        atol: Absolute tolerance on q [rad or m]; ``rtol`` if left out. The tolerance on v is ``atol`` times the speed
+            of the robot [rad/s or m/s].
     """
 
     rtol: float = 1e-12
@@ -127,13 +127,13 @@ class Reference(Integrator):
         increment: Floats,  # noqa: ARG002
         dt: float,  # noqa: ARG002
     ) -> Segment:
-        """Never called for a scene without noise, and others are refused."""
+        """Refuse; :meth:`start` refuses scenes with noise, and others do not call it."""
         raise InputError(f"{self} integrates no noise: leave it out of the scene")
 
     def rollout_compiled(
         self, scene: Scene, state: ReferenceRun, commands: Commands, increments: Floats, drift: Floats, dt: float
     ) -> list[Segment]:
-        """See :meth:`Integrator.rollout_compiled`; the rate of change is compiled, the steps are SciPy's."""
+        """See :meth:`Integrator.rollout_compiled`; the rate of change is compiled, the steps are those of SciPy."""
         if increments.size:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
         nodes = new_nodes(len(state.x), steps_of(commands), scene.robot.dof, scene.controls)
@@ -147,7 +147,7 @@ class Reference(Integrator):
     def _path(
         self, scene: Scene, state: ReferenceRun, commands: Commands, drift: Floats, dt: float, nodes: Nodes, i: int
     ) -> Failure | None:
-        """The steps of path ``i``, written to ``nodes``; what stopped them, if anything did."""
+        """Write the steps of path ``i`` to ``nodes``; return the failure, if any."""
         u = nodes.u[i]
         for s in range(len(u)):
             decision, held = divmod(s, commands.hold)
@@ -172,14 +172,14 @@ class Reference(Integrator):
         return None
 
     def _force(self, values: Floats, dt: float) -> Force:
-        """The force (n,) at a time from the start of a step on [s], of that at its stages, or of one for all of it."""
+        """The force (n,) as a function of time [s] in a step, from values at its stages (s, n) or a constant (1, n)."""
         if len(values) == 1:
             return lambda _: values[0]
         times = np.array(self.stage_times)
         return lambda t: interpolation(times, np.array([t / dt]))[0] @ values
 
     def _step(self, state: ReferenceRun, i: int, force: Force, dt: float) -> tuple[Floats, int]:
-        """(q, v) of path ``i`` after one step, and how many evaluations of forward dynamics it took."""
+        """(q, v) of path ``i`` after one step, and the number of evaluations of forward dynamics."""
 
         def rate(t: float, x: Floats) -> Floats:
             slope, regular = state.dynamics.rate(x, force(t))
@@ -226,7 +226,7 @@ class Reference(Integrator):
         return J
 
     def _derivatives(self, scene: Scene, x: Floats, force: Force, dt: float, *, ramp: bool) -> Floats:
-        """Derivatives (2n, 3n) of one step in (q, v, force), the last in one that grows from 0 if it is a ramp."""
+        """Derivatives (2n, 3n) of one step in (q, v, force); with ``ramp`` the force grows linearly from 0."""
         n = len(x) // 2
 
         def rate(t: float, y: Floats) -> Floats:
@@ -242,7 +242,7 @@ class Reference(Integrator):
         y = np.concatenate([x, np.eye(2 * n, 3 * n).ravel()])
         slope = rate(dt if ramp else 0.0, y)
         atol = self._atol(x, slope[: 2 * n], dt)
-        # The derivative of v in q is a rate, that of q in v a time, those in the force are inverse inertias.
+        # Scales by units: dv/dq is a rate, dq/dv a time, derivatives in the force are inverse inertias.
         blocks = np.empty((2 * n, 3 * n))
         unit = atol[0]
         fast = max(float(np.abs(slope[2 * n :].reshape(2 * n, 3 * n)[n:, : 2 * n]).max()) * dt, _SLOWEST)
@@ -254,10 +254,10 @@ class Reference(Integrator):
 
 
 def _integrate(rate: Rate, x: Floats, dt: float, rtol: float, atol: Floats, tried: float) -> tuple[Floats, int, float]:
-    """X after ``dt`` [s], the number of evaluations, and the length of the last whole step inside [s]."""
+    """X after ``dt`` [s], the number of evaluations, and the length of the longest internal step [s]."""
     first = min(tried, dt) if tried > 0.0 else None
     solution = scipy.integrate.solve_ivp(rate, (0.0, dt), x, method="DOP853", rtol=rtol, atol=atol, first_step=first)
     if not solution.success:
         raise _RunsAway
-    # The last step inside is cut at the end of the interval, so the longest one is what the method wanted.
+    # The end of the interval shortens the last internal step, so the longest one is taken for the next trial.
     return solution.y[:, -1], int(solution.nfev), float(np.diff(solution.t).max())

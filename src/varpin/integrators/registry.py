@@ -1,4 +1,4 @@
-"""Integrators by name, and as text: what a trajectory says made it can be made again."""
+"""Integrators by name, and from the text that a trajectory stores."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from varpin.integrators.reference import Reference
 from varpin.integrators.variational import Guard
 
 _OWN: tuple[type[Integrator], ...] = (Midpoint, Gauss, Radau, ExplicitEuler, SemiImplicitEuler, RungeKutta4, Reference)
-# By the names of their classes. A new integrator enters here.
+# Integrators by class name. A new integrator is added to the tuple above.
 BY_NAME: Mapping[str, type[Integrator]] = MappingProxyType({kind.__name__: kind for kind in _OWN})
 
 
@@ -28,15 +28,14 @@ def options_of(kind: type[Integrator]) -> tuple[str, ...]:
 
 
 def integrator_of(text: str) -> Integrator:
-    """The integrator that a text names, with its options: ``str`` and ``repr`` of one give such a text.
+    """The integrator of a text with its name and options, as ``str`` and ``repr`` of an integrator write it.
 
         integrator_of("RungeKutta4")
         integrator_of("Gauss(3)")
         integrator_of("Midpoint(alpha=0.5, kick=split)")
 
     Raises:
-        InputError: The text is no such call, or names an integrator or an option that varpin does not have; a value is
-            out of its range.
+        InputError: The text has another form, the integrator or an option is unknown, or a value is out of its range.
     """
     form = "a name, or a name with options such as Gauss(stages=3)"
     try:
@@ -64,7 +63,7 @@ def integrator_of(text: str) -> Integrator:
 
 
 def _value(node: ast.expr) -> Any:
-    """A number, None, a word with or without quotes, or a guard."""
+    """The value of an option: a number, None, a word with or without quotes, or a guard."""
     match node:
         case ast.Name(id=name):
             return name

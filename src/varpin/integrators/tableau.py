@@ -23,17 +23,14 @@ def interpolation(nodes: Floats, at: Floats) -> Floats:
 
 @functools.cache
 def gauss_coefficients(stages: int) -> tuple[Floats, Floats, Floats]:
-    """A (s, s), b (s,) and c (s,) of the Gauss-Legendre method with s stages, of order 2 s, over a unit step.
-
-    They are not to be written to.
-    """
+    """A (s, s), b (s,), c (s,) of the Gauss-Legendre method with s stages, of order 2 s, on a unit step; read-only."""
     x, w = np.polynomial.legendre.leggauss(stages)
     c, b = 0.5 * (1.0 + x), 0.5 * w
-    # The rule itself integrates the Lagrange polynomials from 0 to each node, exactly.
+    # The quadrature rule integrates the Lagrange polynomials from 0 to each node exactly.
     a = np.array([c[i] * (b @ interpolation(c, c[i] * c)) for i in range(stages)])
-    # Symplectic, b_i a_ij + b_j a_ji = b_i b_j, to the last digit.
+    # Make b_i a_ij + b_j a_ji = b_i b_j (symplecticity) exact to rounding.
     half = b[:, None] * a
-    return _held(0.5 * b + 0.5 * (half - half.T) / b[:, None], b, c)
+    return _read_only(0.5 * b + 0.5 * (half - half.T) / b[:, None], b, c)
 
 
 @functools.cache
@@ -41,17 +38,17 @@ def radau_coefficients(stages: int) -> tuple[Floats, Floats, Floats]:
     """A (s, s), b (s,) and c (s,) of the Radau IIA method with s stages, of order 2 s - 1, over a unit step.
 
     Its points are the end of the step and the roots of a Jacobi polynomial (Hairer and Wanner, Solving Ordinary
-    Differential Equations II, IV.5). They are not to be written to.
+    Differential Equations II, IV.5). The arrays are read-only.
     """
     inner, _ = scipy.special.roots_jacobi(stages - 1, 1.0, 0.0) if stages > 1 else (np.zeros(0), None)
     c = np.append(0.5 * (1.0 + inner), 1.0)
-    # Gauss's rule of as many points integrates the Lagrange polynomials exactly.
+    # The Gauss rule with as many points integrates the Lagrange polynomials exactly.
     _, weights, points = gauss_coefficients(stages)
     a = np.array([c[i] * (weights @ interpolation(c, c[i] * points)) for i in range(stages)])
-    return _held(a, a[-1].copy(), c)
+    return _read_only(a, a[-1].copy(), c)
 
 
-def _held(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats, Floats]:
+def _read_only(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats, Floats]:
     for array in (a, b, c):
         array.setflags(write=False)
     return a, b, c
@@ -87,7 +84,7 @@ def radau(stages: int) -> Tableau:
 def midpoint(alpha: float) -> Tableau:
     """The generalized midpoint rule: the Lagrangian at ``alpha``, each half-step with half of the forces' impulse."""
     one = np.ones(1)
-    # At its end the polynomial through the one stage meets the next step's; at alpha = 1 they are the same point.
+    # The prediction interpolates between c = 1/2, for every alpha, and 1: the two points must differ.
     ahead = interpolation(np.array([0.5, 1.0]), np.array([1.5]))
     return Tableau.make(
         a=np.full((1, 1), alpha),
@@ -104,9 +101,9 @@ def midpoint(alpha: float) -> Tableau:
 
 @functools.cache
 def lobatto_places(stages: int) -> Floats:
-    """Integrals (s + 1, s) of the Lagrange polynomials on Gauss's s points from 0 to each of Lobatto's s + 1 points.
+    """Integrals (s + 1, s) of the Lagrange polynomials on s Gauss points, from 0 to each of s + 1 Lobatto points.
 
-    Where constraints hold within a step of unit length. They are not to be written to.
+    Constraints hold at the Lobatto points of a unit step. The array is read-only.
     """
     _, weights, points = gauss_coefficients(stages)
     inner = np.polynomial.legendre.Legendre.basis(stages).deriv().roots().real
@@ -118,7 +115,7 @@ def lobatto_places(stages: int) -> Floats:
 
 
 def stability(a: Floats, b: Floats, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """The stability function 1 + z b' (1 - z A)^-1 1 of a Runge-Kutta method at some places z (k,)."""
+    """The stability function 1 + z b' (1 - z A)^-1 1 (k,) of a Runge-Kutta method at z (k,)."""
     stages = np.linalg.solve(np.eye(len(b)) - z[:, None, None] * a, np.ones((len(z), len(b), 1)))
     values: NDArray[np.complex128] = 1.0 + z * (stages[..., 0] @ b)
     return values

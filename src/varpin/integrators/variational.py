@@ -1,4 +1,4 @@
-"""What the variational integrators share: state, kicks, guards."""
+"""The base class of variational integrators: state, noise impulses, guards."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ from varpin.trajectory import MOST_HALVINGS, Bytes, Trajectory
 
 Floats = NDArray[np.float64]
 
-# A balance of energies that always closes.
-_ANY_ENERGY = 1e300
+# Tolerance of an energy balance that is not checked.
+_UNCHECKED = 1e300
 
 # Second derivatives under constraints are differences of the first of fourth order: places and weights, in units of a
 # shift [rad or m, or of speed].
@@ -69,34 +69,34 @@ REASONS: dict[int, str] = {
 
 @dataclass(frozen=True)
 class VariationalRun:
-    """Where a rollout stands.
+    """State of a rollout.
 
     Attributes:
-        paths: In the core.
-        start: Configurations at which the rollout started (P, n) [rad or m].
-        moved: Whether joints are moved by hand.
+        paths: The paths in the core.
+        start: Initial configurations (P, n) [rad or m].
+        driven: Whether the scene has kinematic inputs.
     """
 
     paths: VariationalRollout | ConstrainedRollout
     start: Floats
-    moved: bool = False
+    driven: bool = False
 
 
 @dataclass(frozen=True)
 class Guard:
-    """When a variational step is accepted; one that is not is taken in halves, and halves of halves.
+    """Conditions on accepted variational steps. A step that is not accepted is halved, repeatedly if need be.
 
-    Its step equation has other roots than the one that is connected to dt -> 0, and Newton's method finds them
+    The step equation has other roots than the one that is connected to dt -> 0, and Newton's method may find them
     (docs/mathematics.md, "The principal branch").
 
     Args:
-        branch_margin: How far from the fold of solutions a root must stay: the destabilising term of the step
-            equation's Jacobian is exaggerated by 1 / (1 - branch_margin), in [0, 1).
-        energy_balance: Largest error in the energy balance of a substep, in units of the energy it turns over.
-        energy_budget: The errors of all substeps together, in units of the largest kinetic energy so far (plus the work
-            done by forces); a fuller ledger leaves less room for errors of its own sign.
-        max_halvings: No part of a step is shorter than 2**-max_halvings of it, at most 30; and there are about 4096
-            parts at most.
+        branch_margin: Required distance of a root from the fold of solutions, in [0, 1): the destabilising term of the
+            step equation's Jacobian is multiplied by 1 / (1 - branch_margin).
+        energy_balance: Largest error in the energy balance of a substep, relative to the energy that it converts.
+        energy_budget: Largest sum of these errors over all substeps, relative to the largest kinetic energy so far
+            (plus the work done by forces). The closer the sum is to the budget, the smaller the errors of the same sign
+            that are accepted.
+        max_halvings: Most halvings of a step, at most 30: a step has at most 2**max_halvings parts.
 
     Raises:
         InputError: A value is out of its range.
@@ -121,7 +121,7 @@ class Guard:
 
 
 class Variational(Integrator):
-    """A variational integrator on (q, p) whose steps are guarded, cut and kicked."""
+    """A variational integrator on (q, p) with guarded steps and noise impulses."""
 
     guard: Guard | None
     tolerance: float
@@ -130,7 +130,7 @@ class Variational(Integrator):
     variational = True
 
     def same_map(self, other: Integrator) -> bool:
-        """See :meth:`Integrator.same_map`: guards decide which steps are cut, not what a step is."""
+        """See :meth:`Integrator.same_map`; guards and tolerances do not change the map of an undivided step."""
         mine, others = ({k: v for k, v in vars(x).items() if k not in ("guard", "tolerance")} for x in (self, other))
         return type(self) is type(other) and mine == others
 
@@ -143,7 +143,7 @@ class Variational(Integrator):
 
     @property
     def left(self) -> float:
-        """The part of a step's kick that comes before the step."""
+        """See :attr:`Integrator.left`."""
         return 1.0 if self.kick == "left" else 0.5
 
     @property
@@ -153,17 +153,17 @@ class Variational(Integrator):
 
     @abstractmethod
     def _tableau(self) -> Tableau:
-        """Its coefficients."""
+        """The coefficients of the method."""
 
     def _constraint_places(self) -> Floats | None:
-        """Integrals (s + 1, s) to the points where constraints hold, :func:`lobatto_places`; None if they cannot."""
+        """:func:`lobatto_places` of the points where constraints hold; None for methods without constraints."""
         return None
 
     def _places(self, scene: Scene) -> Floats:
-        """Those points, for a scene with constraints.
+        """:meth:`_constraint_places`, checked for a scene with constraints.
 
         Raises:
-            InputError: It cannot keep them, or the scene has noise that it cannot take with them.
+            InputError: The method takes no constraints, or the scene has noise that does not go with them.
         """
         places = self._constraint_places()
         if places is None:
@@ -179,27 +179,27 @@ class Variational(Integrator):
         return places
 
     def _shares(self) -> tuple[float, float]:
-        """What of the guard's energy balance and budget is asked of its steps."""
+        """Factors of the guard's energy balance and energy budget."""
         return 1.0, 1.0
 
     def _guards(self) -> Guards:
-        return _of_core(self.guard, *self._shares())
+        return _core_guards(self.guard, *self._shares())
 
-    def _guards_of(self, *, moved: bool) -> Guards:
-        """Those of a scene: what moves a joint by hand gives and takes energy as it likes."""
-        if self.guard is None or not moved:
+    def _guards_of(self, *, driven: bool) -> Guards:
+        """Guards of a scene; with kinematic inputs, which exchange energy, they do not check the energy."""
+        if self.guard is None or not driven:
             return self._guards()
-        return _of_core(replace(self.guard, energy_balance=_ANY_ENERGY, energy_budget=_ANY_ENERGY))
+        return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
 
     def _guards_again(self, trajectory: Trajectory) -> Guards:
-        """When the parts of a motion's steps are accepted that are taken again at dw = 0.
+        """Guards for repeating the steps of a trajectory at dw = 0.
 
-        The guards have passed them once, and where nothing is noisy no more is asked. Without the kick that noise gave
-        it, a step is another one: its parts must have roots on the branch that is connected to dt -> 0.
+        Without noise the steps are the same, and there is nothing to check. Otherwise the steps differ by the noise
+        impulses, and their roots must lie on the branch that is connected to dt -> 0.
         """
         if self.guard is None or not trajectory.dw.any():
-            return _of_core(None)
-        return _of_core(replace(self.guard, energy_balance=_ANY_ENERGY, energy_budget=_ANY_ENERGY))
+            return _core_guards(None)
+        return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[VariationalRun, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
@@ -209,7 +209,7 @@ class Variational(Integrator):
 
     def _begun(self, scene: Scene, q0: Floats, v0: Floats) -> VariationalRun:
         rollout: VariationalRollout | ConstrainedRollout
-        guards = self._guards_of(moved=bool(scene.inputs))
+        guards = self._guards_of(driven=bool(scene.inputs))
         if scene.constraints:
             rollout = ConstrainedRollout(
                 scene.core, self._tableau(), self._places(scene), float(self.tolerance), guards, len(q0)
@@ -222,7 +222,7 @@ class Variational(Integrator):
 
     def fork(self, state: VariationalRun) -> VariationalRun:
         """See :meth:`Integrator.fork`."""
-        return replace(state, paths=state.paths.fork(self._guards_of(moved=state.moved)))
+        return replace(state, paths=state.paths.fork(self._guards_of(driven=state.driven)))
 
     def rollout_compiled(
         self,
@@ -266,7 +266,7 @@ class Variational(Integrator):
         dt: float,
         impulses: Floats | None = None,
     ) -> tuple[Floats, Floats] | None:
-        """See :meth:`Integrator.motions`; under constraints it takes no impulses."""
+        """See :meth:`Integrator.motions`; impulses are not available under constraints."""
         if impulses is not None and scene.constraints:
             return None
         try:
@@ -307,19 +307,19 @@ class Variational(Integrator):
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, p).
 
-        A step that was taken in parts is taken again in the same parts, and their derivatives are chained.
+        Divided steps are repeated in the same parts, and the derivatives of the parts are multiplied.
         """
         Jx, Jf = self._derivatives(scene, trajectory)
         kicks = Jx[:, :, scene.robot.dof :]
         if max(scene.rates, default=-1) >= 0:
-            # The momentum of such a joint tells its velocity, which a kick leaves as it is.
+            # A noise impulse does not change the velocity of a joint with a cubic input.
             kicks = kicks @ _along(scene, trajectory.q[:-1])
         return Jx, Jf, kicks
 
     def _derivatives(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> tuple[Floats, Floats]:
-        """Of each step in (q, p) and in a force that is constant over it, or grows from 0 to it if it is a ramp.
+        """Derivatives of each step in (q, p) and in a constant force, with ``ramp`` one that grows linearly from 0.
 
-        Behind the forces stand the velocities of cubic inputs, as in :attr:`Scene.transmission`.
+        The columns of velocities of cubic inputs follow those of the force, as in :attr:`Scene.transmission`.
         """
         steps = self._steps(scene, trajectory)
         guess = np.ascontiguousarray(self._guess(trajectory))
@@ -387,7 +387,7 @@ class Variational(Integrator):
         return self._derivatives(scene, trajectory, ramp=True)[1]
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
-        """See :meth:`Integrator.contract`; steps that were taken in parts are chained as in :meth:`linearize`."""
+        """See :meth:`Integrator.contract`; divided steps are treated as in :meth:`linearize`."""
         if scene.custom is not None:
             raise InputError("second derivatives are not there for a scene with a CustomForce")
         if scene.constraints:
@@ -400,13 +400,13 @@ class Variational(Integrator):
         return H
 
     def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
-        """See :meth:`Integrator.quiet_ends`; of the steps that :meth:`linearize` differentiates."""
+        """See :meth:`Integrator.quiet_ends`; the steps are those that :meth:`linearize` differentiates."""
         q, v, outcome, done = variational_ends(**self._steps(scene, trajectory))
         _require_solved(trajectory, outcome, done)
         return q, v
 
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
-        """What the core takes every step at dw = 0 again from, by the names of its arguments."""
+        """Arguments of the core, by name, to repeat every step at dw = 0."""
         statistics = trajectory.statistics
         damage = statistics.damage()
         if damage is None and (statistics.substeps < 1).any():
@@ -432,16 +432,16 @@ class Variational(Integrator):
         }
 
     def _guess(self, trajectory: Trajectory) -> Floats:
-        """Stage velocities (N, s, n) next to the roots of every step at dw = 0: of the cubic through both nodes.
+        """Initial stage velocities (N, s, n) for every step at dw = 0, from the cubic through both nodes.
 
-        With noise that step starts from another momentum, and its velocity is all there is to go by.
+        With noise that step starts from another momentum, so the guess is the velocity at its start.
         """
         q, v, c = trajectory.q, trajectory.v, self._times()[None, :, None]
         if trajectory.dw.any():
             return v[:-1, None] + np.zeros_like(c)
         mean = (np.diff(q, axis=0) / trajectory.dt)[:, None]
         if c.size == 1:
-            return mean  # of one stage the root itself
+            return mean  # the exact root for one stage
         guess: Floats = (
             (1.0 - c) * (1.0 - 3.0 * c) * v[:-1, None] + c * (3.0 * c - 2.0) * v[1:, None] + 6.0 * c * (1.0 - c) * mean
         )
@@ -449,11 +449,11 @@ class Variational(Integrator):
 
     @abstractmethod
     def _times(self) -> Floats:
-        """Where its stages stand in a step of unit length (s,)."""
+        """Times of the stages in a unit step (s,)."""
 
 
 def _constrained(scene: Scene, paths: ConstrainedRollout, i: int, segment: Segment) -> Segment:
-    """With the impulses of path ``i``, and the constraint that stopped it, if one did."""
+    """The segment with the impulses of path ``i`` and, in its failure, the constraint that stopped the path."""
     failure = segment.failure
     if failure is not None and failure.reason in (REASONS[Outcome.toggle], REASONS[Outcome.assembly]):
         label = scene.bound_constraints.labels[paths.weakest(i)]
@@ -462,7 +462,7 @@ def _constrained(scene: Scene, paths: ConstrainedRollout, i: int, segment: Segme
 
 
 def _along(scene: Scene, q: Floats) -> Floats:
-    """What constraints leave of impulses at configurations (N, n): 1 - C' (C M^-1 C')^-1 C M^-1, (N, n, n)."""
+    """Projection 1 - C' (C M^-1 C')^-1 C M^-1 (N, n, n) of impulses onto the constraints at configurations (N, n)."""
     M = scene.core.jets(np.ascontiguousarray(q), np.zeros_like(q))[0]
     C = scene.core.constraints(np.ascontiguousarray(q))[2]
     eased = np.linalg.solve(M, C.transpose(0, 2, 1))
@@ -473,10 +473,10 @@ def _along(scene: Scene, q: Floats) -> Floats:
 
 
 @functools.lru_cache(maxsize=256)
-def _of_core(asked: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
-    guard = asked or Guard(max_halvings=0)
+def _core_guards(given: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
+    guard = given or Guard(max_halvings=0)
     return Guards.make(
-        active=asked is not None,
+        active=given is not None,
         branch_margin=float(guard.branch_margin),
         energy_balance=balance * float(guard.energy_balance),
         energy_budget=budget * float(guard.energy_budget),
@@ -492,7 +492,7 @@ def _require_solved(trajectory: Trajectory, outcome: int, done: int) -> None:
 def _rolled(
     scene: Scene, state: VariationalRun, commands: Commands, increments: Floats, drift: Floats, dt: float
 ) -> Nodes:
-    """The nodes of some steps, by which the state moves on."""
+    """Advance ``state`` by the steps of ``commands``; the nodes after them."""
     nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
     state.paths.roll(dt, commands, increments, drift, nodes)
     return nodes

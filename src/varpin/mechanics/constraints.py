@@ -1,10 +1,10 @@
-"""Holonomic constraints g(q) = 0: loops that close, welds, planes, lines, rods, gears, functions of one's own.
+"""Holonomic constraints g(q) = 0: closed loops, welds, planes, lines, rods, gears, user functions.
 
     scene = vp.Scene(robot, constraints=[vp.PointOnPoint("tip", (1.0, 0.0, 0.0), axes="xz")])
 
-They hold at every node and at inner points of every step, and they are bilateral: nothing lifts off, nothing hits.
-Points are given as in :mod:`varpin.mechanics.forces`: a frame's name for its origin, a pair of that and a place in the
-frame's axes (3,) [m], or a place in the world (3,) [m].
+They hold at every node and at inner points of every step. They are bilateral: there is no contact and no impact.
+Points are given as in :mod:`varpin.mechanics.forces`: a frame name for the frame's origin, (frame name, point in the
+frame's axes (3,) [m]), or a point in world axes (3,) [m].
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _AXES = "xyz"
 
 
 class Bound(NamedTuple):
-    """A constraint on a robot, as the core takes it."""
+    """A constraint on a robot, in the form of the core."""
 
     rows: ConstraintRows
-    labels: tuple[str, ...]  # of each row
-    # Pairs of vectors whose product is positive in the assembly that is meant, and not in others that the rows allow.
+    labels: tuple[str, ...]  # one for each row
+    # Pairs of vectors whose product is 1 in the intended assembly, and -1 or 0 in others that satisfy the rows.
     aligned: tuple[tuple[int, int], ...] = ()
 
 
@@ -57,9 +57,9 @@ class Constraint(Frozen, ABC):
         """The constraint on a robot.
 
         Raises:
-            InputError: A wrong shape, or a value that is not finite or out of range; no joint moves what it ties.
-            UnknownJoint: It names a joint that is no coordinate of the robot.
-            UnknownFrame: It names a frame that the robot does not have.
+            InputError: A wrong shape; a value that is not finite or out of range; no joint moves either end.
+            UnknownJoint: A joint is no coordinate of the robot.
+            UnknownFrame: The robot has no such frame.
         """
 
 
@@ -71,14 +71,14 @@ def _shown(value: Any) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointOnPoint(Constraint):
-    """Two points that stay together along some axes of the world: g = x_a - x_b, the closure of a loop.
+    """Two points that coincide along some world axes, for closed loops: g = x_a - x_b.
 
-    Its forces act on a along these axes, and on b the other way [N].
+    The constraint forces act on a along these axes, and with opposite sign on b [N].
 
     Attributes:
-        a: The one point.
-        b: The other.
-        axes: Which axes: some of ``"xyz"``.
+        a: First point.
+        b: Second point.
+        axes: Constrained world axes, some of ``"xyz"``.
     """
 
     a: Point
@@ -98,14 +98,15 @@ class PointOnPoint(Constraint):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrameOnFrame(Constraint):
-    """Two frames that stay together as if welded: three rows of places and three of rotation.
+    """Two frames welded together: three rows of position and three of rotation.
 
-    Its forces act on a along the axes of the world [N], its moments about those of b [N m].
+    The constraint forces act on a along the world axes [N], the moments about the axes of b [N m].
 
     Attributes:
-        a: The one frame's name.
-        b: The other's; ``"universe"`` is the world.
-        placement: Where a stands in b's axes: (4, 4) with a rotation and a place [m]. Left out, on b itself.
+        a: Name of the first frame.
+        b: Name of the second frame; ``"universe"`` is the world.
+        placement: Pose of a in b's axes, (4, 4) homogeneous matrix of a rotation and a translation [m]; the identity if
+            left out.
     """
 
     a: str
@@ -131,7 +132,7 @@ class FrameOnFrame(Constraint):
         # d(y_a . z_b) = (w_a - w_b) . (y_a x z_b), the turn about x.
         turns = [Product(4 + (k + 1) % 3, 7 + (k + 2) % 3, 1.0, 0.0) for k in range(3)]
         rows = ConstraintRows(tuple(vectors), (*(Product(0, 1 + k, 1.0, 0.0) for k in range(3)), *turns))
-        # Without the sixteen numbers of the placement, behind which the rest would not be seen.
+        # The labels leave out the sixteen numbers of the placement.
         name = f"FrameOnFrame(a={self.a!r}, b={self.b!r})"
         labels = [f"{name} along {axis}" for axis in _AXES] + [f"{name} about {axis}" for axis in _AXES]
         return Bound(rows, tuple(labels), tuple((4 + k, 7 + k) for k in range(3)))
@@ -139,12 +140,12 @@ class FrameOnFrame(Constraint):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointOnPlane(Constraint):
-    """A point that stays in a plane: g = normal . (x_a - x_b). Its force acts on a along the normal [N].
+    """A point on a plane: g = normal . (x_a - x_b). The constraint force acts on a along the normal [N].
 
     Attributes:
         a: The point.
-        b: A point of the plane, which may be carried by a frame.
-        normal: Of the plane (3,), of any length, in the axes of b's frame, or of the world.
+        b: A point of the plane; it may be fixed to a frame.
+        normal: Normal of the plane (3,), of any length, in the axes of b's frame, or of the world.
     """
 
     a: Point
@@ -161,12 +162,12 @@ class PointOnPlane(Constraint):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointOnLine(Constraint):
-    """A point that stays on a line. Its two forces act on a across the line [N].
+    """A point on a line. The two constraint forces act on a across the line [N].
 
     Attributes:
         a: The point.
-        b: A point of the line, which may be carried by a frame.
-        direction: Of the line (3,), of any length, in the axes of b's frame, or of the world.
+        b: A point of the line; it may be fixed to a frame.
+        direction: Direction of the line (3,), of any length, in the axes of b's frame, or of the world.
     """
 
     a: Point
@@ -187,13 +188,13 @@ class PointOnLine(Constraint):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Distance(Constraint):
-    """Two points at a fixed distance, as of a rigid rod: g = (d . d - length^2) / (2 length), d = x_a - x_b.
+    """Two points at a fixed distance (a rigid rod): g = (d . d - length^2) / (2 length), d = x_a - x_b.
 
-    Its force acts on a away from b [N].
+    The constraint force acts on a, away from b [N].
 
     Attributes:
-        a: The one point.
-        b: The other.
+        a: First point.
+        b: Second point.
         length: > 0 [m].
     """
 
@@ -210,13 +211,13 @@ class Distance(Constraint):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointTie(Constraint):
-    """A joint tied to another: g = q_joint - (c_0 + c_1 q_leader + c_2 q_leader^2 + ...), as gears and cams are.
+    """A joint that follows another, as with gears and cams: g = q_joint - (c_0 + c_1 q_leader + c_2 q_leader^2 + ...).
 
-    Its force is that on the joint [N m or N].
+    The constraint force is the one on the following joint [N m or N].
 
     Attributes:
-        joint: The one joint's name.
-        leader: The other's.
+        joint: Name of the following joint.
+        leader: Name of the leading joint.
         coefficients: c (k,); (0, r) is a gear of ratio r.
     """
 
@@ -241,18 +242,18 @@ class JointTie(Constraint):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class KinematicInput(Constraint):
-    """A joint that is moved by hand: its control is where it is at the end of a step, and its force follows.
+    """A joint with a prescribed motion: its control is its position at the end of each step, and its force results.
 
-    Row k of the controls has its position [rad or m] at node k + 1, in place of a force; the actuation gives it a
-    control of its own with a 1, as it does where it is left out. ``Trajectory.constraint_forces`` has the force on the
-    joint, its mean over each step [N m or N].
+    Row k of the controls holds the joint's position [rad or m] at node k + 1, in place of a force. The joint needs a
+    control of its own: a column of the actuation with a 1, as in the default actuation.
+    ``Trajectory.constraint_forces`` holds the mean force on the joint over each step [N m or N].
 
     Attributes:
-        joint: The joint's name.
-        interpolation: How it moves within a step: ``"linear"``, at a constant rate from where it is, or ``"cubic"``, on
-            the cubic through position and velocity at both nodes. A cubic has a second control, its velocity at node
-            k + 1 [rad/s or m/s]: a column that the scene adds behind those of ``actuation``, in the order of the
-            scene's constraints. Velocities are continuous then, and no impulse acts at nodes.
+        joint: Name of the joint.
+        interpolation: Motion within a step. ``"linear"``: constant rate. ``"cubic"``: the cubic through position and
+            velocity at both nodes. A cubic has a second control, the velocity at node k + 1 [rad/s or m/s]: a column
+            that the scene adds behind those of ``actuation``, in the order of the scene's constraints. Velocities are
+            then continuous, and no impulse acts at nodes.
     """
 
     joint: str
@@ -269,21 +270,21 @@ class KinematicInput(Constraint):
         if not is_one_of(self.interpolation, ("linear", "cubic")):
             raise InputError(f"interpolation must be 'linear' or 'cubic', got {self.interpolation!r}")
         c = robot.coordinate(self.joint)
-        # Which control its rate is, the scene knows.
+        # 0 marks a cubic; the scene fills in the index of the velocity control.
         rate = 0 if self.interpolation == "cubic" else -1
         return Bound(ConstraintRows(ties=(Tied(c, c, (), rate),)), (f"{self!r}",))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CustomConstraint(Constraint):
-    """Constraints of one's own. Its forces go with its rows: the joints feel jacobian' force.
+    """Constraints that the user writes in Python. Their generalized force is jacobian' lambda, one lambda per row.
 
     Attributes:
-        rows: How many, r.
+        rows: Number of rows r.
         value: g, a function of q (n,) that returns (r,), in [m] or [rad].
-        jacobian: dg/dq, a function of q that returns (r, n). Forces come from it: it has to be exact.
-        curvature: sum_k w_k d2 g_k/dq2, a function of q and weights w (r,) that returns (n, n). Left out, it is taken
-            from differences of the Jacobian: linearizations are then good to about 1e-9.
+        jacobian: dg/dq, a function of q that returns (r, n). It must be exact: it also gives the constraint forces.
+        curvature: sum_k w_k d2 g_k/dq2, a function of q and weights w (r,) that returns (n, n). If left out,
+            differences of the Jacobian replace it, and linearizations are accurate to about 1e-9.
     """
 
     rows: int
@@ -307,21 +308,21 @@ class CustomConstraint(Constraint):
 
 
 class CustomConstraintError(InputError):
-    """A function of a custom constraint raised, or returned something that is no value of it."""
+    """A function of a custom constraint raised, or returned a wrong type, shape or value."""
 
 
-def _asked(name: str, call: Callable[[], ArrayLike], shape: tuple[int, ...], q: Floats) -> Floats:
-    """What a function of a custom constraint returns, checked.
+def _called(name: str, call: Callable[[], ArrayLike], shape: tuple[int, ...], q: Floats) -> Floats:
+    """The checked result of a function of a custom constraint.
 
     Raises:
-        CustomConstraintError: It raised, or returned something else.
+        CustomConstraintError: The function raised, or its result is not a finite array of this shape.
     """
     what = f"the {name} of a CustomConstraint"
     try:
         given = call()
     except Exception as error:
-        place = np.array2string(q, precision=6)
-        raise CustomConstraintError(f"{what} raised {error!r} at q = {place}") from error
+        at = np.array2string(q, precision=6)
+        raise CustomConstraintError(f"{what} raised {error!r} at q = {at}") from error
     try:
         return finite_array(what, given, shape)
     except InputError as error:
@@ -330,22 +331,22 @@ def _asked(name: str, call: Callable[[], ArrayLike], shape: tuple[int, ...], q: 
 
 @dataclass(frozen=True)
 class _Values:
-    """G and C of a custom constraint, checked."""
+    """Checked g (r,) and dg/dq (r, n) of a custom constraint."""
 
     custom: CustomConstraint
     dof: int
 
     def __call__(self, q: Floats) -> tuple[Floats, Floats]:
         r = int(self.custom.rows)
-        return _asked("value", lambda: self.custom.value(q), (r,), q), self.jacobian(q)
+        return _called("value", lambda: self.custom.value(q), (r,), q), self.jacobian(q)
 
     def jacobian(self, q: Floats) -> Floats:
-        return _asked("jacobian", lambda: self.custom.jacobian(q), (int(self.custom.rows), self.dof), q)
+        return _called("jacobian", lambda: self.custom.jacobian(q), (int(self.custom.rows), self.dof), q)
 
 
 @dataclass(frozen=True)
 class _Curvature:
-    """Its second derivatives, contracted."""
+    """Checked sum_k w_k d2 g_k/dq2 (n, n) of a custom constraint, by differences where the user gives none."""
 
     custom: CustomConstraint
     dof: int
@@ -354,7 +355,7 @@ class _Curvature:
         n = self.dof
         curvature = self.custom.curvature
         if curvature is not None:
-            return _asked("curvature", lambda: curvature(q, weights), (n, n), q)
+            return _called("curvature", lambda: curvature(q, weights), (n, n), q)
         slope = _Values(self.custom, n).jacobian
         H = np.empty((n, n))
         for c in range(n):
@@ -367,17 +368,17 @@ class _Curvature:
 
 
 def constraints_of(given: Constraint | Sequence[Constraint]) -> tuple[Constraint, ...]:
-    """What a user gives as constraints.
+    """A constraint or a sequence of them as a tuple.
 
     Raises:
-        InputError: It is none of them.
+        InputError: Something else is given.
     """
     note = "; those of a plan, such as limits and obstacles, belong to varpin.OptimalControlProblem(constraints=)"
     return tuple_of("constraints", given, Constraint, note)
 
 
 def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:
-    """All of them as one, its rows in the core's order; and where each row of the given order stands there."""
+    """All constraints as one with its rows in the core's order, and the position there of each row as given (c,)."""
     vectors: list[tuple[Carried, ...]] = []
     products: list[tuple[int, Product]] = []
     ties: list[tuple[int, Tied]] = []
@@ -401,8 +402,8 @@ def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:
         tuple(tie for _, tie in ties),
         tuple(custom for _, custom in customs),
     )
-    place = np.argsort(np.array(core, dtype=np.int64))
-    return Bound(together, tuple(labels[row] for row in core), tuple(aligned)), place
+    order = np.argsort(np.array(core, dtype=np.int64))
+    return Bound(together, tuple(labels[row] for row in core), tuple(aligned)), order
 
 
 def _row(values: Floats) -> tuple[float, float, float]:

@@ -20,41 +20,41 @@ Floats = NDArray[np.float64]
 Field: TypeAlias = Callable[[Floats, Floats], ArrayLike]
 Slopes: TypeAlias = Callable[[Floats, Floats], tuple[ArrayLike, ArrayLike]]
 
-# Of central differences of eighth order, and of those of sixth order at the same points; what the two differ by, in
-# units of the derivative and the force, that needs no smaller step.
+# Weights of central differences of eighth order, and of sixth order at the same points.
 _WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 _LOWER = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60, 4: 0.0}
+# Largest difference of the two orders that needs no smaller step, relative to the derivative and the force.
 _SMOOTH = 1e-8
-# Their steps in units of what is moved, 1 at least: the next where the function is not smooth over four of one.
+# Steps of the differences, relative to max(1, |coordinate|), from the largest on.
 _STEPS = (2e-3, 2e-4, 2e-5, 2e-6)
-# An imaginary step, and how far derivatives may be from differences, beside the error of those.
-_TINY, _AGREES = 1e-200, 1e-6
-_DOUBT = 10.0
-# Differences that are known less well than this are no derivatives.
+# Imaginary step of the complex-step derivative.
+_TINY = 1e-200
+# A derivative is right within this share of its size, plus this many error bounds of the differences.
+_AGREES, _DOUBT = 1e-6, 10.0
+# Differences with a larger relative error bound than this are not compared.
 _KNOWN = 1e-4
-# States at which the complex step is held against differences, and how far from rest they are.
+# Number of random states at which complex steps are compared with differences, and their standard deviation.
 _PROBES, _AROUND = 2, 0.3
 
 
 class CustomForceError(InputError):
-    """A function of a custom force raised, or returned something that is no force."""
+    """A function of a custom force raised, or returned a wrong type, shape or value."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CustomForce(Force):
-    """A generalized force of your own, in Python: drag, a cable, a learned friction.
+    """A generalized force that you write in Python: drag, a cable, a learned friction.
 
-    Every integrator asks for it wherever it looks at the scene's forces, at every iterate of every stage, and so the
-    order of the motion is whole; each call takes its time in Python. It may act on all joints and depend on all of
-    them. What it does is work in the balance of the energy. A motion keeps no record of it.
+    Integrators evaluate it in every iteration of every stage, so they keep their order; each evaluation costs a Python
+    call. The force may depend on and act on all joints. Its work enters the energy balance. Trajectories do not record
+    it.
 
     Attributes:
-        f: Function of (q (n,), v (n,)) that returns the force (n,) [N m or N], n coordinates of the robot.
-        derivatives: Function of (q, v) that returns (dF/dq, dF/dv), each (n, n); ``"complex"`` takes them by complex
-            steps, exact to rounding, for an ``f`` of analytic operations (no ``abs``, no comparisons); left out,
-            by central differences of eighth order, good to about 1e-10 of the force where it is smooth, in steps that
-            become as small as it takes. Those that are given are held against differences once, where a motion
-            starts.
+        f: Function of (q (n,), v (n,)) that returns the force (n,) [N m or N] on the n coordinates of the robot.
+        derivatives: Function of (q, v) that returns (dF/dq, dF/dv), each (n, n). It is compared with differences once,
+            at the start of the first motion. ``"complex"``: complex steps, exact to rounding, for an ``f`` of analytic
+            operations (no ``abs``, no comparisons). Left out: central differences of eighth order with adaptive steps,
+            accurate to about 1e-10 of the force where it is smooth.
     """
 
     f: Field
@@ -75,11 +75,11 @@ class CustomForce(Force):
 
     @property
     def name(self) -> str:
-        """Of the function."""
+        """Name of the function."""
         return str(getattr(self.f, "__name__", type(self.f).__name__))
 
     def bind(self, robot: Robot) -> tuple[Element | Coupling, ...]:
-        """See :meth:`Force.bind`; the core asks the function itself.
+        """See :meth:`Force.bind`; the core calls the function itself.
 
         Raises:
             InputError: Complex steps do not give the derivatives of ``f``.
@@ -92,13 +92,13 @@ class CustomForce(Force):
         """The force (n,).
 
         Raises:
-            CustomForceError: The function raised, or returned something that is no force.
+            CustomForceError: The function raised, or its result is not a finite real array (n,).
         """
-        value = self._asked(lambda: self.f(q.copy(), v.copy()), "f(q, v)", q, v)
+        value = self._called(lambda: self.f(q.copy(), v.copy()), "f(q, v)", q, v)
         return self._read(value, "f(q, v)", (q.size,), q, v)
 
     def slopes(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        """Its derivatives (n, n) in q and in v.
+        """Derivatives dF/dq and dF/dv, each (n, n).
 
         Raises:
             CustomForceError: As :meth:`at`.
@@ -106,7 +106,7 @@ class CustomForce(Force):
         n = q.size
         if callable(self.derivatives):
             derivatives = self.derivatives
-            value = self._asked(lambda: derivatives(q.copy(), v.copy()), "derivatives(q, v)", q, v)
+            value = self._called(lambda: derivatives(q.copy(), v.copy()), "derivatives(q, v)", q, v)
             if not isinstance(value, tuple | list) or len(value) != 2:
                 raise CustomForceError(
                     f"CustomForce {self.name}: derivatives(q, v) must return dF/dq and dF/dv, two matrices {(n, n)}, "
@@ -121,7 +121,7 @@ class CustomForce(Force):
         def column(moved: int, c: int) -> Floats:
             state = [q.astype(complex), v.astype(complex)]
             state[moved][c] += 1j * _TINY
-            value = self._asked(lambda: self.f(*state), "f(q, v) of complex numbers", q, v)
+            value = self._called(lambda: self.f(*state), "f(q, v) of complex numbers", q, v)
             return self._read(np.imag(np.asarray(value)) / _TINY, "f(q, v) of complex numbers", (q.size,), q, v)
 
         return self._columns(column, q.size)
@@ -131,10 +131,9 @@ class CustomForce(Force):
         return by_q, by_v
 
     def _difference(self, q: Floats, v: Floats, moved: int, c: int) -> tuple[Floats, float]:
-        """A column of dF/dq or dF/dv, ``moved`` 0 or 1, and what it may be off by.
+        """Column ``c`` (n,) of dF/dq (``moved`` 0) or dF/dv (``moved`` 1), and a bound of its error.
 
-        The step is made smaller until differences of two orders agree: friction may turn round within a small part of
-        it.
+        The step shrinks until differences of two orders agree, since friction may change its sign within a short range.
         """
         best, least = np.zeros_like(q), np.inf
         for share in _STEPS:
@@ -166,12 +165,12 @@ class CustomForce(Force):
             self.check(*(_AROUND * rng.normal(size=(2, n))))
 
     def check(self, q: Floats, v: Floats) -> None:
-        """Hold derivatives that are given, or taken by complex steps, against differences at a state.
+        """Compare derivatives from the user or from complex steps with differences at a state.
 
-        Where the function has none, at a kink or an edge, or is not defined, nothing is said: steps tell.
+        The check skips points where the function is not differentiable or not defined; integration steps report those.
 
         Raises:
-            CustomForceError: They are others.
+            CustomForceError: They differ.
         """
         if self.derivatives is None:
             return
@@ -207,7 +206,7 @@ class CustomForce(Force):
                     f"{column[r]:.8g}, at {_place(q, v)}"
                 )
 
-    def _asked(self, call: Callable[[], object], what: str, q: Floats, v: Floats) -> object:
+    def _called(self, call: Callable[[], object], what: str, q: Floats, v: Floats) -> object:
         try:
             return call()
         except Exception as error:
@@ -231,11 +230,11 @@ def _place(q: Floats, v: Floats) -> str:
 
 @dataclass(frozen=True, eq=False)
 class CustomForces(Frozen):
-    """Several of them together, as the core asks for them.
+    """The sum of several custom forces, in the form that the core calls.
 
     Attributes:
         parts: The forces.
-        checked: Whether their derivatives have been held against differences.
+        checked: Not empty once the derivatives have been compared with differences.
     """
 
     parts: tuple[CustomForce, ...]
@@ -243,11 +242,11 @@ class CustomForces(Frozen):
 
     @property
     def names(self) -> str:
-        """Of the functions."""
+        """Names of the functions."""
         return ", ".join(part.name for part in self.parts)
 
     def check(self, q: Floats, v: Floats) -> None:
-        """:meth:`CustomForce.check` of all, at the first state that a motion starts from.
+        """:meth:`CustomForce.check` of all forces, in the first call only.
 
         Raises:
             CustomForceError: Derivatives are wrong.
@@ -259,9 +258,9 @@ class CustomForces(Frozen):
         self.checked.append(True)
 
     def __call__(self, q: Floats, v: Floats, derivatives: bool) -> tuple[Floats, Floats, Floats]:
-        """The force (n,) and, if wanted, its derivatives (n, n) in q and v.
+        """The force (n,) and its derivatives (n, n) in q and v, or (0, 0) without ``derivatives``.
 
-        An iterate that is not finite has none that is.
+        All are NaN where q or v is not finite.
         """
         n = q.size
         size = n if derivatives else 0

@@ -1,11 +1,11 @@
-"""Forces on joints and on frames: springs, dampers, friction, stops, rotors, servos, wrenches; any number in a scene.
+"""Forces on joints and frames: springs, dampers, friction, stops, rotors, servos, wrenches. A scene takes any number.
 
     scene = vp.Scene(robot, forces=[vp.CoulombFriction(0.5), vp.JointStop(stiffness=1e3, damping=5.0)])
 
-Every integrator and every derivative knows them: steps, linearizations of first and second order, energies and the part
-of them that turns into heat. Parameters of forces on joints are one number for every joint, (n,), or numbers by joint
-name; joints that are not named have none. Forces on frames act at points: a frame's name for its origin, a pair of that
-and a place in the frame's axes (3,) [m], or, where there is another end, a place in the world (3,) [m].
+Every integrator takes them, in steps, in linearizations of first and second order, in energies and in dissipated work.
+Parameters of forces on joints are one number for every joint, (n,), or numbers by joint name; a joint without a number
+has no such force. Forces on frames act at points: a frame name for the frame's origin, (frame name, point in the
+frame's axes (3,) [m]), or, for forces with two ends, a point in world axes (3,) [m].
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from varpin.support.checks import JointValues, as_floats, finite_array, is_one_o
 from varpin.support.frozen import Frozen
 
 Floats = NDArray[np.float64]
-# A frame's origin, a place in its axes, or a place in the world.
+# A frame name or (frame name, point in the frame's axes); a Point may also be a point in world axes.
 FramePoint: TypeAlias = str | tuple[str, ArrayLike]
 Point: TypeAlias = FramePoint | ArrayLike
 
-# How far a rotation matrix may be from one.
+# Tolerance of R' R = 1 for rotation matrices.
 _ROTATION = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Force(Frozen, ABC):
-    """A force that acts on joints one by one, or on frames."""
+    """A force on single joints or on frames."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -50,17 +50,17 @@ class Force(Frozen, ABC):
 
     @abstractmethod
     def bind(self, robot: Robot) -> tuple[Element | Coupling, ...]:
-        """The force on a robot, as the core takes it: one element for each joint that it acts on, or couplings.
+        """The force on a robot, in the form of the core: one element for each joint that it acts on, or couplings.
 
         Raises:
             InputError: A wrong shape, or a value that is not finite or out of range.
-            UnknownJoint: It names a joint that is no coordinate of the robot.
-            UnknownFrame: It names a frame that the robot does not have.
+            UnknownJoint: A joint is no coordinate of the robot.
+            UnknownFrame: The robot has no such frame.
         """
 
 
 def kept(name: str, value: Any) -> Any:
-    """A parameter that no one can change any more."""
+    """An immutable copy of a parameter."""
     if value is None or isinstance(value, str):
         return value
     if isinstance(value, Mapping):
@@ -83,11 +83,11 @@ def shown(value: Any) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointSpring(Force):
-    """Linear springs, part of the potential energy: the force -stiffness * (q - rest).
+    """Linear springs: the force -stiffness * (q - rest). Their energy is part of the potential energy.
 
     Attributes:
         stiffness: >= 0 [N m/rad or N/m].
-        rest: Where they are slack [rad or m].
+        rest: Position without force [rad or m].
     """
 
     stiffness: JointValues
@@ -118,7 +118,7 @@ class JointDamper(Force):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Armature(Force):
-    """Inertia of rotors, seen at the joints: gear ratio squared times the rotor's own. It adds to the robot's armature.
+    """Rotor inertia reflected to the joints, gear ratio squared times rotor inertia; it adds to the robot's armature.
 
     Attributes:
         inertia: >= 0 [kg m^2 or kg].
@@ -136,16 +136,16 @@ class Armature(Force):
 class CoulombFriction(Force):
     """Dry friction, smooth in the velocity: the force -g(v) tanh(v / width).
 
-    g is ``level``; or, with ``breakaway``, level + (breakaway - level) exp(-(v / stribeck_velocity)^2). Nothing sticks
-    for good: under a load of half the level a joint creeps by about half the width. Near rest it is a damper of level /
-    width, as a rule far faster than a step: implicit integrators take that, explicit ones do not, and
-    :attr:`Trajectory.warnings` says where a velocity near rest is wrong for it.
+    g is ``level``; or, with ``breakaway``, level + (breakaway - level) exp(-(v / stribeck_velocity)^2). Joints do not
+    stick: under a load of half the level a joint creeps at about half the width. Near rest the friction is a damper of
+    level / width, usually with a time constant far below a time step. Implicit integrators can step over it, explicit
+    ones cannot; :attr:`Trajectory.warnings` names joints whose velocity near rest is wrong for this reason.
 
     Attributes:
-        level: Friction of a joint that moves, >= 0 [N m or N].
-        width: Velocity at which it is 76 % of itself, > 0 [rad/s or m/s].
+        level: Friction of a moving joint, >= 0 [N m or N].
+        width: Velocity at which tanh reaches 76 %, > 0 [rad/s or m/s].
         breakaway: Friction of a joint that hardly moves, >= level [N m or N]; ``level`` if left out.
-        stribeck_velocity: At which 37 % of the difference are left, > 0 [rad/s or m/s].
+        stribeck_velocity: Velocity at which 37 % of breakaway - level remain, > 0 [rad/s or m/s].
     """
 
     level: JointValues
@@ -171,17 +171,17 @@ class CoulombFriction(Force):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointStop(Force):
-    """A spring and a damper beyond the ends of a joint's way, part of the potential energy and of the losses.
+    """A spring and a damper beyond the ends of a joint's range; they store potential energy and dissipate.
 
-    Stiffness and damping rise smoothly from 0 to the whole over the first ``width`` beyond an end, so that forces have
-    continuous derivatives.
+    Stiffness and damping rise smoothly from 0 to their full values over the first ``width`` beyond an end, so that
+    forces have continuous derivatives.
 
     Attributes:
         stiffness: >= 0 [N m/rad or N/m].
         damping: >= 0 [N m s/rad or N s/m].
         lower: Lower end [rad or m], -inf for none; the robot's own position limit if left out.
         upper: Upper end [rad or m], inf for none; the robot's own position limit if left out.
-        width: > 0 [rad or m].
+        width: Width of the transition, > 0 [rad or m].
     """
 
     stiffness: JointValues
@@ -197,10 +197,10 @@ class JointStop(Force):
         own_lower, own_upper = robot.position_limits
         lower = own_lower if self.lower is None else _ends("lower", self.lower, robot, -np.inf)
         upper = own_upper if self.upper is None else _ends("upper", self.upper, robot, np.inf)
-        asked = (stiffness > 0.0) | (damping > 0.0)
-        acts = asked & (np.isfinite(lower) | np.isfinite(upper))
-        endless = [name for name, wanted, has in zip(robot.joint_names, asked, acts, strict=True) if wanted and not has]
-        # One number for all leaves joints without limits alone, as those that turn for ever.
+        given = (stiffness > 0.0) | (damping > 0.0)
+        acts = given & (np.isfinite(lower) | np.isfinite(upper))
+        endless = [name for name, wanted, has in zip(robot.joint_names, given, acts, strict=True) if wanted and not has]
+        # One number for all joints skips those without limits, such as continuous joints.
         if endless and (isinstance(self.stiffness, Mapping) or not acts.any()):
             raise InputError(
                 f"JointStop: {robot.name} has no position limits for {', '.join(map(repr, endless))}: give lower= and "
@@ -218,11 +218,11 @@ class JointStop(Force):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PositionServo(Force):
-    """Position servos: the control of a joint is the position it is to go to [rad or m], and no force.
+    """Position servos: the control of a joint is its target position [rad or m] in place of a force.
 
-    The drive's force is S(stiffness * (u - q) - damping * v) at every instant of a step, not only where it begins, so
-    implicit integrators take servos of any stiffness. S is the identity up to 0.9 of the effort limit and bends
-    smoothly to the limit at 1.1. The energy of a motion is that of the robot, without its servos'.
+    The drive's force is S(stiffness * (u - q) - damping * v) throughout a step, not only at its start, so implicit
+    integrators take servos of any stiffness. S is the identity up to 0.9 of the effort limit and bends smoothly to the
+    limit at 1.1. The energy of a trajectory excludes the energy of servos.
 
     Attributes:
         stiffness: >= 0 [N m/rad or N/m]; joints with 0 have no servo.
@@ -246,14 +246,14 @@ class PositionServo(Force):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrameWrench(Force):
-    """A constant wrench at a frame. The joints feel J(q)' w.
+    """A constant wrench w at a frame: the generalized force J(q)' w.
 
-    A force that is constant in the world is part of the potential energy, -force . x; a moment, or a wrench that turns
-    with the frame, is not, and does work.
+    A force that is constant in world axes is part of the potential energy, -force . x. A moment, or a wrench that turns
+    with the frame, has no potential; its work changes the energy.
 
     Attributes:
-        frame: Where it acts: a frame's name, or (name, place in the frame's axes).
-        wrench: Force [N] and moment about that place [N m] (6,), linear part first.
+        frame: Point of action: a frame name, or (frame name, point in the frame's axes).
+        wrench: Force [N] and moment about that point [N m] (6,), linear part first.
         axes: ``"world"``, or ``"frame"`` for a wrench that turns with the frame.
     """
 
@@ -286,24 +286,24 @@ class FrameWrench(Force):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrameSpring(Force):
-    """A linear spring between two points, and one that resists turning, part of the potential energy.
+    """A linear spring between two points, with an optional rotational spring. Both are part of the potential energy.
 
     With d = x_a - x_b in world axes the energy is 1/2 sum of stiffness (d - rest)^2 over the axes; with a number > 0
-    for ``rest``, 1/2 stiffness (``|d|`` - rest)^2, whose force has no direction at d = 0, and is none there.
+    for ``rest``, 1/2 stiffness (``|d|`` - rest)^2, whose force is set to zero at d = 0.
 
-    With E = R_0' R_b' R_a, by which frame a has turned from its rest R_0 in b, and the stiffnesses k about the axes of
-    a, the energy of turning is the sum of g_i (1 - E_ii), g_i = (k_1 + k_2 + k_3) / 2 - k_i; with one stiffness k,
-    k (3 - tr E) / 2. That is k (1 - cos angle), k angle^2 / 2 for small angles, smooth at all of them; its moment
-    k sin(angle) is largest at a quarter turn and none at half a turn, where the equilibrium is unstable.
+    Let E = R_0' R_b' R_a be the rotation of frame a from its rest orientation R_0 in b, and k the stiffnesses about the
+    axes of a. The rotational energy is the sum of g_i (1 - E_ii), g_i = (k_1 + k_2 + k_3) / 2 - k_i; with one stiffness
+    k, k (3 - tr E) / 2. That is k (1 - cos angle), smooth at all angles and k angle^2 / 2 at small ones. Its moment
+    k sin(angle) is largest at a quarter turn and zero at half a turn, an unstable equilibrium.
 
     Attributes:
-        a: The one end: a frame's name, (name, place in the frame's axes), or a place in the world (3,) [m].
-        b: The other end.
-        stiffness: >= 0, one number or along each axis of the world (3,) [N/m].
-        rest: Where it is slack: d in world axes (3,), or a length >= 0 [m].
-        rotational_stiffness: >= 0, one number or about each axis of frame a (3,) [N m/rad]; left out, none.
-        rest_rotation: R_0, the axes of frame a in those of b where turning is slack, a rotation matrix (3, 3); left
-            out, they are the same. A place in the world has the axes of the world.
+        a: First end: a frame name, (frame name, point in the frame's axes), or a point in world axes (3,) [m].
+        b: Second end.
+        stiffness: >= 0, one number or along each world axis (3,) [N/m].
+        rest: d without force: in world axes (3,), or a length >= 0 [m].
+        rotational_stiffness: >= 0, one number or about each axis of frame a (3,) [N m/rad]; zero if left out.
+        rest_rotation: R_0, the orientation of frame a in b without moment, a rotation matrix (3, 3); the identity if
+            left out. A point in world axes has the orientation of the world.
     """
 
     a: Point
@@ -318,7 +318,7 @@ class FrameSpring(Force):
         return (*self._of_points(robot), *self._of_turning(robot))
 
     def _of_turning(self, robot: Robot) -> tuple[Coupling, ...]:
-        """One spring between each axis of frame a and where it is at rest."""
+        """One spring between each axis of frame a and its rest direction in b."""
         rest = np.eye(3) if self.rest_rotation is None else finite_array("rest_rotation", self.rest_rotation, (3, 3))
         if not (np.abs(rest.T @ rest - np.eye(3)).max() <= _ROTATION and np.linalg.det(rest) > 0.0):
             raise InputError(f"rest_rotation must be a rotation matrix, got {shown(rest)}")
@@ -356,14 +356,14 @@ class FrameSpring(Force):
 class FrameDamper(Force):
     """A viscous damper between two points: the force -damping (v_a - v_b) on a, and its opposite on b.
 
-    And of their turning: the moment -rotational_damping (w_a - w_b) on a's body, w being angular velocities in world
-    axes, and its opposite on b's.
+    Optionally also the moment -rotational_damping (w_a - w_b) on a's body, with angular velocities w in world axes, and
+    its opposite on b's.
 
     Attributes:
-        a: The one end, as of :class:`FrameSpring`.
-        b: The other end.
-        damping: >= 0, one number or along each axis of the world (3,) [N s/m].
-        rotational_damping: >= 0, one number or along each axis of the world (3,) [N m s/rad]; left out, none.
+        a: First end, as in :class:`FrameSpring`.
+        b: Second end.
+        damping: >= 0, one number or along each world axis (3,) [N s/m].
+        rotational_damping: >= 0, one number or along each world axis (3,) [N m s/rad]; zero if left out.
     """
 
     a: Point
@@ -386,7 +386,7 @@ class FrameDamper(Force):
 
 
 def point_of(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
-    """The body that carries a point, -1 for the world, with the frame's rotation (3, 3) and the place (3,) on it."""
+    """The body of a point (-1: the world), and on it the frame's rotation (3, 3) and the point's position (3,)."""
     offset: Any = (0.0, 0.0, 0.0)
     frame = point
     if isinstance(point, tuple) and len(point) == 2:
@@ -405,7 +405,7 @@ def point_of(name: str, point: Any, robot: Robot) -> tuple[int, Floats, Floats]:
 
 
 def require_movable(owner: object, a: int, b: int, robot: Robot) -> None:
-    """Refuse what acts between bodies ``a`` and ``b``, as :func:`point_of` has them, if no joint moves either."""
+    """Refuse a force or constraint between bodies ``a`` and ``b`` of :func:`point_of` if both are fixed."""
     if a < 0 and b < 0:
         raise InputError(
             f"{type(owner).__name__}: both ends are fixed, in the world or to the base of robot {robot.name!r}: no "
@@ -414,7 +414,7 @@ def require_movable(owner: object, a: int, b: int, robot: Robot) -> None:
 
 
 def _ends_of(force: FrameSpring | FrameDamper, robot: Robot) -> tuple[tuple[int, int], tuple[float, ...]]:
-    """The bodies at both ends, and the places on them one after the other."""
+    """The bodies at both ends, and the points on them, concatenated (6,)."""
     (a, _, here), (b, _, there) = point_of("a", force.a, robot), point_of("b", force.b, robot)
     require_movable(force, a, b, robot)
     return (a, b), (*here.tolist(), *there.tolist())
@@ -434,7 +434,7 @@ def of_kind(elements: Iterable[Element], kind: str) -> tuple[Element, ...]:
 
 
 def drive_force(servo: Element, q: Floats, v: Floats, force: Floats) -> Floats:
-    """What a servo's drive does to its joint (K,) [N m or N], S of :class:`PositionServo`.
+    """The force of a servo on its joint (K,) [N m or N], S of :class:`PositionServo`.
 
     Args:
         servo: A ``PositionServo``.
@@ -452,7 +452,7 @@ def drive_force(servo: Element, q: Floats, v: Floats, force: Floats) -> Floats:
 
 
 def drive_forces(elements: Iterable[Element], q: Floats, v: Floats, force: Floats) -> Floats:
-    """The forces (K, n) that drives make of the controls' constant forces (K, n), at q and v (K, n) [N m or N]."""
+    """``force`` (K, n) [N m or N] with the columns of servos replaced by :func:`drive_force` at q and v (K, n)."""
     driven = force.copy()
     for servo in of_kind(elements, "PositionServo"):
         c = servo.coordinate
@@ -473,10 +473,10 @@ def keeps_energy(coupling: Coupling) -> bool:
 
 
 def forces_of(given: Force | Sequence[Force]) -> tuple[Force, ...]:
-    """What a user gives as forces.
+    """A force or a sequence of them as a tuple.
 
     Raises:
-        InputError: It is none of them.
+        InputError: Something else is given.
     """
     return tuple_of("forces", given, Force)
 
@@ -498,7 +498,7 @@ def _positive(name: str, value: JointValues, robot: Robot, needed: NDArray[np.bo
 
 
 def _ends(name: str, value: JointValues, robot: Robot, absent: float) -> Floats:
-    """Ends of a way for each joint (n,), ``absent`` for those that have none."""
+    """A limit for each joint (n,), ``absent`` for joints without one."""
     joints = robot.joint_names
     if isinstance(value, Mapping):
         values = np.full(len(joints), absent)

@@ -1,4 +1,4 @@
-"""Controls of joints that are moved by hand, in parts of the steps that they were given for."""
+"""Controls of kinematic inputs for divided steps."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ Floats = NDArray[np.float64]
 
 
 def in_parts_of_steps(scene: Scene, u: Floats, q: Floats, v: Floats, dt: float, parts: int) -> Floats:
-    """Controls (N, m) of steps of ``dt`` [s] for ``parts`` equal parts of each, (N * parts, m): the same motion.
+    """Controls (N * parts, m) of steps divided into ``parts`` equal parts, for the same prescribed motion.
 
-    Forces stay as they are; joints that are moved by hand go on along the lines and cubics of their steps.
+    Forces stay constant; positions and velocities of kinematic inputs follow the lines and cubics of their steps.
 
     Args:
         scene: The scene.
-        u: Controls of the steps (N, m).
-        q: Configurations where the steps begin (N, n) [rad or m].
-        v: Velocities there (N, n), for cubics.
-        dt: Length of a step [s].
-        parts: In how many.
+        u: Controls of the whole steps (N, m).
+        q: Configurations at the start of the steps (N, n) [rad or m].
+        v: Velocities there (N, n) [rad/s or m/s], for cubics.
+        dt: Length of a whole step [s].
+        parts: Number of parts.
     """
     fine = np.repeat(u, parts, axis=0)
     share = np.arange(1, parts + 1) / parts
@@ -35,13 +35,13 @@ def in_parts_of_steps(scene: Scene, u: Floats, q: Floats, v: Floats, dt: float, 
             square, cube = 3.0 * way - 2.0 * before - after, before + after - 2.0 * way
             fine[:, own] = (begin + share * (before + share * (square + share * cube))).ravel()
             fine[:, rate] = ((before + share * (2.0 * square + share * 3.0 * cube)) / dt).ravel()
-        # Where a step ends stays to the last digit.
+        # No rounding error at the end of the whole steps.
         fine[parts - 1 :: parts] = u
     return fine
 
 
 def held_in_parts(scene: Scene, u: Floats, q0: Floats, v0: Floats, dt: float, parts: int) -> Floats:
-    """:func:`in_parts_of_steps` of steps that follow each other from q0 and v0 (n,) on."""
+    """:func:`in_parts_of_steps` for consecutive steps from q0 and v0 (n,) on."""
     q, v = np.tile(q0, (len(u), 1)), np.tile(v0, (len(u), 1))
     for c, rate in zip(scene.inputs.values(), scene.rates, strict=True):
         q[1:, c] = u[:-1, int(np.argmax(scene.actuation[c]))]

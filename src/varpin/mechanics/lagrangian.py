@@ -80,7 +80,7 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     model.gravity = pin.Motion(scene.gravity, np.zeros(3))
     data = model.createData()
     full_q, full_v = robot.free_positions(q), robot.free_velocities(v)
-    # Columns of G: how the free joints move with each coordinate. Mimic joints make it more than a permutation.
+    # Jacobian of the free joints in the coordinates; mimic joints make it more than a permutation.
     G = robot.free_velocities(np.eye(robot.dof)).T
 
     own_armature = model.armature.copy()
@@ -109,7 +109,7 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
 
 
 def _coupled(scene: Scene, model: pin.Model, full_q: Floats, G: Floats) -> tuple[float, Floats, Floats]:
-    """The energy V of all couplings that have one, with dV/dq (n,) and d2V/dq2 (n, n)."""
+    """The potential energy V of all couplings, with dV/dq (n,) and d2V/dq2 (n, n)."""
     n = G.shape[1]
     data = model.createData()
     pin.forwardKinematics(model, data, full_q)
@@ -121,7 +121,7 @@ def _coupled(scene: Scene, model: pin.Model, full_q: Floats, G: Floats) -> tuple
         numbers = np.array(coupling.values)
         ends = [(1.0, coupling.a, numbers[:3]), (-1.0, coupling.b, numbers[3:6])]
         if coupling.kind == "FrameTurnSpring":
-            # Directions are from the origins of their bodies.
+            # This kind couples directions, differences from the origins of their bodies.
             ends += [(-side, body, np.zeros(3)) for side, body, _ in ends]
         for side, body, at_body in ends:
             if body < 0:
@@ -136,7 +136,7 @@ def _coupled(scene: Scene, model: pin.Model, full_q: Floats, G: Floats) -> tuple
                 by_q, by_v = pin.getFrameVelocityDerivatives(model, data, joint, point, pin.LOCAL)
                 velocity = by_v[:3] @ rates
                 J[:, i] += side * here.rotation @ velocity
-                # What turns the frame turns its velocity.
+                # The derivative of R v_local is R (d v_local + w x v_local).
                 H[i] += side * here.rotation @ (by_q[:3] + np.cross(by_v[3:].T, velocity).T) @ G
         own_energy, force, stiff = _between(coupling.kind, numbers[6:], d)
         energy += own_energy
@@ -167,9 +167,9 @@ def _between(kind: str, numbers: Floats, d: Floats) -> tuple[float, Floats, Floa
 
 
 def _stops(scene: Scene, q: Floats) -> tuple[float, Floats, Floats]:
-    """The energy V of all joint stops, with -dV/dq and -d2V/dq2 (n,)."""
+    """The potential energy V of all joint stops, with -dV/dq and -d2V/dq2 (n,)."""
     energy, force, curvature = 0.0, np.zeros_like(q), np.zeros_like(q)
-    # The integrals of s(y) = 3 y^2 - 2 y^3 over the first width, and the first and second of them at its end.
+    # The relative stiffness s(y) = 3 y^2 - 2 y^3 over the first width, and its first and second integrals.
     rise = np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0])
     once, twice = rise.integ(), rise.integ(2)
     for element in scene.elements:
@@ -217,15 +217,14 @@ def discrete_lagrangian(
 ) -> DiscreteLagrangian:
     """L_d(q0, q1) = dt L((1 - alpha) q0 + alpha q1, (q1 - q0) / dt) and its slot derivatives.
 
-    The generalized midpoint rule (Marsden and West 2001, Johnson and Murphey 2009). Friction and controls are no
-    part of it.
+    The generalized midpoint rule (Marsden and West 2001, Johnson and Murphey 2009), without friction and controls.
 
     Args:
         scene: The scene.
         q0: Configuration at the start, (n,) or by joint name [rad or m].
         q1: Configuration at the end, (n,) or by joint name [rad or m].
         dt: Time step [s].
-        alpha: Where between q0 and q1 the Lagrangian is taken, in [0, 1]; 1/2 is of second order.
+        alpha: Evaluation point of the Lagrangian between q0 and q1, in [0, 1]; 1/2 gives second order.
 
     Raises:
         InputError: Wrong shapes, values that are not finite, dt <= 0, alpha outside [0, 1].

@@ -1,10 +1,10 @@
 """Noise models: diffusion fields F_i(q, v, u), one for each of k independent Wiener processes.
 
-In the equations of motion they add the generalized force sum_i F_i o dw_i / dt (Stratonovich). Models add up:
-``AdditiveNoise(1e-3) + ControlNoise(0.1)`` has the processes of both, independent of each other.
+They add the generalized force sum_i F_i o dw_i / dt (Stratonovich) to the equations of motion. The sum of models,
+``AdditiveNoise(1e-3) + ControlNoise(0.1)``, has the processes of all of them, independent of each other.
 
-Motions follow the paths of the noise with strong order 1 in the time step: the error of a path halves with it. Where a
-field depends on the velocity (:class:`CustomNoise` alone can) the strong order is 1/2.
+Paths converge with strong order 1 in the time step: half the step, half the error of a path. If a field depends on the
+velocity, which only :class:`CustomNoise` allows, the strong order is 1/2.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 
 
 class NoiseFieldError(InputError):
-    """A function of a custom noise raised, or returned something that is no field."""
+    """A function of a custom noise raised, or returned a wrong type, shape or value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Fields:
     Attributes:
         F: (N, n, k) generalized force per square root of time [N m s^0.5 or N s^0.5].
         Fq: dF/dq (N, n, k, n).
-        Fv: dF/dv (N, n, k, n), or None where no field depends on the velocity.
+        Fv: dF/dv (N, n, k, n), or None if no field depends on the velocity.
         Fu: dF/du (N, n, k, m).
     """
 
@@ -55,13 +55,13 @@ class Fields:
 
 
 class Noise(ABC):
-    """A diffusion model. Whoever adds one provides ``bind``, which fits it to a robot."""
+    """A diffusion model. A subclass provides ``bind``, which applies it to a robot."""
 
     def named(self, joints: Sequence[str]) -> Noise:  # noqa: ARG002
-        """The model with numbers in the order of ``joints`` where it has them by the joints' names.
+        """The model with its parameters by joint name replaced by arrays in the order of ``joints``.
 
         Raises:
-            UnknownJoint: A name that is no joint's.
+            UnknownJoint: A name is not in ``joints``.
         """
         return self
 
@@ -89,19 +89,16 @@ class BoundNoise(Frozen, ABC):
 
     @property
     def velocity_dependent(self) -> bool:
-        """Whether a field depends on the velocity, so that Stratonovich and Ito differ."""
+        """Whether a field depends on the velocity, so that the Stratonovich and Ito equations differ."""
         return False
 
     @property
     def diffusion(self) -> Diffusion | None:
-        """The form that the core evaluates, or None for fields in Python."""
+        """The fields in the form of the core, or None for fields in Python."""
         return None
 
     def curvature(self, weight: Floats) -> Floats:
-        """Second derivatives of sum_i weight_i . F_i in q (N, n, n), for weights (N, n, k), as far as they are known.
-
-        Only what a field of one's own would have to provide is missing: there it is taken for zero.
-        """
+        """Second derivatives of sum_i weight_i . F_i in q (N, n, n), weights (N, n, k); zero for fields in Python."""
         return np.zeros((len(weight), weight.shape[1], weight.shape[1]))
 
     @abstractmethod
@@ -111,7 +108,7 @@ class BoundNoise(Frozen, ABC):
 
 @dataclass(frozen=True, eq=False)
 class CompiledFields(BoundNoise):
-    """Fields of the form that the core evaluates: constant, linear in u, quadratic in q."""
+    """Fields in the form of the core: constant, linear in u, quadratic in q."""
 
     arrays: Diffusion
 
@@ -141,21 +138,21 @@ class CompiledFields(BoundNoise):
 
 
 def _values(arrays: Diffusion, q: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
-    """The fields that the core evaluates (N, n, k), and how far q is from their centres."""
+    """The fields F (N, n, k), and the offset of q from their centers (N, n, k)."""
     offset = q[:, :, None] - np.where(np.isnan(arrays.center), start[:, None], arrays.center)
     F: Floats = arrays.constant + np.einsum("ikm,Nm->Nik", arrays.control, u) + arrays.quadratic * offset**2
     return F, offset
 
 
 def impulses(arrays: Diffusion, q: Floats, u: Floats, dw: Floats, start: Floats) -> Floats:
-    """sum_i F_i(q, u) dw_i (N, n) of fields that the core evaluates, for dw (N, k); the rest as of ``fields``."""
+    """The momentum impulses sum_i F_i(q, u) dw_i (N, n), for dw (N, k); other arguments as in ``fields``."""
     found: Floats = np.einsum("Nik,Nk->Ni", _values(arrays, q, u, start)[0], dw)
     return found
 
 
 @dataclass(frozen=True, eq=False)
 class CompositeFields(BoundNoise):
-    """The processes of several bound models, side by side."""
+    """The concatenated processes of several bound models."""
 
     parts: tuple[BoundNoise, ...]
 
@@ -171,7 +168,7 @@ class CompositeFields(BoundNoise):
 
     @property
     def diffusion(self) -> Diffusion | None:
-        """One set of arrays, where every part has them."""
+        """The concatenated arrays of the parts; None if a part has none."""
         diffusions = [part.diffusion for part in self.parts]
         if any(fields is None for fields in diffusions):
             return None
@@ -224,7 +221,7 @@ def _compiled(
 
 @dataclass(frozen=True, eq=False)
 class AdditiveNoise(Noise):
-    """Forces of constant strength: F constant.
+    """Forces of constant intensity: F is constant.
 
     Attributes:
         intensity: One number C for F_i = C e_i; (n,), or by joint name, for F_i = C_i e_i; or the matrix F (n, k)
@@ -250,7 +247,7 @@ class AdditiveNoise(Noise):
 
 @dataclass(frozen=True, eq=False)
 class ControlNoise(Noise):
-    """Forces in proportion to the controls: F_i = C_i b_i u_i, b_i the i-th column of the actuation matrix.
+    """Forces proportional to the controls: F_i = C_i b_i u_i, where b_i is column i of the actuation matrix.
 
     Attributes:
         intensity: One number or (m,) [s^0.5]; or an array (n, k, m) with F_i = sum_j intensity[:, i, j] u_j.
@@ -277,7 +274,7 @@ class StateNoise(Noise):
 
     Attributes:
         intensity: One number, (n,) or by joint name [N m s^0.5 / rad^2 or N s^0.5 / m^2].
-        center: One number, (n,) or by joint name [rad or m]; the configuration at which the motion starts if None.
+        center: One number, (n,) or by joint name [rad or m]; the initial configuration of the motion if None.
     """
 
     intensity: JointValues
@@ -300,16 +297,16 @@ Field = Callable[[Floats, Floats, Floats], ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class CustomNoise(Noise):
-    """A diffusion field of your own, in Python. Motions with it are stepped in Python, not compiled.
+    """A diffusion field that you write in Python. Motions with it run in Python, not in compiled code.
 
     Attributes:
         field: Function of (q (n,), v (n,), u (m,)) that returns F (n, k) [N m s^0.5 or N s^0.5].
         processes: k.
-        dq: The same for dF/dq (n, k, n); None where F does not depend on q.
-        dv: dF/dv (n, k, n); None where F does not depend on v. With it the drift (1/2) sum_i (dF_i/dv) M^-1 F_i
-            takes the Stratonovich equation to the Ito one that is stepped, with strong order 1/2 instead of 1.
-        du: dF/du (n, k, m); None where F does not depend on u.
-        check: Hold the derivatives against differences when the noise is given to a scene.
+        dq: Function of the same arguments that returns dF/dq (n, k, n); None if F does not depend on q.
+        dv: dF/dv (n, k, n); None if F does not depend on v. With it, the drift (1/2) sum_i (dF_i/dv) M^-1 F_i converts
+            the Stratonovich equation to the Ito equation that is integrated, with strong order 1/2 instead of 1.
+        du: dF/du (n, k, m); None if F does not depend on u.
+        check: Compare the derivatives with differences when a scene is made with the noise.
     """
 
     field: Field
@@ -354,10 +351,10 @@ class CustomFields(BoundNoise):
         """See :meth:`BoundNoise.fields`.
 
         Raises:
-            InputError: A function raised, or returned something that is no field.
+            NoiseFieldError: A function raised, or its result is not a finite array of the right shape.
         """
         shape = (self.n, self.processes)
-        # Copies: a field that writes into its arguments must not reach the state of a motion.
+        # Copies, so that a field that writes into its arguments cannot change the state of a motion.
         points = list(zip(q.copy(), v.copy(), u.copy(), strict=True))
         noise = self.noise
         return Fields(
@@ -386,10 +383,10 @@ class CustomFields(BoundNoise):
             raise NoiseFieldError(str(error)) from None
 
     def check(self) -> None:
-        """Hold the derivatives against central differences at three seeded random points.
+        """Compare the derivatives with central differences at three seeded random points.
 
         Raises:
-            InputError: A derivative is off; the message says which, where and by how much.
+            InputError: A derivative differs; the message names it, the point and the error.
         """
         rng = np.random.default_rng(0)
         for _ in range(3):
@@ -423,7 +420,7 @@ class CustomFields(BoundNoise):
 
 @dataclass(frozen=True, eq=False)
 class NoiseSum(Noise):
-    """Several models at once, their processes independent of each other."""
+    """The sum of several models with independent processes."""
 
     terms: tuple[Noise, ...]
 
@@ -440,7 +437,7 @@ _Model = TypeVar("_Model", "AdditiveNoise", "StateNoise")
 
 
 def _named(noise: _Model, joints: Sequence[str], *names: str) -> _Model:
-    """A model with arrays where it has numbers by joint name."""
+    """The model with arrays in place of numbers by joint name."""
     given = {name: getattr(noise, name) for name in names}
     by_name = {
         name: joint_array(f"{type(noise).__name__} {name}", value, joints)
@@ -455,7 +452,7 @@ def _terms(noise: Noise) -> tuple[Noise, ...]:
 
 
 def _sound(model: Noise, bound: BoundNoise, n: int, m: int) -> BoundNoise:
-    """What a model's own ``bind`` gave, if the core can take it."""
+    """``bound``, the result of a model's ``bind``, checked for type, shapes and finite values."""
     name = type(model).__name__
     if not isinstance(bound, BoundNoise):
         raise InputError(f"bind of {name} must return a BoundNoise, got {type(bound).__name__}")
@@ -465,18 +462,18 @@ def _sound(model: Noise, bound: BoundNoise, n: int, m: int) -> BoundNoise:
         for field, array, shape in zip(Diffusion._fields, bound.diffusion, shapes, strict=True):
             if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
                 raise InputError(f"the diffusion of {name} has a field {field!r} that is no float64 array {shape}")
-            # NaN in a center stands for the start of the motion.
+            # NaN in a center means the initial configuration.
             if not (np.isfinite(array).all() or field == "center"):
                 raise InputError(f"the diffusion of {name} has a field {field!r} that is not finite")
     return bound
 
 
 def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats, joints: Sequence[str] | None = None) -> BoundNoise:
-    """None, a model or several, on a robot with this actuation matrix (n, m) and joints of these names.
+    """No noise model, one, or several, on a robot with this actuation matrix (n, m) and these joint names.
 
     Raises:
-        UnknownJoint: A model names a joint that is none of them.
-        InputError: Something else than a noise model, or parameters that do not fit.
+        UnknownJoint: A model names a joint that is not in ``joints``.
+        InputError: Not a noise model, or parameters that do not fit the robot.
     """
     if noise is None or (isinstance(noise, Sequence) and not noise):
         n, m = actuation.shape

@@ -1,4 +1,4 @@
-"""Controls that are neither rows nor a law: of time alone, linear between nodes, or fed back by the core."""
+"""Controls as functions of time, as linear interpolation between nodes, and as linear feedback in the core."""
 
 from __future__ import annotations
 
@@ -31,27 +31,26 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Controls that are a function of time alone.
+    """Controls as a function of time.
 
-    The function is evaluated at the stages of every step, once and before the motion goes on: ``Gauss(s)`` stays of
-    order 2 s, ``Radau(s)`` of 2 s - 1, Runge-Kutta's method of 4. A method with one stage holds the value from the
-    middle of the step, and stays of its own order. Parts of a step that a guard cuts take the polynomial through its
-    stages, which keeps the order too. ``Trajectory.u`` has the mean over each step, ``Trajectory.u_stages`` the values.
-    Where the function jumps within a step the order is lost there; jumps at nodes alone are for rows of controls.
+    The function is evaluated once at each stage of every step, so ``Gauss(s)`` keeps order 2 s, ``Radau(s)`` order
+    2 s - 1 and Runge-Kutta's method order 4. A method with one stage holds the value at the middle of the step and
+    keeps its order. If a guard divides a step, its parts take the polynomial through the stages, which keeps the order
+    too. ``Trajectory.u`` holds the mean over each step, ``Trajectory.u_stages`` the values. A jump within a step lowers
+    the order there; give controls that jump at nodes only as rows.
 
-    It is called in order of time, for many steps ahead of the motion, and for some times more after it, unless
-    ``check=False``; a tolerance calls it for the times of every step that it tries. So it should depend on the time
-    alone. What depends on the state is a control law, a function of (t, q, v).
+    The function must depend on time alone: it is called in order of time, for many steps ahead of the motion, and again
+    after it unless ``check=False``; a tolerance calls it for the times of every step that it tries. Controls that
+    depend on the state are a control law, a function of (t, q, v).
 
     Attributes:
-        f: Of the time [s]; returns the controls, (m,) or by joint name where each is the force of a joint, 0 for joints
-            that are not named.
-        vectorized: Whether f takes an array of times (K,) [s] and returns the controls at all of them, (K, m). Then it
-            is called a few times in all and not once for each stage, which for light robots takes longer than the
-            motion itself.
+        f: Function of the time [s] that returns the controls, (m,), or by joint name if each control is the force of a
+            joint; 0 for joints that are not named.
+        vectorized: Whether f takes an array of times (K,) [s] and returns the controls (K, m). A few calls in all then
+            replace one call for each stage, which for light robots takes longer than the motion itself.
 
     Raises:
-        InputError: It is no function, or not one of one argument; ``vectorized`` is not True or False.
+        InputError: ``f`` is not a function of one argument, or ``vectorized`` is not a bool.
     """
 
     f: Callable[[float], JointValues] | Callable[[Floats], ArrayLike]
@@ -71,14 +70,14 @@ class OpenLoop:
 class FirstOrderHold(Frozen):
     """Controls at the nodes, linear in time between them.
 
-    Methods with several stages follow the line, and stay of their order; those with one hold its mean over the step.
-    With a tolerance the N parts are each of duration / N.
+    Methods with several stages follow the line and keep their order; those with one hold its mean over the step.
+    With a tolerance, each of the N intervals lasts duration / N.
 
     Attributes:
-        u: Controls at N + 1 nodes (N + 1, m).
+        u: Controls at N + 1 nodes (N + 1, m), N >= 1.
 
     Raises:
-        InputError: It is no array of two rows or more, or not finite.
+        InputError: ``u`` has a wrong shape or is not finite.
     """
 
     u: Floats
@@ -99,29 +98,29 @@ class FirstOrderHold(Frozen):
 
 @dataclass(frozen=True, eq=False, init=False)
 class LinearPolicy(Frozen):
-    """u = u_k + gains_k (x - x_k) within limits, evaluated at the start of each of N intervals and held over it.
+    """Linear feedback u = u_k + gains_k (x - x_k) within limits, for N intervals.
 
-    With ``linear`` it is the control at the end of the interval, and the control is linear in time from the one before.
+    The control is evaluated at the start of each interval and held over it. With ``linear``, u is instead the control
+    at the end of the interval, and the control changes linearly in time.
 
-    x is (q, p) for variational integrators and (q, v) for the others. Where changes of the control cost something
-    (:class:`varpin.ControlRateCost`), the control of the interval before is fed back, too:
+    x is (q, p) for variational integrators and (q, v) for the others. If changes of the control have a cost
+    (:class:`varpin.ControlRateCost`), the control of the previous interval is fed back, too:
     u = u_k + gains_k (x - x_k) + previous_gains_k (u_before - previous_k).
 
     Attributes:
-        u: Feed-forward (N, m).
-        gains: (N, m, 2n).
+        u: Feed-forward controls (N, m).
+        gains: Feedback gains (N, m, 2n).
         reference: x_k (N, 2n).
-        hold: Steps that an interval has.
-        on: What x is made for: ``"momentum"``, (q, p), ``"velocity"``, (q, v), or None where nobody said.
-        limits: Least and greatest control (2, m), infinite where there is none.
-        previous_gains: On the control of the interval before (N, m, m), or None for none.
-        previous: What those gains expect it to be (N, m), or None.
-        before: The control before the first interval (m,); None where nobody said, and it counts as expected.
-        period: Of an interval [s], or None where nobody said. Then the policy acts at any dt that goes into it, held
-            over as many steps as that takes.
-        joints: The joint whose force, or servo's position, each control is, or None where nobody said.
-        servos: The joints whose controls are positions, or None where nobody said.
-        linear: Whether controls are linear in time over each interval, from ``before`` on, and not held.
+        hold: Number of steps in an interval.
+        on: The state x: ``"momentum"`` for (q, p), ``"velocity"`` for (q, v), or None where it is unknown.
+        limits: Lower and upper limit of each control (2, m), infinite where there is none.
+        previous_gains: Gains on the control of the previous interval (N, m, m), or None for none.
+        previous: Reference of those gains (N, m), or None.
+        before: Control before the first interval (m,); None where it is unknown and taken as ``previous``.
+        period: Length of an interval [s]. The policy then acts at any dt that divides it. None where it is unknown.
+        joints: The joint whose force, or servo position, each control is; None where they are unknown.
+        servos: The joints whose controls are positions; None where they are unknown.
+        linear: Whether controls are linear in time over each interval, from ``before`` on, instead of constant.
     """
 
     u: Floats
@@ -159,28 +158,27 @@ class LinearPolicy(Frozen):
 
         Args:
             u: Feed-forward controls (N, m).
-            gains: (N, m, 2n).
-            reference: (N, 2n), or (N + 1, 2n), of which the last row is not used.
-            hold: Steps of a simulation that each control is held over: the rate of a digital controller.
-            on: Say what x is, and an integrator on the other x refuses the policy.
-            limits: (lower, upper), each one number, (m,) or by joint name, of the whole control: feedback saturates
-                there.
-            previous_gains: (N, m, m), on the control of the interval before.
-            previous: (N, m), what they expect it to be; left out, u of the interval before, and ``before`` for the
+            gains: Feedback gains (N, m, 2n).
+            reference: x_k (N, 2n), or (N + 1, 2n), whose last row is not used.
+            hold: Number of simulation steps over which each control is held; it sets the rate of a digital controller.
+            on: The state x, ``"momentum"`` or ``"velocity"``. Integrators on the other state refuse the policy.
+            limits: (lower, upper) of the control with its feedback, each one number, (m,) or by joint name.
+            previous_gains: Gains on the control of the previous interval (N, m, m).
+            previous: Reference of those gains (N, m); if left out, u of the previous interval, and ``before`` for the
                 first.
-            before: The control before the first interval, (m,) or by joint name.
-            period: Of an interval [s]: with it ``hold`` follows from the dt of a simulation, and a dt that does not go
-                into it is refused.
-            joints: The joint whose force each control is, :attr:`varpin.Scene.control_joints`: they give names to
-                ``limits`` and ``before``, and a scene with other controls refuses the policy.
-            servos: The joints whose controls are positions, :attr:`varpin.Scene.servo_joints`: a scene with other
+            before: Control before the first interval, (m,) or by joint name.
+            period: Length of an interval [s]. ``hold`` then follows from the dt of a simulation, which must divide the
+                period.
+            joints: The joint of each control, as in :attr:`varpin.Scene.control_joints`. ``limits`` and ``before`` may
+                then be given by joint name, and a scene with other controls refuses the policy.
+            servos: The joints whose controls are positions, as in :attr:`varpin.Scene.servo_joints`. A scene with other
                 servos refuses the policy.
-            linear: Controls are linear in time over each interval: u and what is fed back are those at its end. It
-                needs ``before``, the control at the first node.
+            linear: Make controls linear in time over each interval, with u and the feedback at its end. It needs
+                ``before``, the control at the first node.
 
         Raises:
             InputError: Shapes that do not fit each other, values that are not finite, or names without ``joints``.
-            UnknownJoint: A name that is not in ``joints``.
+            UnknownJoint: A name is not in ``joints``.
         """
         rows, gains = as_floats("reference", reference), as_floats("gains", gains)
         shape = gains.shape
@@ -216,7 +214,7 @@ class LinearPolicy(Frozen):
         start = None if before is None else control_values("before", before, names, m)
         object.__setattr__(self, "linear", bool(linear))
         if linear and start is None:
-            raise InputError("controls that are linear between nodes begin at one: give before, that of the first node")
+            raise InputError("controls that are linear between nodes need before, the control at the first node")
         changes: Floats | None = None
         expected: Floats | None = None
         if previous_gains is not None:
@@ -225,7 +223,7 @@ class LinearPolicy(Frozen):
             if previous is not None:
                 expected = finite_array("previous", previous, (steps, m))
         elif previous is not None:
-            raise InputError("previous is what previous_gains expect: give them too")
+            raise InputError("previous is the reference of previous_gains: give them too")
         for name, array in {"previous_gains": changes, "previous": expected, "before": start}.items():
             if array is not None:
                 array.setflags(write=False)
@@ -238,7 +236,7 @@ class LinearPolicy(Frozen):
         return f"LinearPolicy({steps} intervals of {self.hold} steps, {m} controls, {size // 2} joints{on}{line})"
 
     def without_feedback(self) -> LinearPolicy:
-        """The controls alone."""
+        """The same feed-forward controls with zero gains."""
         limits = (self.limits[0], self.limits[1])
         return LinearPolicy(
             self.u,
@@ -255,28 +253,28 @@ class LinearPolicy(Frozen):
         )
 
     def hold_at(self, dt: float) -> int:
-        """Steps of ``dt`` [s] that an interval has.
+        """Number of steps of ``dt`` [s] in an interval.
 
         Raises:
-            InputError: The intervals have a period, and ``dt`` does not go into it.
+            InputError: ``dt`` does not divide the period.
         """
         if self.period is None:
             return self.hold
         hold = max(1, round(self.period / dt))
         if abs(hold * dt - self.period) > 1e-9 * self.period:
             raise InputError(
-                f"the policy decides every {self.period:g} s, and dt = {dt:g} s does not go into that: "
+                f"the policy has intervals of {self.period:g} s, which dt = {dt:g} s does not divide: "
                 f"dt = {self.period / hold:g} s does"
             )
         return hold
 
     def control(self, interval: int, x: ArrayLike, before: ArrayLike | None = None) -> Floats:
-        """The control (m,) of an interval at the state x (2n,), after the control ``before`` (m,).
+        """The control (m,) of an interval at the state x (2n,), for a ``linear`` policy at the end of the interval.
 
-        Left out, that is what the policy expects. Of a ``linear`` policy it is the control at the interval's end.
+        ``before`` (m,) is the control of the previous interval, the policy's ``previous`` if left out.
 
         Raises:
-            InputError: There is no such interval, or an argument of a wrong shape or value.
+            InputError: There is no such interval, or an argument has a wrong shape or value.
         """
         N, m, size = self.gains.shape
         if not 0 <= count("interval", interval) < N:
@@ -295,13 +293,13 @@ class LinearPolicy(Frozen):
         dt: float | None = None,
         stage_times: Sequence[float] = (),
     ) -> Commands:
-        """The policy as the core takes it, for an integrator on (q, p) if it is ``variational``, else on (q, v).
+        """The policy in the form of the core, for a ``variational`` integrator on (q, p) or another one on (q, v).
 
-        Its intervals have :meth:`hold_at` steps, or ``hold`` where ``dt`` [s] is left out. Where it is ``linear``, the
-        integrator's ``stage_times`` say where in a step it looks at the controls.
+        Its intervals have :meth:`hold_at` steps, or ``hold`` without ``dt`` [s]. A ``linear`` policy needs the
+        integrator's ``stage_times``, in units of a step.
 
         Raises:
-            InputError: It is for another number of steps, controls or coordinates, for another dt, or for the other x.
+            InputError: The policy has another number of steps, controls or coordinates, another dt, or the other x.
         """
         if self.on is not None and variational != (self.on == "momentum"):
             raise InputError(
@@ -313,7 +311,7 @@ class LinearPolicy(Frozen):
             finer = ""
             if self.period is None and intervals and steps % intervals == 0 and steps > intervals * hold:
                 finer = (
-                    f". Where dt is finer than the policy's own, hold={steps // intervals} holds each control as long, "
+                    f". If dt is finer than the policy's own, hold={steps // intervals} holds each control as long, "
                     "or give LinearPolicy the period of its intervals, period= [s]"
                 )
             raise InputError(

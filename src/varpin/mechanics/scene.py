@@ -1,4 +1,4 @@
-"""A scene: a robot and only what it needs around it. Gravity, forces on joints, actuation, noise.
+"""A scene: a robot with gravity, forces, actuation, noise and constraints.
 
 Equation (1.1) of the paper.
 """
@@ -43,68 +43,67 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-# What a scene's values are called, and what is said where they are others; of joints, numbers are given.
+# Names of a scene's values, and the message where they differ; values by joint are also reported with numbers.
 VALUES = {
-    "gravity": "gravity is another",
-    "damping": "damping is another",
-    "stiffness": "stiffness is another",
-    "rest": "rest is another",
-    "armature": "armature is another",
-    "actuation": "actuation is another",
-    "center": "the robot's centres of mass are others",
-    "inertia": "the robot's inertias are others",
-    "rotation": "the robot's joints have other axes",
-    "translation": "the robot's joints are in other places",
-    "ratio": "the robot's mimic joints are tied otherwise",
-    "offset": "the robot's mimic joints are tied otherwise",
-    "CoulombFriction": "dry friction is another",
-    "JointStop": "joint stops are others",
-    "PositionServo": "position servos are others",
-    "FrameLoad": "forces on frames are others",
-    "FrameWrench": "forces on frames are others",
-    "FrameSpring": "springs between frames are others",
-    "FrameLengthSpring": "springs between frames are others",
-    "FrameTurnSpring": "springs between frames are others",
-    "FrameDamper": "dampers between frames are others",
-    "FrameTurnDamper": "dampers between frames are others",
-    "functions": "forces that are functions are others",
-    "constraints.between": "constraints between frames are others",
-    "constraints.ties": "ties of joints are others",
-    "constraints.custom": "custom constraints are others",
-    "noise.constant": "the noise has another strength",
-    "noise.control": "the noise has another strength",
-    "noise.quadratic": "the noise has another strength",
-    "noise.center": "the noise has another center",
+    "gravity": "gravity differs",
+    "damping": "damping differs",
+    "stiffness": "stiffness differs",
+    "rest": "rest differs",
+    "armature": "armature differs",
+    "actuation": "actuation differs",
+    "center": "the robot's centres of mass differ",
+    "inertia": "the robot's inertias differ",
+    "rotation": "the axes of the robot's joints differ",
+    "translation": "the positions of the robot's joints differ",
+    "ratio": "the ratios of the robot's mimic joints differ",
+    "offset": "the offsets of the robot's mimic joints differ",
+    "CoulombFriction": "dry friction differs",
+    "JointStop": "joint stops differ",
+    "PositionServo": "position servos differ",
+    "FrameLoad": "forces on frames differ",
+    "FrameWrench": "forces on frames differ",
+    "FrameSpring": "springs between frames differ",
+    "FrameLengthSpring": "springs between frames differ",
+    "FrameTurnSpring": "springs between frames differ",
+    "FrameDamper": "dampers between frames differ",
+    "FrameTurnDamper": "dampers between frames differ",
+    "functions": "custom forces differ",
+    "constraints.between": "constraints between frames differ",
+    "constraints.ties": "joint ties differ",
+    "constraints.custom": "custom constraints differ",
+    "noise.constant": "the intensity of the noise differs",
+    "noise.control": "the intensity of the noise differs",
+    "noise.quadratic": "the intensity of the noise differs",
+    "noise.center": "the center of the noise differs",
 }
-# Kinds of forces that have an entry of their own, a row of the coordinate and the numbers for each element.
+# Forces on joints among the values: a row (coordinate, numbers) for each element.
 OF_ELEMENTS = ("CoulombFriction", "JointStop", "PositionServo")
-# The same of couplings, with the bodies of both ends; entries are there only if couplings are.
+# Forces on frames among the values: a row (body a, body b, numbers) for each; left out where there are none.
 OF_COUPLINGS = (
     "FrameLoad", "FrameWrench", "FrameSpring", "FrameLengthSpring", "FrameTurnSpring", "FrameDamper", "FrameTurnDamper",
 )  # fmt: skip
-# The same of constraints.
+# Constraints among the values; left out where there are none.
 OF_CONSTRAINTS = ("constraints.between", "constraints.ties", "constraints.custom")
 OF_FORCES = (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS)
-# What a configuration that is said to keep constraints may miss them by, and a start to be moved onto them unasked
-# [m or rad]; and the singular values, relative to the largest, of rows that depend on others.
-_OFF, CORRECTED, _DEPENDENT = 1e-6, 0.02, 1e-9
-# So many joints are told of with numbers.
+# Largest constraint residual of a given configuration, and of a start that is projected without request [m or rad].
+_OFF, CORRECTED = 1e-6, 0.02
+# Rank tolerance of the constraint Jacobian, relative to its largest singular value.
+_RANK = 1e-9
+# Most joints that a log message lists.
 _NAMED = 7
 _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
 EARTH = (0.0, 0.0, -9.81)
-# Fields of the tree that the core takes.
+# Fields of the robot's tree that are arguments of the core.
 _TREE = (
     "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
     "origin", "loads", "carried", "periodic",
 )  # fmt: skip
-
-
-# How far a joint may go into a stop, in units of the width over which that becomes stiff.
-_GIVES = 2.0
+# Depth to which a joint may press into a stop, in widths of the stop.
+_STOP_DEPTH = 2.0
 
 
 class Bounds(NamedTuple):
-    """Least and greatest position, velocity and force (n,) of the joints; infinite where there is no limit."""
+    """Lower and upper limits (n,) of position, velocity and force of the joints; infinite where there is no limit."""
 
     position: tuple[Floats, Floats]  # [rad or m]
     velocity: tuple[Floats, Floats]  # [rad/s or m/s]
@@ -113,23 +112,23 @@ class Bounds(NamedTuple):
 
 @dataclass(frozen=True, eq=False, init=False)
 class Scene(Frozen):
-    """A robot in its surroundings.
+    """A robot with gravity, forces, actuation, noise and constraints.
 
     Attributes:
-        robot: The arm.
+        robot: The robot.
         gravity: Gravity (3,) [m/s^2] in world axes.
-        forces: What acts on joints and frames, ``damping`` and ``stiffness`` among it.
-        elements: What of it acts on single joints, one by one, as the core takes it, armature apart.
-        couplings: What of it acts on frames and between them.
-        custom: What of it is a :class:`varpin.CustomForce`, together; None for none.
+        forces: Forces on joints and frames, including those of ``damping`` and ``stiffness``.
+        elements: ``forces`` on joints in the form of the core, without armature.
+        couplings: ``forces`` on frames in the form of the core.
+        custom: All :class:`varpin.CustomForce` in ``forces``; None for none.
         damping: Viscous damping (n,) of all dampers [N m s/rad or N s/m]: the force -damping * v.
-        stiffness: Of all joint springs (n,) [N m/rad or N/m]; they are part of the potential energy.
-        rest: Configuration (n,) at which the springs are slack, those of a joint taken together [rad or m].
-        armature: Inertia of rotors (n,), the robot's own and that of ``forces`` [kg m^2 or kg].
-        actuation: Matrix (n, m) from controls to generalized forces [N m or N per unit of control]; of a position
-            servo's control, its stiffness; zero for velocities of cubic inputs, its last columns.
-        noise: The diffusion fields of the noise models, if any.
-        constraints: What the motion keeps, g(q) = 0; see :mod:`varpin.mechanics.constraints`.
+        stiffness: Stiffness (n,) of all joint springs [N m/rad or N/m]; they are part of the potential energy.
+        rest: Configuration (n,) at which the springs of each joint exert no force together [rad or m].
+        armature: Rotor inertia (n,) of the robot and of ``forces`` [kg m^2 or kg].
+        actuation: Matrix (n, m) from controls to generalized forces [N m or N per unit of control]; the stiffness for
+            the control of a position servo; zero in the last columns, the velocities of cubic inputs.
+        noise: Diffusion fields of the noise models.
+        constraints: Constraints g(q) = 0; see :mod:`varpin.mechanics.constraints`.
     """
 
     robot: Robot
@@ -145,10 +144,10 @@ class Scene(Frozen):
     actuation: Floats = field(repr=False)
     noise: BoundNoise = field(repr=False)
     constraints: tuple[Constraint, ...]
-    # The same as the core takes them, and the place there of each of their rows (c,).
+    # The constraints in the form of the core, and the core's row of each constraint row (c,).
     bound_constraints: Bound = field(repr=False)
     constraint_order: NDArray[np.int64] = field(repr=False)
-    # Warnings that the log of this process has had: their kind, the time step [s] and the joint, if one is named.
+    # Warnings that this process has logged: kind, time step [s] and joint, or None.
     announced: set[tuple[str, float, int | None]] = field(repr=False)
 
     def __init__(
@@ -169,27 +168,27 @@ class Scene(Frozen):
         Main args:
             robot: From :func:`varpin.load_robot`.
             gravity: ``True`` for (0, 0, -9.81), ``False`` for none, or any vector (3,) [m/s^2].
-            forces: What acts on the joints: friction, stops, rotors, springs, dampers, servos, as
-                :class:`varpin.CoulombFriction` does; and on frames: wrenches, springs and dampers, as
-                :class:`varpin.FrameSpring` does.
+            forces: Forces on joints (friction, stops, rotors, springs, dampers, servos, such as
+                :class:`varpin.CoulombFriction`) and on frames (wrenches, springs, dampers, such as
+                :class:`varpin.FrameSpring`).
             damping: Short for a :class:`varpin.JointDamper` in ``forces``: one number, (n,), or numbers by joint name,
-                ``{"elbow": 0.1}``, >= 0 [N m s/rad or N s/m]. Joints that are not named have none. ``"robot"`` takes
-                what the robot's description gives (:attr:`varpin.Robot.damping`). Left out there is none, and where
-                the description gives damping or dry friction the log says so.
-            stiffness: Short for a :class:`varpin.JointSpring`: the same, >= 0 [N m/rad or N/m].
+                ``{"elbow": 0.1}``, >= 0 [N m s/rad or N s/m]; 0 for joints that are not named. ``"robot"`` takes the
+                damping of the robot's description (:attr:`varpin.Robot.damping`). If left out there is no damping, and
+                the log warns if the description gives damping or dry friction.
+            stiffness: Short for a :class:`varpin.JointSpring` in ``forces``, in the forms of ``damping``,
+                >= 0 [N m/rad or N/m].
 
         Other Args:
-            rest: Where that spring is slack, the same [rad or m]; 0 for joints that are not named.
+            rest: Rest position of that spring, in the same forms [rad or m]; 0 for joints that are not named.
             actuation: A matrix (n, m); or the names of the m actuated joints; every joint if left out.
             noise: A noise model, several of them, or their sum; see :mod:`varpin.mechanics.noise`.
-            constraints: What the motion keeps: loops that close, gears, rods, as :class:`varpin.PointOnPoint` does.
+            constraints: Constraints of the motion: closed loops, gears, rods, such as :class:`varpin.PointOnPoint`.
 
         Raises:
-            InputError: A wrong shape, a value that is not finite, negative damping or stiffness, a force that does not
-                fit the robot.
-            UnknownJoint: ``actuation``, ``damping``, ``stiffness``, ``rest`` or one of ``forces`` names a joint that is
-                no coordinate of the robot.
-            UnknownFrame: One of ``forces`` names a frame that the robot does not have.
+            InputError: A wrong shape; a value that is not finite; negative damping or stiffness; a force, noise model
+                or constraint that does not fit the robot.
+            UnknownJoint: An argument names a joint that is no coordinate of the robot.
+            UnknownFrame: A force or constraint names a frame that the robot does not have.
         """
         if not isinstance(robot, Robot):
             raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
@@ -203,7 +202,7 @@ class Scene(Frozen):
         }
         values |= _forces(robot, forces, damping, stiffness, rest)
         values["actuation"] = _served(robot, _actuation(robot, actuation), values["elements"])
-        _refuse_trembling_angles(noise, values["elements"], robot)
+        _refuse_noisy_servos(noise, values["elements"], robot)
         values["constraints"] = constraints_of(constraints)
         bound, order = joined([constraint.bind(robot) for constraint in values["constraints"]])
         _require_positions(robot, values["actuation"], values["elements"], bound)
@@ -217,7 +216,7 @@ class Scene(Frozen):
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
-        # Another process, or a copy, has a log of its own.
+        # A copy, possibly in another process, logs its warnings again.
         return state | {"values": state["values"] | {"announced": set()}}
 
     def __repr__(self) -> str:
@@ -249,7 +248,7 @@ class Scene(Frozen):
         return facts(f"Scene of {self.robot.name}", rows)
 
     def _other_forces(self) -> list[tuple[str, list[str]]]:
-        """Kinds of forces besides springs and dampers, with the joints that they act on."""
+        """Kinds of forces other than joint springs and dampers, with the joints that they act on."""
         acting: dict[str, dict[str, None]] = {}
         for force in self.forces:
             if not isinstance(force, JointSpring | JointDamper):
@@ -272,21 +271,24 @@ class Scene(Frozen):
 
     @property
     def dissipates(self) -> bool:
-        """Whether anything turns energy into heat."""
+        """Whether any force may dissipate energy."""
         damped = any(map(dissipates, self.elements)) or any(map(dissipates, self.couplings))
         return damped or self.custom is not None
 
     @property
     def conservative(self) -> bool:
-        """Whether energy stays where no controls and no noise act: all forces are gradients."""
+        """Whether energy is constant without controls and noise: all forces have a potential."""
         return not self.dissipates and all(map(keeps_energy, self.couplings))
 
     @cached_property
     def group(self) -> NDArray[np.int64]:
-        """Which coordinates (n,) move each other, labels from 0: the robot's groups, some joined by couplings."""
+        """Group (n,) of each coordinate, from 0 on: groups of the robot, merged by couplings and constraints.
+
+        Coordinates of different groups do not affect each other.
+        """
         group = self.robot.tree.group.copy()
         if self.custom is not None:
-            # Nobody knows which joints the function joins.
+            # The joints that the function couples are unknown.
             group[:] = 0
         for coupling in self.couplings:
             together = np.unique(group[self._moved_by([coupling])])
@@ -310,7 +312,7 @@ class Scene(Frozen):
 
     @property
     def constraint_labels(self) -> tuple[str, ...]:
-        """What each row of the constraints is (c,), in words."""
+        """A label for each constraint row (c,)."""
         return tuple(self.bound_constraints.labels[row] for row in self.constraint_order)
 
     def constraint_values(self, q: JointValues) -> tuple[Floats, Floats]:
@@ -330,7 +332,7 @@ class Scene(Frozen):
 
     @cached_property
     def inputs(self) -> Mapping[int, int]:
-        """Joints that are moved by hand: the coordinate of each by the core's row of its :class:`KinematicInput`."""
+        """The core's row of each :class:`KinematicInput`, mapped to the coordinate of its joint."""
         rows = self.bound_constraints.rows
         return {
             len(rows.products) + k: tie.follower
@@ -340,12 +342,12 @@ class Scene(Frozen):
 
     @cached_property
     def rates(self) -> tuple[int, ...]:
-        """For each of :attr:`inputs`, the control that is its velocity at the end of a step; -1 for one on a line."""
+        """For each of :attr:`inputs`, the control with its velocity at the end of a step; -1 for a linear input."""
         return tuple(tie.rate for tie in self.bound_constraints.rows.ties if tie.follower == tie.leader)
 
     @cached_property
     def transmission(self) -> Floats:
-        """From controls (m,) to what steps are differentiated in: forces (n,), and of cubic inputs velocities."""
+        """Matrix from controls (m,) to the inputs of linearized steps: forces (n,), then velocities of cubic inputs."""
         rates = [rate for rate in self.rates if rate >= 0]
         if not rates:
             return self.actuation
@@ -353,7 +355,7 @@ class Scene(Frozen):
 
     @property
     def _gear(self) -> Floats:
-        """Force (n,) of a control that is one joint's alone: 1, or the stiffness of its servo."""
+        """Force (n,) per unit of a control that drives one joint only: 1, or the stiffness of its servo."""
         gear = np.ones(self.robot.dof)
         for servo in of_kind(self.elements, "PositionServo"):
             gear[servo.coordinate] = servo.values[0]
@@ -366,10 +368,7 @@ class Scene(Frozen):
 
     @cached_property
     def control_joints(self) -> tuple[str, ...] | None:
-        """The joint whose force, or servo's position, each of the m controls is; None where one is anything else.
-
-        A share of several, say.
-        """
+        """The joint of each of the m controls; None unless each is the force, or servo position, of a joint alone."""
         joints = np.argmax(self.actuation, axis=0)
         alone = len(set(joints.tolist())) == self.controls
         if not alone or not np.array_equal(self.actuation, np.diag(self._gear)[:, joints]):
@@ -378,11 +377,11 @@ class Scene(Frozen):
 
     @cached_property
     def servo_joints(self) -> tuple[str, ...]:
-        """The joints whose control is the position that a servo goes to."""
+        """The joints whose control is the target position of a servo."""
         return tuple(self.robot.joint_names[servo.coordinate] for servo in of_kind(self.elements, "PositionServo"))
 
     def command_at(self, q: Floats) -> Floats:
-        """The controls (m,) that stand for none at q (n,): no forces; servos and inputs stay where they are."""
+        """Neutral controls (m,) at q (n,): zero forces; servos and kinematic inputs hold their positions."""
         command = np.zeros(self.controls)
         for servo in of_kind(self.elements, "PositionServo"):
             command[int(np.argmax(np.abs(self.actuation[servo.coordinate])))] = q[servo.coordinate]
@@ -397,7 +396,7 @@ class Scene(Frozen):
 
     @cached_property
     def core(self) -> Core:
-        """The scene as the compiled core takes it; without fields that only Python can evaluate."""
+        """The scene in the compiled core, without noise fields that only Python can evaluate."""
         tree, fields = self.robot.tree, self.diffusion
         values = {name: getattr(tree, name) for name in _TREE}
         if self.constraints:
@@ -421,11 +420,11 @@ class Scene(Frozen):
         )
 
     def _of_constrained_tree(self) -> dict[str, NDArray[np.int64]]:
-        """What of the tree is another under constraints."""
+        """Fields of the tree that differ under constraints."""
         tree, rows = self.robot.tree, self.bound_constraints.rows
-        # Constraints do work on a light part, whose energy has no balance of its own then.
+        # Constraints do work on light parts, so these have no energy balance of their own.
         changed = {"loads": tree.loads[:0], "carried": tree.carried[:0]}
-        # A tie knows how often a joint went round; so may a function.
+        # Ties, and possibly custom constraints, are not periodic in a full turn.
         periodic = tree.periodic.copy()
         periodic[[c for tie in rows.ties for c in (tie.follower, tie.leader)]] = 0
         if rows.customs:
@@ -434,37 +433,37 @@ class Scene(Frozen):
 
     @cached_property
     def bounds(self) -> Bounds:
-        """What the robot's description lets its joints do, and how far stops let them go."""
+        """Limits of the robot's description, with position limits widened where a joint stop gives way."""
         lower, upper = self.robot.position_limits
-        # Limits that leave no room are a fault of the description, which inspect_robot tells of.
+        # Crossed limits are a fault of the description, which inspect_robot reports.
         none = ~(lower < upper)
         lower, upper = np.where(none, -np.inf, lower), np.where(none, np.inf, upper)
         for stop in of_kind(self.elements, "JointStop"):
-            # What goes on against a stop is no motion that nothing stops, as far as the stop does not give way.
+            # A joint may press into its stop, up to the largest depth.
             c, (first, last, *_, width) = stop.coordinate, stop.values
-            lower[c] = min(lower[c], first - _GIVES * width) if first > lower[c] - width else lower[c]
-            upper[c] = max(upper[c], last + _GIVES * width) if last < upper[c] + width else upper[c]
+            lower[c] = min(lower[c], first - _STOP_DEPTH * width) if first > lower[c] - width else lower[c]
+            upper[c] = max(upper[c], last + _STOP_DEPTH * width) if last < upper[c] + width else upper[c]
         speed, effort = self.robot.velocity_limit, self.robot.effort_limit
         return Bounds((lower, upper), (-speed, speed), (-effort, effort))
 
     @cached_property
     def bounded(self) -> tuple[bool, ...]:
-        """Whether any joint has bounds, of each kind in :class:`Bounds`."""
+        """For each kind of :class:`Bounds`, whether any joint has one."""
         return tuple(bool(np.isfinite(pair).any()) for pair in self.bounds)
 
     @cached_property
     def diffusion(self) -> Diffusion:
-        """The noise's fields that the core can evaluate; without those that only Python can."""
+        """The noise fields that the core can evaluate; empty if some need Python."""
         n, m = self.actuation.shape
         nothing = Diffusion(np.zeros((n, 0)), np.zeros((n, 0, m)), np.zeros((n, 0)), np.zeros((n, 0)))
         return self.noise.diffusion or nothing
 
     @cached_property
     def values(self) -> Mapping[str, Floats]:
-        """The numbers that its motions depend on, by the names of :data:`VALUES`: a motion keeps them.
+        """The numbers that motions depend on, by the names of :data:`VALUES`; a trajectory stores them.
 
-        Of the noise, strengths (n, k), for which its share of the controls is summed up; nothing of a
-        :class:`varpin.CustomNoise`.
+        The noise is stored as intensities (n, k); its factors of the controls are reduced to their norm. A
+        :class:`varpin.CustomNoise` is not stored.
         """
         tree, values = (
             self.robot.tree,
@@ -483,7 +482,7 @@ class Scene(Frozen):
             if ends := [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]:
                 values[kind] = np.array(ends, dtype=np.float64)
         if self.custom is not None:
-            # Of functions nothing but how many there are.
+            # Functions are stored as their number only.
             values["functions"] = np.array([float(len(self.custom.parts))])
         values |= _numbers_of(self.bound_constraints.rows)
         values |= {"rotation": tree.rotation, "translation": tree.translation}
@@ -496,14 +495,14 @@ class Scene(Frozen):
 
     @cached_property
     def silence(self) -> Floats:
-        """The increments of Wiener processes that a rollout without noise is given."""
+        """Wiener increments (0, 0, k) of a rollout without noise."""
         none = np.zeros((0, 0, self.diffusion.constant.shape[1]))
         none.setflags(write=False)
         return none
 
     @cached_property
     def no_drift(self) -> Floats:
-        """What a rollout is given that has no force on top of the controls'."""
+        """Additional forces (0, 0, n) of a rollout without any."""
         none = np.zeros((0, 0, self.robot.dof))
         none.setflags(write=False)
         return none
@@ -511,11 +510,11 @@ class Scene(Frozen):
     def holding_torque(self, q: JointValues) -> Floats:
         """The generalized forces (n,) that hold the robot at rest at ``q`` [N m or N].
 
-        Against gravity and springs, the gradient of the potential energy, -L_q(q, 0), and against wrenches on frames.
-        Constraints take what is normal to them; of the forces that hold the robot together with them, the smallest.
+        They balance gravity and springs, -L_q(q, 0), and wrenches on frames. Constraint forces take the part normal to
+        the constraints; the result is the smallest of the remaining solutions.
 
         Args:
-            q: Configuration, (n,) or by joint name [rad or m]; it keeps the constraints.
+            q: Configuration, (n,) or by joint name [rad or m]; it satisfies the constraints.
 
         Raises:
             InputError: A wrong shape, a value that is not finite, or a configuration off the constraints.
@@ -526,7 +525,7 @@ class Scene(Frozen):
         return along @ (along.T @ self.static_pull(at))
 
     def static_pull(self, q: Floats) -> Floats:
-        """What holds the robot at rest at ``q`` (n,) without constraints (n,)."""
+        """The generalized forces (n,) that hold the robot without its constraints at rest at ``q`` (n,)."""
         at = np.asarray(q, dtype=np.float64)
         _, Lq, *_ = self.core.jet(at, np.zeros_like(at))
         acts = self.couplings or self.custom is not None
@@ -534,7 +533,7 @@ class Scene(Frozen):
         return np.asarray(-Lq - wrenches, dtype=np.float64)
 
     def holding_controls(self, q: JointValues) -> Floats:
-        """The controls (m,) that hold the robot at rest at ``q``; of several that do, the smallest.
+        """The smallest controls (m,) that hold the robot at rest at ``q``.
 
         Args:
             q: Configuration, (n,) or by joint name [rad or m].
@@ -552,13 +551,13 @@ class Scene(Frozen):
         drives = self.core.forces(*still, force[None])[0][0] - self.core.coupled_forces(*still)[0][0]
         along = tangent_basis(self, at)
         left = along @ (along.T @ (torque - force - drives))
-        # Where nothing pulls, rounding leaves a trace of the weights' own moments, those at a metre say.
+        # Rounding error of holding torques that cancel, in terms of the robot's weight at a metre.
         weight = float(self.robot.tree.mass.sum() * np.linalg.norm(self.gravity))
         if (np.abs(left) > 1e-9 * (np.abs(torque).max() + weight)).any():
             c = int(np.argmax(np.abs(left)))
             raise InputError(
-                f"no controls hold the robot at this q: joint {self.robot.joint_names[c]!r} is left with {left[c]:.4g} "
-                "N m or N that no actuator takes"
+                f"no controls hold the robot at this q: no actuator takes the remaining {left[c]:.4g} N m or N at "
+                f"joint {self.robot.joint_names[c]!r}"
             )
         return controls
 
@@ -585,14 +584,14 @@ def _driven(scene: Scene, actuation: Floats) -> Scene:
 
 
 def _unowned(rows: ConstraintRows) -> ConstraintRows:
-    """Rows whose functions the scene keeps, and not the core."""
+    """Rows with weak references to their functions, which the scene owns."""
     return rows._replace(
         customs=tuple(row._replace(value=Weak(row.value), curvature=Weak(row.curvature)) for row in rows.customs)
     )
 
 
 def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
-    """The numbers of constraints by the names of :data:`VALUES`, none where there are no such rows."""
+    """The numbers of constraints by the names of :data:`VALUES`; kinds without rows are left out."""
     found: dict[str, Floats] = {}
     if rows.products:
         table = []
@@ -625,7 +624,7 @@ _KEEPS = "motions and plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
 
 
 def refuse_constraints(scene: Scene, what: str, instead: str = _KEEPS) -> None:
-    """Refuse a scene with constraints where they would not be kept; ``instead`` says what takes them.
+    """Refuse a scene with constraints in ``what``; the message ends with the alternative ``instead``.
 
     Raises:
         InputError: The scene has constraints.
@@ -636,23 +635,23 @@ def refuse_constraints(scene: Scene, what: str, instead: str = _KEEPS) -> None:
 
 
 def refuse_inputs(scene: Scene, what: str) -> None:
-    """Refuse a scene with joints that are moved by hand where that is not known.
+    """Refuse a scene with kinematic inputs in ``what``.
 
     Raises:
-        InputError: It has some.
+        InputError: The scene has kinematic inputs.
     """
     if scene.inputs:
         names = ", ".join(scene.robot.joint_names[c] for c in scene.inputs.values())
         raise InputError(
-            f"{what} does not take scenes with a KinematicInput, and this one has some of {names}: simulate and "
+            f"{what} does not take scenes with a KinematicInput, and this one has them for {names}: simulate and "
             "simulate_ensemble do with controls that are rows (N, m) or a plan's policy, and OptimalControlProblem does"
         )
 
 
 def closest_controls(scene: Scene, q: Floats) -> Floats:
-    """The controls (m,) whose forces come closest to what holds the robot at ``q`` (n,); of several, the smallest.
+    """The least-squares controls (m,) for the forces that hold the robot at ``q`` (n,), the smallest of several.
 
-    Those of a servo as if it had no effort limit.
+    Effort limits of servos are ignored.
     """
     torque = scene.static_pull(q)
     for servo in of_kind(scene.elements, "PositionServo"):
@@ -667,7 +666,7 @@ def closest_controls(scene: Scene, q: Floats) -> Floats:
 
 
 def tangent_basis(scene: Scene, q: Floats, off: float = _OFF) -> Floats:
-    """An orthonormal basis (n, f) of the velocities that constraints allow at ``q`` (n,); all of them without any.
+    """An orthonormal basis (n, f) of the velocities that constraints allow at ``q`` (n,); identity without any.
 
     Raises:
         InputError: The configuration misses the constraints by more than ``off`` [m or rad].
@@ -679,15 +678,15 @@ def tangent_basis(scene: Scene, q: Floats, off: float = _OFF) -> Floats:
     if not abs(g[worst]) <= off:
         raise InputError(
             f"q misses {scene.constraint_labels[worst]} by {abs(g[worst]):.4g} m or rad: varpin.assemble(scene, q) "
-            "looks for the nearest configuration that keeps the constraints"
+            "finds the nearest configuration that satisfies the constraints"
         )
     _, sizes, basis = np.linalg.svd(C)
-    rank = int((sizes > _DEPENDENT * sizes[0]).sum())
+    rank = int((sizes > _RANK * sizes[0]).sum())
     return np.ascontiguousarray(basis[rank:].T)
 
 
 def same(one: Floats, other: Floats) -> bool:
-    """Whether a scene's values are alike but for rounding: a robot may have been read by another Pinocchio."""
+    """Whether values of scenes agree up to rounding; versions of Pinocchio may read a robot differently by as much."""
     if one.shape != other.shape:
         return False
     least = 1e-12 * max(float(np.abs(x[np.isfinite(x)]).max(initial=0.0)) for x in (one, other))
@@ -695,7 +694,7 @@ def same(one: Floats, other: Floats) -> bool:
 
 
 def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> list[str]:
-    """In what a scene is another than one whose :attr:`Scene.values` are given, in words; ``noise`` counts if asked."""
+    """Messages on how a scene differs from the one of these :attr:`Scene.values`, with ``noise`` or without."""
     found = []
     for name, before in values.items():
         now = scene.values.get(name)
@@ -724,14 +723,14 @@ def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> l
 
 
 def require_scene(scene: object) -> Scene:
-    """``scene`` itself, or an InputError that says what it is instead."""
+    """``scene`` itself; an InputError if it is no Scene."""
     if not isinstance(scene, Scene):
         raise InputError(f"scene must be a varpin.Scene, got {type(scene).__name__}")
     return scene
 
 
 def _gravity(gravity: ArrayLike | bool) -> Floats:
-    """Gravity (3,) from what a user gives."""
+    """Gravity (3,) [m/s^2] from the argument of a scene."""
     if isinstance(gravity, bool | np.bool_):
         return np.array(EARTH if gravity else (0.0, 0.0, 0.0))
     given = as_floats("gravity", gravity)
@@ -745,36 +744,37 @@ def _gravity(gravity: ArrayLike | bool) -> Floats:
 
 
 def damping_of(robot: Robot, given: JointValues | Literal["robot"] | None, forces: Sequence[Force] = ()) -> Floats:
-    """Damping (n,) as :class:`Scene` takes it; the log has what of the robot's description is left out unasked."""
+    """Damping (n,) from the argument of a scene; logs friction of the robot's description that the scene leaves out."""
     if isinstance(given, str) and given != "robot":
         raise InputError(f"damping must be numbers, or 'robot' for those of the robot's description, got {given!r}")
     if given is None or isinstance(given, str):
         damped = given is not None or any(isinstance(force, JointDamper) for force in forces)
-        _tell_of_friction(robot, damped=damped, rubs=any(isinstance(force, CoulombFriction) for force in forces))
+        dry = any(isinstance(force, CoulombFriction) for force in forces)
+        _log_friction(robot, damped=damped, dry=dry)
         given = 0.0 if given is None else robot.damping
     return not_negative("damping", given, robot)
 
 
-def _tell_of_friction(robot: Robot, *, damped: bool, rubs: bool) -> None:
-    """Log what the description gives of damping and dry friction that a scene has nothing of."""
-    words = []
+def _log_friction(robot: Robot, *, damped: bool, dry: bool) -> None:
+    """Log damping and dry friction of the description that the scene has none of."""
+    left_out = []
     if robot.damping.any() and not damped:
-        words.append(
+        left_out.append(
             f"damping [N m s/rad or N s/m] of {_by_joint(robot, robot.damping)} "
-            "(damping='robot' takes it, damping=0 says that none is meant)"
+            "(damping='robot' takes it, damping=0 silences this message)"
         )
-    if robot.friction.any() and not rubs:
-        words.append(
+    if robot.friction.any() and not dry:
+        left_out.append(
             f"dry friction [N m or N] of {_by_joint(robot, robot.friction)} "
             "(forces=[varpin.CoulombFriction(robot.friction)] takes it)"
         )
-    if words:
-        told = "robot %r: the scene leaves out what the description gives: %s"
-        logger.warning(told, robot.name, ", and ".join(words))
+    if left_out:
+        message = "robot %r: the scene leaves out what the description gives: %s"
+        logger.warning(message, robot.name, ", and ".join(left_out))
 
 
 def _by_joint(robot: Robot, values: Floats) -> str:
-    """Numbers that are not zero, by joint, a few of them."""
+    """The first nonzero numbers by joint, as text."""
     named = [f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value]
     if len(named) == robot.dof and np.ptp(values) == 0.0:
         return f"{values[0]:g} at every joint"
@@ -788,8 +788,8 @@ def _forces(
     stiffness: JointValues,
     rest: JointValues,
 ) -> dict[str, Any]:
-    """What a scene keeps of its forces, by the names of its attributes."""
-    # Both are checked even where they make no element.
+    """The attributes of a scene that follow from its forces, by name."""
+    # Both are checked even if they are zero and make no element.
     given = forces_of(forces)
     short = damping_of(robot, damping, given), not_negative("stiffness", stiffness, robot)
     slack = joint_array("rest", rest, robot.joint_names, uniform=True)
@@ -820,27 +820,27 @@ def _forces(
     }
 
 
-def _refuse_trembling_angles(noise: Noise | Sequence[Noise] | None, elements: Sequence[Element], robot: Robot) -> None:
-    """Refuse noise in proportion to controls that are positions: where an angle is 0 says nothing of a drive."""
+def _refuse_noisy_servos(noise: Noise | Sequence[Noise] | None, elements: Sequence[Element], robot: Robot) -> None:
+    """Refuse noise in proportion to the controls of servos: these are positions, whose zero is arbitrary."""
     given = noise if isinstance(noise, Sequence) else [noise]
     models = [term for model in given for term in (model.terms if isinstance(model, NoiseSum) else [model])]
     servos = [servo.coordinate for servo in of_kind(elements, "PositionServo")]
     if servos and any(isinstance(model, ControlNoise) for model in models):
         raise InputError(
-            f"ControlNoise is in proportion to forces, and the control of joint {robot.joint_names[servos[0]]!r} is "
+            f"ControlNoise is proportional to forces, but the control of joint {robot.joint_names[servos[0]]!r} is "
             "the position of its servo: take AdditiveNoise"
         )
 
 
 def _sole_control(actuation: Floats, c: int) -> int | None:
-    """The control that drives coordinate ``c`` with share 1, and nothing else; None where there is no such control."""
+    """The control that drives coordinate ``c`` alone, with factor 1; None where there is no such control."""
     drives = np.flatnonzero(actuation[c])
     alone = len(drives) == 1 and actuation[c, drives[0]] == 1.0 and np.count_nonzero(actuation[:, drives[0]]) == 1
     return int(drives[0]) if alone else None
 
 
 def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
-    """Refuse a KinematicInput whose joint has no control of its own, or a servo besides."""
+    """Refuse a KinematicInput whose joint has no control of its own, or also has a servo."""
     served = {servo.coordinate for servo in of_kind(elements, "PositionServo")}
     for tie in bound.rows.ties:
         if tie.follower != tie.leader or tie.coefficients:
@@ -850,19 +850,19 @@ def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Eleme
             raise InputError(f"joint {name!r} has both a PositionServo and a KinematicInput")
         if _sole_control(actuation, c) is None:
             raise InputError(
-                f"the KinematicInput of joint {name!r} needs a control of its own, its position: under this actuation "
-                "none is; name the joint in the actuation, or give it a column with a 1"
+                f"the KinematicInput of joint {name!r} needs a control of its own for its position, and this actuation "
+                "has none; name the joint in the actuation, or give it a column with a 1"
             )
 
 
 def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:
-    """The actuation with a column of zeros for the velocity of each cubic input, and the rows that know these."""
+    """The actuation with a column of zeros for the velocity of each cubic input, and the ties with these columns."""
     m, ties = actuation.shape[1], list(bound.rows.ties)
     cubic = [k for k, tie in enumerate(ties) if tie.rate >= 0]
     if not cubic:
         return actuation, bound
-    for k, place in enumerate(cubic):
-        ties[place] = ties[place]._replace(rate=m + k)
+    for k, index in enumerate(cubic):
+        ties[index] = ties[index]._replace(rate=m + k)
     return (
         np.hstack([actuation, np.zeros((len(actuation), len(cubic)))]),
         bound._replace(rows=bound.rows._replace(ties=tuple(ties))),
@@ -870,10 +870,10 @@ def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:
 
 
 def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Floats:
-    """The actuation with controls of servos, which are positions, multiplied by their stiffness.
+    """The actuation with the columns of servos multiplied by their stiffness.
 
     Raises:
-        InputError: A servo's joint has two, or not exactly one control, of its own and of unit share.
+        InputError: A joint has two servos, or a servo's joint has no control of its own with factor 1.
     """
     servos = of_kind(elements, "PositionServo")
     scaled = actuation.copy()
@@ -884,8 +884,8 @@ def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Flo
         alone = _sole_control(actuation, c)
         if alone is None:
             raise InputError(
-                f"the position servo of joint {name!r} needs a control of its own: under this actuation none is the "
-                "joint's alone, with share 1"
+                f"the position servo of joint {name!r} needs a control of its own: in this actuation no control drives "
+                "this joint alone, with factor 1"
             )
         scaled[c, alone] = servo.values[0]
     return scaled

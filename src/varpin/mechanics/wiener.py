@@ -1,4 +1,4 @@
-"""Wiener increments: drawn from a seed, given, refined to half the step or summed to twice."""
+"""Wiener increments: drawn from a seed, refined to half the step, or summed to a multiple of it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from varpin.support.checks import as_floats, count, finite_array, positive, requ
 
 Floats = NDArray[np.float64]
 
-# Seeds that are made at a time.
-_AT_ONCE = 10_000
+# Children spawned in one call.
+_BATCH = 10_000
 
 
 def wiener_increments(
@@ -32,13 +32,13 @@ def wiener_increments(
         dt: Time step [s].
         steps: N.
         rng: Generator or seed; each increment is drawn from N(0, dt).
-        increments: The increments themselves, (N, k) [s^0.5], to be checked only; 0 for none.
+        increments: Given increments (N, k) [s^0.5], which are only checked; 0 for none.
 
     Returns:
-        (N, k) [s^0.5], or (0, k) with neither ``rng`` nor ``increments``, or without processes: none.
+        Increments (N, k) [s^0.5]; (0, k) without noise: no processes, or neither ``rng`` nor ``increments``.
 
     Raises:
-        InputError: Both are given, a wrong shape, or values that are not finite.
+        InputError: Both ``rng`` and ``increments``, a wrong shape, or values that are not finite.
     """
     if increments is not None:
         if rng is not None:
@@ -67,14 +67,14 @@ def generator(rng: np.random.Generator | int | None) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class Children:
-    """The children of a generator, each made where it is needed: bytes that travel, instead of a million generators.
+    """The children of a random generator, in a few bytes for other processes; generators are made on demand.
 
     Attributes:
-        kind: Of their bit generators.
-        entropy: Of the parent's seed.
-        spawn_key: Of the parent's seed.
-        pool_size: Of the parent's seed.
-        before: How many children the parent had.
+        kind: Class of the bit generators.
+        entropy: Entropy of the parent's seed sequence.
+        spawn_key: Spawn key of the parent's seed sequence.
+        pool_size: Pool size of the parent's seed sequence.
+        before: Number of children that the parent had spawned before.
     """
 
     kind: type[np.random.BitGenerator]
@@ -84,7 +84,7 @@ class Children:
     before: int
 
     def generators(self, first: int, last: int) -> list[np.random.Generator]:
-        """The children first .. last, as ``Generator.spawn`` makes them."""
+        """The children first, ..., last - 1, equal to those of ``Generator.spawn``."""
         return [
             np.random.Generator(
                 self.kind(
@@ -98,10 +98,10 @@ class Children:
 
 
 def children(rng: np.random.Generator | int, number: int) -> Children:
-    """So many children of ``rng``; a generator has had them then.
+    """``number`` children of ``rng``; a generator counts them as spawned.
 
     Raises:
-        InputError: Neither a generator nor a seed, or a generator that cannot have children.
+        InputError: Neither a generator nor a seed, or a generator without a numpy SeedSequence.
     """
     parent = generator(rng).bit_generator
     seed = parent.seed_seq
@@ -109,8 +109,8 @@ def children(rng: np.random.Generator | int, number: int) -> Children:
         raise InputError(f"rng must be seeded by a numpy SeedSequence, to have a child for each path; got {seed!r}")
     children = Children(type(parent), seed.entropy, tuple(seed.spawn_key), seed.pool_size, seed.n_children_spawned)
     if isinstance(rng, np.random.Generator):
-        for first in range(0, number, _AT_ONCE):
-            seed.spawn(min(_AT_ONCE, number - first))
+        for first in range(0, number, _BATCH):
+            seed.spawn(min(_BATCH, number - first))
     return children
 
 
@@ -118,7 +118,7 @@ def coarsen(increments: ArrayLike, factor: int = 2) -> Floats:
     """The same Brownian path at ``factor`` times the step: sums of increments, (N, k) to (N / factor, k).
 
     Raises:
-        InputError: N is no multiple of ``factor``, or the increments are not finite or no such array.
+        InputError: N is no multiple of ``factor``, or the increments are not a finite array (N, k).
     """
     values = _rows(increments)
     steps, processes = values.shape
@@ -131,15 +131,15 @@ def coarsen(increments: ArrayLike, factor: int = 2) -> Floats:
 def refine(increments: ArrayLike, dt: float, rng: np.random.Generator | int) -> Floats:
     """The same Brownian path at half the step, by Brownian bridge: (N, k) to (2 N, k).
 
-    The path's middle, given its ends, is normal with mean half the increment and variance dt / 4.
+    The first half of an increment, given the whole, is normal with mean half the increment and variance dt / 4.
 
     Args:
-        increments: Over steps of ``dt`` (N, k) [s^0.5].
-        dt: Their time step [s].
-        rng: Of the bridges.
+        increments: Increments over steps of ``dt`` (N, k) [s^0.5].
+        dt: Time step of ``increments`` [s].
+        rng: Generator or seed of the bridges.
 
     Raises:
-        InputError: dt <= 0, or the increments are not finite or no such array.
+        InputError: dt <= 0, or the increments are not a finite array (N, k).
     """
     half = 0.5 * _rows(increments)
     deviation = 0.5 * math.sqrt(positive("dt", dt, "s"))
