@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from varpin.control.costs import Cost, CostSum, Terminal
 from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
 from varpin.io.scenefile.references import Timeline, constant
-from varpin.io.scenefile.spec import CostSpec, ForceSpec, SceneSpec, degrees_for_radians
+from varpin.io.scenefile.spec import CostSpec, ForceSpec, degrees_for_radians
 from varpin.io.scenefile.table import Floats, SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Given
 from varpin.mechanics.constraints import Constraint, KinematicInput
@@ -20,6 +20,9 @@ from varpin.mechanics.forces import Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.mechanics.scene import Scene, closest_controls, damping_of
 from varpin.model import Robot, load_robot
+
+if TYPE_CHECKING:
+    from varpin.io.scenefile.tables import SceneSpec
 
 _OnFrames = TypeVar("_OnFrames", bound=Force | Constraint)
 

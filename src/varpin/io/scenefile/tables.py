@@ -1,10 +1,10 @@
-"""The tables of a scene file: their keys, and what these take."""
+"""The tables of a scene file: their keys, what these take, and what they say together, a :class:`SceneSpec`."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,7 +45,6 @@ from varpin.io.scenefile.spec import (
     ForceSpec,
     FrameForceSpec,
     PlanConstraintSpec,
-    SceneSpec,
     word_of,
 )
 from varpin.io.scenefile.table import ByName, Table, inside
@@ -481,6 +480,80 @@ class SceneKeys(Keys):
     simulate: SimulateKeys = SimulateKeys()
     solve: SolveKeys = SolveKeys()
     outputs: OutputKeys = OutputKeys()
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSpec:
+    """A scene file.
+
+    Attributes:
+        name: Of the file, or of the bundled scene.
+        title: For people.
+        path: Of the file.
+        root: Its tables, for messages.
+        robot: Which robot, and how it is taken.
+        gravity: [m/s^2], or whether there is any.
+        damping: By joint [N m s/rad or N s/m], or "robot" for the description's own; None where nothing is said.
+        stiffness: Of joint springs, by joint [N m/rad or N/m].
+        rest: Where springs are slack, by joint [rad or m].
+        forces: Others on joints.
+        frame_forces: Others on frames.
+        constraints: What the motion keeps.
+        plan_constraints: What the plan keeps; where there are some, no joint is left out.
+        actuated: Joints that are driven; None for all.
+        gear: Generalized force per control, by driven joint.
+        torque_limit: By driven joint [N m or N]; ``"robot"`` for the robot description's; None for none.
+        noise: Models.
+        q0: Initial configuration by joint [rad or m].
+        v0: Initial velocity by joint.
+        dt: [s].
+        steps: N.
+        hold: Steps that share a control.
+        sampling: Of running costs.
+        shape: Of a plan's controls in time: ``"held"``, or ``"linear"`` between nodes.
+        integrator: The integrator; None where the file names none.
+        costs: Terms.
+        controls: Of a simulation: None for none, ``"hold"`` for holding ones, or values over time.
+        seed: Of the noise of a simulation; without it there is none.
+        options: Of solve.
+        outputs: Files to write.
+    """
+
+    name: str
+    title: str
+    path: Path
+    root: Table
+    robot: RobotKeys
+    gravity: bool | tuple[float, ...]
+    damping: ByName | Literal["robot"] | None
+    stiffness: ByName
+    rest: ByName
+    forces: tuple[ForceSpec, ...]
+    frame_forces: tuple[FrameForceSpec, ...]
+    constraints: tuple[ConstraintSpec, ...]
+    plan_constraints: tuple[PlanConstraintSpec, ...]
+    actuated: tuple[str, ...] | None
+    gear: ByName
+    torque_limit: ByName | str | None
+    noise: tuple[NoiseKeys, ...]
+    q0: ByName
+    v0: ByName
+    dt: float
+    steps: int
+    hold: int
+    sampling: str
+    shape: str
+    integrator: Integrator | None
+    costs: tuple[CostSpec, ...]
+    controls: Reference | str | None
+    seed: int | None
+    options: Mapping[str, Any]
+    outputs: OutputKeys
+
+    @property
+    def duration(self) -> float:
+        """The horizon [s]."""
+        return self.dt * self.steps
 
 
 def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
