@@ -122,11 +122,8 @@ def alternating(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     found = None if trajectory.dw.any() else alternation(trajectory.v, trajectory.u)
     if found is None or _does_so_in_smaller_steps(scene, integrator, trajectory, found):
         return ()
-    sentence = (
-        f"the velocity of {scene.robot.joint_names[found.joint]} alternates from step to step, {found.changes} times "
-        f"in a row from t = {trajectory.t[found.first]:.4g} s on: dt = {trajectory.dt:g} s is too long for what is "
-        "stiff, damped or fed back here"
-    )
+    seen = found.sentence(scene.robot.joint_names, trajectory.t)
+    sentence = f"{seen}: dt = {trajectory.dt:g} s is too long for what is stiff, damped or fed back here"
     return (Finding("alternating velocities", sentence, found.joint),)
 
 
