@@ -505,11 +505,15 @@ def test_dampers_that_nothing_excites_are_quiet():
 
 
 def test_parts_of_steps_are_no_reason_to_warn():
-    """Three links that whip: a few steps are taken in two parts, and the motion is right to a thousandth."""
+    """Three links that whip: a few steps are taken in two parts, and each period is right to a thousandth.
+
+    Over 20 s such motions part all the same.
+    """
     scene, rest = vp.Scene(vp.planar_chain(3)), np.zeros(3)
     motion = vp.simulate(scene, rest, rest, dt=0.1, steps=200, integrator=vp.Gauss(4))
     assert motion.statistics.split_steps > 0
-    assert motion.warnings == ()
+    (told,) = motion.warnings
+    assert told.startswith("disturbances grow here")
     unchecked = vp.simulate(scene, rest, rest, dt=0.1, steps=200, integrator=vp.Gauss(4), check=False)
     assert any("parts" in sentence for sentence in unchecked.warnings)
 
@@ -539,7 +543,7 @@ def evaluations(monkeypatch):
 def test_what_a_look_costs(links, integrator, evaluations):
     """Less than the motion where steps resolve it; where they do not, forty times its evaluations at most."""
     scene, rest = vp.Scene(vp.planar_chain(links)), np.zeros(links)
-    for steps, most in ((10, 40), (20, 40), (320, 0.8)):
+    for steps, most in ((10, 40), (20, 40), (320, 0.9)):
         motion = vp.simulate(scene, rest, rest, dt=1.0 / steps, steps=steps, integrator=integrator, check=False)
         own = int((motion.statistics.jets + motion.statistics.sweeps).sum())
         evaluations()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,7 @@ from varpin.simulation.accuracy import (
 from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.damping import Fast, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
+from varpin.simulation.growth import grown_error
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import SHOWS as PHASE_SHOWS
 from varpin.simulation.phase import phase_lost
@@ -268,7 +270,22 @@ def _not_told(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> t
 def _adding_up(scene: Scene, integrator: Integrator, trajectory: Trajectory, *, stays: bool) -> tuple[Finding, ...]:
     """Says what adds up over a motion that steps resolve from period to period; oscillations whose phase ``stays``."""
     phase = () if stays else _out_of_phase(scene, integrator, trajectory)
-    return (*phase, *_at_limits_of_drives(scene, integrator, trajectory))
+    found = (*phase, *_at_limits_of_drives(scene, integrator, trajectory))
+    return found or _growing(scene, integrator, trajectory)
+
+
+def _growing(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Says if errors of single steps, small as they are, grow to what shows."""
+    found = grown_error(scene, integrator, trajectory)
+    if found is None:
+        return ()
+    sentence = (
+        f"disturbances grow here: single steps of dt = {trajectory.dt:g} s by {integrator} are off by about "
+        f"{found.step:.1g} rad or m, and a method of more stages puts joint {trajectory.joint_names[found.joint]!r} "
+        f"elsewhere by up to {found.off:.2g} rad or m, {100 * found.share:.2g}% of the longest way of a joint, from "
+        f"t = {found.time:.4g} s on; smaller steps or more stages tell the motion for longer"
+    )
+    return (Finding("growing errors", sentence, found.joint),)
 
 
 def _at_limits_of_drives(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
