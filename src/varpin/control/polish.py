@@ -183,15 +183,15 @@ class _Around:
                 node[part] = places
         back = np.zeros_like(carried)
         for j in reversed(range(problem.steps)):
-            k, here = j // hold, node == j + 1
+            own, here = j // hold, node == j + 1
             back[here] += carried[here]
-            G[:, k] += back @ self.linear.B[j]
+            G[:, own] += back @ self.linear.B[j]
             back = back @ self.linear.A[j]
             if j % hold == 0:
-                # The control acts on the state before it, and on the control before.
-                back += G[:, k] @ self.gains[k]
-                if k > 0:
-                    G[:, k - 1] += G[:, k] @ self.previous[k]
+                # The control follows the state before it, and the control before.
+                back += G[:, own] @ self.gains[own]
+                if own > 0:
+                    G[:, own - 1] += G[:, own] @ self.previous[own]
         return G.reshape(total, R * m)
 
     def moved(self, ahead: Floats) -> tuple[Floats, Floats]:
