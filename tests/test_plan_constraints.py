@@ -65,6 +65,35 @@ def reference(problem, plan):
     return minimize(lambda x: problem.cost_of(motion(x)), start, method="SLSQP", constraints=rules, options=options)
 
 
+def test_the_last_step_onto_constraints_costs_next_to_nothing():
+    """The wrist of an arm that falls over without feedback: brought to its bound, it comes back to its way."""
+    robot = vp.load_robot("kinova")
+    begin = np.array([0.3, 2.6, 1.6, 0.5, 1.0, 0.5])
+    end = begin + np.array([0.7, -0.2, 0.3, 0.4, 0.3, 0.2])
+    middle = robot.frame_positions(0.5 * (begin + end)[None], robot.end_effector)[0]
+    cost = vp.ControlCost(1.0 / robot.effort_limit**2) + vp.VelocityCost(0.1)
+    cost += vp.Terminal(vp.TrackingCost(end, 50.0) + vp.VelocityCost(10.0))
+    ball = vp.KeepOutOfSphere(robot, robot.end_effector, middle + np.array([0.0, 0.0, 0.02]), 0.06)
+    scene, rest = vp.Scene(robot, damping=0.1), np.zeros(6)
+    problem = vp.OptimalControlProblem(scene, cost, begin, rest, dt=0.04, steps=30, constraints=[ball])
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    assert plan.violation <= 1e-12
+    assert plan.constraints[0].active.any()
+    # The Lagrangian's slope by differences, along torques that accelerate all joints alike.
+    (report,), (bound,) = plan.constraints, problem.bound_constraints
+    masses = np.array([vp.lagrangian_jet(scene, q, rest).Lvv for q in plan.trajectory.q[:-1]])
+    way = (masses @ np.random.default_rng(0).normal(size=(30, 6, 1)))[:, :, 0]
+
+    def parts(u):
+        motion = problem.simulate(u)
+        pull = (report.multipliers * bound.value(motion.q, motion.v, motion.u)).sum()
+        return np.append(problem.shares(motion), pull)
+
+    slopes = (parts(plan.controls + 1e-6 * way) - parts(plan.controls - 1e-6 * way)) / 2e-6
+    assert abs(slopes.sum()) <= 1e-2 * np.abs(slopes).sum()
+
+
 QUICK = ("velocities", "plane", "out of a sphere")
 
 

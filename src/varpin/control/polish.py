@@ -18,7 +18,7 @@ from varpin.control.solution import Solution
 from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
 from varpin.integrators.base import open_loop
-from varpin.linearization import linearize_steps, velocity_at_nodes
+from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -91,26 +91,27 @@ def _corrected(
     R, m = problem.decisions, problem.scene.controls
     u = motion.u[:: problem.hold]
     lower, upper = problem.control_limits
-    around = _Around(problem, motion)
-    G = around.rows(active).reshape(-1, R, m)
     free = (u > lower) & (u < upper)
     # Controls of large machines may change more than those of small ones.
     size = np.abs(u).max(axis=0)
     size = np.where(size > 0.0, size, max(float(size.max()), 1.0))
     c = np.concatenate([value[rows] for value, rows in zip(values, active, strict=True)])
-    change = np.zeros((R, m))
+    linear = linearize_steps(problem.scene, motion, problem.integrator, problem.q0)
+    ahead = np.zeros((R, m))
     for _ in range(_CLIPS):
         # What has met a limit stays there, and the others do its part.
-        left = c + np.einsum("aRm,Rm->a", G, np.where(free, 0.0, change))
-        change = np.where(
-            free, _least_change((G * (free * size)).reshape(len(G), -1), left).reshape(R, m) * size, change
-        )
+        around = _Around(problem, motion, linear, plan, free)
+        G = around.rows(active).reshape(-1, R, m)
+        left = c + np.einsum("aRm,Rm->a", G, np.where(free, 0.0, ahead))
+        ahead = np.where(free, _least_change((G * (free * size)).reshape(len(G), -1), left).reshape(R, m) * size, ahead)
+        moved, change = around.moved(ahead)
         beyond = free & ((u + change < lower) | (u + change > upper))
         if not beyond.any():
             break
         free = free & ~beyond
         change = np.clip(u + change, lower, upper) - u
-    gains, reference = plan.gains, states(problem, motion) + around.moved(change)
+        ahead = np.where(beyond, change, ahead)
+    gains, reference = plan.gains, states(problem, motion) + moved
     reference = reference[: -1 : problem.hold]
     if plan.previous_gains is not None:
         before = np.vstack([u[:1], (u + change)[:-1]])
@@ -136,17 +137,32 @@ def _least_change(G: Floats, c: Floats) -> Floats:
 
 @dataclass
 class _Around:
-    """The linearization of a motion, with what constraints make of it."""
+    """The linearization of a motion under a plan's feedback, with what constraints make of it.
+
+    With the feedback, what is changed on the way to a bound is brought back behind it as the plan would. Without it
+    the rest of an unstable motion would go astray.
+
+    Attributes:
+        problem: The problem with its constraints.
+        motion: The motion.
+        linear: Of its steps.
+        plan: Whose feedback acts.
+        free: Controls (R, m) on which it acts.
+    """
 
     problem: OptimalControlProblem
     motion: Trajectory
+    linear: Linearization
+    plan: Solution
+    free: Mask
 
     def __post_init__(self) -> None:
-        problem, motion = self.problem, self.motion
-        self.linear = linearize_steps(problem.scene, motion, problem.integrator, problem.q0)
+        previous, acts = self.plan.previous_gains, self.free[:, :, None]
+        self.gains = self.plan.gains * acts
+        self.previous = np.zeros((*self.free.shape, self.free.shape[1])) if previous is None else previous * acts
 
     def rows(self, active: list[Mask]) -> Floats:
-        """Derivatives (a, R m) of the active rows in the controls of all decisions."""
+        """Derivatives (a, R m) of the active rows in what controls do beside the feedback."""
         problem, motion = self.problem, self.motion
         n, R, m, hold = problem.scene.robot.dof, problem.decisions, problem.scene.controls, problem.hold
         total = sum(int(rows.sum()) for rows in active)
@@ -167,19 +183,29 @@ class _Around:
                 node[part] = places
         back = np.zeros_like(carried)
         for j in reversed(range(problem.steps)):
-            here = node == j + 1
-            back[here] = carried[here]
-            G[:, j // hold] += back @ self.linear.B[j]
+            own, here = j // hold, node == j + 1
+            back[here] += carried[here]
+            G[:, own] += back @ self.linear.B[j]
             back = back @ self.linear.A[j]
+            if j % hold == 0:
+                # The control follows the state before it, and the control before.
+                back += G[:, own] @ self.gains[own]
+                if own > 0:
+                    G[:, own - 1] += G[:, own] @ self.previous[own]
         return G.reshape(total, R * m)
 
-    def moved(self, change: Floats) -> Floats:
-        """What changes (R, m) of the controls do to the states (N + 1, 2n), to first order."""
+    def moved(self, ahead: Floats) -> tuple[Floats, Floats]:
+        """What states (N + 1, 2n) and controls (R, m) change by if controls do ``ahead`` (R, m) beside the feedback."""
         A, B, hold = self.linear.A, self.linear.B, self.problem.hold
-        found = np.zeros((len(A) + 1, A.shape[1]))
+        found, change = np.zeros((len(A) + 1, A.shape[1])), ahead.copy()
         for j in range(len(A)):
-            found[j + 1] = A[j] @ found[j] + B[j] @ change[j // hold]
-        return found
+            k = j // hold
+            if j % hold == 0:
+                change[k] += self.gains[k] @ found[j]
+                if k > 0:
+                    change[k] += self.previous[k] @ change[k - 1]
+            found[j + 1] = A[j] @ found[j] + B[j] @ change[k]
+        return found, change
 
 
 def _of_rate(item: BoundRate, k: NDArray[np.int64], r: NDArray[np.int64], R: int, m: int) -> Floats:

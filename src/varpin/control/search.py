@@ -180,7 +180,8 @@ def solve(
             another planner will do, though no controls make it: forces on the joints hold the first motion on it, and
             the first iterations take them away (multiple shooting). ``controls`` are then those that go with the
             states; left out, they are the inverse dynamics' within their limits. Single shooting goes on from there.
-            Held controls only, and no :class:`KinematicInput`.
+            Held controls only, and no :class:`KinematicInput`. A search that ends before the forces are gone is left
+            with the controls alone: resumed, it goes on from these, and not as if it had not been interrupted.
 
     Returns:
         The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
