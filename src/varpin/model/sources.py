@@ -45,6 +45,7 @@ class Description:
         inertials: Of the links in a URDF, which the model has merged into bodies.
         remarks: What the source leaves out, in words.
         postures: Of the joints of ``model``.
+        loops: Pairs of frames that the source wants together, and the tree leaves apart.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Description:
     inertials: tuple[Inertial, ...] = ()
     remarks: tuple[str, ...] = ()
     postures: tuple[Posture, ...] = ()
+    loops: tuple[tuple[str, str], ...] = ()
 
 
 def models_dir() -> Path:
@@ -323,6 +325,7 @@ def _of_urdf(
         inertials=urdf.inertials,
         remarks=remarks,
         postures=postures,
+        loops=urdf.loops,
     )
 
 
