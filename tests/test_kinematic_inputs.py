@@ -312,6 +312,8 @@ def test_a_controller_moves_a_joint_by_hand():
     # Within a tick at one rate, and never beyond the limits.
     np.testing.assert_allclose(np.diff(motion.q[:, 0], n=2).reshape(-1)[[0, 1, 4, 5, 6, 8]], 0.0, atol=1e-12)
     assert (motion.q[:, 0] <= limits[1] + 1e-12).all()
+    # No advice to hold decisions, which such problems refuse.
+    assert any("problem.at(dt=0.01) has finer steps" in line for line in run.warnings)
     with pytest.raises(vp.InputError, match="the plant has linear KinematicInputs on no joints; the problem on joint1"):
         vp.Mpc(problem).run(vp.Plant(vp.Scene(heavy, actuation=["joint1"])), duration=0.1)
 
