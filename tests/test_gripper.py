@@ -65,3 +65,35 @@ def test_the_plan_closes_it_to_forty_millimetres(task):
     pads = [task.robot.frame_positions(plan.trajectory.q[-1:], f"{side}_pad")[0, 0] for side in ("right", "left")]
     assert pads[0] - pads[1] == pytest.approx(0.04, abs=1e-6)
     assert abs(plan.verify().closed_loop_loss) < 1e-6
+
+
+def test_a_gripper_whose_loops_are_open_says_so(caplog):
+    robot = vp.load_robot("gripper")
+    assert robot.loops == (("right_crank_pin", "right_finger_pin"), ("left_crank_pin", "left_finger_pin"))
+    assert "2 loops for a scene to close" in repr(robot)
+    assert any("'left_crank_pin' on 'left_finger_pin'" in line for line in vp.inspect_robot("gripper").warnings)
+    pair = vp.combine(robot, vp.load_robot("finger"), prefixes=["a_", "b_"])
+    assert pair.loops[0] == ("a_right_crank_pin", "a_right_finger_pin")
+    assert vp.load_robot("finger").loops == ()
+    assert "loops" not in caplog.text
+    start = np.zeros(6), np.zeros(6)
+    for check in (True, False):
+        tied = vp.Scene(robot, damping=0.0, constraints=vp.JointTie("left_crank", "right_crank"))
+        motion = vp.simulate(tied, *start, dt=1e-3, steps=3, check=check)
+        assert any("are open" in line and "'right_crank_pin' on 'right_finger_pin'" in line for line in motion.warnings)
+        assert caplog.text.count("are open") == 1
+        vp.simulate(tied, *start, dt=1e-3, steps=3, check=check)
+        assert caplog.text.count("are open") == 1
+        caplog.clear()
+    one = vp.Scene(robot, damping=0.0, constraints=vp.PointOnPoint("right_crank_pin", "right_finger_pin", axes="xz"))
+    assert not any("are open" in line for line in vp.simulate(one, *start, dt=1e-3, steps=3).warnings)
+    assert not vp.load_scene("gripper_closes").scene.open_loops
+
+
+def test_loops_of_a_file_that_says_too_little_are_none(tmp_path):
+    text = vp.load_robot("gripper").urdf.read_text()
+    path = tmp_path / "gripper.urdf"
+    path.write_text(
+        text.replace('<link2 link="left_finger_pin"/>', "").replace('<link1 link="right_crank_pin"/>', "<link1/>")
+    )
+    assert vp.load_robot(path).loops == ()

@@ -294,13 +294,37 @@ def test_noise_does_not_move_what_is_moved_by_hand():
     np.testing.assert_allclose(still.q[:, 0], q[0], atol=1e-14)
 
 
+def test_a_controller_moves_a_joint_by_hand():
+    """The plant is heavier and damped; the joint goes on evenly from tick to tick, and the pole comes to hang."""
+    hand = vp.KinematicInput("joint1")
+    scene = vp.Scene(vp.planar_chain(2, length=0.5, mass=0.5), actuation=["joint1"], constraints=hand)
+    begin = np.array([0.5 * np.pi, 0.0])
+    goal = begin + np.array([0.8, -0.8])
+    cost = vp.ControlRateCost(0.02, before=[begin[0]]) + vp.VelocityCost([0.0, 0.02]) + vp.TrackingCost(goal, 20.0)
+    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost([0.0, 10.0]))
+    limits = (begin[0] - 0.1, goal[0] + 0.1)
+    problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(2), dt=0.04, steps=25, control_limits=limits)
+    heavy = vp.planar_chain(2, length=0.5, mass=0.7)
+    other = vp.Scene(heavy, damping=[0.0, 0.01], actuation=["joint1"], constraints=hand)
+    run = vp.Mpc(problem).run(vp.Plant(other, substeps=4), duration=2.4)
+    motion = run.motion
+    np.testing.assert_allclose(motion.q[-1], goal, atol=0.02)
+    np.testing.assert_allclose(motion.q[1:, 0], motion.u[:, 0], atol=1e-13)
+    # Within a tick at one rate, and never beyond the limits.
+    np.testing.assert_allclose(np.diff(motion.q[:, 0], n=2).reshape(-1)[[0, 1, 4, 5, 6, 8]], 0.0, atol=1e-12)
+    assert (motion.q[:, 0] <= limits[1] + 1e-12).all()
+    # No advice to hold decisions, which such problems refuse.
+    assert any("problem.at(dt=0.01) has finer steps" in line for line in run.warnings)
+    with pytest.raises(vp.InputError, match="the plant has linear KinematicInputs on no joints; the problem on joint1"):
+        vp.Mpc(problem).run(vp.Plant(vp.Scene(heavy, actuation=["joint1"])), duration=0.1)
+
+
 def test_what_does_not_know_inputs_refuses_them():
     scene, q, v = crank()
     robot, loop = scene.robot, scene.constraints[0]
     hand = vp.KinematicInput("joint1")
     held = vp.LinearPolicy(np.zeros((3, 1)), np.zeros((3, 1, 6)), np.zeros((3, 6)), hold=2, on="momentum")
     tries = [
-        lambda: vp.Plant(scene),
         lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=lambda t, q, v: [0.0]),
         lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=vp.OpenLoop(lambda t: [0.0])),
         lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=held),

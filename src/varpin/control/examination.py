@@ -294,7 +294,8 @@ def _sentence(problem: OptimalControlProblem, replay: Replay) -> str:
     fed, alone = (percent(part) if np.isfinite(part) else "runs away" for part in (replay.feedback, replay.alone))
     dt = f"{problem.dt / PARTS:g}"
     finer = f"problem.at(dt={dt}, hold={problem.hold * PARTS}) decides as often in finer steps"
-    if problem.linear:
+    if problem.linear or problem.scene.inputs:
+        # Where joints are moved by hand, decisions are not held over several steps.
         finer = f"problem.at(dt={dt}) has finer steps"
     if -GAIN <= replay.alone <= LOSS:
         why = f"the feedback is too fast for the step; {finer}, and a greater weight on the controls slows it"

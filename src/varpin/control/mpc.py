@@ -17,7 +17,8 @@ from varpin.control.history import Status
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure
-from varpin.mechanics.scene import Scene, refuse_inputs, require_scene
+from varpin.mechanics.inputs import in_parts_of_steps
+from varpin.mechanics.scene import Scene, require_scene
 from varpin.simulation.chatter import alternation
 from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
 from varpin.simulation.loop_stability import examined_in_loop
@@ -53,7 +54,7 @@ class Plant:
     substeps: int = 10
 
     def __post_init__(self) -> None:
-        refuse_inputs(require_scene(self.scene), "Plant")
+        require_scene(self.scene)
         if self.integrator is not None and not isinstance(self.integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, got {self.integrator!r}")
         count("substeps", self.substeps, least=1)
@@ -194,7 +195,6 @@ class Mpc:
     def __post_init__(self) -> None:
         if not isinstance(self.problem, OptimalControlProblem):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
-        refuse_inputs(self.problem.scene, "Mpc")
         if self.problem.linear:
             raise InputError("Mpc decides on controls that are held: the problem's are linear between nodes")
         count("iterations", self.iterations, least=1)
@@ -316,6 +316,9 @@ class Mpc:
                 f"the plant has servos on {', '.join(plant.scene.servo_joints) or 'no joints'}; the problem on "
                 f"{', '.join(problem.scene.servo_joints) or 'no joints'}"
             )
+        if _moved(plant.scene) != _moved(problem.scene):
+            moved = (", ".join(_moved(scene)) or "no joints" for scene in (plant.scene, problem.scene))
+            raise InputError("the plant has linear KinematicInputs on {}; the problem on {}".format(*moved))
         ticks = max(1, round(positive("duration", duration, "s") / self.period))
         dt = self.period / plant.substeps
         generator = None if rng is None else np.random.default_rng(rng)
@@ -486,6 +489,13 @@ def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integr
     return integrator_along(scene, chosen, plan.q, plan.v, plan.u, dt)
 
 
+def _moved(scene: Scene) -> tuple[str, ...]:
+    """The joints that are moved by hand on lines, which plans are of."""
+    return tuple(
+        scene.robot.joint_names[c] for c, rate in zip(scene.inputs.values(), scene.rates, strict=True) if rate < 0
+    )
+
+
 def _simulated(
     plant: Plant,
     method: Integrator,
@@ -497,7 +507,9 @@ def _simulated(
     before: Sequence[Trajectory],
 ) -> Trajectory:
     """The plant's motion of one tick; what came before is in its failure."""
-    options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": u, "integrator": method}
+    # Joints with kinematic inputs move on lines to their next positions over the tick.
+    controls = in_parts_of_steps(plant.scene, u[None], q[None], v[None], dt * plant.substeps, plant.substeps)
+    options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": controls, "integrator": method}
     options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}
     try:
         return simulate(plant.scene, q, v, **options, check=False)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.core import Mechanism as Core
 from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
-from varpin.mechanics.constraints import Bound, Constraint, constraints_of, joined
+from varpin.mechanics.constraints import Bound, Constraint, CustomConstraint, constraints_of, joined
 from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.forces import (
     CoulombFriction,
@@ -299,6 +299,12 @@ class Scene(Frozen):
         label: NDArray[np.int64] = np.unique(group, return_inverse=True)[1].astype(np.int64)
         label.setflags(write=False)
         return label
+
+    @property
+    def open_loops(self) -> tuple[tuple[str, str], ...]:
+        """Loops of the robot's description, :attr:`Robot.loops`, where no constraint can close one."""
+        closes = any(hasattr(own, "a") or isinstance(own, CustomConstraint) for own in self.constraints)
+        return () if closes else self.robot.loops
 
     def _constrained(self) -> list[list[int]]:
         """The coordinates of each constraint row."""

@@ -87,6 +87,7 @@ def combine(
             for state in robot.group_states
         ),
         parts=tuple(parts),
+        loops=tuple((word + a, word + b) for robot, word in pairs for a, b in robot.loops),
     )
 
 

@@ -77,6 +77,8 @@ class Robot(Frozen):
         visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
         group_states: The postures that :meth:`posture` reads.
         parts: The robots of a combined robot, see :func:`combine`; empty for others.
+        loops: Pairs of frames that the description closes to loops (``<loop_joint>`` of a URDF file). The tree leaves
+            them open; constraints of a scene close them.
     """
 
     name: str
@@ -93,10 +95,12 @@ class Robot(Frozen):
     visuals: pin.GeometryModel | None = field(default=None, repr=False)
     group_states: tuple[Posture, ...] = field(default=(), repr=False)
     parts: tuple[Part, ...] = field(default=(), repr=False)
+    loops: tuple[tuple[str, str], ...] = ()
 
     def __repr__(self) -> str:
         locked = f", {len(self.locked)} locked" if self.locked else ""
-        return f"Robot({self.name}: {', '.join(self.joint_names)}{locked})"
+        loops = f", {len(self.loops)} loops for a scene to close" if self.loops else ""
+        return f"Robot({self.name}: {', '.join(self.joint_names)}{locked}{loops})"
 
     def _repr_html_(self) -> str:
         lower, upper = self.position_limits
@@ -109,6 +113,8 @@ class Robot(Frozen):
             rows.append(("locked", listed(self.locked)))
         if self.ties:
             rows.append(("tied to others", listed(self.free_model.names[tie.follower] for tie in self.ties)))
+        if self.loops:
+            rows.append(("loops for a scene to close", listed(f"{a} on {b}" for a, b in self.loops)))
         rows.append(("end effector", self.end_effector))
         head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
         return facts(f"Robot {self.name}", rows, table(head, [(name, *map(float, row)) for name, *row in columns]))
@@ -451,6 +457,7 @@ def _built(
         package_dirs=description.package_dirs,
         visuals=visuals,
         group_states=of_joints(description.postures, description.model.names),
+        loops=description.loops,
     )
     return robot, description
 

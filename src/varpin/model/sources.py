@@ -45,6 +45,7 @@ class Description:
         inertials: Inertias of the links of a URDF, which the model merges into bodies.
         remarks: What the source leaves out, in words.
         postures: Postures of the joints of ``model``.
+        loops: Pairs of frames that the source closes to loops, and the tree leaves open.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Description:
     inertials: tuple[Inertial, ...] = ()
     remarks: tuple[str, ...] = ()
     postures: tuple[Posture, ...] = ()
+    loops: tuple[tuple[str, str], ...] = ()
 
 
 def models_dir() -> Path:
@@ -325,6 +327,7 @@ def _of_urdf(
         inertials=urdf.inertials,
         remarks=remarks,
         postures=postures,
+        loops=urdf.loops,
     )
 
 

@@ -106,6 +106,13 @@ class Urdf:
     remarks: tuple[str, ...] = ()
     fault: str = ""
 
+    @property
+    def loops(self) -> tuple[tuple[str, str], ...]:
+        """The links of each ``<loop_joint>``, which no tree has."""
+        ends = [[joint.find(end) for end in ("link1", "link2")] for joint in self.elements("loop_joint")]
+        names = [[end.get("link", "") for end in pair if end is not None] for pair in ends]
+        return tuple((pair[0], pair[1]) for pair in names if len(pair) == 2 and all(pair))
+
     def elements(self, tag: str) -> list[ET.Element]:
         """The children of the root with a tag."""
         return [] if self.root is None else self.root.findall(tag)

@@ -98,6 +98,7 @@ def inspect_robot(
         *_limit_warnings(joints, robot, None if q is None else configuration),
         *_mimic_warnings(robot, urdf, joints, tied=mimic == "tied"),
         *_damping_warnings(robot),
+        *_loop_warnings(robot),
         *(f"joint {name!r} is locked at {_position(at)}" for name, at in robot.locked.items()),
     ]
     return RobotReport(
@@ -376,6 +377,12 @@ def _damping_warnings(robot: Robot) -> Iterator[str]:
         given = ", ".join(f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value)
         if given:
             yield f"the description gives joint {what} [{unit}], {usage}: {given}"
+
+
+def _loop_warnings(robot: Robot) -> Iterator[str]:
+    if robot.loops:
+        pairs = ", ".join(f"{a!r} on {b!r}" for a, b in robot.loops)
+        yield f"the description has loops, which the tree leaves open for a scene's constraints to close: {pairs}"
 
 
 def _position(value: float | tuple[float, ...]) -> str:

@@ -1,4 +1,4 @@
-"""Limits of the robot's description that a motion leaves: of joints' positions and velocities, and of their motors.
+"""What a motion leaves of the robot's description: limits of joints and of their motors, and loops that are open.
 
 No motion is stopped by them; as a motion of the robot without end stops, and with motors as strong as it takes, it may
 be right.
@@ -21,7 +21,8 @@ Floats = NDArray[np.float64]
 POSITION = "joints leave their limits"
 VELOCITY = "joints pass their velocity limits"
 EFFORT = "controls pass the joints' effort limits"
-KINDS = (POSITION, VELOCITY, EFFORT)
+LOOPS = "loops of the robot's description are open"
+KINDS = (POSITION, VELOCITY, EFFORT, LOOPS)
 # Beyond its limit by more than this a joint is spoken of: of position [rad or m], of others as a share of the limit.
 _OUTSIDE, _SHARE = 1e-6, 1e-6
 # So many joints are told of with numbers.
@@ -29,7 +30,14 @@ _NAMED = 6
 
 
 def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
-    """Which kinds of limits a motion leaves, and for each a sentence: which joints, by how much, and when."""
+    """Which kinds of limits a motion leaves, and for each a sentence: which joints, by how much, and when.
+
+    And which loops the scene leaves open.
+    """
+    if loops := scene.open_loops:
+        (a, b), pairs = loops[0], ", ".join(f"{a!r} on {b!r}" for a, b in loops)
+        closed = f"varpin.Scene(robot, constraints=[varpin.PointOnPoint({a!r}, {b!r}), ...])"
+        yield LOOPS, f"{LOOPS}, and the motion is that of a tree: {pairs}; {closed} closes them"
     if not any(scene.bounded):
         return
     robot, t = scene.robot, trajectory.t

@@ -176,7 +176,7 @@ def evident(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tup
 
 
 def _beyond_limits(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says which limits of the robot's description the motion leaves; the motion itself may be right."""
+    """Says what of the robot's description the motion leaves, limits and loops; the motion itself may be right."""
     return tuple(Finding(kind, sentence) for kind, sentence in limits_left(scene, trajectory))
 
 
