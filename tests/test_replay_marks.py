@@ -503,7 +503,7 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
     no("ghost of several robots must be a list with one for each of the 2", robot=both, motion=None, ghost=sweep)
     no("torques of several robots must be a list", robot=both, motion=None, torques=[np.ones((20, 6))])
     no("torque_limit needs torques", robot=both, motion=None, torques=False, torque_limit=1.0)
-    no("ahead is of the plans of an MpcRun", ahead=0.1)
+    no("ahead needs a run of an Mpc", ahead=0.1)
     no("motion 2 must have shape (N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
     no("give the robot's motion", motion=None)
     scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"])
@@ -520,5 +520,5 @@ def test_a_reference_keeps_its_corners():
 
 def test_another_robot_s_motion_is_refused(ur5, tmp_path):
     motion = vp.simulate(vp.Scene(vp.load_robot("ur10")), np.zeros(6), np.zeros(6), dt=0.01, steps=2, check=False)
-    with pytest.raises(vp.InputError, match="of robot 'ur10', whose joints lie otherwise than those of 'ur5'"):
+    with pytest.raises(vp.InputError, match="of robot 'ur10', whose joints have the same names as those of 'ur5'"):
         replay(ur5, motion, html=tmp_path / "other.html")

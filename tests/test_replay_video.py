@@ -91,7 +91,7 @@ def test_says_what_is_missing_and_how_to_get_it(chain, tmp_path, monkeypatch):
 def test_refuses_other_formats_and_sizes(chain, tmp_path):
     for name, size, message in [
         ("chain.avi", (320, 240), "video must end in .gif or .mp4, got 'chain.avi'"),
-        ("chain.mp4", (321, 240), "size must be even numbers of pixels, as films have them, got 321 x 240"),
+        ("chain.mp4", (321, 240), "size must be even numbers of pixels, as video formats need, got 321 x 240"),
         ("chain.mp4", 320, "size must be a width and a height [pixels], got 320"),
         ("chain.mp4", (320, 2), "size must be at least 16, got 2"),
     ]:
