@@ -151,7 +151,7 @@ def test_monte_carlo_with_noise_of_ones_own_on_processes(spawned):
     plan = plan_of(vp.Scene(vp.planar_chain(2), noise=vp.CustomNoise(field, 2)), max_iterations=2)
     assert plan.monte_carlo(4, 1, executor=spawned) == plan.monte_carlo(4, 1)
     here = plan_of(vp.Scene(vp.planar_chain(2), noise=vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)))
-    with pytest.raises(vp.InputError, match=r"cannot be sent to them: .*; functions must be importable there"):
+    with pytest.raises(vp.InputError, match=r"cannot be sent to the workers: .*; functions must be importable there"):
         here.monte_carlo(4, 1, executor=spawned)
 
 
