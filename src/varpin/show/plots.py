@@ -131,19 +131,19 @@ def plot_controls(
 def plot_energy_error(
     trajectory: Trajectory, axes: Axes | None = None, *, relative: bool = False
 ) -> tuple[Figure | SubFigure, Axes]:
-    """Energy over time, less the initial energy: an error where nothing drives or damps the robot.
+    """Change of the energy over time, which is an error if no force drives or damps the robot.
 
     Args:
         trajectory: The motion.
         axes: Where to draw; a new figure if left out.
-        relative: Divide by the initial energy, instead of plotting joules. The zero of the potential energy is at the
-            world's origin, so this figure depends on where the robot stands.
+        relative: Divide by the initial energy, instead of plotting joules. The potential energy is zero at the world's
+            origin, so the result depends on the placement of the robot.
 
     Returns:
         The figure and its axes.
 
     Raises:
-        InputError: ``relative`` where the initial energy is 0.
+        InputError: ``relative`` is set and the initial energy is 0.
     """
     start = trajectory.energy[0]
     if relative and start == 0.0:

@@ -32,7 +32,7 @@ class Page:
         try:
             self.commands.append(umsgpack.packb(lowered(command), force_float_precision="single"))
         except OverflowError:
-            raise InputError("what is to be shown has sizes or places beyond 3e38, which no viewer draws") from None
+            raise InputError("the replay has sizes or positions beyond 3e38, which no viewer draws") from None
 
     def html(self, script: Script) -> str:
         """The page: meshcat's viewer, the compressed commands, the legend and the control bar."""
