@@ -1,4 +1,4 @@
-"""Problems of varpin for the solvers of crocoddyl: FDDP, BoxFDDP and their callbacks on the variational map.
+"""Problems of varpin for crocoddyl's solvers (FDDP, BoxFDDP) and their callbacks, on the variational map.
 
 Needs crocoddyl, which is built against one version of Pinocchio: ``pip install "varpin[crocoddyl]"``.
 
@@ -34,7 +34,7 @@ try:
 except ImportError as missing:
     raise ImportError(
         f"varpin.crocoddyl needs crocoddyl ({missing}): pip install 'varpin[crocoddyl]', "
-        "in an environment of its own, as it brings the Pinocchio that it was built against"
+        "in a separate environment, as it installs the Pinocchio that it was built against"
     ) from missing
 
 Floats = NDArray[np.float64]
@@ -43,11 +43,11 @@ logger = logging.getLogger(__name__)
 
 
 class StepModel(crocoddyl.ActionModelAbstract):
-    """Step ``step`` of a problem, its running cost included, as an action of crocoddyl.
+    """Step ``step`` of a problem with its running cost, as an action of crocoddyl.
 
-    The state is (q, p) for variational integrators and (q, v) for the others, (2n,); ``Fx`` and ``Fu`` are the exact
-    derivatives of the step that is taken, second derivatives of the cost those of Gauss and Newton. Noise does not act.
-    A step that cannot be solved ends in NaN, on which crocoddyl's line search shortens its step, and is logged.
+    The state is (q, p) for variational integrators and (q, v) for the others, (2n,). ``Fx`` and ``Fu`` are the exact
+    derivatives of the step; second derivatives of the cost are Gauss-Newton approximations. Noise is left out. A step
+    that cannot be solved is logged and returns NaN, for which crocoddyl's line search shortens its step.
     """
 
     def __init__(self, problem: OptimalControlProblem, step: int) -> None:
@@ -105,11 +105,11 @@ class StepModel(crocoddyl.ActionModelAbstract):
 
     @property
     def _weight(self) -> float:
-        # Every rule weighs its samples alike.
+        # All samples of a rule have the same weight.
         return float(self._problem.dt * self._problem.rule[0, 0])
 
     def _step(self, x: Floats, u: Floats) -> Trajectory | None:
-        """The step from x under u; the last one is remembered, as crocoddyl asks for its derivatives next."""
+        """The step from x under u. The last one is cached, as crocoddyl needs its derivatives next."""
         if self._known is not None and np.array_equal(self._known[0], x) and np.array_equal(self._known[1], u):
             return self._known[2]
         problem = self._problem
@@ -155,16 +155,16 @@ class EndModel(crocoddyl.ActionModelAbstract):
 
 
 def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProblem:
-    """The problem as crocoddyl's: one action a step, and the terminal cost.
+    """The problem for crocoddyl: an action for each step, and the terminal cost.
 
     The actions are Python objects, so leave ``nthreads`` at 1.
 
     Raises:
-        InputError: Controls that are held over several steps, or whose changes cost something; a scene with
-            constraints.
+        InputError: Controls are held over several steps, are linear between nodes, or have a cost of their rate; or the
+            scene or the plan has constraints.
     """
     if problem.rate is not None:
-        raise InputError("crocoddyl's actions know no control but their own: leave the ControlRateCost out")
+        raise InputError("crocoddyl's actions do not have the previous control: leave the ControlRateCost out")
     if problem.linear:
         raise InputError("crocoddyl's actions hold their control over a step; the problem's are linear between nodes")
     if problem.hold != 1:
@@ -174,7 +174,7 @@ def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProble
 
 
 def first_guess(problem: OptimalControlProblem) -> tuple[list[Floats], list[Floats]]:
-    """States and controls, ``xs`` and ``us``, of the motion that :func:`varpin.solve` starts from.
+    """States ``xs`` and controls ``us`` of the initial motion of :func:`varpin.solve`.
 
     Raises:
         StepFailure: That motion cannot be integrated.
@@ -188,7 +188,7 @@ def first_guess(problem: OptimalControlProblem) -> tuple[list[Floats], list[Floa
 
 
 def policy_of(problem: OptimalControlProblem, solver: Any) -> LinearPolicy:
-    """Controls and feedback of a crocoddyl solver that has solved ``shooting_problem(problem)``: us - K (x - xs)."""
+    """The policy us - K (x - xs) of a crocoddyl solver that has solved ``shooting_problem(problem)``."""
     gains: Sequence[Floats] = solver.K
     return LinearPolicy(
         np.array(solver.us.tolist()),

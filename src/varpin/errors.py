@@ -1,4 +1,4 @@
-"""Every error varpin raises on purpose. Each keeps its data as attributes and says what is allowed."""
+"""The errors that varpin raises. Each has its data as attributes, and a message that tells what is allowed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class VarpinError(Exception):
-    """Base of every error that varpin raises on purpose."""
+    """Base of all errors that varpin raises."""
 
 
 class RobotError(VarpinError, ValueError):
@@ -15,7 +15,7 @@ class RobotError(VarpinError, ValueError):
 
 
 def _meant(name: str, known: tuple[str, ...]) -> tuple[list[str], str]:
-    """The known names that come close to ``name``, and a question that offers them; both empty if none does."""
+    """The known names similar to ``name``, and a hint with them; both are empty if there are none."""
     matches = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
     return matches, f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
 
@@ -24,8 +24,8 @@ class RobotNotFound(RobotError):
     """No robot of that name, or no file at that path.
 
     Attributes:
-        name: What was asked for.
-        matches: Names that come close.
+        name: The given name or path.
+        matches: Similar names.
     """
 
     def __init__(self, name: str, known: Iterable[str], note: str = "") -> None:
@@ -40,9 +40,9 @@ class UnknownJoint(RobotError):
     """A joint name that the robot does not have, or that no control has.
 
     Attributes:
-        joint: The name given.
-        joints: The names there are.
-        matches: Those that come close.
+        joint: The given name.
+        joints: The known names.
+        matches: Similar names.
     """
 
     def __init__(self, joint: str, joints: Iterable[str], where: str, lack: str = "the robot has no joint") -> None:
@@ -56,8 +56,8 @@ class UnsupportedJoint(RobotError):
     """A joint type outside generalized coordinates in R^n.
 
     Attributes:
-        joint: Its name.
-        kind: Its Pinocchio type.
+        joint: Name of the joint.
+        kind: Pinocchio type of the joint.
     """
 
     def __init__(self, joint: str, kind: str, numbers: int) -> None:
@@ -76,7 +76,7 @@ class SingularMassMatrix(RobotError):
 
     Attributes:
         joints: The joints whose motion carries no inertia, or a negative one.
-        negative: Which of the two.
+        negative: Whether the inertia is negative.
     """
 
     def __init__(self, joints: Iterable[str], q: object, *, negative: bool = False) -> None:
@@ -100,12 +100,12 @@ class InputError(VarpinError, ValueError):
 
 
 class AssemblyError(InputError):
-    """No configuration that the search comes to keeps all constraints.
+    """The search finds no configuration that satisfies all constraints.
 
     Attributes:
-        constraint: The one that misses by most.
-        miss: By how much [m or rad].
-        q: Where the search ended (n,) [rad or m].
+        constraint: The most violated constraint.
+        miss: Its violation [m or rad].
+        q: Final configuration of the search (n,) [rad or m].
     """
 
     def __init__(self, constraint: str, miss: float, q: object) -> None:
@@ -122,9 +122,9 @@ class UnknownFrame(InputError):
     """A frame name that the robot does not have.
 
     Attributes:
-        frame: The name given.
-        frames: The names there are.
-        matches: Those that come close.
+        frame: The given name.
+        frames: The known names.
+        matches: Similar names.
     """
 
     def __init__(self, frame: str, frames: Iterable[str], robot: str) -> None:
@@ -138,9 +138,9 @@ class UnknownPosture(InputError):
     """A posture that the robot does not have.
 
     Attributes:
-        posture: The name given.
-        postures: The names there are.
-        matches: Those that come close.
+        posture: The given name.
+        postures: The known names.
+        matches: Similar names.
     """
 
     def __init__(self, posture: str, postures: Iterable[str], robot: str) -> None:
@@ -153,16 +153,16 @@ class UnknownPosture(InputError):
 
 
 class FileError(VarpinError, OSError):
-    """A file cannot be read, or not be written."""
+    """A file cannot be read or written."""
 
 
 class MissingDependency(VarpinError, ImportError):
-    """Something that is asked for needs a package or a program that is not installed.
+    """A feature needs a package or a program that is not installed.
 
     Attributes:
-        purpose: What needs it.
-        missing: What is not there.
-        command: What installs it.
+        purpose: The feature.
+        missing: The missing packages or programs.
+        command: The command that installs them.
     """
 
     def __init__(self, purpose: str, missing: Iterable[str], command: str) -> None:
@@ -177,8 +177,8 @@ class LinearizationError(VarpinError, RuntimeError):
 
     Attributes:
         step: Index of the step.
-        time: Its start [s].
-        reason: What stopped the solver.
+        time: Time at its start [s].
+        reason: Why the solver stopped.
     """
 
     def __init__(self, step: int, time: float, reason: str) -> None:

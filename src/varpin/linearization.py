@@ -1,4 +1,4 @@
-"""The structured linearization of a stochastic discrete map, and what it says of means and covariances.
+"""The structured linearization of a stochastic discrete map, and its means and covariances.
 
 Equation (L3) of docs/mathematics.md; (1.7) and (1.10) of the paper.
 """
@@ -22,8 +22,8 @@ from varpin.trajectory import Trajectory, require_motion, require_scene_of
 
 Floats = NDArray[np.float64]
 
-# Steps of a motion that does not say what scene it was made in which are taken again, and what they may be off by: as
-# shares of the largest change of velocity in the step, and of the largest velocity.
+# Number of steps that are repeated to check the scene of a motion without scene values, and tolerances as shares of
+# the largest change of velocity in the step and of the largest velocity.
 _RETAKEN, _OF_CHANGE, _OF_SPEED = 8, 1e-5, 1e-8
 
 
@@ -33,31 +33,31 @@ class Linearization:
 
         dx[j+1] = (A + sum_i Gx_i dw_i) dx + (B + sum_i Gu_i dw_i) du + G dw
 
-    with every derivative taken at dw = 0 (the paper's choice; the exact second derivative in x and dw differs by
-    O(dt)), and so at the state that a step from the trajectory's node reaches without noise, where a split kick has its
-    second half. x is (q, p) for variational integrators and (q, v) for the others.
+    Every derivative is taken at dw = 0, the paper's choice; the exact second derivative in x and dw differs by O(dt).
+    The end of a step, at which a split kick has its second half, is therefore the one without noise. x is (q, p) for
+    variational integrators and (q, v) for the others.
 
-    Under constraints each step is a map on all of R^2n: it begins at any (q, p), of p takes what is normal to the
-    constraints away, and ends on them. A, B and K are derivatives of that map: A has rank 2 (n - r) for r independent
-    rows, is symplectic on tangent directions of the constraints alone, and K has nothing of an impulse normal to them.
+    Under constraints each step is a map on all of R^2n: it begins at any (q, p), removes the part of p normal to the
+    constraints, and ends on them. A, B and K are derivatives of that map: A has rank 2 (n - r) for r independent rows
+    and is symplectic on tangent directions of the constraints alone; K is zero for an impulse normal to them.
 
     Attributes:
-        A: dx1/dx0 (N, 2n, 2n); symplectic where nothing is forced or damped.
-        B: dx1/du (N, 2n, m), of a control that is moved by du over the whole step.
-        K: What a kick does to x1 (N, 2n, n): a jump of the momentum at the start of the step, under an unchanged drift.
-            It is dx1/dp0 where no diffusion field depends on the velocity. Where one does, the drift from Stratonovich
-            to Ito, (1/2) sum_i (dF_i/dv) M^-1 F_i, is that of the state before the kick; dx1/dp0 has its derivative
-            too, and is A[:, :, n:], or A[:, :, n:] M^-1 for integrators on (q, v).
+        A: dx1/dx0 (N, 2n, 2n); symplectic without forces and damping.
+        B: dx1/du (N, 2n, m), for a change du of the control over the whole step.
+        K: Derivative of x1 in a kick (N, 2n, n): a jump of the momentum at the start of the step, with the drift
+            unchanged. It is dx1/dp0 if no diffusion field depends on the velocity. Otherwise the drift from
+            Stratonovich to Ito, (1/2) sum_i (dF_i/dv) M^-1 F_i, is that of the state before the kick; dx1/dp0 includes
+            the derivative of the drift, and is A[:, :, n:], or A[:, :, n:] M^-1 for integrators on (q, v).
         J: The same for a jump of x's second half (N, 2n, n): of p, which is K, or of v.
         F: Diffusion fields (N, n, k).
-        G: dx1/dw (N, 2n, k); K F where the whole kick comes before the step.
+        G: dx1/dw (N, 2n, k); K F if the whole kick precedes the step.
         Gx: Derivative of G in x0 through the fields (N, 2n, k, 2n).
-        Gu: The same in u (N, 2n, k, m).
+        Gu: Derivative of G in u (N, 2n, k, m).
         dt: Time step [s].
         variational: Whether x is (q, p) rather than (q, v).
-        ramp: dx1/du of a control that is moved by nothing at the step's start and by du at its end, linearly
-            (N, 2n, m), from :func:`linearize` of a motion whose controls change within steps; else None. Of controls
-            that are linear between nodes, dx1 = A dx + (B - ramp) du_k + ramp du_(k+1).
+        ramp: dx1/du for a change of the control that grows linearly from 0 at the start of the step to du at its end
+            (N, 2n, m), from :func:`linearize` of a motion whose controls change within steps; else None. For controls
+            linear between nodes, dx1 = A dx + (B - ramp) du_k + ramp du_(k+1).
     """
 
     A: Floats
@@ -93,7 +93,7 @@ class Linearization:
         return len(self.A)
 
     def step(self, j: int, dx: ArrayLike, du: ArrayLike, dw: ArrayLike) -> Floats:
-        """The deviation (..., 2n) one step on, from dx (..., 2n), du (..., m) and increments dw (..., k)."""
+        """The deviation (..., 2n) after step j, from dx (..., 2n), du (..., m) and increments dw (..., k)."""
         x, u, w = (np.asarray(value, dtype=float) for value in (dx, du, dw))
         noise = self.G[j] + np.einsum("aib,...b->...ai", self.Gx[j], x) + np.einsum("aib,...b->...ai", self.Gu[j], u)
         dx1: Floats = x @ self.A[j].T + u @ self.B[j].T + np.einsum("...ai,...i->...a", noise, w)
@@ -104,17 +104,16 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     """Linearize every step of a trajectory.
 
     Main args:
-        scene: The scene in which it was made.
+        scene: The scene of the trajectory.
         trajectory: From :func:`varpin.simulate`.
 
     Other Args:
-        integrator: What made it; read from ``trajectory.integrator`` if left out. It has to be given where that is no
-            integrator of varpin's own; other guards than those of the simulation may be given too.
+        integrator: Its integrator; read from ``trajectory.integrator`` if left out. It has to be given if it is not one
+            of varpin's own; its guards may differ from those of the simulation.
 
     Raises:
         InputError: The trajectory is of another robot, another number of controls or processes, another integrator or
-            a scene of other gravity, damping, springs, inertias or actuation; or nobody knows the integrator that made
-            it.
+            a scene with other gravity, damping, springs, inertias or actuation; or its integrator is unknown.
         LinearizationError: A step has no solution at dw = 0.
     """
     integrator = _matching(require_scene(scene), trajectory, integrator)
@@ -125,7 +124,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
 
 
 def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:
-    """:func:`linearize` of a part of a motion that began at configuration ``first`` (n,); nothing is checked."""
+    """:func:`linearize` without checks, of a part of a motion that began at configuration ``first`` (n,)."""
     n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
     Jx, Jf, Jk = integrator.linearize(scene, trajectory)
     q, v = trajectory.q, trajectory.v
@@ -159,7 +158,7 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     Gx = left * _chain(Jk, jump_x)
     Gu = left * _chain(Jk, jump_u)
     if left < 1.0:
-        # There the part of a kick that comes after the step is evaluated.
+        # The part of a kick after the step is evaluated at the step's end.
         end_q, end_v = trajectory.q[1:], trajectory.v[1:]
         if trajectory.dw.any():
             end_q, end_v = integrator.quiet_ends(scene, trajectory)
@@ -187,9 +186,9 @@ class Curvature:
     """Second derivatives of N deterministic steps, each contracted with a vector: sum_a z_a d2 x1_a.
 
     Attributes:
-        xx: In the state, twice (N, 2n, 2n).
-        ux: In the controls and the state (N, m, 2n).
-        uu: In the controls, twice (N, m, m).
+        xx: Second derivatives in the state (N, 2n, 2n).
+        ux: Mixed derivatives in controls and state (N, m, 2n).
+        uu: Second derivatives in the controls (N, m, m).
     """
 
     xx: Floats
@@ -209,21 +208,21 @@ def second_order(
 ) -> Curvature:
     """Second-order linearization of every step of a trajectory at dw = 0, contracted with vectors.
 
-    Exact, and without a tensor: third derivatives of the Lagrangian enter through a derivative of the jet along one
-    direction. Under constraints by differences of the first derivatives, good to about 1e-8. It is what full
-    differential dynamic programming needs, with z the gradient of the value function.
+    The result needs no tensor: third derivatives of the Lagrangian enter through a derivative of the jet along one
+    direction. It is exact; under constraints it comes from differences of the first derivatives, good to about 1e-8.
+    Full differential dynamic programming needs it with z the gradient of the value function.
 
     Main args:
-        scene: The scene in which it was made.
+        scene: The scene of the trajectory.
         trajectory: From :func:`varpin.simulate`.
         z: One vector for each step (N, 2n), or one for all of them (2n,).
 
     Other Args:
-        integrator: As for :func:`linearize`. Variational integrators alone provide second derivatives.
+        integrator: As for :func:`linearize`. Only variational integrators have second derivatives.
 
     Raises:
-        InputError: As for :func:`linearize`; an integrator that has no second derivatives; noise fields that depend on
-            the velocity.
+        InputError: As for :func:`linearize`; or the integrator has no second derivatives, or noise fields depend on the
+            velocity.
         LinearizationError: A step has no solution at dw = 0.
     """
     integrator = _matching(require_scene(scene), trajectory, integrator)
@@ -235,9 +234,9 @@ def second_order(
 
 
 def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrator: Integrator) -> Curvature:
-    """:func:`second_order`, without a look at whether the trajectory fits."""
+    """:func:`second_order` without checks of the trajectory."""
     if scene.noise.velocity_dependent:
-        raise InputError("second derivatives are not there for noise fields that depend on the velocity")
+        raise InputError("there are no second derivatives for noise fields that depend on the velocity")
     n = scene.robot.dof
     H = integrator.contract(scene, trajectory, z)
     B = scene.transmission
@@ -246,7 +245,7 @@ def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrat
 
 
 def _kick_columns(scene: Scene, trajectory: Trajectory, integrator: Integrator, Jk: Floats) -> Floats:
-    """What a jump of the momentum does: ``Jk`` itself for integrators on (q, p)."""
+    """Derivatives in a jump of the momentum: ``Jk`` itself for integrators on (q, p)."""
     if integrator.variational:
         return Jk
     M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
@@ -267,7 +266,7 @@ def velocity_at_nodes(scene: Scene, q: Floats, v: Floats) -> Floats:
 def velocity_curvature(scene: Scene, q: Floats, v: Floats, c: Floats) -> Floats:
     """Second derivatives of c . v in (q, p) at many nodes (N, 2n, 2n), for c (N, n).
 
-    With y = M^-1 c they are those of -y . L_v(q, v) in (q, v), brought to (q, p).
+    With y = M^-1 c they are those of -y . L_v(q, v) in (q, v), transformed to (q, p).
     """
     N, n = q.shape
     first = velocity_at_nodes(scene, q, v)
@@ -318,14 +317,14 @@ def _drift_derivatives(
 ) -> tuple[Floats, Floats]:
     """Derivatives of the drift in (q, p), or (q, v), (N, n, 2n) and in u (N, n, m), by differences of eighth order.
 
-    The drift is the one place that needs second derivatives of a diffusion field, which nobody has to write down.
+    Differences, as the drift alone needs second derivatives of diffusion fields, which noise classes do not provide.
     """
     n, m = scene.robot.dof, scene.controls
     weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
     in_state, in_control = np.zeros((trajectory.steps, n, 2 * n)), np.zeros((trajectory.steps, n, m))
     for j in range(trajectory.steps):
-        # In v also where the state is (q, p): a step in p that suits the base moves a light wrist by rad/s, and at rest
-        # the momentum says nothing of the size of a step.
+        # In v even if the state is (q, p): a difference in p that suits the base moves a light wrist by rad/s, and at
+        # rest the momentum gives no scale.
         point = [trajectory.q[j], trajectory.v[j], trajectory.u[j]]
         for slot, (target, offset) in enumerate(((in_state, 0), (in_state, n), (in_control, 0))):
             size = 2e-3 * max(1.0, np.abs(point[slot]).max(initial=0.0))
@@ -345,7 +344,7 @@ def _drift_derivatives(
 
 
 def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
-    """The integrator that made the trajectory, which has to be one of the scene."""
+    """The integrator of the trajectory, after a check that the trajectory fits the scene."""
     require_motion(scene, trajectory)
     integrator = _integrator_of(scene, trajectory, given)
     require_scene_of(scene, trajectory)
@@ -356,12 +355,12 @@ def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) ->
 
 
 def _require_steps_of(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> None:
-    """Refuse a motion some steps of which are others in this scene: what a file without the scene's values tells.
+    """Refuse a motion of another scene, by repeating some of its steps, where it has no values of the scene to compare.
 
-    Steps that were taken in parts, and kicks after the first step, depend on more than a node, and are left out.
+    Split steps, and steps with noise after the first, depend on more than a node and are left out.
 
     Raises:
-        InputError: Naming the step, and by how much it is off.
+        InputError: A step differs; the message names it and the difference.
     """
     whole = np.flatnonzero(trajectory.statistics.substeps <= 1)
     if trajectory.dw.any():
@@ -389,7 +388,7 @@ def _require_steps_of(scene: Scene, trajectory: Trajectory, integrator: Integrat
 
 
 def _integrator_of(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
-    """The integrator that made the trajectory."""
+    """The integrator of the trajectory."""
     if trajectory.dw.shape[1] != scene.processes:
         raise InputError(f"the trajectory has {trajectory.dw.shape[1]} processes, the scene {scene.processes}")
     made: Integrator | None = None
@@ -419,8 +418,8 @@ class Moments:
     """Mean and covariance of the deviation from a trajectory, at its nodes.
 
     Attributes:
-        mean: (N + 1, 2n).
-        covariance: (N + 1, 2n, 2n).
+        mean: Mean (N + 1, 2n).
+        covariance: Covariance (N + 1, 2n, 2n).
     """
 
     mean: Floats
@@ -439,7 +438,7 @@ class Moments:
 
 
 def _sizes(arrays: Mapping[str, Floats]) -> str:
-    """Shapes and largest entries, as a notebook shows them."""
+    """A table (HTML) of shapes and largest entries."""
     rows = [(name, str(array.shape), float(np.abs(array).max(initial=0.0))) for name, array in arrays.items()]
     return table(("array", "shape", "largest entry"), rows)
 
@@ -453,11 +452,11 @@ def propagate_moments(
 
     Args:
         linearization: From :func:`linearize`.
-        mean: Of dx at the first node (2n,); zero if left out.
-        covariance: Of dx there (2n, 2n), symmetric and positive semidefinite; zero if left out.
+        mean: Mean of dx at the first node (2n,); zero if left out.
+        covariance: Covariance of dx at the first node (2n, 2n), symmetric and positive semidefinite; zero if left out.
 
     Raises:
-        InputError: A wrong shape, values that are not finite, or a matrix that is no covariance.
+        InputError: A shape is wrong, a value is not finite, or ``covariance`` is not symmetric and semidefinite.
     """
     size = linearization.A.shape[1]
     means, covariances = np.zeros((linearization.steps + 1, size)), np.zeros((linearization.steps + 1, size, size))
@@ -474,9 +473,9 @@ def propagate_moments(
 
 
 def _require_covariance(P: Floats) -> Floats:
-    """``P`` unless it is asymmetric or indefinite beyond rounding.
+    """``P``, refused if it is asymmetric or indefinite beyond rounding.
 
-    Entries of x have units of their own, so P is looked at with a unit diagonal.
+    P is scaled to a unit diagonal for the check, as the entries of x have different units.
     """
     deviation = np.sqrt(np.maximum(np.diag(P), 0.0))
     known = deviation > 0.0

@@ -1,12 +1,12 @@
-"""The method of the paper in plain NumPy, on Pinocchio's own calls. The place to start reading.
+"""The method of the paper in plain NumPy, on Pinocchio's own calls. Start reading here.
 
 From top to bottom: the Lagrangian and its derivatives from the mass matrix and the derivatives of RNEA; the discrete
 Lagrangian and its slot derivatives; the forced discrete Euler-Lagrange equations and the step that solves them; the
 structured stochastic linearization of that step; S-DDP on it. Nothing is compiled, guarded or fast. The rest of varpin
-computes the same, and its tests hold it against this module.
+computes the same quantities, and its tests compare it with this module.
 
-Numbers in parentheses are the paper's equations. Two readings of them: each half-step carries *half* of the impulse of
-the forces, h/2 F (equation (1.4) has the half, (1.5) to (1.10) drop it; without it forces count twice), and the
+Numbers in parentheses are the paper's equations, with two interpretations. Each half-step carries *half* of the impulse
+of the forces, h/2 F: equation (1.4) has the half, (1.5) to (1.10) drop it, and without it forces count twice. The
 correction F_i' F_i of (1.3) is (dF_i/dv) M^-1 F_i, which vanishes here because the fields F_i depend on q and u alone.
 
     q (n,) configuration [rad or m]     v (n,) velocity     p (n,) momentum     u (m,) control [N m or N per unit]
@@ -40,7 +40,7 @@ Reference = Callable[[float], Floats]
 
 
 def no_noise(q: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
-    """No Wiener process at all."""
+    """Fields without a Wiener process."""
     return np.zeros((q.size, 0)), np.zeros((q.size, 0, q.size)), np.zeros((q.size, 0, u.size))
 
 
@@ -55,7 +55,7 @@ def white_noise(C: float) -> Fields:
 
 
 def control_noise(C: float) -> Fields:
-    """The paper's case 2, one control a joint: F_i = C e_i u_i."""
+    """The paper's case 2, with one control for each joint: F_i = C e_i u_i."""
 
     def fields(q: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         n, i = q.size, np.arange(q.size)
@@ -80,15 +80,15 @@ def state_noise(C: float, center: Floats) -> Fields:
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """An arm with what acts on it.
+    """An arm and the forces on it.
 
     Attributes:
-        model: From Pinocchio; its gravity counts. Every joint has one configuration and one velocity variable, in the
-            same order; continuous joints, which Pinocchio gives two, and mimic joints are left to the rest of varpin.
+        model: Pinocchio model, with its gravity. Every joint has one configuration and one velocity variable, in the
+            same order; the rest of varpin treats mimic joints and continuous joints, which have two in Pinocchio.
         actuation: B (n, m), generalized force per unit of control.
-        damping: (n,) [N m s/rad or N s/m]; with the controls it is F_c = B u - damping v.
-        stiffness: Of joint springs (n,) [N m/rad or N/m].
-        rest: Configuration (n,) at which they are slack [rad or m].
+        damping: Viscous damping (n,) [N m s/rad or N s/m]; the force is F_c = B u - damping v.
+        stiffness: Stiffness of joint springs (n,) [N m/rad or N/m].
+        rest: Rest configuration of the springs (n,) [rad or m].
         fields: The diffusion fields: a function of (q, u) that returns F (n, k), one column for each Wiener process,
             dF/dq (n, k, n) and dF/du (n, k, m).
     """
@@ -110,7 +110,7 @@ def system(
     rest: Floats | float = 0.0,
     fields: Fields = no_noise,
 ) -> System:
-    """A :class:`System`; one number stands for all joints, and every joint is driven if ``actuation`` is left out.
+    """A :class:`System`. One number applies to all joints; every joint is driven if ``actuation`` is left out.
 
     Raises:
         InputError: A joint of the model has more than one variable.
@@ -141,11 +141,10 @@ class Lagrangian(NamedTuple):
 
 
 def lagrangian(system: System, q: Floats, v: Floats) -> Lagrangian:
-    """L and its derivatives at q (n,), v (n,), put together from Pinocchio's algorithms.
+    """L and its derivatives at q (n,), v (n,), from Pinocchio's algorithms.
 
-    L_vv = M from ``crba`` and L_v = M v. The inverse dynamics at rest with v for the acceleration are M(q) v + g(q), so
-    their derivative in q, less that of g, is L_vq. L_q = C'v - g, as dM/dt = C + C'. L_qq is in
-    :func:`rigid_body_Lqq`.
+    L_vv = M from ``crba`` and L_v = M v. The inverse dynamics at rest with the acceleration v are M(q) v + g(q); their
+    derivative in q, minus that of g, is L_vq. L_q = C'v - g, as dM/dt = C + C'. L_qq is in :func:`rigid_body_Lqq`.
     """
     model, data = system.model, system.model.createData()
     M = pin.crba(model, data, q)
@@ -167,11 +166,11 @@ def lagrangian(system: System, q: Floats, v: Floats) -> Lagrangian:
 
 
 def rigid_body_Lqq(model: pin.Model, q: Floats, v: Floats) -> Floats:
-    """L_qq (n, n) without springs: W_i . (Y_j W_j + S_j x* H_j) - (Y_j S_j) . (S_i x g), i above j or j itself.
+    """L_qq (n, n) without springs: W_i . (Y_j W_j + S_j x* H_j) - (Y_j S_j) . (S_i x g) for i above j or i = j.
 
-    S_j is the joint's axis and W_j = V_j x S_j its rate, the columns of Pinocchio's J and dJ/dt in world axes; Y_j and
-    H_j are inertia and momentum of all that joint j carries. Derived in docs/mathematics.md. Pinocchio's Python has no
-    second derivatives of RNEA.
+    S_j is the axis of joint j and W_j = V_j x S_j its rate, the columns of Pinocchio's J and dJ/dt in world axes; Y_j
+    and H_j are inertia and momentum of all bodies that joint j carries. docs/mathematics.md has the derivation.
+    Pinocchio's Python bindings have no second derivatives of RNEA.
     """
     data = model.createData()
     pin.computeJointJacobiansTimeVariation(model, data, q, v)
@@ -232,7 +231,7 @@ def discrete_lagrangian(system: System, q0: Floats, q1: Floats, h: float, a: flo
 
 
 class Forces(NamedTuple):
-    """F- = F+ of a step, half its impulse each, and the derivatives in q0, q1 and u."""
+    """F- = F+ of a step, each half of its impulse, and their derivatives in q0, q1 and u."""
 
     F: Floats
     D1: Floats
@@ -264,11 +263,11 @@ def step(
     """One step (q0, p0) -> (q1, p1).
 
     Solves p0 + D1 L_d + F- + sum_i F_i(q0, u) dw_i = 0 for q1 (1.8) by Newton's iteration, whose matrix is
-    D2D1 L_d + D2 F-, and takes p1 = D2 L_d + F+ (1.9). It ends when a correction is lost in rounding, or after it no
-    longer shrinks; a fixed tolerance as in algorithm 1 suits one robot only.
+    D2D1 L_d + D2 F-, and computes p1 = D2 L_d + F+ (1.9). The iteration ends when corrections reach rounding, or no
+    longer shrink near it; a fixed tolerance as in algorithm 1 suits one robot only.
 
     Raises:
-        VarpinError: It does not converge.
+        VarpinError: The iteration does not converge.
     """
     kick = 0.0 if dw is None else system.fields(q0, u)[0] @ dw
     q1 = q0 + h * np.linalg.solve(lagrangian(system, q0, np.zeros_like(q0)).Lvv, p0)
@@ -310,8 +309,8 @@ def rollout(
 class StepLinearization(NamedTuple):
     """dx1 = (A + sum_i K Fq_i dw_i) dx + (B + sum_i K Fu_i dw_i) du + K F dw to first order, x = (q, p): (1.7).
 
-    A (2n, 2n), B (2n, m), K (2n, n) the columns of A that belong to p0, since noise acts as p0 does in (1.8); F (n, k),
-    Fq (n, k, n), Fu (n, k, m). Everything is deterministic, so mean and covariance of dx1 are closed-form.
+    A (2n, 2n), B (2n, m), F (n, k), Fq (n, k, n), Fu (n, k, m). K (2n, n) are the columns of A for p0, since noise adds
+    to p0 in (1.8). All of these are deterministic, so mean and covariance of dx1 have closed forms.
     """
 
     A: Floats
@@ -340,9 +339,9 @@ def linearize_step(system: System, q0: Floats, q1: Floats, u: Floats, h: float, 
 
 @dataclass(frozen=True)
 class TrackingCost:
-    """The paper's cost, with sums over joints and controls.
+    """The paper's cost, summed over joints and controls.
 
-    The integral of position (q - r(t))^2 + effort u^2, as the sum over the left ends of the steps, and
+    It is the integral of position (q - r(t))^2 + effort u^2, as a sum over the left ends of the steps, plus
     terminal (q - r(t_f))^2 at the end.
     """
 
@@ -358,7 +357,7 @@ class TrackingCost:
         return float(h * running + self.terminal * (off[-1] ** 2).sum())
 
     def expansion(self, motion: Motion, h: float) -> tuple[Floats, Floats]:
-        """Derivatives in q of the terms at all nodes (N + 1, n), and their second derivatives (N + 1,), times 1."""
+        """Gradients in q of the terms at all nodes (N + 1, n), and factors (N + 1,) of their Hessians, times 1."""
         weight = 2.0 * np.append(np.full(len(motion.u), h * self.position), self.terminal)
         return weight[:, None] * self._off(motion.q, h), weight
 
@@ -368,7 +367,7 @@ class TrackingCost:
 
 
 class BackwardPass(NamedTuple):
-    """Feed-forward k (N, m), feedback G (N, m, 2n), Q_u . k, k'Q_uu k, and what noise weighs: Sg (N, n, n)."""
+    """Feed-forward k (N, m), feedback G (N, m, 2n), Q_u . k, k'Q_uu k, and the weights of noise Sg (N, n, n)."""
 
     feedforward: Floats
     feedback: Floats
@@ -380,10 +379,10 @@ class BackwardPass(NamedTuple):
 def backward_pass(
     system: System, cost: TrackingCost, motion: Motion, h: float, a: float = 0.5, regularization: float = 0.0
 ) -> BackwardPass:
-    """The quadratic model of the cost to go, from the end to the start.
+    """The quadratic model of the cost-to-go, from the end to the start.
 
     With the value v0 + Vx.dx + dx'Vxx dx / 2 after a step and Sg = h K'Vxx K, noise adds sum_i F_i'Sg F_i / 2 to the
-    expected value before it, whose derivatives hold Sg. Where no F_i depends on q or u the controls are those of DDP.
+    expected value before it; Sg is constant in its derivatives. If no F_i depends on q or u, the controls are DDP's.
 
     Raises:
         np.linalg.LinAlgError: Q_uu is not positive definite; ``regularization`` (relative to its diagonal) helps.
@@ -415,7 +414,7 @@ def backward_pass(
 
 
 def noise_cost(system: System, motion: Motion, plan: BackwardPass) -> float:
-    """What noise adds to the expected cost, sum_k sum_i F_i'Sg F_i / 2."""
+    """The expected cost of noise, sum_k sum_i F_i'Sg F_i / 2."""
     total = 0.0
     for k, Sg in enumerate(plan.noise_weight):
         F = system.fields(motion.q[k], motion.u[k])[0]
@@ -424,7 +423,7 @@ def noise_cost(system: System, motion: Motion, plan: BackwardPass) -> float:
 
 
 def forward_pass(system: System, motion: Motion, plan: BackwardPass, gamma: float, h: float, a: float = 0.5) -> Motion:
-    """The motion under u + gamma k + G (x - x_old), with the feedback on the new motion's own states."""
+    """The motion under u + gamma k + G (x - x_old), with feedback from the states x of the new motion."""
     q, p, u = [motion.q[0]], [motion.p[0]], []
     for k in range(len(motion.u)):
         off = np.concatenate([q[-1] - motion.q[k], p[-1] - motion.p[k]])
@@ -436,7 +435,7 @@ def forward_pass(system: System, motion: Motion, plan: BackwardPass, gamma: floa
 
 
 class Plan(NamedTuple):
-    """A motion, the backward pass around it, its cost without noise, what noise adds, and the iterations it took."""
+    """A motion, the backward pass around it, its cost without noise, the cost of noise, and the iterations."""
 
     motion: Motion
     policy: BackwardPass
@@ -461,8 +460,8 @@ def solve(
 ) -> Plan:
     """Algorithm 2: S-DDP with an Armijo line search, from controls u (N, m).
 
-    Where a trial fails, in Newton's iteration or in all lengths of the line search, the model is regularized tenfold.
-    It ends when the decrease that the model promises is below ``tolerance`` of the motion's own cost.
+    If all step lengths of the line search fail, by Newton's iteration or by Armijo's rule, regularization is multiplied
+    by ten. The search ends when the expected decrease is below ``tolerance`` times the cost of the motion.
     """
     motion = rollout(system, q0, v0, u, h, a=a)
     regularization, done = 0.0, 0

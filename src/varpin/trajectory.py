@@ -29,24 +29,25 @@ Bytes = NDArray[np.uint8]
 FORMAT = "varpin.trajectory/2"
 
 _ARRAYS = ("t", "q", "v", "p", "u", "dw", "energy", "masses")
-_AT_A_TIME = 1_000_000  # parts of steps
+# Number of parts of steps that are checked at a time.
+_AT_A_TIME = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class StepStatistics(Frozen):
-    """What each of N steps took, and how sound its solution is. Zeros where an integrator has no such thing.
+    """Work and accuracy of the solution of each of N steps. Zeros where an integrator does not have the quantity.
 
     Attributes:
-        newton_iterations: (N,).
+        newton_iterations: Newton iterations (N,).
         jets: Evaluations of the whole jet (N,).
         sweeps: Evaluations of its first derivatives alone, or of forward dynamics (N,).
-        substeps: Parts the step was taken in (N,); more than 1 where a guard refused the whole step, and there the
-            map is not the integrator's own.
-        halvings: Of dt in each part of the steps taken in more than one (K,), step after step: a part is
-            dt / 2**halvings long. Nothing is kept of the other steps.
+        substeps: Number of parts of the step (N,); more than 1 where a guard refused the whole step, so that the map is
+            not that of a single step.
+        halvings: Halvings of dt in each part of the split steps (K,), step after step: a part lasts dt / 2**halvings.
+            Steps that are not split have no entries.
         residual: Residual of the step equation (N,), in units of the rounding error of its terms.
-        energy_defect: Errors of the energy balances so far (N,) [J], added up over the mechanically independent groups
-            of joints: what the energy is off by, of what no force accounts for.
+        energy_defect: Accumulated error of the energy balance (N,) [J], summed over the mechanically independent groups
+            of joints: the change of energy that is not the work of a force.
         branch_margin: Distance from the fold of the step equation's solutions (N,): 1 as dt -> 0, refused at 0.
     """
 
@@ -70,17 +71,17 @@ class StepStatistics(Frozen):
 
     @property
     def split_steps(self) -> int:
-        """How many steps were taken in more than one part."""
+        """Number of steps that were split into parts."""
         return int(np.count_nonzero(self.substeps > 1))
 
     def part(self, begin: int, end: int) -> StepStatistics:
-        """Of the steps begin .. end, as views."""
+        """Statistics of the steps begin .. end, as views."""
         first, last = (_parts_in(self.substeps[:step]) for step in (begin, end))
         numbers = {name: getattr(self, name)[begin:end] for name in STEP_NUMBERS}
         return StepStatistics(**numbers, halvings=self.halvings[first:last])
 
     def damage(self) -> str | None:
-        """What is wrong with a record of parts that no motion has, in words."""
+        """The fault of inconsistent records of parts, in words; None if there is none."""
         halvings = self.halvings
         if not halvings.size and (not self.substeps.size or self.substeps.max() <= 1):
             return None
@@ -93,19 +94,19 @@ class StepStatistics(Frozen):
         return None if fits else "statistics.halvings does not hold the parts that statistics.substeps counts"
 
 
-# What statistics hold one number of for each step.
+# Statistics with one number for each step.
 STEP_NUMBERS = tuple(item.name for item in fields(StepStatistics) if item.name != "halvings")
-# A step is never halved more often.
+# Largest number of halvings of a step.
 MOST_HALVINGS = 30
 
 
 def _parts_in(substeps: Integers) -> int:
-    """How many parts the steps have together that were not taken whole."""
+    """Total number of parts of the split steps."""
     return int(substeps[substeps > 1].sum())
 
 
 def _add_up(counts: Integers, halvings: Bytes) -> bool:
-    """Whether the parts of every step make a whole one; takes little memory, whatever a file holds."""
+    """Whether the parts of every split step add up to a whole step, computed in blocks to limit memory."""
     units = 1 << (MOST_HALVINGS - np.arange(MOST_HALVINGS + 1))
     ends, done = np.cumsum(counts), 0
     for begin in range(0, halvings.size, _AT_A_TIME):
@@ -118,24 +119,25 @@ def _add_up(counts: Integers, halvings: Bytes) -> bool:
 
 
 def joined(statistics: Sequence[StepStatistics]) -> StepStatistics:
-    """Of steps that follow each other."""
+    """Statistics of successive stretches of steps as one."""
     names = (item.name for item in fields(StepStatistics))
     return StepStatistics(**{name: np.concatenate([getattr(part, name) for part in statistics]) for name in names})
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How a motion came by its integrator and step where it was asked for with a tolerance, and what it is good for.
+    """Accuracy of a motion that was simulated with a tolerance, and the search for its integrator and step.
 
-    It is a tolerance itself: ``simulate(..., tolerance=trajectory.accuracy)`` begins with this integrator and step.
+    It can be given as a tolerance: ``simulate(..., tolerance=trajectory.accuracy)`` begins with this integrator and
+    step.
 
     Attributes:
-        tolerance: What was asked for [rad or m].
-        error: The estimate of what was reached: in q, the largest over nodes and joints [rad or m].
-        integrator: What was taken, as text; ``varpin.integrators.integrator_of`` makes it again.
-        dt: The step that was taken [s].
-        search_steps: Steps of all the runs that finding out took.
-        search_evaluations: Evaluations of forward dynamics or of the jet in them.
+        tolerance: The requested tolerance [rad or m].
+        error: Estimated error in q, the largest over nodes and joints [rad or m].
+        integrator: The selected integrator as text, for ``varpin.integrators.integrator_of``.
+        dt: The selected time step [s].
+        search_steps: Number of steps of all runs of the search.
+        search_evaluations: Evaluations of forward dynamics or of the jet in these runs.
     """
 
     tolerance: float
@@ -166,7 +168,7 @@ class Accuracy:
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """A stretch of a motion while it is computed, as :func:`varpin.simulate` hands it to a ``progress`` function.
+    """New nodes of a motion while it is computed, for a ``progress`` function of :func:`varpin.simulate`.
 
     Attributes:
         t: Times (k,) [s].
@@ -188,30 +190,29 @@ class Trajectory(Frozen):
         q: Configurations (N + 1, n) [rad or m].
         v: Velocities (N + 1, n) [rad/s or m/s]; M(q)^-1 p for variational integrators.
         p: Momenta (N + 1, n) [N m s or N s].
-        u: Controls (N, m): constant over each step, or the mean over it of those that change within it.
+        u: Controls (N, m): constant over each step, or their mean if they change within it.
         dw: Wiener increments (N, k) [s^0.5]; zeros where no noise was drawn.
-        energy: Kinetic and potential energy together (N + 1,) [J]; springs included.
-        masses: Of the robot's bodies (b,) [kg]; they tell robots apart whose joints have the same names.
+        energy: Sum of kinetic and potential energy (N + 1,) [J]; springs included.
+        masses: Masses of the robot's bodies (b,) [kg], to distinguish robots with the same joint names.
         dt: Time step [s].
-        integrator: What made it, as text with all options that are not the default;
-            ``varpin.integrators.integrator_of`` makes it again.
+        integrator: The integrator as text, with its options that are not the default, for
+            ``varpin.integrators.integrator_of``.
         robot: The robot's name.
         joint_names: Names of the coordinates.
-        statistics: What each step took.
-        version: The varpin that made it.
-        warnings: What varpin said of the motion, a sentence each: dt too coarse, energy off, steps taken in parts.
-        scene_values: Numbers of the scene it was made in, :attr:`varpin.Scene.values`; empty in files that varpin wrote
-            before it kept them.
-        u_stages: Controls (N, s, m) at the stages of each step, where they change within it
-            (:class:`varpin.OpenLoop`, :class:`varpin.FirstOrderHold`, with a method of several stages); else (N, 0, m).
-            The motion is that under the polynomial through them.
-        u_nodes: Controls at the nodes (N + 1, m) of a policy or a plan whose controls are linear between them; of other
-            motions (N + 1, 0).
-        accuracy: The estimated error, and what finding integrator and step took, of a motion that was asked for with a
-            tolerance; None of others.
-        constraint_forces: Of a scene's constraints, the mean over each step (N, c) [N or N m]: the joints feel
-            dg/dq' times them. Where rows depend on others the forces of those that were left out are zero.
-        constraint_labels: What each of them is of (c,), in words.
+        statistics: Work and accuracy of each step.
+        version: The version of varpin that computed it.
+        warnings: One sentence each: dt too coarse, energy off, steps split into parts.
+        scene_values: Numbers of its scene, :attr:`varpin.Scene.values`; empty in files of versions that did not store
+            them.
+        u_stages: Controls (N, s, m) at the stages of each step, if they change within it (:class:`varpin.OpenLoop` or
+            :class:`varpin.FirstOrderHold` with a method of several stages); else (N, 0, m). The motion is that under
+            the polynomial through them.
+        u_nodes: Controls at the nodes (N + 1, m) of a policy or a plan with controls linear between them; (N + 1, 0)
+            for other motions.
+        accuracy: Estimated error and search for integrator and step, for a motion with a tolerance; None for others.
+        constraint_forces: Mean force of each constraint row over each step (N, c) [N or N m]; the generalized force is
+            dg/dq' times them. Redundant rows that were left out have zero force.
+        constraint_labels: Name of the constraint of each row (c,), in words.
     """
 
     t: Annotated[Floats, Axes("nodes", finite=True)]
@@ -248,13 +249,13 @@ class Trajectory(Frozen):
         if not self.constraint_labels and not np.size(self.constraint_forces):
             object.__setattr__(self, "constraint_forces", np.zeros((max(np.size(self.t) - 1, 0), 0)))
         nodes, n = np.size(self.t), len(self.joint_names)
-        # Whoever reads a record relies on its shapes.
+        # Readers of a record rely on these shapes.
         for name, lead in {"t": nodes, "energy": nodes, "q": nodes, "v": nodes, "p": nodes}.items():
             self._require(name, (lead, n) if name in "qvp" else (lead,))
         for name in ("u", "dw"):
             self._require(name, (nodes - 1, *np.shape(getattr(self, name))[1:2]))
         if nodes < 1 or self.u.ndim != 2 or self.dw.ndim != 2:
-            raise InputError("a trajectory has one node or more, and controls and increments (N, ...)")
+            raise InputError("a trajectory must have at least one node, and controls and increments (N, ...)")
         self._require("constraint_forces", (nodes - 1, len(self.constraint_labels)))
         if not np.size(self.u_stages):
             object.__setattr__(self, "u_stages", np.zeros((nodes - 1, 0, self.u.shape[1])))
@@ -317,7 +318,7 @@ class Trajectory(Frozen):
         if self.accuracy is not None:
             rows.append(("estimated error in q [rad or m]", f"{self.accuracy.error:.2g}"))
         if statistics.energy_defect.any():
-            rows.append(("of it, what no force accounts for [J]", f"{np.abs(statistics.energy_defect).max():.3g}"))
+            rows.append(("of it, not the work of a force [J]", f"{np.abs(statistics.energy_defect).max():.3g}"))
         if statistics.newton_iterations.any():
             rows.append(("Newton iterations", f"{statistics.newton_iterations.mean():.2f} a step"))
         if statistics.split_steps:
@@ -332,7 +333,7 @@ class Trajectory(Frozen):
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the trajectory as a compressed npz file without pickle; returns its path.
 
-        A file that is there is replaced only once the new one is whole.
+        An existing file is replaced only when the new one is complete.
 
         Raises:
             FileError: The path cannot be written.
@@ -348,9 +349,9 @@ class Trajectory(Frozen):
             robot: If given, the trajectory must be of a robot with the same joints.
 
         Raises:
-            FileError: The file is missing, truncated, no npz, written by something else, holds pickled objects,
-                arrays that do not fit together, a state that is not finite, or is of another robot. Energies and
-                statistics may be infinite or NaN, where the motion's own were.
+            FileError: The file is missing, truncated, not npz or not a trajectory; it has pickled objects, inconsistent
+                arrays or a state that is not finite; or it is of another robot. Energies and statistics may be infinite
+                or NaN, as in the saved motion.
         """
         source = path_like("path", path)
         if robot is not None and not isinstance(robot, Robot):
@@ -361,7 +362,7 @@ class Trajectory(Frozen):
     def of_members(
         cls, source: Path, members: Mapping[str, NDArray[Any]], robot: Robot | None, prefix: str = ""
     ) -> Trajectory:
-        """The trajectory whose entries in the file ``source`` have names that begin with ``prefix``.
+        """The trajectory from the entries of the file ``source`` whose names begin with ``prefix``.
 
         Raises:
             FileError: As for :meth:`load`.
@@ -370,7 +371,7 @@ class Trajectory(Frozen):
         kept = {name: values for name, values in found.scene_values.items() if name in VALUES}
         found = replace(found, scene_values=MappingProxyType(kept))
         _require_scene_values(source, kept, len(found.joint_names))
-        # Energies overflow before q and v do, and momenta with them: they are saved as they are.
+        # Energies and momenta overflow before q and v do; they may then be infinite.
         if not np.isfinite(found.p[np.isfinite(found.energy)]).all():
             raise FileError(f"{source}: p holds values that are not finite numbers")
         expected = found.t[0] + np.arange(found.steps + 1) * found.dt
@@ -385,7 +386,7 @@ class Trajectory(Frozen):
         return found
 
     def _require_robot(self, source: Path, robot: Robot) -> None:
-        """Refuse a robot that the motion in the file ``source`` is not of: by its joints, and by its masses."""
+        """Refuse a robot with other joints or masses than those of the motion in the file ``source``."""
         if self.joint_names != robot.joint_names:
             raise FileError(
                 f"{source} is of robot {self.robot} with joints {', '.join(self.joint_names)}; "
@@ -400,21 +401,21 @@ class Trajectory(Frozen):
 
 
 def _require_scene_values(source: Path, values: Mapping[str, Floats], n: int) -> None:
-    """Refuse numbers of a scene that are not finite, or not as many as a scene with n joints has."""
+    """Refuse numbers of a scene that are not finite, or whose shape does not fit n joints."""
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("damping", "stiffness", "rest", "armature"), (n,))
     shapes |= {"gravity": (3,), "actuation": (n, -1), "center": (-1, 3), "translation": (-1, 3)}
     shapes |= {"inertia": (-1, 6), "rotation": (-1, 3, 3)}
     for name, array in values.items():
         shape = shapes.get(name, array.shape)
         if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
-            raise FileError(f"{source}: scene.{name} has shape {array.shape}, where {shape} belongs")
-        # A noise without a center of its own has NaN there, a stop of one end an infinite other one.
+            raise FileError(f"{source}: scene.{name} has shape {array.shape} instead of {shape}")
+        # A noise without a center has NaN there, and a one-sided stop an infinite end.
         if name not in {"noise.center", *OF_FORCES} and not np.isfinite(array).all():
             raise FileError(f"{source}: scene.{name} holds values that are not finite numbers")
 
 
 def _with_accuracy(members: Mapping[str, Any], prefix: str) -> Mapping[str, Any]:
-    """The entries of an accuracy by name, where a file of varpin 0.1 has its four numbers in one array."""
+    """``members`` with the entries of an accuracy by name; a file of varpin 0.1 has four numbers in one array."""
     numbers = members.get(f"{prefix}accuracy")
     if numbers is None or numbers.shape != (4,) or numbers.dtype != np.float64:
         return members
@@ -425,12 +426,12 @@ def _with_accuracy(members: Mapping[str, Any], prefix: str) -> Mapping[str, Any]
 
 
 def chained(parts: Sequence[Trajectory]) -> Trajectory:
-    """Motions at one dt, each of which begins where the one before ended, as one that begins when the first does.
+    """Concatenate motions with the same dt, each of which begins at the end of the previous one.
 
-    Their warnings, each in the times of its own part, are left out.
+    Their warnings are left out, as the times in them are those of the parts.
 
     Raises:
-        InputError: Their controls change within steps at other stages.
+        InputError: Their controls change within steps, at different numbers of stages.
     """
     first = parts[0]
     steps = sum(part.steps for part in parts)
@@ -438,17 +439,17 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         name: np.concatenate([getattr(first, name)[:1], *(getattr(part, name)[1:] for part in parts)])
         for name in ("q", "v", "p", "energy")
     }
-    # At the node where two motions meet each may have a control of its own.
+    # The controls of two motions may differ at the node where they meet.
     arrays["u_nodes"] = np.zeros((steps + 1, 0))
     of_steps = ("u", "dw", "constraint_forces")
     arrays |= {name: np.concatenate([getattr(part, name) for part in parts]) for name in of_steps}
     stages = sorted({part.u_stages.shape[1] for part in parts} - {0})
     if len(stages) > 1:
         raise InputError(
-            f"motions whose controls change within steps are chained only where all have them at as many stages, got "
+            f"motions whose controls change within steps are chained only if they have the same number of stages, got "
             f"{' and '.join(map(str, stages))}"
         )
-    # Controls that are constant over a step are so at its stages.
+    # A control that is constant over a step has the same value at all stages.
     within = [part.u_stages if part.u_stages.shape[1] or not stages else part.u[:, None].repeat(stages[0], axis=1)
            for part in parts]  # fmt: skip
     arrays["u_stages"] = np.concatenate(within)
@@ -462,18 +463,18 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
     )
 
 
-def moved_by_hand(trajectory: Trajectory) -> Floats:
-    """Rows (k, 2 or more) of a record's ties that are joints moved by hand, which are tied to themselves."""
+def kinematic_input_rows(trajectory: Trajectory) -> Floats:
+    """Rows (k, 2 or more) of a record's ties that are kinematic inputs: joints tied to themselves."""
     ties = trajectory.scene_values.get("constraints.ties", np.zeros((0, 2)))
-    # A file may hold anything.
+    # A file may have other shapes.
     return ties[ties[:, 0] == ties[:, 1]] if ties.ndim == 2 and ties.shape[1] > 1 else np.zeros((0, 2))
 
 
 def require_motion(scene: Scene, trajectory: Trajectory) -> None:
-    """Refuse what is no trajectory of a scene's robot with its number of controls.
+    """Refuse anything but a trajectory of a scene's robot with the scene's number of controls.
 
     Raises:
-        InputError: It says what it is instead.
+        InputError: It is not one; the message tells the difference.
     """
     if not isinstance(trajectory, Trajectory):
         raise InputError(f"the motion must be a varpin.Trajectory, got {type(trajectory).__name__}")
@@ -487,12 +488,12 @@ def require_motion(scene: Scene, trajectory: Trajectory) -> None:
 
 
 def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
-    """Refuse a motion that was made in a scene of other numbers, as far as it keeps them.
+    """Refuse a motion of a scene with other numbers, as far as the motion has them.
 
-    Noise counts where there was some: without, the motion is that of any noise.
+    Noise is compared only if the motion has increments: a motion without noise does not depend on it.
 
     Raises:
-        InputError: It says what differs.
+        InputError: The scenes differ; the message tells where.
     """
     found = differences(scene, trajectory.scene_values, noise=bool(trajectory.dw.any()))
     if not same(trajectory.masses, scene.robot.tree.mass):

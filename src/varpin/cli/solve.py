@@ -1,4 +1,4 @@
-"""``varpin solve``: plan the motion that a scene file asks for."""
+"""``varpin solve``: plan the motion of a scene file."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class Histogram:
         Args:
             node: Index of the node.
             below: Cumulated counts (2n, B + 2).
-            rank: Of the value of each state (2n,).
+            rank: Rank for each state (2n,).
         """
         (least, width), bins = self.grid[0][:, node], self.grid[1]
         first, last = self.bounds[:, node]

@@ -1,4 +1,4 @@
-"""What one worker does: a chunk of paths, from their seeds to their moments."""
+"""The work of one worker: the simulation of a chunk of paths and its statistics."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def chunks(steps: int, paths: int) -> Iterator[tuple[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class Shared(Frozen):
-    """What all paths of an ensemble share.
+    """The data that all paths of an ensemble share.
 
     Attributes:
         scene: The scene.
@@ -83,7 +83,7 @@ class Task(Frozen):
     """A chunk of C paths to simulate, and which results to return.
 
     Attributes:
-        shared: What all paths share.
+        shared: The data that all paths share.
         first: Index of the first path.
         q0: Initial configurations (C, n) [rad or m].
         v0: Initial velocities (C, n) [rad/s or m/s].

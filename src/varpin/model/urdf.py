@@ -336,7 +336,7 @@ def _require_tree(root: ET.Element, path: Path) -> None:
         while link in above and link not in rooted:
             if link in way:
                 loop = list(way)[list(way).index(link) :]
-                raise RobotError(f"{path}: links {', '.join(map(repr, loop))} form a loop that hangs on no root")
+                raise RobotError(f"{path}: links {', '.join(map(repr, loop))} form a loop without a root")
             way[link] = None
             link = above[link][0]
         rooted.update(way)

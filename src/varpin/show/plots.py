@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import InputError
 from varpin.model import Robot
-from varpin.trajectory import Trajectory, moved_by_hand
+from varpin.trajectory import Trajectory, kinematic_input_rows
 
 if TYPE_CHECKING:
     # Imported for types alone: plotting a joint needs no optimizer.
@@ -131,19 +131,19 @@ def plot_controls(
 def plot_energy_error(
     trajectory: Trajectory, axes: Axes | None = None, *, relative: bool = False
 ) -> tuple[Figure | SubFigure, Axes]:
-    """Energy over time, less the initial energy: an error where nothing drives or damps the robot.
+    """Change of the energy over time, which is an error if no force drives or damps the robot.
 
     Args:
         trajectory: The motion.
         axes: Where to draw; a new figure if left out.
-        relative: Divide by the initial energy, instead of plotting joules. The zero of the potential energy is at the
-            world's origin, so this figure depends on where the robot stands.
+        relative: Divide by the initial energy, instead of plotting joules. The potential energy is zero at the world's
+            origin, so the result depends on the placement of the robot.
 
     Returns:
         The figure and its axes.
 
     Raises:
-        InputError: ``relative`` where the initial energy is 0.
+        InputError: ``relative`` is set and the initial energy is 0.
     """
     start = trajectory.energy[0]
     if relative and start == 0.0:
@@ -420,7 +420,7 @@ def _served(trajectory: Trajectory) -> list[int | None]:
     actuation = values["actuation"]
     joints = range(min(len(trajectory.joint_names), len(actuation)))
     servos = values.get("PositionServo", np.zeros((0, 1)))
-    for joint in [*(servos[:, 0].tolist() if servos.size else ()), *moved_by_hand(trajectory)[:, 0].tolist()]:
+    for joint in [*(servos[:, 0].tolist() if servos.size else ()), *kinematic_input_rows(trajectory)[:, 0].tolist()]:
         # A file may have invalid joints.
         drives = np.flatnonzero(actuation[int(joint)]) if joint in joints else np.zeros(0, dtype=np.int64)
         if len(drives) and drives[0] < len(found):
@@ -434,7 +434,7 @@ def _rates(trajectory: Trajectory) -> dict[int, int]:
     if actuation.ndim != 2 or actuation.shape[1] != trajectory.u.shape[1]:
         return {}
     idle, joints = np.flatnonzero(~actuation.any(axis=0)), range(len(trajectory.joint_names))
-    rows = moved_by_hand(trajectory)
+    rows = kinematic_input_rows(trajectory)
     return {int(row[-1]): int(row[0]) for row in rows if row[-1] in idle and row[0] in joints}
 
 

@@ -1,1 +1,1 @@
-"""What every module may use: checks of arguments, frozen arrays, executors, tables, HTML."""
+"""Helpers for all modules: checks of arguments, frozen arrays, executors, tables, HTML."""

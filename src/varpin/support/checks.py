@@ -1,4 +1,4 @@
-"""Validators of user input. Each returns the value it checked, ready to compute with."""
+"""Validators of user input. Each returns the checked value."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """``value`` as a new C-contiguous float array of exactly ``shape``.
 
     Raises:
-        InputError: Not numbers, another shape (both are named), or an entry that is NaN or infinite.
+        InputError: The entries are not numbers, the shape is another one (both are named), or an entry is not finite.
     """
     array = as_floats(name, value)
     if array.shape != shape:
@@ -46,12 +46,16 @@ def rotation_matrix(name: str, value: ArrayLike) -> Floats:
 
 
 def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ...]:
-    """``given``, one of a kind of varpin's objects or a sequence of them, as a tuple; the kind's plural is ``name``.
+    """``given``, an object of type ``kind`` or a sequence of them, as a tuple.
 
-    ``note`` ends the message, where other objects go by the same name.
+    Args:
+        name: Plural of the type, for the error.
+        given: The object or sequence.
+        kind: The type.
+        note: End of the message, where other objects have the same name.
 
     Raises:
-        InputError: It is none of them, or one of them is not.
+        InputError: ``given`` is neither, or one of the entries has another type.
     """
     found = (given,) if isinstance(given, kind) else given
     if isinstance(found, str) or not isinstance(found, Sequence):
@@ -78,13 +82,13 @@ def joint_array(name: str, value: JointValues, joints: Sequence[str], *, uniform
     """``value`` as a new float array (n,) with a number for each of the n ``joints``.
 
     Args:
-        name: What it is, for the error.
-        value: (n,), or numbers by the joints' names; joints that are not named get 0.
+        name: Name of the argument, for the error.
+        value: (n,), or numbers by joint name; joints that are not named get 0.
         joints: The names, in order.
-        uniform: Whether one number may stand for every joint.
+        uniform: Whether one number may be given for all joints.
 
     Raises:
-        UnknownJoint: A name that is no joint's.
+        UnknownJoint: There is no joint of that name.
         InputError: As for :func:`finite_array`.
     """
     if not isinstance(value, Mapping):
@@ -105,18 +109,18 @@ def control_array(
     absent: float = 0.0,
     read: Callable[[str, Any], float] | None = None,
 ) -> Floats:
-    """``value``, by the names of the joints whose forces the m controls are, as a new float array (m,).
+    """``value``, by the names of the driven joints, as a new float array (m,) with a number for each control.
 
     Args:
-        name: What it is, for the error.
-        value: Numbers by joint.
-        joints: The joint of each control; None where controls are no forces of one joint each.
-        absent: The number of joints that are not named.
-        read: Makes a float of an entry or refuses it; :func:`finite` if left out.
+        name: Name of the argument, for the error.
+        value: Numbers by joint name.
+        joints: The joint of each control; None where a control is not the force of one joint.
+        absent: The number for joints that are not named.
+        read: Converts an entry to a float or raises; :func:`finite` if left out.
 
     Raises:
-        UnknownJoint: A name that is no driven joint's.
-        InputError: Controls have no names, or an entry that ``read`` refuses.
+        UnknownJoint: There is no driven joint of that name.
+        InputError: Controls have no names, or ``read`` refuses an entry.
     """
     if joints is None:
         raise InputError(
@@ -142,7 +146,7 @@ def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: 
     """(lower, upper), each one number or (size,), as an array (2, size); infinite where there is no limit.
 
     Raises:
-        InputError: No pair, a wrong shape, NaN, or a lower limit above the upper one.
+        InputError: ``limits`` is not a pair, a shape is wrong, a limit is NaN, or a lower one is above the upper one.
     """
     pair = (-np.inf, np.inf) if limits is None else limits
     if not isinstance(pair, tuple | list | np.ndarray) or len(pair) != 2:
@@ -166,7 +170,7 @@ def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: 
 def named_limits(
     name: str, limits: tuple[JointValues, JointValues] | None, joints: Sequence[str] | None, size: int
 ) -> Floats:
-    """:func:`checked_limits` of controls, of which a side may be by the names of their ``joints``."""
+    """:func:`checked_limits` of controls; a side may be given by the names of their ``joints``."""
     sides: Any = limits
     if isinstance(limits, tuple | list) and len(limits) == 2:
         sides = tuple(
@@ -179,10 +183,10 @@ def named_limits(
 
 
 def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, size: int) -> Floats:
-    """A function of time at some times (N,), (N, size).
+    """Values (N, size) of a function of time at times (N,) [s].
 
     Raises:
-        InputError: It raises, or returns another shape or values that are not finite.
+        InputError: The function raises, or returns another shape or values that are not finite.
     """
     rows = []
     for time in times.tolist():
@@ -195,7 +199,7 @@ def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, 
 
 
 def as_floats(name: str, value: object) -> Floats:
-    """``value`` as a new float array, or an InputError that names it."""
+    """``value`` as a new float array; raises an InputError that names it otherwise."""
     try:
         array = np.asarray(value)
         numbers = array.dtype.kind in "biuf" or all(isinstance(entry, Real) for entry in array.flat)
@@ -210,7 +214,7 @@ def require_finite(name: str, array: Floats) -> Floats:
     """``array`` itself if all of it is finite.
 
     Raises:
-        InputError: Naming the first entry that is not.
+        InputError: An entry is not finite; the message names the first one.
     """
     if not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
@@ -223,7 +227,7 @@ def positive(name: str, value: Any, unit: str) -> float:
     """``value`` as a float > 0 and finite.
 
     Raises:
-        InputError: Naming the value and its unit.
+        InputError: It is not; the message names the value and its unit.
     """
     number = real(name, value)
     if not (math.isfinite(number) and number > 0.0):
@@ -232,7 +236,7 @@ def positive(name: str, value: Any, unit: str) -> float:
 
 
 def real(name: str, value: Any) -> float:
-    """``value`` as a float, or an InputError that names it."""
+    """``value`` as a float; raises an InputError that names it otherwise."""
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
     if isinstance(value, bool) or not isinstance(value, Real):
@@ -244,7 +248,7 @@ def real(name: str, value: Any) -> float:
 
 
 def finite(name: str, value: Any) -> float:
-    """``value`` as a finite float, or an InputError that names it."""
+    """``value`` as a finite float; raises an InputError that names it otherwise."""
     number = real(name, value)
     if not math.isfinite(number):
         raise InputError(f"{name} is {number}; it must be finite")
@@ -252,7 +256,7 @@ def finite(name: str, value: Any) -> float:
 
 
 def fraction(name: str, value: float) -> float:
-    """``value`` as a float in [0, 1], or an InputError that names it."""
+    """``value`` as a float in [0, 1]; raises an InputError that names it otherwise."""
     number = real(name, value)
     if not 0.0 <= number <= 1.0:
         raise InputError(f"{name} must be in [0, 1], got {value}")
@@ -260,7 +264,7 @@ def fraction(name: str, value: float) -> float:
 
 
 def is_one_of(value: object, words: tuple[str, ...]) -> bool:
-    """Whether ``value`` is one of some words; an array, which compares entry by entry, is not."""
+    """Whether ``value`` is one of ``words``; False for arrays, which compare entry by entry."""
     return isinstance(value, str) and value in words
 
 
@@ -268,7 +272,7 @@ def count(name: str, value: Any, least: int = 0) -> int:
     """``value`` as an int >= ``least``.
 
     Raises:
-        InputError: Not an integer, or too small.
+        InputError: It is not an integer, or too small.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise InputError(f"{name} must be an integer, got {value!r}")
@@ -278,10 +282,10 @@ def count(name: str, value: Any, least: int = 0) -> int:
 
 
 def path_like(name: str, path: Any) -> Path:
-    """``path`` as a Path, its ~ expanded.
+    """``path`` as a Path, with ~ expanded.
 
     Raises:
-        InputError: Not a path.
+        InputError: It is not a path.
     """
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         raise InputError(f"{name} must be a path, got {path!r}")
@@ -289,11 +293,11 @@ def path_like(name: str, path: Any) -> Path:
 
 
 def writable(path: str | os.PathLike[str]) -> Path:
-    """``path`` with links followed, if a file can be written there: said before the work, not after it.
+    """``path`` with links resolved, checked before any work is done for the file.
 
     Raises:
-        FileError: Naming the folder that is missing or cannot be written.
-        InputError: Not a path.
+        FileError: No file can be written there; the message gives the reason.
+        InputError: It is not a path.
     """
     target = path_like("path", path).resolve()
     if target.is_dir():
@@ -308,7 +312,7 @@ def writable(path: str | os.PathLike[str]) -> Path:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file, and no folder or device; False of what cannot be the path of one."""
+    """Whether ``path`` is a regular file; False for an invalid path."""
     try:
         return path.is_file()
     except OSError:
@@ -316,7 +320,7 @@ def is_file(path: Path) -> bool:
 
 
 def takes(function: Callable[..., object], arguments: int) -> bool:
-    """Whether a function can be called with so many arguments; true where it does not tell."""
+    """Whether a function can be called with ``arguments`` arguments; True if its signature is unknown."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
@@ -329,22 +333,22 @@ def takes(function: Callable[..., object], arguments: int) -> bool:
 
 
 def told_motion(name: str, function: object, arguments: str, motion: str) -> bool:
-    """Whether a function that is told how far something is wants the motion, too, as one argument more.
+    """Whether a progress function takes the motion, too, as one argument more.
 
     Args:
-        name: Of the function.
-        function: What was given; None for nobody to be told.
-        arguments: What it is told at least, in words, separated by commas.
-        motion: The last argument, in words.
+        name: Name of the option, for the error.
+        function: The function, or None.
+        arguments: Its first arguments in words, separated by commas.
+        motion: The last argument in words.
 
     Raises:
-        InputError: It can be called with neither.
+        InputError: The function can be called with neither number of arguments.
     """
     if function is None:
         return False
     least = arguments.count(",") + 1
     if callable(function):
-        # What takes any number of arguments, as print does, is told the least.
+        # A function of any number of arguments, such as print, gets the fewer ones.
         if takes(function, least):
             return False
         if takes(function, least + 1):

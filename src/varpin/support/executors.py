@@ -1,4 +1,4 @@
-"""Work that is handed to an executor of :mod:`concurrent.futures`: results in order, and what gets lost again."""
+"""Tasks on an executor of :mod:`concurrent.futures`: results in order, and lost tasks repeated."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ Result = TypeVar("Result")
 
 logger = logging.getLogger(__name__)
 
-# Tasks that wait or run for each worker; in all, where an executor does not say how many it has; and the bytes that
-# their results may take in all.
+# Largest number of tasks submitted ahead: for each worker, and in all where the number of workers is unknown; and the
+# largest total size of their results [bytes].
 _AHEAD, _AHEAD_OF_ANY, _BYTES_AHEAD = 4, 1024, 2**31
-# Losses without a result between them after which it is no accident.
+# Number of successive lost workers, without a result in between, that are tolerated.
 _LOSSES = 3
 
 
 @contextlib.contextmanager
 def executing(executor: Executor | None, workers: int | None) -> Iterator[Executor]:
-    """The user's executor, which stays open; or so many threads, as many as there are cores if neither is given.
+    """The user's executor, which stays open, or ``workers`` threads; as many as there are cores if both are None.
 
     Raises:
-        InputError: Both are given, or one is no such thing.
+        InputError: Both are given, or one is invalid.
     """
     if executor is None:
         with ThreadPoolExecutor(
@@ -45,7 +45,7 @@ def executing(executor: Executor | None, workers: int | None) -> Iterator[Execut
 
 
 def require_executor(executor: object) -> Executor:
-    """``executor`` itself, or an InputError that says what it is instead."""
+    """``executor`` itself; raises an InputError with its type if it is not an Executor."""
     if not isinstance(executor, Executor):
         raise InputError(
             "executor must be a concurrent.futures.Executor, for example a ProcessPoolExecutor or Dask's "
@@ -55,12 +55,12 @@ def require_executor(executor: object) -> Executor:
 
 
 def in_process(executor: Executor) -> bool:
-    """Whether its workers share this process."""
+    """Whether the workers of an executor run in this process."""
     return isinstance(executor, ThreadPoolExecutor)
 
 
 class _Raised:
-    """What a task raised by itself, told apart from what befell its worker."""
+    """An exception of a task, as distinct from the loss of its worker."""
 
     def __init__(self, error: Exception) -> None:
         self.error = error
@@ -77,7 +77,7 @@ class _Guarded(Generic[Task, Result]):
             try:
                 pickle.loads(pickle.dumps(error))
             except Exception:
-                # On the way back it would break the pool.
+                # An error that cannot be pickled would break the pool.
                 return _Raised(VarpinError(f"{type(error).__name__}: {error}"))
             return _Raised(error)
 
@@ -85,21 +85,21 @@ class _Guarded(Generic[Task, Result]):
 def in_order(
     executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task], *, result_bytes: int = 0
 ) -> Generator[Result, None, None]:
-    """``function`` of each task, in their order.
+    """Results of ``function`` for each task, in the order of the tasks.
 
-    A task whose worker is lost is done again, in a pool that has broken by a new one like it. Few tasks are ahead of
-    the result that is waited for, so that results do not pile up: four for each worker, and so many that their results
-    take 2 GiB, but two at least. Close the iterator to call off what has not begun.
+    A task whose worker is lost is repeated; a broken pool is replaced by a new one. The number of tasks ahead of
+    the awaited result is limited, so that results do not accumulate: four for each worker and 2 GiB of results, but at
+    least two. Close the iterator to cancel tasks that have not begun.
 
     Args:
-        executor: Where ``function`` is called.
-        function: Of a task.
-        tasks: Asked for one by one.
-        result_bytes: What a result takes [bytes].
+        executor: The executor.
+        function: Function of a task.
+        tasks: The tasks, which are consumed one by one.
+        result_bytes: Size of a result [bytes].
 
     Raises:
-        VarpinError: Workers get lost again and again.
-        Exception: Whatever ``function`` raises.
+        VarpinError: Workers are lost repeatedly.
+        Exception: ``function`` raised it.
     """
     work: _Guarded[Task, Result] = _Guarded(function)
     current: Executor | None = None
@@ -114,7 +114,7 @@ def in_order(
                 renew(error)
 
     def renew(error: BrokenExecutor) -> None:
-        """Go on in a new pool with all that the broken one has not done."""
+        """Resubmit the tasks that the broken pool has not finished to a new pool."""
         nonlocal executor, current, losses
         executor, losses = _renewed(executor, error), _counted(losses, error)
         if current is not None:
@@ -143,7 +143,7 @@ def in_order(
                 result = future.result()
             except (pickle.PicklingError, AttributeError, TypeError) as error:
                 raise InputError(
-                    f"what the workers need cannot be sent to them: {error}; functions must be importable there, "
+                    f"the tasks cannot be sent to the workers: {error}; functions must be importable there, "
                     "defined at the top of a module and not in index"
                 ) from error
             except BrokenExecutor as error:
@@ -162,16 +162,16 @@ def in_order(
         for _, future in waiting:
             future.cancel()
         if current is not None:
-            # With nothing left to do, waiting is short. Without it, Python 3.11 replaces a worker that has done its
-            # max_tasks_per_child in a pool that is gone, and hangs when it ends.
+            # Without tasks left, waiting is short. Without waiting, Python 3.11 may replace a worker that has done its
+            # max_tasks_per_child after the shutdown of its pool, and then hangs at exit.
             current.shutdown(wait=not waiting, cancel_futures=True)
 
 
 def _counted(losses: int, error: Exception) -> int:
-    """The losses without a result between them, this one among them.
+    """The number of successive losses, including this one.
 
     Raises:
-        VarpinError: They are too many for an accident.
+        VarpinError: There are more than ``_LOSSES``.
     """
     if losses == _LOSSES:
         raise VarpinError(f"workers get lost again and again, at last by {error!r}") from error
@@ -180,27 +180,27 @@ def _counted(losses: int, error: Exception) -> int:
 
 
 def _workers(executor: Executor) -> int | None:
-    """How many it has now, if it says."""
+    """The number of workers of an executor; None if it is unknown."""
     workers = getattr(executor, "_max_workers", None) or getattr(executor, "num_workers", None)
     client = getattr(executor, "_client", None)
     if client is not None and hasattr(client, "ncores"):
-        # Dask's, whose workers come and go, with so many threads each.
+        # Dask: the number of threads of all workers, which may change.
         workers = sum(client.ncores().values())
     return workers if isinstance(workers, int) and workers > 0 else None
 
 
 def _ahead(executor: Executor, result_bytes: int) -> int:
-    """How many tasks may be ahead of the result that is waited for."""
+    """How many tasks may be submitted ahead of the awaited result."""
     workers = _workers(executor)
     most = _AHEAD_OF_ANY if workers is None else _AHEAD * workers
     return max(2, min(most, _BYTES_AHEAD // max(1, result_bytes)))
 
 
 def _renewed(executor: Executor, error: BrokenExecutor) -> Executor:
-    """A pool like one that has broken.
+    """A new pool like one that has broken.
 
     Raises:
-        VarpinError: It is of a kind that only its owner can make.
+        VarpinError: It is not a ProcessPoolExecutor.
     """
     if not isinstance(executor, ProcessPoolExecutor):
         raise VarpinError(f"the executor has broken, and only a ProcessPoolExecutor is made anew: {error}") from error

@@ -1,4 +1,4 @@
-"""Frozen objects that leave the process and come back as they were."""
+"""Frozen objects that pickle and deepcopy preserve exactly."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import numpy as np
 class Frozen:
     """Base of frozen dataclasses that are pickled and deep-copied.
 
-    Pickle forgets which arrays were read-only, and arrays whose bytes travelled beside it come back read-only. So
-    attributes, and what tuples among them hold, keep their kind here. Views of mappings, which pickle refuses, travel
-    as mappings; cached properties stay behind and are made again on use.
+    Pickle does not keep the read-only flag of arrays, and arrays with out-of-band buffers are restored read-only. This
+    class restores the flag of attributes and of entries of tuples. Views of mappings, which cannot be pickled, are
+    pickled as mappings. Cached properties are left out and computed again on use.
     """
 
     def changed(self, **values: Any) -> Self:
-        """A copy with other attributes, of which nothing is checked."""
+        """A copy with other values of attributes, which are not checked."""
         copy = object.__new__(type(self))
-        # Past the dataclass, which refuses assignments.
+        # The frozen dataclass refuses assignments.
         vars(copy).update(vars(self) | values)
         return copy
 
@@ -41,12 +41,12 @@ class Frozen:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         values = {name: _restored(value, state["writable"][name]) for name, value in state["values"].items()}
-        # Past the dataclass, which refuses assignments.
+        # The frozen dataclass refuses assignments.
         vars(self).update(values | {name: MappingProxyType(values[name]) for name in state["views"]})
 
 
 def _writable(value: Any) -> Any:
-    """Of an array whether it can be written to; of a tuple or a view of a mapping the same of its items."""
+    """Whether an array is writable; for a tuple or a view of a mapping, the same for each item."""
     if isinstance(value, np.ndarray):
         return bool(value.flags.writeable)
     if isinstance(value, MappingProxyType):
@@ -56,7 +56,7 @@ def _writable(value: Any) -> Any:
 
 def _restored(value: Any, writable: Any) -> Any:
     if isinstance(value, np.ndarray):
-        # Bytes of others may be read-only, or begin at an odd place.
+        # A buffer of another owner may be read-only or unaligned.
         array = value if value.flags.owndata and value.flags.aligned else value.copy(order="K")
         array.setflags(write=writable)
         return array

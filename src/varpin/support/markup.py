@@ -1,4 +1,4 @@
-"""HTML: tables of objects in a notebook, whose plain text is escaped here, and pages of reports."""
+"""HTML: tables of objects in a notebook, and pages of reports. Plain text is escaped here."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import html
 from collections.abc import Iterable, Sequence
 
-# Longer tables say how much they leave out.
+# Largest number of rows of a table, and of names in a list.
 _MOST = 50
 
 _PAGE_STYLE = """
@@ -21,7 +21,7 @@ _LEFT, _RIGHT = "text-align: left; vertical-align: top", "text-align: right; ver
 
 
 def facts(title: str, rows: Iterable[tuple[str, object]], *parts: str) -> str:
-    """What an object is, a row each of a name and some text, and parts that are markup already below it."""
+    """A table of names and values, followed by ``parts``, which are HTML."""
     body = "".join(
         f'<tr><th style="{_LEFT}; white-space: nowrap">{_text(name)}</th><td style="{_LEFT}">{_text(value)}</td></tr>'
         for name, value in rows
@@ -30,7 +30,7 @@ def facts(title: str, rows: Iterable[tuple[str, object]], *parts: str) -> str:
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iterable[int] = ()) -> str:
-    """Rows under headings: text to the left, numbers to the right, some rows bold."""
+    """Rows under headings, with text aligned left and numbers right; rows with indices in ``strong`` are bold."""
     every, bold = list(rows), set(strong)
     head = "".join(f'<th style="{_LEFT}">{_text(name)}</th>' for name in columns)
     body = ""
@@ -46,29 +46,29 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iter
 
 
 def folded(title: str, part: str) -> str:
-    """A part that is markup already, shown on a click."""
+    """A part (HTML) that is shown on a click."""
     return f"<details><summary>{_text(title)}</summary>{part}</details>"
 
 
 def listed(names: Iterable[object]) -> str:
-    """Names in a row of text; the first of many."""
+    """Names separated by commas, at most ``_MOST``."""
     every = [str(name) for name in names]
     more = f" and {len(every) - _MOST} more" if len(every) > _MOST else ""
     return ", ".join(every[:_MOST]) + more if every else "none"
 
 
 def _text(value: object) -> str:
-    """A value as markup: a number to four digits, anything else as its own text."""
+    """A value as HTML: a float with four digits, anything else as str."""
     return html.escape(f"{value:.4g}" if isinstance(value, float) else str(value))
 
 
 def warning_count(warnings: Sequence[str]) -> str:
-    """How many warnings there are, for one line; nothing if there are none."""
+    """The number of warnings as a part of a line; empty if there are none."""
     return f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if warnings else ""
 
 
 def page(title: str, body: str, style: str = "") -> str:
-    """A whole page of a title, a body that is markup, and rules of style beside those of all pages."""
+    """A complete page with a title, a body (HTML), and additional CSS rules."""
     return f"""<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{_text(title)}</title><style>{_PAGE_STYLE}{style}</style></head>
 <body><h1>{_text(title)}</h1>

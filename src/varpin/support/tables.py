@@ -10,7 +10,7 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-# Width of tables in a pipe or a file, which have none of their own.
+# Width of tables in a pipe or a file.
 WIDTH = 140
 
 
@@ -31,8 +31,8 @@ def facts(title: str) -> Table:
 
 
 def add_row(table: Table, *cells: str, style: str = "") -> None:
-    """Add a row of plain words to a table."""
-    # As Text: rich takes what stands in brackets for markup, and units stand in brackets.
+    """Add a row of plain text to a table."""
+    # As Text: rich takes brackets, in which units are written, for markup.
     table.add_row(*(Text(cell) for cell in cells), style=style)
 
 
@@ -46,7 +46,7 @@ def csv_text(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 
 
 def plain(parts: Iterable[RenderableType]) -> str:
-    """Tables and texts below each other, as text without colours."""
+    """Tables and texts below one another, as text without colours."""
     stream = io.StringIO()
     console = Console(file=stream, width=WIDTH, color_system=None, force_terminal=False, force_jupyter=False)
     for part in parts:

@@ -1,7 +1,7 @@
-"""Functions that the compiled core calls and does not own.
+"""Weak references to functions that the compiled core calls.
 
-What the core keeps is out of sight of Python's garbage collector. A user's function that knows its scene would keep the
-scene, the scene its core, and the core the function, for good.
+Python's garbage collector does not see references held by the core. A user's function that refers to its scene would
+form a cycle that is never collected: the scene refers to its core, and the core to the function.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from typing import Any
 
 
 class Weak:
-    """Calls a function that somebody else keeps.
+    """Calls a function through a weak reference.
 
     Raises:
-        ReferenceError: Nobody does any more.
+        ReferenceError: The function no longer exists.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = weakref.ref(function)
 
     def __call__(self, *args: Any) -> Any:
-        """What the function returns."""
+        """Call the function."""
         function = self._function()
         if function is None:
-            raise ReferenceError("the scene that this function belongs to is gone")
+            raise ReferenceError("the scene that this function belongs to no longer exists")
         return function(*args)

@@ -16,7 +16,7 @@ from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.show.replay.script import Outlook, Target, Trace
 from varpin.support.checks import JointValues, as_floats, joint_array, require_finite
-from varpin.trajectory import Trajectory, moved_by_hand
+from varpin.trajectory import Trajectory, kinematic_input_rows
 
 if TYPE_CHECKING:
     from varpin.control.mpc import MpcRun
@@ -246,7 +246,7 @@ def torque_shares(
                 "torques=True takes controls for torques, but controls of this trajectory are positions of servos; "
                 f"give the torques (N, {robot.dof}) themselves"
             )
-        if len(moved_by_hand(motion)):
+        if len(kinematic_input_rows(motion)):
             raise InputError(
                 "torques=True takes controls for torques, but controls of this trajectory are positions of kinematic "
                 f"inputs; give the torques (N, {robot.dof}) themselves"

@@ -120,7 +120,7 @@ class _Drawing:
             extents.append(np.concatenate([seen, *around]))
             poses.append(picture.body_poses(positions))
         if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
-            raise InputError(f"what is to be shown has sizes or places beyond {_FARTHEST:g} m, which no viewer draws")
+            raise InputError(f"the replay has sizes or positions beyond {_FARTHEST:g} m, which no viewer draws")
         # The camera is one metre away from a point or anything of negligible size.
         size = size if size > 1.0 / _FARTHEST else 1.0
         toward = view_direction(np.concatenate([R[..., 2].reshape(-1, 3) for R, _ in poses]))

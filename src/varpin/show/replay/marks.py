@@ -1,4 +1,4 @@
-"""What a replay adds to robots: tubes along paths, triads of axes, balls and labels."""
+"""Objects of a replay besides robots: tubes along paths, triads, balls and labels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _AXES = np.array([[0.85, 0.15, 0.12], [0.15, 0.6, 0.15], [0.12, 0.3, 0.85]])
 
 
 def tube(points: Floats, radius: float, color: int) -> Object:
-    """A tube along a path (P, 3), P > 1; lines would be a pixel wide, whatever they are told."""
+    """A tube along a path (P, 3), P > 1; WebGL draws lines one pixel wide, whatever width is set."""
     vertices, faces = _swept(points, radius)
     return meshcat.geometry.Mesh(TriangularMeshGeometry(vertices, faces), MeshBasicMaterial(color=color))
 
@@ -35,13 +35,13 @@ def bead(radius: float, color: int) -> Object:
 
 
 def ball(radius: float, color: int) -> Object:
-    """A translucent sphere, which hides nothing that arrives at it."""
+    """A translucent sphere, which does not hide a frame that reaches it."""
     material = MeshPhongMaterial(color=color, opacity=0.6, transparent=True)
     return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), material)
 
 
 def pin(radius: float, color: int) -> Object:
-    """A small sphere that is seen through the links around it."""
+    """A small sphere that is visible through the links around it."""
     material = MeshBasicMaterial(color=color, opacity=0.85, transparent=True, depthTest=False, depthWrite=False)
     return meshcat.geometry.Mesh(meshcat.geometry.Sphere(radius), material)
 
@@ -52,14 +52,14 @@ def rod(radius: float, color: int) -> Object:
 
 
 def sheet(half: float, color: int) -> Object:
-    """A translucent square across the z axis, half as wide as ``half`` [m] to each side, seen from both."""
+    """A translucent square normal to the z axis, of side 2 ``half`` [m], visible from both sides."""
     corners = half * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     form = TriangularMeshGeometry(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     return meshcat.geometry.Mesh(form, _glass(MeshBasicMaterial, color, 0.25))
 
 
 def capsule(radius: float, length: float, color: int) -> Object:
-    """A translucent capsule around the z axis; of length 0, a sphere."""
+    """A translucent capsule along the z axis; a sphere if its length is 0."""
     parts, rings = 48, 12
     angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * rings)
     z = radius * np.sin(angles) + np.repeat([-0.5 * length, 0.5 * length], rings)
@@ -72,7 +72,7 @@ def capsule(radius: float, length: float, color: int) -> Object:
 
 
 def box(sides: Floats, color: int) -> Object:
-    """A translucent box of some sides (3,) [m] around the origin."""
+    """A translucent box with ``sides`` (3,) [m], centred at the origin."""
     return meshcat.geometry.Mesh(meshcat.geometry.Box(sides.tolist()), _glass(MeshPhongMaterial, color, 0.3))
 
 
@@ -92,19 +92,19 @@ def triad(length: float) -> Object:
 
 
 def label_width(text: str) -> float:
-    """Width of a label, in heights of its plate."""
-    # The mean letter of a word takes at most 0.58 of a sans-serif font's size; those of East Asian scripts are square.
+    """Width of a label relative to the height of its plate."""
+    # The mean width of a letter is at most 0.58 of a sans-serif font's size; East Asian letters are square.
     letters = sum(0.58 if ord(letter) < 0x2E80 else 1.05 for letter in text)
     return 0.7 * letters + 0.6
 
 
 class Label(Object):
-    """A word on a light plate above a place, turned to the camera and before everything else.
+    """A text on a light plate above a point. It faces the camera and is in front of everything else.
 
     Args:
-        text: What it says.
+        text: The text.
         size: Height of the plate [m].
-        above: From the place to the plate [m].
+        above: Distance from the point to the plate [m].
     """
 
     def __init__(self, text: str, size: float, above: float) -> None:
@@ -112,7 +112,7 @@ class Label(Object):
         self.text, self.size, self.above = text, size, above
 
     def lower(self) -> dict[str, Any]:
-        """What three.js's loader reads: a sprite, with a drawing of the plate as its texture."""
+        """The object for three.js's loader: a sprite with an image of the plate as its texture."""
         image, texture, material = (f"{self.uuid}-{part}" for part in ("image", "texture", "material"))
         picture, width, height = _plate(self.text, self.above / self.size)
         return {
@@ -141,9 +141,9 @@ class Label(Object):
 
 
 def _plate(text: str, above: float) -> tuple[str, float, float]:
-    """A picture whose middle is the place that it labels: its address, width and height in heights of the plate.
+    """An image of the plate, whose centre is the labelled point: its URL, and its width and height in plate heights.
 
-    Its lower half is empty, and as much of its upper half as lies between place and plate.
+    The lower half, and the part between point and plate, are empty.
     """
     width, height = label_width(text), 2.0 * (1.0 + above)
     pixels = 64
@@ -159,7 +159,7 @@ def _plate(text: str, above: float) -> tuple[str, float, float]:
 
 
 def _swept(points: Floats, radius: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Vertices (P * sides, 3), a ring around each point, and triangles (2 * (P - 1) * sides, 3) between the rings."""
+    """Vertices (P * sides, 3) in a ring around each point, and triangles (2 * (P - 1) * sides, 3) between the rings."""
     steps = np.diff(points, axis=0)
     steps /= np.linalg.norm(steps, axis=1)[:, None]
     before, after = np.vstack([steps[:1], steps]), np.vstack([steps, steps[-1:]])
@@ -170,7 +170,7 @@ def _swept(points: Floats, radius: float) -> tuple[Floats, NDArray[np.int64]]:
     normal = z_to(tangents[0])[:, 0]
     normals = np.empty_like(points)
     for k, tangent in enumerate(tangents):
-        # Carried along without a twist; where the path turns into the normal, any other will do.
+        # Transported without twist; where the path turns into the normal, any other normal is used.
         normal = normal - (normal @ tangent) * tangent
         length = float(np.linalg.norm(normal))
         normal = normal / length if length > 1e-6 else z_to(tangent)[:, 0]
@@ -182,7 +182,7 @@ def _swept(points: Floats, radius: float) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def _bands(rings: int, parts: int) -> NDArray[np.int64]:
-    """Triangles (2 * (rings - 1) * parts, 3) between rings of so many corners."""
+    """Triangles (2 * (rings - 1) * parts, 3) between rings of ``parts`` corners each."""
     side = np.arange(parts)
     low, high = side, (side + 1) % parts
     quads = np.stack([low, high, low + parts, high, high + parts, low + parts], axis=1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Motions as keyframes in time, to be shown by meshcat."""
+"""Replays of motions: motions and annotations sampled at keyframes for meshcat."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
-# What a joint may be off by between keyframes without a word [rad or m].
-_SEEN = 0.02
+# Threshold of the warning: error of a joint position between keyframes [rad or m].
+_VISIBLE = 0.02
 Motion: TypeAlias = "Trajectory | MpcRun | Solution | ArrayLike"
 
 
@@ -73,60 +73,59 @@ def replay(
     max_frames: int = 10_000,
     size: tuple[int, int] = (800, 600),
 ) -> Path | meshcat.Visualizer | Inline:
-    """Show a motion in meshcat, in the time it took.
+    """Show a motion in meshcat, in real time.
 
     Main args:
-        robot: The arm that moved; or pairs of an arm and its motion, to be shown side by side on one clock: a plan and
-            its execution, two scenes. What is over before the others is held.
+        robot: The robot; or pairs of a robot and its motion, shown side by side on one clock: a plan and its execution,
+            two scenes. A motion that ends before the others stays at its end.
         motion: A trajectory or a plan; a run of :class:`varpin.Mpc`, which is shown with its plans; or configurations
             (N + 1, n) [rad or m] with ``dt``, of which a single row shows a pose.
-        html: Write one self-contained HTML file here. It plays by itself, with neither server nor network.
+        html: Write one self-contained HTML file here. It needs neither a server nor a network.
         video: Write a film here, as ``.gif`` or ``.mp4``; with or without ``html``.
         open: Open a live window instead.
-        inline: Return the page instead, to be shown by a notebook as the value of its cell.
+        inline: Return the page instead, which a notebook shows as the value of a cell.
 
     Other Args:
         dt: Time between the rows of an array [s].
-        ghost: A second motion of the same robot, drawn translucent in the same place: a reference, another plan. A
-            trajectory of any time step, started together with the motion, cut at its end and held if it is over
-            before; or configurations (K, n) [rad or m] spread evenly over the motion's time, of which a single row
-            stands still. Of several robots, a list with one for each, or None. The ghost of a run of
-            :class:`varpin.Mpc`, if none is given, is where its plans mean to be.
-        ahead: How far ahead the plans of such a run are shown [s]: where they mean to be then, as the ghost, and the
-            way of each traced frame up to there, as beads. To the end of the horizon if left out, 0 for not at all.
-        trace: Frames whose paths are drawn, the motion's and the ghost's; ``True`` for the end effector.
-        growing: Draw these paths as far as the motion has come.
+        ghost: A second motion of the same robot, drawn translucent in the same place: a reference, another plan. Either
+            a trajectory of any time step, which starts with the motion and is cut or held at its end; or configurations
+            (K, n) [rad or m], spread evenly over the motion's time, of which a single row shows a pose. For several
+            robots, a list with one for each, or None. Without it, the ghost of a run of :class:`varpin.Mpc` shows the
+            planned configurations.
+        ahead: Time ahead at which the plans of such a run are shown [s]: their configurations as the ghost, and the
+            planned path of each traced frame as beads. The end of the horizon if left out; 0 to show no plans.
+        trace: Frames whose paths are drawn, for the motion and the ghost; ``True`` for the end effector.
+        growing: Let these paths grow with the motion.
         reference: A path (K, 3) in the world [m] to draw, or several by name.
-        targets: What to reach, by name, which is shown: a point (3,) [m], a pose (4, 4) or ``pin.SE3``; or rows of
-            them, (K, 3) or (K, 4, 4), spread evenly over the motion's time. In the world of each robot.
+        targets: Targets by name, which is shown: a point (3,) [m], a pose (4, 4) or ``pin.SE3``; or rows of them,
+            (K, 3) or (K, 4, 4), spread evenly over the motion's time. They are in the world of each robot.
         frames: Frames to draw as triads, x red, y green, z blue; ``True`` for the end effector.
         torques: Colour each link by the torque of the joint that moves it, grey for none, red at its limit: ``True``
-            for the controls of the trajectory, one a joint; or the torques (N, n) themselves [N m or N], of N steps
-            spread evenly over the motion's time. Of several robots, that for all of them, or a list with one for each.
+            for the controls of the trajectory, one for each joint; or the torques (N, n) themselves [N m or N], of N
+            steps spread evenly over the motion's time. For several robots, True or False for all, or a list.
         torque_limit: One number, (n,) or by joint name [N m or N]; the robot's effort limits if left out. A joint
-            without one is red at its own largest torque.
-        constraints: Draw what the motion is held to: where constraints of the mechanism act, and of a plan its
-            obstacles, regions and goals. ``True`` takes them from a plan or a controller's run, and ``False`` draws
-            none; a trajectory or an array has none of its own, so give its scene or its problem. Of several robots,
-            True or False for all of them, or a list with one for each.
-        offset: From each of several robots to the next (3,) [m]; far enough to see them all if left out.
+            without a limit is red at its own largest torque.
+        constraints: Draw the constraints of the mechanism, and the obstacles, regions and goals of a plan. ``True``
+            takes them from a plan or a controller's run, ``False`` draws none. A trajectory or an array does not
+            contain them: give its scene or its problem. For several robots, True or False for all, or a list.
+        offset: Translation from each of several robots to the next (3,) [m]; if left out, so that none hides another.
         speed: Playback speed; 1 is true speed, 0.1 ten times slower.
         loop: Start again at the end; otherwise stop there.
-        fps: Keyframes a second of playback, and frames of a film. Between them the page interpolates q linearly, and
-            draws at the screen's own rate.
-        max_frames: Most keyframes, and frames of a film; a longer motion gets fewer a second and keeps its speed, and
-            the log says so where joints are off by 0.02 rad or m between them.
-        size: Width and height of a film, or at most of a frame in a notebook [pixels].
+        fps: Keyframes a second of playback, and frames of a film. Between keyframes the page interpolates q linearly
+            and draws at the screen's own rate.
+        max_frames: Largest number of keyframes, and of frames of a film. A longer motion gets fewer a second and keeps
+            its speed; the log warns if joints are off by 0.02 rad or m between keyframes.
+        size: Width and height of a film, or largest size of a frame in a notebook [pixels].
 
-    The meshes are the robot's own. Where one cannot be read, its link becomes a skeleton, as the whole robot does where
-    the source has none, and the log says why. The ghost leaves out what cannot move, and gives way to the robot where
-    they coincide.
+    The meshes are the robot's own. A link whose mesh cannot be read is drawn as a skeleton, as is a robot without
+    meshes, and the log gives the reason. The ghost has no links of the base, and the robot covers it where they
+    coincide.
 
     The live window's server belongs to this process and ends with it; ``.wait()`` on the returned visualizer blocks
     until a browser has connected. The server listens on every network interface of the machine, as meshcat's always
     does.
 
-    A film is taken by a headless Chromium that draws the page at the frames' exact times, so it is the same on a slow
+    A headless Chromium draws a film at the exact times of its frames, so that it does not depend on the speed of the
     machine. A GIF's frames last whole hundredths of a second; ``fps`` is rounded to that.
 
     Returns:
@@ -134,11 +133,11 @@ def replay(
         as an object that notebooks show.
 
     Raises:
-        InputError: Neither a file nor ``open``, or both; a motion or a ghost of another shape or another robot, or not
-            finite; ``dt`` missing or out of place; a frame that is not there; a target, a reference, torques,
-            ``constraints`` or an ``offset`` that are none, or of another robot.
+        InputError: Neither a file nor ``open`` is given, or both; a motion or a ghost has another shape, is of another
+            robot, or is not finite; ``dt`` is missing or superfluous; a frame does not exist; or a target, a reference,
+            torques, ``constraints`` or ``offset`` are invalid or of another robot.
         FileError: The file cannot be written.
-        MissingDependency: A film needs imageio, selenium, Chromium or its driver, which are not there.
+        MissingDependency: A film needs imageio, selenium, Chromium or its driver, and one of them is not installed.
     """
     shown = _pairs(robot, motion)
     several = len(shown) > 1
@@ -163,7 +162,7 @@ def replay(
     arms = [arm for arm, _ in pairs]
     looks = [_ahead(ahead, run) for run in runs]
     if ahead is not None and not any(runs):
-        raise InputError("ahead is of the plans of an MpcRun; the motion is none")
+        raise InputError("ahead needs a run of an Mpc with its plans; the motion is not one")
     ghosts: list[tuple[Floats, Floats] | None] = []
     beside = _each("ghost", ghost, len(pairs))
     for arm, run, look, given in zip(arms, runs, looks, beside, strict=True):
@@ -186,7 +185,7 @@ def replay(
     moving = [t for t, _, _ in tracks.values() if len(t) > 1]
     followed = [second[0] for second in ghosts if second is not None]
     times = _times([t for t, _ in motions], followed + moving, end, fps / speed, max_frames)
-    _say_thinned(motions, times, max_frames)
+    _warn_if_thinned(motions, times, max_frames)
     clock = times if growing else None
     marked = tuple(target(name, track, times) for name, track in tracks.items())
     actors = []
@@ -198,7 +197,7 @@ def replay(
         run = runs[k]
         if run is not None and looks[k] > 0.0:
             plans = outlooks(arm, traced[k], run, looks[k], np.minimum(times, t[-1]))
-        # A ghost that jumps from plan to plan leaves no trace.
+        # The ghost of an Mpc run jumps from plan to plan and has no trace.
         if second is not None and beside[k] is not None:
             lines += traces("ghost", arm, traced[k], *second, end, clock)
         efforts = _efforts(arm, shares[k], t[-1], times)
@@ -219,7 +218,7 @@ def replay(
 
 
 def _each(name: str, given: Any, robots: int) -> list[Any]:
-    """One for each robot: all of a list, or the same for all of what is no motion."""
+    """One value for each robot: the entries of a list, or the same None, True or False for all."""
     if robots == 1:
         return [given]
     if given is None or isinstance(given, bool | np.bool_):
@@ -230,19 +229,19 @@ def _each(name: str, given: Any, robots: int) -> list[Any]:
 
 
 def _is_run(motion: object) -> TypeGuard[MpcRun]:
-    """Whether a motion is a controller's; asked of what it can do, as few replays need controllers imported."""
+    """Whether a motion is the run of a controller; by its attributes, to avoid an import of controllers."""
     return hasattr(motion, "planned")
 
 
 def _moved(motion: Motion) -> Trajectory | ArrayLike:
-    """What moves: of a controller's run the plant's motion, of a plan its own."""
+    """The motion of a controller's run or of a plan; others are returned as they are."""
     if _is_run(motion):
         return motion.motion
     return cast("Trajectory | ArrayLike", getattr(motion, "trajectory", motion))
 
 
 def _ahead(ahead: float | None, run: MpcRun | None) -> float:
-    """How far ahead a run's plans are shown [s]; 0 for not at all."""
+    """Time ahead at which a run's plans are shown [s]; 0 to show none."""
     if run is None:
         return 0.0
     if ahead is None:
@@ -253,7 +252,7 @@ def _ahead(ahead: float | None, run: MpcRun | None) -> float:
 def _shares(
     pairs: Sequence[tuple[Robot, Trajectory | ArrayLike]], torques: Sequence[Any], limit: JointValues | None
 ) -> list[Floats | None]:
-    """:func:`torque_shares` of each robot; the limit is of those that are coloured."""
+    """:func:`torque_shares` of each robot; the limit is for those whose torques are shown."""
     hidden = [isinstance(torque, bool | np.bool_) and not torque for torque in torques]
     limits = [None if out and not all(hidden) else limit for out in hidden]
     return [torque_shares(*pair, torque, bound) for pair, torque, bound in zip(pairs, torques, limits, strict=True)]
@@ -268,7 +267,7 @@ def _pairs(robot: Robot | Sequence[tuple[Robot, Motion]], motion: Motion | None)
     if not isinstance(robot, list | tuple) or not robot:
         raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
     if motion is not None:
-        raise InputError("of several robots, give pairs of a robot and its motion, and no motion beside them")
+        raise InputError("for several robots, give pairs of a robot and its motion, and no other motion")
     for pair in robot:
         if not (isinstance(pair, list | tuple) and len(pair) == 2 and isinstance(pair[0], Robot)):
             raise InputError(f"several robots must be pairs of a robot and its motion, got {reprlib.repr(pair)}")
@@ -286,7 +285,7 @@ def _motion(robot: Robot, motion: Trajectory | ArrayLike, dt: float | None, name
 
 
 def _ghost(robot: Robot, ghost: Trajectory | ArrayLike, duration: float) -> tuple[Floats, Floats]:
-    """The same of the ghost, beside a motion of some duration [s]."""
+    """Times (K,) from 0 [s] and configurations (K, n) of the ghost of a motion with a ``duration`` [s]."""
     if isinstance(ghost, Trajectory):
         return _nodes(robot, "ghost", "ghost", ghost)
     q = _rows(robot, "ghost", "(K, {}), its rows spread evenly over the motion's time", ghost)
@@ -302,11 +301,12 @@ def _nodes(robot: Robot, title: str, name: str, motion: Trajectory) -> tuple[Flo
             f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
         )
     for what in ("rotation", "translation"):
-        made, given = motion.scene_values.get(what), getattr(robot.tree, what)
-        if made is not None and not (made.shape == given.shape and np.allclose(made, given, rtol=1e-6, atol=1e-9)):
+        saved, present = motion.scene_values.get(what), getattr(robot.tree, what)
+        same = saved is None or (saved.shape == present.shape and np.allclose(saved, present, rtol=1e-6, atol=1e-9))
+        if not same:
             raise InputError(
-                f"the {title} is of robot {motion.robot!r}, whose joints lie otherwise than those of {robot.name!r}, "
-                "which have the same names"
+                f"the {title} is of robot {motion.robot!r}, whose joints have the same names as those of "
+                f"{robot.name!r} but other placements"
             )
     return motion.t - motion.t[0], require_finite(f"{name}.q", motion.q)
 
@@ -319,9 +319,9 @@ def _rows(robot: Robot, name: str, shape: str, motion: ArrayLike) -> Floats:
 
 
 def _times(motions: Sequence[Floats], others: Sequence[Floats], end: float, fps: float, max_frames: int) -> Floats:
-    """Keyframe times (K,) from 0 to ``end`` [s], of motions with given times and of whatever moves beside them.
+    """Keyframe times (K,) from 0 to ``end`` [s], from the times of motions and of other moving objects.
 
-    The page interpolates linearly between keyframes, so the nodes themselves are enough where they are sparse.
+    The page interpolates linearly between keyframes, so the given times themselves are enough where they are sparse.
     """
     if end == 0.0:
         return np.zeros(1)
@@ -329,14 +329,14 @@ def _times(motions: Sequence[Floats], others: Sequence[Floats], end: float, fps:
     times = np.array([0.0, end])
     for t in (*motions, *others):
         times = np.union1d(times, t[t < end])
-    # Nodes of two motions can be the same but for rounding.
+    # Nodes of two motions can be equal up to rounding.
     times = times[np.diff(times, prepend=-np.inf) > 1e-9 * end]
     times[-1] = end
     return np.linspace(0.0, end, frames + 1) if frames < len(times) - 1 else times
 
 
-def _say_thinned(motions: Sequence[tuple[Floats, Floats]], times: Floats, max_frames: int) -> None:
-    """Say if so few keyframes are left of a long motion that it is seen to be another."""
+def _warn_if_thinned(motions: Sequence[tuple[Floats, Floats]], times: Floats, max_frames: int) -> None:
+    """Warn if a long motion has too few keyframes to be shown accurately."""
     if len(times) < max_frames:
         return
     off = max(
@@ -344,16 +344,16 @@ def _say_thinned(motions: Sequence[tuple[Floats, Floats]], times: Floats, max_fr
         for t, q in motions
         for column in q.T
     )
-    if off > _SEEN:
+    if off > _VISIBLE:
         logger.warning(
-            "%g s of motion are shown with %d keyframes, between which joints are off by up to %.2g rad or m: a larger "
-            "max_frames, or a part of the motion, shows more",
+            "%g s of motion are shown with %d keyframes, between which joints are off by up to %.2g rad or m: use a "
+            "larger max_frames, or replay a part of the motion",
             times[-1], len(times), off,
         )  # fmt: skip
 
 
 def _positions(robot: Robot, t: Floats, q: Floats, times: Floats) -> Floats:
-    """Positions (K, b) [rad or m] of all joints of the tree, mimic ones too, at the keyframes."""
+    """Positions (K, b) [rad or m] of all joints of the tree, mimic joints included, at the keyframes."""
     tree = robot.tree
     at = np.column_stack([np.interp(times, t, column) for column in q.T])
     return at[:, tree.coordinate] * tree.ratio + tree.offset
@@ -363,6 +363,6 @@ def _efforts(robot: Robot, shares: Floats | None, end: float, times: Floats) -> 
     """Shares of the limit (K, b) of all joints of the tree at the keyframes, from those of N steps to ``end`` [s]."""
     if shares is None or not len(shares) or end == 0.0:
         return None if shares is None else np.zeros((len(times), len(robot.tree.parent)))
-    # Constant over each step; the last one's holds at the end.
+    # Constant over each step; the value of the last step also holds at the end.
     step = np.minimum((times / end * len(shares) * (1.0 + 1e-12)).astype(int), len(shares) - 1)
     return shares[step][:, robot.tree.coordinate]

@@ -1,4 +1,4 @@
-"""A motion as one HTML file that plays by itself: meshcat's viewer and the commands it is to obey."""
+"""A motion as one self-contained HTML file: meshcat's viewer and its commands."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from varpin.errors import InputError
 from varpin.show.replay.legend import Entry, legend
 from varpin.show.replay.script import Script
 
-# To choose from; 1 is true speed.
+# Playback speeds in the menu of the page; 1 is true speed.
 _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 class Page:
-    """In place of meshcat's window: keeps the commands that a window would send to its server."""
+    """Replaces meshcat's window and keeps the commands that a window would send to its server."""
 
     def __init__(self) -> None:
         self.commands: list[bytes] = []
 
     def send(self, command: Any) -> None:
         """Keep a command."""
-        # three.js computes in single precision; half the bytes say the same.
+        # three.js computes in single precision.
         try:
             self.commands.append(umsgpack.packb(lowered(command), force_float_precision="single"))
         except OverflowError:
-            raise InputError("what is to be shown has sizes or places beyond 3e38, which no viewer draws") from None
+            raise InputError("the replay has sizes or positions beyond 3e38, which no viewer draws") from None
 
     def html(self, script: Script) -> str:
-        """The page: meshcat's viewer, the commands, compressed, the key to the colours and the bar."""
+        """The page: meshcat's viewer, the compressed commands, the legend and the control bar."""
         viewer = Path(meshcat.viewer_assets_path(), "dist", "main.min.js").read_text(encoding="utf-8")
         stream = b"".join(len(command).to_bytes(4, "little") + command for command in self.commands)
         packed = base64.b64encode(gzip.compress(stream, 6, mtime=0)).decode()
@@ -60,7 +60,7 @@ class Page:
 
 
 def lowered(command: Any) -> dict[str, Any]:
-    """A command as the viewer reads it, its mesh files under the name that the viewer has for them now."""
+    """A command in the viewer's format, with the viewer's present name for the type of mesh files."""
     words: dict[str, Any] = command.lower()
     for geometry in words.get("object", {}).get("geometries", ()):
         if geometry["type"] == "_meshfile":
@@ -79,7 +79,7 @@ def _line(entry: Entry) -> str:
 
 
 def _bar(script: Script) -> str:
-    """Play and pause, the time, the speed; nothing for a pose."""
+    """The control bar with play, time and speed; empty for a pose."""
     if len(script.times) < 2:
         return ""
     options = "".join(
@@ -98,9 +98,9 @@ class Inline:
     """A page that a notebook shows as the value of a cell.
 
     Attributes:
-        html: The whole page.
+        html: The page.
         title: Its title.
-        size: Most of its width, and its height [pixels].
+        size: Its largest width, and its height [pixels].
     """
 
     html: str
@@ -111,7 +111,7 @@ class Inline:
         return f"Inline(replay of {self.title}, {len(self.html) / 1e6:.1f} MB)"
 
     def _repr_html_(self) -> str:
-        """The page in a frame of its own, cut off from the notebook's."""
+        """The page in a sandboxed frame, isolated from the notebook's page."""
         width, height = self.size
         return (
             f'<iframe srcdoc="{markup.escape(self.html)}" title="{markup.escape(self.title)}" sandbox="allow-scripts" '

@@ -1,4 +1,4 @@
-"""What a robot looks like: its meshes, or a skeleton where there are none, body by body."""
+"""Shapes of a robot by body: its meshes, or a skeleton where there are none."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _ROD, _JOINT, _CENTER = (0.45, 0.52, 0.6, 1.0), (0.85, 0.45, 0.15, 1.0), (0.15, 
 
 @dataclass(frozen=True)
 class Picture:
-    """What to draw, body by body; body -1 is the base.
+    """The shapes to draw, by body; body -1 is the base.
 
-    A body's node moves by one number: its angle about, or its way along, the z axis of the joint frame.
+    The motion of a body's node is one number: the rotation about, or the translation along, the z axis of the joint.
 
     Attributes:
-        robot: The arm.
+        robot: The robot.
         shapes: Its visual geometry, or a skeleton; on joints of ``robot.free_model``.
-        bodies: The body each shape is on, -1 for the base.
-        placements: Of each shape in its body's frame.
+        bodies: Body of each shape, -1 for the base.
+        placements: Placement of each shape in its body's frame.
     """
 
     robot: Robot
@@ -41,7 +41,7 @@ class Picture:
 
     @classmethod
     def of(cls, robot: Robot) -> Picture:
-        """The picture of a robot, made of the meshes that can be read."""
+        """The picture of a robot from the meshes that can be read."""
         visuals, missing = readable_geometry(robot)
         shapes = list(visuals.geometryObjects)
         problem = "; ".join(dict.fromkeys(error for _, error in missing.values()))
@@ -63,13 +63,13 @@ class Picture:
         )
 
     def frame(self, name: str) -> tuple[int, pin.SE3]:
-        """The body a frame of the model is on, -1 for the base, and its placement there."""
+        """The body of a frame, -1 for the base, and the frame's placement on it."""
         model = self.robot.free_model
         frame = model.frames[model.getFrameId(name)]
         return frame.parentJoint - 1, _turns(self.robot)[frame.parentJoint] * frame.placement
 
     def moving_nodes(self, root: str) -> list[str]:
-        """Scene path of each body (b,) below a root."""
+        """Scene path below ``root`` of each body (b,)."""
         names = labels(self.robot.free_model.names[1:])
         nodes: list[str] = []
         for name, parent in zip(names, self.robot.tree.parent, strict=True):
@@ -77,7 +77,7 @@ class Picture:
         return nodes
 
     def body_poses(self, positions: Floats) -> tuple[Floats, Floats]:
-        """World orientation (S, b, 3, 3) and place (S, b, 3) [m] of each body at joint positions (S, b)."""
+        """World rotation (S, b, 3, 3) and position (S, b, 3) [m] of each body at joint positions (S, b)."""
         tree = self.robot.tree
         samples, bodies = positions.shape
         R, p = np.empty((samples, bodies, 3, 3)), np.empty((samples, bodies, 3))
@@ -108,7 +108,7 @@ class Picture:
         return np.concatenate(boxes)
 
     def swept(self, positions: Floats) -> Floats:
-        """Points (k, 3) [m] around all that is drawn at joint positions (S, b), in the world."""
+        """Points (k, 3) [m] of the world around all shapes at joint positions (S, b)."""
         R, p = self.body_poses(positions)
         points = [self.corners(-1), p.reshape(-1, 3)]
         for j in range(R.shape[1]):
@@ -117,7 +117,7 @@ class Picture:
 
 
 def _turns(robot: Robot) -> list[pin.SE3]:
-    """From each joint's frame in the model, the universe's first, to that of its body, whose z axis it moves by."""
+    """Rotations from the model's joint frames, the universe first, to those of the bodies, whose joint axis is z."""
     model = robot.free_model
     axes = [joint_axis(model, joint)[1] for joint in range(1, model.njoints)]
     return [pin.SE3.Identity(), *(pin.SE3(z_to(axis).T, np.zeros(3)) for axis in axes)]
@@ -128,12 +128,12 @@ def label(name: str) -> str:
     return name.replace("/", "_") or "_"
 
 
-# Steps of scene paths that are not of joints.
+# Steps of scene paths that no joint may have.
 _TAKEN = ("base", "shapes", "frames", "<object>")
 
 
 def labels(names: Iterable[str]) -> list[str]:
-    """Names as steps of scene paths, no two the same."""
+    """Names as distinct steps of scene paths."""
     found: dict[str, None] = dict.fromkeys(_TAKEN)
     for name in names:
         step, count = label(name), 2
@@ -144,7 +144,7 @@ def labels(names: Iterable[str]) -> list[str]:
 
 
 def _skeleton(robot: Robot) -> list[pin.GeometryObject]:
-    """Spheres at the joints and at the centres of mass, and rods from each joint to what hangs on it."""
+    """Spheres at joints and centres of mass, and rods from each joint to its children, frames and centre of mass."""
     model = robot.free_model
     joints = range(1, model.njoints)
     ends: dict[int, list[Floats]] = {joint: [] for joint in range(model.njoints)}

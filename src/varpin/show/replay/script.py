@@ -1,4 +1,4 @@
-"""What a replay shows, as arrays on one clock: to be drawn by meshcat, which this module does not know."""
+"""The contents of a replay as arrays over common keyframes, independent of meshcat."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ class Trace:
     """A path in the world.
 
     Attributes:
-        kind: Of what moves along it.
-        name: Of the frame, or of the reference.
-        points: On the path (P, 3) [m], P > 1, no two in a row the same.
-        reached: How many of its P - 1 pieces are behind what moves at the keyframes (K,), to be drawn as far as that;
-            None where it is to be drawn whole.
+        kind: Whether it is the path of the robot, of its ghost, or a reference.
+        name: Name of the frame, or of the reference.
+        points: Points of the path (P, 3) [m], P > 1, without equal neighbours.
+        reached: For a path that grows, how many of its P - 1 pieces are drawn at the keyframes (K,); else None.
     """
 
     kind: Literal["motion", "ghost", "reference"]
@@ -34,11 +33,11 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """Where a plan means to take a frame, which changes with every plan.
+    """Planned path of a frame, which changes with every plan.
 
     Attributes:
-        name: Of the frame.
-        places: At the keyframes, evenly spaced in time from soon to as far as the plan is shown (K, B, 3) [m].
+        name: Name of the frame.
+        places: Points of the path at the keyframes, evenly spaced in time (K, B, 3) [m].
     """
 
     name: str
@@ -47,12 +46,12 @@ class Outlook:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A place to go to, or a pose to take.
+    """A target point or pose.
 
     Attributes:
-        name: Shown beside it.
-        places: In the world (1, 3) or, of a target that moves, at the keyframes (K, 3) [m].
-        turns: Unit quaternions (x, y, z, w), as many, of a pose; None of a point.
+        name: Its label.
+        places: Position in the world (1, 3), or at the keyframes (K, 3) for a moving target [m].
+        turns: Unit quaternions (x, y, z, w) of a pose, as many; None for a point.
     """
 
     name: str
@@ -62,13 +61,13 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Tie:
-    """Where a constraint of the mechanism acts.
+    """A constraint of the mechanism between two points, or between a point and a line or plane.
 
     Attributes:
         name: The kind of constraint.
-        a: The body that carries the one point, -1 for the world, and the place on it (3,) [m].
-        b: The same of the other.
-        axis: Of a line or a plane through b, a unit vector (3,) in the axes of b's body; None of two points.
+        a: Body of the first point, -1 for the world, and the point in the body's frame (3,) [m].
+        b: The same for the second point.
+        axis: Unit vector (3,), in the axes of b's body, of a line or plane through b; None for two points.
         plane: Whether the axis is the normal of a plane.
     """
 
@@ -81,17 +80,17 @@ class Tie:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A body to keep clear of, or a part of the world that a frame has to be in or out of.
+    """An obstacle, or a region of the world that a frame has to stay in or out of.
 
     Attributes:
         kind: Which of these.
-        name: Of the body, or of the frame.
-        begin: One end of its axis in the world (3,) [m]; of a sphere its centre, of a box its origin.
+        name: Name of the obstacle, or of the frame.
+        begin: One end of its axis in the world (3,) [m]; the centre of a sphere, the origin of a box.
         end: The other end (3,) [m].
-        radius: Of a sphere or a capsule [m].
-        box: Lower and upper sides of a box from its origin (2, 3) [m], infinite where it has none; None of round ones.
+        radius: Radius of a sphere or a capsule [m].
+        box: Lower and upper sides of a box from its origin (2, 3) [m], infinite where it is open; None for others.
         rotation: Axes of the box in the world (3, 3).
-        way: How far it is from there at the keyframes (K, 3) [m]; None where it stands.
+        way: Displacement at the keyframes (K, 3) [m]; None if it is fixed.
     """
 
     kind: Literal["obstacle", "out", "in"]
@@ -105,12 +104,12 @@ class Region:
 
     @property
     def moves(self) -> bool:
-        """Whether it does not stand."""
+        """Whether it moves."""
         return self.way is not None
 
     @property
     def corners(self) -> Floats:
-        """Points (k, 3) around what is finite of it [m], wherever it goes."""
+        """Points (k, 3) [m] around its finite part, over its whole motion."""
         if self.box is None:
             reach = self.radius * np.vstack([np.eye(3), -np.eye(3)])
             found = np.concatenate([self.begin + reach, self.end + reach])
@@ -122,7 +121,7 @@ class Region:
         return np.concatenate([found + self.way.min(axis=0), found + self.way.max(axis=0)])
 
     def box_within(self, points: Floats, margin: float) -> Floats:
-        """Its sides (2, 3) [m], those that are infinite put around points (P, 3), with a margin [m]."""
+        """Its sides (2, 3) [m], with infinite ones replaced by bounds of points (P, 3) plus a margin [m]."""
         assert self.box is not None
         (lower, upper), seen = self.box, (points - self.begin) @ self.rotation
         low = np.minimum(seen.min(axis=0), np.where(np.isfinite(upper), upper, np.inf)) - margin
@@ -140,18 +139,18 @@ class Actor:
     """A robot that moves.
 
     Attributes:
-        robot: The arm.
-        positions: Of every joint of the tree at the keyframes (K, b) [rad or m], of "robot" and, if there is one, of
-            its "ghost".
-        traces: Of its frames.
-        outlooks: Of its frames.
-        frames: Names of those drawn as triads.
-        effort: Share of the limit that the torque of each joint of the tree takes at the keyframes (K, b), in [0, 1];
-            None for the robot in its own colours.
-        ties: Of the mechanism.
-        regions: That it keeps to.
-        goals: Of its plan.
-        reach: Joint positions (S, b) that it may come to, for which the view has room; none if what it does is known.
+        robot: The robot.
+        positions: Positions of every joint of the tree at the keyframes (K, b) [rad or m], by "robot" and, if there is
+            one, "ghost".
+        traces: Paths of its frames.
+        outlooks: Planned paths of its frames.
+        frames: Names of the frames drawn as triads.
+        effort: Torque of each joint of the tree as a share of its limit at the keyframes (K, b), in [0, 1]; None for
+            the robot in its own colours.
+        ties: Constraints of the mechanism.
+        regions: Obstacles and regions of its plan.
+        goals: Goals of its plan.
+        reach: Joint positions (S, b) that the view has to contain; None if the motion is known.
     """
 
     robot: Robot
@@ -168,15 +167,15 @@ class Actor:
 
 @dataclass(frozen=True, eq=False)
 class Script:
-    """Everything that is shown.
+    """The contents of a replay.
 
     Attributes:
-        times: Of the keyframes (K,) [s of playback]. All tracks have the same: each repeats by itself, and they must
-            not drift apart.
+        times: Times of the keyframes (K,) [s of playback]. All tracks share them: each track loops on its own, and
+            tracks of unequal length would drift apart.
         actors: The robots.
         traces: References, in the world of each robot.
-        targets: In the world of each robot.
-        offset: From one robot to the next (3,) [m]; None for as far as they need beside each other.
+        targets: Targets, in the world of each robot.
+        offset: Translation from one robot to the next (3,) [m]; None to place them side by side.
         loop: Start again at the end.
         speed: Seconds of motion in a second of playback.
     """

@@ -1,4 +1,4 @@
-"""Shapes and mesh files as meshcat can take them."""
+"""Loading of shapes and mesh files into meshcat."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ logger = logging.getLogger(__name__)
 
 _GHOST_OPACITY = 0.35
 _WHITE = 0xFFFFFF
-# three.js's word for textures that go on beyond their edges.
+# three.js's constant RepeatWrapping, for textures that repeat beyond their edges.
 _REPEAT = 1000
 
 
 class ShapeLoader(MeshcatVisualizer):
-    """Pinocchio's reader of shapes and mesh files, told which node each goes to."""
+    """Pinocchio's loader of shapes and mesh files, with a given node for each shape."""
 
     def __init__(self, viewer: meshcat.Visualizer) -> None:
         super().__init__()
@@ -36,18 +36,18 @@ class ShapeLoader(MeshcatVisualizer):
         self.collada: str | None = None
 
     def getViewerNodeName(self, geometry_object: pin.GeometryObject, geometry_type: pin.GeometryType) -> str:  # noqa: ARG002
-        """The node that was told."""
+        """The node of the current shape."""
         return self.node
 
     def loadMeshFromFile(self, geometry_object: pin.GeometryObject) -> Any:
-        """A mesh file, in a form that meshcat draws."""
+        """A mesh file in a form that meshcat draws."""
         mesh = super().loadMeshFromFile(geometry_object)
         if self.collada is not None:
             mesh.dae_raw = self.collada
         return mesh
 
     def load(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
-        """Send a shape and where it sits in its parent node."""
+        """Send a shape and its placement in the parent node."""
         suffix = Path(shape.meshPath).suffix.lower()
         if suffix == ".obj":
             self._load_obj(shape, placement, node)
@@ -65,7 +65,7 @@ class ShapeLoader(MeshcatVisualizer):
         scale = np.ones(3)
         problems = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
         if not problems:
-            # Mesh files go out as they are on disk; coal's shapes have their scale applied.
+            # Mesh files are sent unscaled; coal's shapes are already scaled.
             scale = np.asarray(shape.meshScale) if hasMeshFileInfo(shape) else scale
         elif isinstance(shape.geometry, pin.coal.BVHModelBase):
             logger.warning("%s; it is drawn in one colour", " ".join(problems))
@@ -76,7 +76,7 @@ class ShapeLoader(MeshcatVisualizer):
         self.viewer[node].set_transform(placement.homogeneous @ np.diag([*scale, 1.0]))
 
     def _load_obj(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
-        """Send a Wavefront file, each of its materials as a mesh of its own."""
+        """Send a Wavefront file as one mesh for each of its materials."""
         parts = wavefront.parts(Path(shape.meshPath))
         for k, part in enumerate(parts):
             path = node if len(parts) == 1 else f"{node}/{k}"
@@ -92,13 +92,13 @@ class ShapeLoader(MeshcatVisualizer):
         self.viewer[node].set_transform(placement.homogeneous @ np.diag([*shape.meshScale, 1.0]))
 
     def _load_textured(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> bool:
-        """Send a box, ball or cylinder with its texture, if there is a way to draw it."""
+        """Send a box, ball or cylinder with its texture; returns whether it can be drawn."""
         material = meshcat.geometry.MeshPhongMaterial(color=_WHITE, map=_picture(shape.meshTexturePath))
         return self._load_form(shape, placement, node, material)
 
     def load_plain(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
-        """Send a shape in one colour that can be animated; those of mesh files cannot."""
-        # Facets, for coal's meshes share corners across edges, which smooth shading would wrinkle.
+        """Send a shape in one colour, which can be animated; colours of mesh files cannot."""
+        # Flat shading, as coal's meshes share vertices across edges, where smooth shading would be wrong.
         material = meshcat.geometry.MeshPhongMaterial(color=_hex(shape.meshColor), flatShading=True)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -109,20 +109,20 @@ class ShapeLoader(MeshcatVisualizer):
     def load_ghost(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> None:
         """Send a shape in the ghost's colour.
 
-        A polygon offset lets the robot win where both are in one place, up to the facets of a sphere that has turned;
-        without it they would flicker.
+        A polygon offset draws the robot in front where both coincide, except for facets of a rotated sphere; without it
+        they would flicker.
         """
         material = meshcat.geometry.MeshPhongMaterial(
             color=GHOST_COLOR, opacity=_GHOST_OPACITY, transparent=True, polygonOffset=True,
             polygonOffsetFactor=2.0, polygonOffsetUnits=64.0,
         )  # fmt: skip
-        # The robot's own shape has been reported.
+        # Warnings were logged when the robot's own shape was loaded.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             self._load_form(shape, placement, node, material)
 
     def _load_form(self, shape: pin.GeometryObject, placement: pin.SE3, node: str, material: Any) -> bool:
-        """Send a shape as coal has it, without the colours and textures of its file, if there is a way to draw it."""
+        """Send a shape from coal, without colours and textures of its file; returns whether it can be drawn."""
         is_mesh = isinstance(shape.geometry, pin.coal.BVHModelBase)
         form = loadMesh(shape.geometry) if is_mesh else self.loadPrimitive(shape)
         if not isinstance(form, meshcat.geometry.Geometry):
@@ -136,15 +136,15 @@ _PRIMITIVES = frozenset(["lines", "linestrips", "polygons", "polylist", "triangl
 
 
 def _collada_parts(path: str) -> list[str | None]:
-    """A Collada file as texts with one mesh each, where meshcat needs that; else [None], to be taken whole.
+    """A Collada file as texts with one mesh each, where meshcat needs that; else [None], to load it whole.
 
-    meshcat merges the meshes of a file and keeps one material a mesh: of a mesh in several colours beside another
-    it draws nothing, and on meshes with different kinds of vertices it stops. A mesh alone keeps its colours.
+    meshcat merges the meshes of a file and keeps one material a mesh. It does not draw a file with several meshes if
+    one has several colours, and fails on meshes with different vertex attributes. A single mesh keeps its colours.
     """
     try:
         root = ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError):
-        # Pinocchio's loader will say so in its own words.
+        # Pinocchio's loader reports the error.
         return [None]
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -153,7 +153,7 @@ def _collada_parts(path: str) -> list[str | None]:
     kinds = {frozenset(x.get("semantic") for x in child.iter("input")) for mesh in meshes for child in mesh}
     if len(instances) < 2 or (len(kinds) < 2 and max(map(len, meshes)) < 2):
         return [None]
-    # Geometries are most of a file: each goes only where it is used.
+    # Geometries are most of a file: each part contains only the one that it uses.
     geometries = {}
     for library in root.iter("library_geometries"):
         for geometry in library.findall("geometry"):
@@ -175,7 +175,7 @@ def _collada_parts(path: str) -> list[str | None]:
 
 
 def _picture(path: str) -> Any:
-    """The picture in a file, as a texture."""
+    """An image file as a texture."""
     return meshcat.geometry.ImageTexture(meshcat.geometry.PngImage(Path(path).read_bytes()), wrap=[_REPEAT, _REPEAT])
 
 

@@ -1,4 +1,4 @@
-"""What a scene and a plan have beside the robot, to be drawn: ties of the mechanism, obstacles, regions, goals."""
+"""Constraints of a scene and a plan for a replay: ties of the mechanism, obstacles, regions, goals."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ Floats = NDArray[np.float64]
 
 
 def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None, tuple[PlanConstraint, ...], float]:
-    """The scene whose constraints are drawn, the constraints of the plan, and the time that it begins at [s].
+    """The scene whose constraints are drawn, the constraints of the plan, and the initial time of the plan [s].
 
     Args:
-        given: Whether to draw those of the motion; or a scene; or a problem, with those of its plans.
-        motion: What is shown, which knows its problem if it is a plan or a controller's run.
-        robot: The arm that is shown.
+        given: Whether to draw the constraints of the motion; or a scene; or a problem with constraints of its plan.
+        motion: The motion, which has a problem if it is a plan or a controller's run.
+        robot: The robot that is shown.
 
     Raises:
-        InputError: It is none of these, or of another robot.
+        InputError: ``given`` is none of these, or of another robot.
     """
     source = given
     if isinstance(given, bool | np.bool_):
@@ -44,16 +44,16 @@ def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None,
         raise InputError(
             f"constraints must be True or False, a Scene or an OptimalControlProblem, got {type(given).__name__}"
         )
-    planned = scene.robot
-    if planned.joint_names != robot.joint_names or not planned.built_like(robot):
-        raise InputError(f"constraints are of robot {planned.name!r}, another one than {robot.name!r}, which is shown")
+    owner = scene.robot
+    if owner.joint_names != robot.joint_names or not owner.built_like(robot):
+        raise InputError(f"constraints are of robot {owner.name!r}, but the robot that is shown is {robot.name!r}")
     if source is scene:
         return scene, (), 0.0
     return scene, tuple(source.constraints), float(source.t0)  # type: ignore[attr-defined]
 
 
 def ties(scene: Scene | None) -> tuple[Tie, ...]:
-    """Where the constraints of a mechanism act; ties of joints and constraints of one's own have no place."""
+    """The ties of a scene's constraints, except for those between joints and custom ones, which are not drawn."""
     found = [] if scene is None else [_tie(constraint, scene.robot) for constraint in scene.constraints]
     return tuple(tie for tie in found if tie is not None)
 
@@ -71,7 +71,7 @@ def _tie(constraint: Constraint, robot: Robot) -> Tie | None:
 
 
 def regions(constraints: Sequence[PlanConstraint], times: Floats) -> tuple[Region, ...]:
-    """Bodies to keep clear of, and where frames have to be or must not be; those that move at ``times`` (K,) [s]."""
+    """Obstacles, and regions that frames have to stay in or out of; moving ones at ``times`` (K,) [s]."""
     if not constraints:
         return ()
     from varpin.control import constraints as kinds  # noqa: PLC0415 - few replays need controllers imported
@@ -87,7 +87,7 @@ def regions(constraints: Sequence[PlanConstraint], times: Floats) -> tuple[Regio
                     shifts = body.shifts(times)
                     ends, way = (body.begin + shifts[0], body.end + shifts[0]), shifts - shifts[0]
                 region = Region("obstacle", body.name, *ends, body.radius, box, body.rotation, way)
-                # One obstacle may be that of several constraints.
+                # Several constraints may share an obstacle.
                 found[repr(body)] = region
         elif isinstance(constraint, kinds.KeepInSphere | kinds.KeepOutOfSphere):
             kind = "out" if constraint.outside else "in"
@@ -104,7 +104,7 @@ def regions(constraints: Sequence[PlanConstraint], times: Floats) -> tuple[Regio
 
 
 def goals(constraints: Sequence[PlanConstraint], taken: Sequence[Target]) -> tuple[Target, ...]:
-    """Where frames have to end, but for places that are targets already."""
+    """Final positions of frames as targets, except for those that are already among ``taken``."""
     if not constraints:
         return ()
     from varpin.control.constraints import ReachFrame  # noqa: PLC0415 - as above

@@ -1,4 +1,4 @@
-"""Films of a page, drawn frame by frame at exact times by a headless Chromium."""
+"""Films of a page, which a headless Chromium draws frame by frame at exact times."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ Floats = NDArray[np.float64]
 
 FORMATS = (".gif", ".mp4")
 
-# Distributions by what they are imported as.
+# Distributions by the name of their module.
 _PACKAGES = {"imageio": "imageio", "imageio_ffmpeg": "imageio-ffmpeg", "selenium": "selenium"}
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _DRIVER = "chromedriver"
 
-# Rendered in software, to be the same everywhere; without a sandbox, which containers do not allow: the page is ours.
+# Software rendering gives the same pictures everywhere. Containers allow no sandbox, and the page is varpin's own.
 _FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -48,7 +48,7 @@ _FLAGS = (
     "--hide-scrollbars",
 )
 
-_PATIENCE = 120.0  # [s] for a page to load
+_LOAD_LIMIT = 120.0  # time limit for a page to load [s]
 
 _STOP = "viewer.animator.pause(); viewer.set_3d_pane_size(arguments[0], arguments[1]);"
 # Textures are read in the background.
@@ -62,16 +62,16 @@ return complete;
 """
 _DRAW = "viewer.animator.seek(arguments[0]); return viewer.capture_image();"
 
-# A palette for each frame, for colours come and go; no frame waits for the others.
+# A palette for each frame, as colours change; frames are then encoded one by one.
 _FILTER = "split[a][b];[a]palettegen=stats_mode=single[p];[b][p]paletteuse=new=1"
 _GIF = {"codec": "gif", "pix_fmt_out": "pal8", "quality": None, "output_params": ["-filter_complex", _FILTER]}
 
 
 def frame_size(size: tuple[int, int]) -> tuple[int, int]:
-    """A width and a height [pixels].
+    """Width and height [pixels], checked.
 
     Raises:
-        InputError: It is something else.
+        InputError: ``size`` is not two integers >= 16.
     """
     if not isinstance(size, tuple | list) or len(size) != 2:
         raise InputError(f"size must be a width and a height [pixels], got {size!r}")
@@ -81,13 +81,13 @@ def frame_size(size: tuple[int, int]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Film:
-    """A film to be taken.
+    """Settings of a film.
 
     Attributes:
-        path: Where it goes.
+        path: Path of the file.
         size: Width and height [pixels].
-        period: Of its frames [s].
-        max_frames: Most of them; a longer film gets fewer a second.
+        period: Time between frames [s].
+        max_frames: Largest number of frames; a longer film gets fewer a second.
     """
 
     path: Path
@@ -97,23 +97,23 @@ class Film:
 
     @classmethod
     def of(cls, path: Path, size: tuple[int, int], fps: float, max_frames: int) -> Film:
-        """Whatever can be said before the work.
+        """Settings of a film, checked before any work.
 
         Raises:
-            InputError: Another format than gif and mp4, or a size that is none.
-            MissingDependency: A package or a program is not there.
+            InputError: The format is neither gif nor mp4, or the size is invalid.
+            MissingDependency: A package or a program is not installed.
         """
         check_film(path)
         width, height = frame_size(size)
         if width % 2 or height % 2:
-            raise InputError(f"size must be even numbers of pixels, as films have them, got {width} x {height}")
+            raise InputError(f"size must be even numbers of pixels, as video formats need, got {width} x {height}")
         return cls(path, (width, height), 1.0 / fps, max_frames)
 
     def times(self, duration: float) -> Floats:
-        """Of the frames (F,) [s], from 0 to a duration."""
+        """Times of the frames (F,) [s], from 0 to a duration."""
         period = max(self.period, duration / (self.max_frames - 1))
         if self.path.suffix.lower() == ".gif":
-            # A GIF counts hundredths of a second, and below two of them viewers do as they please.
+            # GIF times are in hundredths of a second, and viewers do not follow periods below two.
             period = 0.01 * max(2, round(100.0 * period), math.ceil(100.0 * duration / (self.max_frames - 1) - 1e-9))
         frames = math.floor(duration / period * (1.0 + 1e-9)) + 1
         return np.arange(frames, dtype=np.float64) * period
@@ -146,11 +146,11 @@ class Film:
 
 
 def check_film(path: Path) -> None:
-    """Whether a film could be written, as far as its name and what is installed tell.
+    """Check the format of a film, and that the necessary packages and programs are installed.
 
     Raises:
-        InputError: Another format than gif and mp4.
-        MissingDependency: A package or a program is not there.
+        InputError: The format is neither gif nor mp4.
+        MissingDependency: A package or a program is not installed.
     """
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"video must end in {' or '.join(FORMATS)}, got {path.name!r}")
@@ -172,7 +172,7 @@ def _chromium() -> str | None:
 
 @contextlib.contextmanager
 def _browser(size: tuple[int, int]) -> Iterator[Chrome]:
-    """A headless Chromium whose page has a size [pixels]."""
+    """A headless Chromium with a page of ``size`` [pixels]."""
     from selenium import webdriver  # noqa: PLC0415 - of an extra
     from selenium.common.exceptions import WebDriverException  # noqa: PLC0415
     from selenium.webdriver.chrome.service import Service  # noqa: PLC0415
@@ -202,10 +202,10 @@ def film_frames(
     """A page's picture (height, width, 3) at each time.
 
     Args:
-        page: To be shown.
-        times: [s of playback].
+        page: The HTML file.
+        times: Times of the pictures [s of playback].
         size: Width and height [pixels].
-        scripts: JavaScript to run before, with its arguments.
+        scripts: JavaScript to run first, with its arguments.
 
     Raises:
         VarpinError: The browser cannot show the page.
@@ -220,10 +220,10 @@ def _frames(
     import imageio.v3 as imageio  # noqa: PLC0415 - of an extra
 
     browser.get(page.resolve().as_uri())
-    give_up = time.monotonic() + _PATIENCE
+    give_up = time.monotonic() + _LOAD_LIMIT
     while not browser.execute_script(_COMPLETE):
         if time.monotonic() > give_up:
-            raise VarpinError(f"Chromium did not finish loading the motion within {_PATIENCE:g} s")
+            raise VarpinError(f"Chromium did not finish loading the motion within {_LOAD_LIMIT:g} s")
         time.sleep(0.05)
     browser.execute_script(_STOP, *size)
     for script, arguments in scripts:

@@ -1,4 +1,4 @@
-"""Where the camera stands, and the floor: to the measure of what is shown."""
+"""Camera, grid and background, set from the extent of what is shown."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _GRID_CELL = 0.5
 
 
 def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, floor: float, size: float) -> None:
-    """Camera, grid, axes and background.
+    """Set camera, grid, axes and background.
 
     Args:
-        viewer: Where to.
-        points: All that is to be seen (P, 3) [m].
-        toward: Unit vector (3,) from there to the camera.
+        viewer: The viewer.
+        points: Points that have to be visible (P, 3) [m].
+        toward: Unit vector (3,) from the points to the camera.
         floor: Height of the grid [m].
-        size: Of one robot's motion [m].
+        size: Size of one robot's motion [m].
     """
     right = across(toward)
     axes = np.array([right, np.cross(toward, right), toward])
@@ -42,7 +42,7 @@ def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, floor: 
     camera = meshcat.geometry.PerspectiveCamera(
         fov=math.degrees(_VERTICAL_VIEW), aspect=_ASPECT, near=0.01 * distance, far=100.0 * distance
     )
-    # meshcat's camera turns about the origin and nothing else, so the middle of the motion is put there.
+    # meshcat's camera turns about the origin only, so the middle of the motion is moved there.
     shift = -(middle @ axes)
     centered = np.eye(4)
     centered[:3, 3] = shift
@@ -70,14 +70,14 @@ def across(toward: Floats) -> Floats:
 
 
 def side_by_side(extents: Sequence[Floats], toward: Floats) -> list[Floats]:
-    """Where to put several figures so that the camera sees them in a row.
+    """Translations that put several figures in a row, as seen from the camera.
 
     Args:
-        extents: Points (P, 3) of each [m].
+        extents: Points (P, 3) of each figure [m].
         toward: Unit vector (3,) to the camera.
 
     Returns:
-        Translations (3,), the first of them zero.
+        Translations (3,) of the figures; the first one is zero.
     """
     right = across(toward)
     spans = [((points @ right).min(), (points @ right).max()) for points in extents]
@@ -93,7 +93,7 @@ def view_direction(joint_axes: Floats) -> Floats:
     """Unit vector (3,) from the robot to the camera: across the plane of a planar motion, else from front and side.
 
     Args:
-        joint_axes: In the world (k, 3).
+        joint_axes: Axes of the joints in the world (k, 3).
     """
     weights, directions = np.linalg.eigh(joint_axes.T @ joint_axes)
     if weights[-1] > 0.98 * weights.sum():
@@ -108,6 +108,6 @@ def view_direction(joint_axes: Floats) -> Floats:
 
 
 def _round_number(value: float) -> float:
-    """The 1, 2 or 5 times a power of ten next below ``value``."""
+    """The largest number of the form 1, 2 or 5 times a power of ten that is at most ``value``."""
     power = 10.0 ** math.floor(math.log10(value))
     return power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9))

@@ -1,4 +1,4 @@
-"""A motion shown in meshcat: as one HTML file that needs no server, or live in a browser window."""
+"""A script in meshcat: as one HTML file that needs no server, or in a live browser window."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write_page(path: Path, script: Script) -> Path:
 
 
 def inline(script: Script, size: tuple[int, int]) -> Inline:
-    """A script's page for a notebook, of a width and a height [pixels]."""
+    """A script's page for a notebook, with a width and a height [pixels]."""
     return Inline(_page(script), script.title, size)
 
 
@@ -37,7 +37,7 @@ def _page(script: Script) -> str:
 
 
 def show(script: Script) -> meshcat.Visualizer:
-    """Draw a script in a new meshcat server, and point a web browser to it."""
+    """Draw a script in a new meshcat server, and open it in a web browser."""
     with contextlib.redirect_stdout(io.StringIO()):
         viewer = meshcat.Visualizer()
     draw(viewer, script)
@@ -46,7 +46,7 @@ def show(script: Script) -> meshcat.Visualizer:
 
 
 def open_browser(url: str) -> bool:
-    """Point a web browser to a window's address; whether there is one."""
+    """Open an address in a web browser; returns whether one could be started."""
     logger.info("meshcat serves the motion at %s", url)
     if webbrowser.open(url, new=2):
         return True

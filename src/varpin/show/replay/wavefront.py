@@ -1,4 +1,4 @@
-"""Wavefront (.obj) meshes, taken apart by material: meshcat gives a mesh one."""
+"""Wavefront (.obj) meshes, split by material, as a mesh in meshcat has one material."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from pathlib import Path
 
 logger = logging.getLogger(__name__)
 
-# What browsers show.
+# Suffixes of images that browsers can show.
 _PICTURES = frozenset([".png", ".jpg", ".jpeg", ".gif", ".bmp", ".webp"])
 
-# A corner of a face: its vertex, texture coordinate and normal, counted from 0.
+# A corner of a face: indices of its vertex, texture coordinate and normal, from 0 on.
 Corner = tuple[int, int | None, int | None]
 
 
 @dataclass(frozen=True)
 class Material:
-    """What a material library says of a surface.
+    """A material of a material library.
 
     Attributes:
-        color: Of diffuse light, red, green and blue from 0 to 1; None if it says nothing.
-        opacity: From 0 to 1.
-        texture: Path of a picture, or empty.
+        color: Diffuse red, green and blue from 0 to 1; None if it is not given.
+        opacity: Opacity from 0 to 1.
+        texture: Path of an image, or empty.
     """
 
     color: tuple[float, ...] | None = None
@@ -54,7 +54,7 @@ class Part:
 
 @dataclass
 class _Mesh:
-    """What has been read of a file so far."""
+    """The content of a file read so far."""
 
     points: dict[str, list[str]] = field(default_factory=lambda: {"v": [], "vt": [], "vn": []})
     faces: dict[str, list[list[Corner]]] = field(default_factory=dict)
@@ -64,7 +64,7 @@ class _Mesh:
 def parts(path: Path) -> list[Part]:
     """The parts of a mesh file, one for each material that its faces use.
 
-    A material library that is not there is named in the log.
+    The log names a missing material library.
     """
     mesh, name = _Mesh(), ""
     for line in path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ").splitlines():
@@ -91,7 +91,7 @@ def _corner(text: str, mesh: _Mesh) -> Corner:
 
 
 def _part(mesh: _Mesh, faces: list[list[Corner]], material: Material) -> Part:
-    """Some faces with the points that they use, counted anew."""
+    """Some faces, with the points that they use renumbered."""
     whole = [all(corner[kind] is not None for face in faces for corner in face) for kind in range(3)]
     orders: list[dict[int, int]] = [{}, {}, {}]
     lines = []
@@ -118,7 +118,7 @@ def _library(path: Path, mesh: Path) -> dict[str, Material]:
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
-        logger.info("%s: its material library %r is not there, so its colours are not known", mesh, path.name)
+        logger.info("%s: its material library %r is missing, so its colours are unknown", mesh, path.name)
         return {}
     found: dict[str, dict[str, str]] = {}
     here: dict[str, str] = {}
@@ -136,7 +136,7 @@ def _material(entries: dict[str, str], library: Path) -> Material:
     opacity = _numbers(entries.get("d", "").split()[-1:])
     texture = ""
     if "map_kd" in entries:
-        # Options may come before the name of the file.
+        # Options may precede the name of the file.
         names = (entries["map_kd"], entries["map_kd"].split()[-1])
         places = [library.parent / name.replace("\\", "/") for name in names]
         texture = next((str(place) for place in places if place.is_file()), "")
