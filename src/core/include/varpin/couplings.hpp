@@ -304,7 +304,7 @@ class Couplings {
             }
             out[0].lost += std::max(0.0, std::min(power, damped));
         } else {
-            throw std::logic_error("a force from outside of the core has no second derivatives");
+            throw std::logic_error("a force in Python has no second derivatives");
         }
     }
 
