@@ -148,6 +148,20 @@ def closing(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     _label(below, "torque of the drive [N m]", legend=False)
 
 
+def grip(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
+    """Heights of both tools, and the force between them below."""
+    motion = plan.trajectory
+    above, below = figure.subplots(2, 1, sharex=True)
+    for axes in (above, below):
+        plots.apply_style(axes)
+    for side in ("left", "right"):
+        above.plot(motion.t, scene.robot.frame_positions(motion.q, f"{side}_tool0")[:, 2], label=f"{side} tool")
+    above.set_ylabel("height [m]")
+    above.legend(fontsize=8)
+    below.stairs(np.linalg.norm(motion.constraint_forces[:, :3], axis=1), motion.t, baseline=None, color="0.2")
+    _label(below, "force on the right tool [N]", legend=False)
+
+
 def _axes(figure: SubFigure) -> Axes:
     axes = figure.subplots()
     plots.apply_style(axes)
@@ -171,6 +185,7 @@ SHOTS = {
     "double_pendulum_swing_up": Shot(0.95, swing),
     "talos_wave": Shot(1.2, joints, (-50.0, 21.0, 0.9)),
     "gripper_closes": Shot(0.2, closing, (-80.0, 12.0, 1.0)),
+    "beam_lift": Shot(0.6, grip, (-60.0, 20.0, 0.95)),
 }
 
 # Examples: when they are shown [s], the second time where they draw no figure; and from where.

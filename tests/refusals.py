@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+from collections.abc import Iterable
 
 import pytest
 
@@ -19,6 +20,11 @@ def unnamed(text: str, *facts: str | tuple[str, ...]) -> list[str]:
     """Those of ``facts``, strings and tuples of strings, that ``text`` does not name."""
     flat = [fact for given in facts for fact in ((given,) if isinstance(given, str) else given)]
     return [fact for fact in flat if not named(fact, text)]
+
+
+def naming(sentences: Iterable[str], *facts: str | tuple[str, ...]) -> list[str]:
+    """Those of the sentences, of warnings or a log, that name all ``facts``."""
+    return [sentence for sentence in sentences if not unnamed(sentence, *facts)]
 
 
 @contextlib.contextmanager

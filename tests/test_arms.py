@@ -9,24 +9,31 @@ from findings import about
 from scipy.integrate import solve_ivp
 
 import varpin as vp
-from varpin.mechanics.forces import drive_forces
+from varpin.mechanics.forces import drive_forces, of_kind
 
-# Robots of example-robot-data whose files declare damping, and how many seconds the check of one takes.
-FAST = ("xarm7",)
-SLOW = (
+# Robots of example-robot-data whose files declare damping; those with dry friction, too.
+RUBBING = (
+    "xarm7",
     "z1",
     "talos_arm",
+    "allegro_left_hand",
+    "allegro_right_hand",
+    "tiago_no_hand",
+    "tiago_pro",
+    "alex_psyonic_hands",
+    "tiago",
+    "tiago_dual",
+)
+DAMPED = (
+    *RUBBING,
     "panda",
+    "panda_collision",
     "baxter",
     "double_pendulum",
-    "alex_sake_hands",
-    "allegro_left_hand",
-    "tiago_no_hand",
-    "alex_nub_hands",
-    "alex_psyonic_hands",
-    "allegro_right_hand",
+    "double_pendulum_continuous",
     "double_pendulum_simple",
-    "tiago_pro",
+    "alex_sake_hands",
+    "alex_nub_hands",
 )
 
 
@@ -34,10 +41,14 @@ def exact(scene, q0, rows, dt):
     """q and v (N + 1, n) at the nodes under torques held over dt: SciPy's Radau on Pinocchio's forward dynamics."""
     robot, n = scene.robot, scene.robot.dof
     model, data = robot.model, robot.model.createData()
+    friction = of_kind(scene.elements, "CoulombFriction")
+    level, width = np.zeros(n), np.ones(n)
+    for own in friction:
+        level[own.coordinate], width[own.coordinate] = own.values[:2]
 
     def slope(t, x, u):
         q, v = x[:n], x[n:]
-        force = drive_forces(scene.elements, q[None], v[None], (scene.actuation @ u)[None])[0] - scene.damping * v
+        force = scene.actuation @ u - scene.damping * v - level * np.tanh(v / width)
         if not robot.ties:
             return np.concatenate([v, pin.aba(model, data, robot.configuration(q), v, force)])
         free, rate = robot.free_model, robot.free_velocities(np.eye(n))
@@ -48,7 +59,7 @@ def exact(scene, q0, rows, dt):
 
     states = [np.concatenate([q0, np.zeros(n)])]
     for row in rows:
-        found = solve_ivp(slope, (0.0, dt), states[-1], "Radau", rtol=1e-8, atol=1e-11, args=(row,))
+        found = solve_ivp(slope, (0.0, dt), states[-1], "Radau", rtol=1e-9, atol=1e-12, args=(row,))
         states.append(found.y[:, -1])
     return np.split(np.array(states), [n], axis=1)
 
@@ -58,17 +69,32 @@ def middle(robot):
     return 0.5 * (lower + upper)
 
 
-@pytest.mark.parametrize("share", [0.05, 0.2])
-@pytest.mark.parametrize("name", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
-def test_torques_that_jump_on_arms_with_their_own_damping(load, name, share):
-    """Of the largest way, and of the largest velocity, of each joint, with nothing said of the integrator."""
-    robot = load(name)
-    scene, q0, rng = vp.Scene(robot, damping="robot"), middle(robot), np.random.default_rng(1)
-    rows = scene.holding_torque(q0) + share * rng.normal(size=(20, robot.dof)) * np.minimum(robot.effort_limit, 50.0)
+def judge(robot, share, *, friction, steps=20):
+    """Torques that jump each 10 ms, with nothing said of the integrator.
+
+    Within 1 % of the way and 10 % of the largest velocity of each joint.
+    """
+    forces = [vp.CoulombFriction(robot.friction)] if friction else []
+    scene, q0, rng = vp.Scene(robot, damping="robot", forces=forces), middle(robot), np.random.default_rng(1)
+    rows = scene.holding_torque(q0) + share * rng.normal(size=(steps, robot.dof)) * np.minimum(robot.effort_limit, 50.0)
     q, v = exact(scene, q0, rows, 1e-2)
-    motion = vp.simulate(scene, q0, np.zeros(robot.dof), dt=1e-2, steps=20, controls=rows)
+    motion = vp.simulate(scene, q0, np.zeros(robot.dof), dt=1e-2, steps=steps, controls=rows)
     assert (np.abs(motion.q - q).max(axis=0) <= 0.01 * np.abs(q - q0).max(axis=0)).all()
     assert (np.abs(motion.v - v).max(axis=0) <= 0.10 * np.abs(v).max(axis=0)).all()
+
+
+@pytest.mark.parametrize(("name", "share", "friction"), [("xarm7", 0.2, True), ("z1", 0.05, False)])
+def test_torques_that_jump_on_arms_as_they_are(load, name, share, friction):
+    judge(load(name), share, friction=friction, steps=4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.05, 0.2])
+@pytest.mark.parametrize(
+    ("name", "friction"), [*((name, False) for name in DAMPED), *((name, True) for name in RUBBING)]
+)
+def test_torques_that_jump_on_all_robots_as_they_are(load, name, friction, share):
+    judge(load(name), share, friction=friction)
 
 
 def test_who_integrates_where_nobody_is_named(load):

@@ -323,7 +323,7 @@ class TestScene:
             (np.inf, "inf"),
             ([1, 2, 3], ("(2,)", "(3,)")),
             ([[1, 2]], ("(2,)", "(1, 2)")),
-            *((value, "real numbers") for value in NOT_NUMBERS),
+            ("text", "real numbers"),
         ],
     )
     def test_joint_properties(self, robot, name, value, facts):
@@ -386,7 +386,7 @@ STATES = [
     ([0.0, 0.0, 0.0], ("(2,)", "(3,)")),
     (0.0, ("(2,)", "()")),
     ([[0.0, 0.0]], ("(2,)", "(1, 2)")),
-    *((value, "real numbers") for value in NOT_NUMBERS),
+    ("text", "real numbers"),
 ]
 
 TIME_STEPS = [
@@ -507,7 +507,7 @@ class TestSimulation:
             (0.0, "()"),
             (np.array([[0, 0]] * 4 + [[0, np.nan]]), ("controls[4, 1]", "nan")),
             ([0, np.inf], ("controls[1]", "inf")),
-            *((value, ("controls", "real numbers")) for value in NOT_NUMBERS),
+            ("text", ("controls", "real numbers")),
         ],
     )
     def test_controls(self, scene, value, facts):

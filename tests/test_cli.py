@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 from chromium import commands
+from refusals import naming, unnamed
 from rich.console import Console
 
 import varpin as vp
@@ -154,80 +155,72 @@ def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "facts"),
     [
-        (["--q0", "1", "2", "3"], "--q0 takes one number for all joints or 2, for shoulder, elbow; got 3"),
-        (["--damping", "1", "2", "3"], "--damping takes one number for all joints or 2, for shoulder, elbow; got 3"),
-        (["--damping", "-1"], "damping[0] is -1.0; it must be >= 0"),
-        (["--q0", "nan"], "q0 is nan; it must be finite"),
-        (["--v0", "0", "-inf"], "v0[1] is -inf; it must be finite"),
-        (["--dt", "0"], "--dt must be positive and finite [s], got 0.0"),
-        (["--dt", "-1e-3"], "--dt must be positive and finite [s], got -0.001"),
-        (["--duration", "-2"], "--duration must be positive and finite [s], got -2.0"),
-        (["--duration", "1e-5"], "--duration 1e-05 s is less than one step of 0.001 s"),
-        (["--duration", "1e300", "--dt", "1e-300"], "1000000001 steps or more are asked for; a run has 1000000000"),
-        (["--steps", "0"], "--steps must be at least 1, got 0"),
-        (["--steps", "-3"], "--steps must be at least 1, got -3"),
-        (["--alpha", "1.5"], "alpha must be in [0, 1], got 1.5"),
-        (["--integrator", "gaus"], "there is no integrator 'gaus'; did you mean Gauss? integrators: Midpoint, Gauss, "),
-        (["--integrator", "gauss", "--stages", "9"], "stages must be at most 6, got 9"),
-        (["--integrator", "Gauss(steps=2)"], "Gauss has no option 'steps'; its options are stages, "),
-        (["--integrator", "RungeKutta4", "--stages", "2"], "--stages is an option of Gauss, not of RungeKutta4"),
-        (["--stages", "2", "--alpha", "0.5"], "--stages is an option of Gauss, not of Midpoint"),
-        (["--q0", "elbo=1"], "q0: the robot has no joint 'elbo'; did you mean 'elbow'?"),
-        (["--q0", "elbow=nan"], "q0['elbow'] is nan; it must be finite"),
-        (["--q0", "elbow=1", "2"], "--q0 takes either numbers or JOINT=VALUE, not both at once"),
-        (["--v0", "elbow=1", "elbow=2"], "--v0 names 'elbow' more than once"),
-        (["--save", "a.txt"], "--save must end in .npz, got 'a.txt'"),
-        (["--save", "a"], "--save must end in .npz, got 'a'"),
-        (["--html", "a.npz"], "--html must end in .html, .htm, got 'a.npz'"),
-        (["--lock", "elbo=1"], "the robot has no joint 'elbo'; did you mean 'elbow'?"),
-        (["--save", "/nowhere/a.npz"], "cannot write /nowhere/a.npz: there is no folder /nowhere"),
-        (["--plot", "a.gif"], "--plot must end in .png, .pdf, .svg, got 'a.gif'"),
+        (["--q0", "1", "2", "3"], ("--q0", "2", "shoulder, elbow", "3")),
+        (["--damping", "1", "2", "3"], ("--damping", "2", "shoulder, elbow", "3")),
+        # What simulate refuses is refused in its words.
+        (["--damping", "-1"], ("damping[0]", "-1.0")),
+        (["--dt", "0"], ("--dt", "0.0")),
+        (["--dt", "-1e-3"], ("--dt", "-0.001")),
+        (["--duration", "-2"], ("--duration", "-2.0")),
+        (["--duration", "1e-5"], ("--duration", "1e-05 s", "0.001 s")),
+        (["--duration", "1e300", "--dt", "1e-300"], "1000000000"),
+        (["--steps", "0"], ("--steps", "1", "0")),
+        (["--steps", "-3"], ("--steps", "1", "-3")),
+        (["--integrator", "gaus"], ("'gaus'", "Gauss", "Midpoint")),
+        (["--integrator", "RungeKutta4", "--stages", "2"], ("--stages", "Gauss", "RungeKutta4")),
+        (["--stages", "2", "--alpha", "0.5"], ("--stages", "Gauss", "Midpoint")),
+        (["--q0", "elbow=1", "2"], ("--q0", "JOINT=VALUE")),
+        (["--v0", "elbow=1", "elbow=2"], ("--v0", "'elbow'")),
+        (["--save", "a.txt"], ("--save", ".npz", "'a.txt'")),
+        (["--save", "a"], ("--save", ".npz", "'a'")),
+        (["--html", "a.npz"], ("--html", ".html", "'a.npz'")),
+        (["--plot", "a.gif"], ("--plot", ".png", "'a.gif'")),
     ],
 )
-def test_mistakes_are_one_line_and_status_2(arm, capsys, options, message):
+def test_mistakes_are_one_line_and_status_2(arm, capsys, options, facts):
     assert main(["simulate", arm, *options]) == 2
     line = error_of(capsys)
     assert line.startswith("varpin: error: ")
-    assert message in line
+    assert not unnamed(line, facts)
 
 
 @pytest.mark.parametrize("command", ["simulate", "inspect"])
 def test_unknown_robot_gets_close_matches(capsys, command):
     assert main([command, "ur55"]) == 2
-    assert error_of(capsys) == "varpin: error: no robot or URDF file 'ur55'; close matches: ur5, ur3, ur10"
+    assert not unnamed(error_of(capsys), "'ur55'", "ur5", "ur3", "ur10")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "facts"),
     [
-        ([], "varpin: error: a command is missing; commands: simulate, "),
-        (["simulat", "finger"], "varpin: error: there is no command 'simulat'; did you mean 'simulate'? commands: "),
-        (["repla"], "did you mean 'replay'?"),
-        (["frobnicate"], "varpin: error: there is no command 'frobnicate'; commands: simulate, "),
-        (["--frobnicate"], "varpin: error: "),
-        (["simulate"], "varpin simulate: error: the following arguments are required: ROBOT"),
-        (["simulate", "finger", "--q0", "a"], "argument --q0: 'a' is neither a number nor of the form JOINT=VALUE"),
-        (["simulate", "finger", "--lock", "elbow"], "'elbow' is not of the form JOINT=VALUE, for example elbow=0.5"),
-        (["simulate", "finger", "--lock", "elbow=x"], "'elbow=x' is not of the form JOINT=VALUE"),
-        (["simulate", "finger", "--steps", "1.5"], "argument --steps: invalid int value: '1.5'"),
-        (["simulate", "finger", "--steps", "1", "--duration", "1"], "not allowed with argument --steps"),
-        (["simulate", "finger", "--no-gravity", "--gravity", "0", "0", "-1"], "not allowed with argument"),
-        (["simulate", "finger", "--dur", "1"], "unrecognized arguments: --dur; did you mean --duration for --dur?"),
+        ([], ("varpin: error", "simulate")),
+        (["simulat", "finger"], ("varpin: error", "'simulat'", "'simulate'")),
+        (["repla"], ("'repla'", "'replay'")),
+        (["frobnicate"], ("varpin: error", "'frobnicate'", "simulate")),
+        (["--frobnicate"], "varpin: error"),
+        (["simulate"], ("varpin simulate: error", "ROBOT")),
+        (["simulate", "finger", "--q0", "a"], ("--q0", "'a'", "JOINT=VALUE")),
+        (["simulate", "finger", "--lock", "elbow"], ("--lock", "'elbow'", "JOINT=VALUE")),
+        (["simulate", "finger", "--lock", "elbow=x"], ("--lock", "'elbow=x'", "JOINT=VALUE")),
+        (["simulate", "finger", "--steps", "1.5"], ("--steps", "'1.5'")),
+        (["simulate", "finger", "--steps", "1", "--duration", "1"], ("--steps", "--duration")),
+        (["simulate", "finger", "--no-gravity", "--gravity", "0", "0", "-1"], ("--gravity", "--no-gravity")),
+        (["simulate", "finger", "--dur", "1"], ("--dur", "--duration")),
         (
             ["simulate", "finger", "--stifness", "0.5", "-1e-3"],
-            "varpin simulate: error: unrecognized arguments: --stifness; did you mean --stiffness for --stifness?",
+            ("varpin simulate: error", "--stifness", "--stiffness"),
         ),
-        (["inspect", "ur5", "--packagedir=x"], "did you mean --package-dir for --packagedir?"),
-        (["robots", "ur5"], "varpin robots: error: unrecognized arguments: ur5"),
+        (["inspect", "ur5", "--packagedir=x"], ("--packagedir", "--package-dir")),
+        (["robots", "ur5"], ("varpin robots: error", "ur5")),
         # What is misspelled comes before what is missing for it.
-        (["advise", "ur5", "--tolerence", "1e-3"], "did you mean --tolerance for --tolerence?"),
+        (["advise", "ur5", "--tolerence", "1e-3"], ("--tolerence", "--tolerance")),
     ],
 )
-def test_usage_errors_are_one_line_and_status_2(capsys, arguments, message):
+def test_usage_errors_are_one_line_and_status_2(capsys, arguments, facts):
     line = usage_error(arguments, capsys)
-    assert message in line
+    assert not unnamed(line, facts)
     assert re.search(r" \(see varpin( \w+)? --help\)$", line)
 
 
@@ -337,21 +330,21 @@ def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "facts"),
     [
-        (["none.npz"], "there is no file none.npz"),
-        (["SAVED"], "is of robot 'arm', which is no name that varpin knows: give its URDF file, or its scene file, as"),
-        (["SAVED", "--robot", "ur5"], "with joints shoulder, elbow; 'ur5' has joints shoulder_pan_joint, "),
-        (["SAVED", "--robot", "ARM", "--trace", "nose"], "--trace: robot 'arm' has no frame 'nose'"),
-        (["SAVED", "--robot", "ARM", "--html", "a.txt"], "--html must end in .html, .htm, got 'a.txt'"),
-        (["SAVED", "--robot", "ARM", "--html", "a.html", "--open"], "ask for one or the other"),
-        (["SAVED", "--robot", "ARM", "--html", "a.html", "--ghost", "no.npz"], "there is no file no.npz"),
-        (["SAVED", "--robot", "ARM", "--speed", "0"], "--speed must be positive"),
+        (["none.npz"], "none.npz"),
+        (["SAVED"], ("'arm'", "URDF")),
+        (["SAVED", "--robot", "ur5"], ("shoulder, elbow", "'ur5'", "shoulder_pan_joint")),
+        (["SAVED", "--robot", "ARM", "--trace", "nose"], ("--trace", "'arm'", "'nose'")),
+        (["SAVED", "--robot", "ARM", "--html", "a.txt"], ("--html", ".html", "'a.txt'")),
+        (["SAVED", "--robot", "ARM", "--html", "a.html", "--open"], ("--html", "--open")),
+        (["SAVED", "--robot", "ARM", "--html", "a.html", "--ghost", "no.npz"], "no.npz"),
+        (["SAVED", "--robot", "ARM", "--speed", "0"], "--speed"),
     ],
 )
-def test_mistakes_about_replays(words, message, saved, arm, capsys):
+def test_mistakes_about_replays(words, facts, saved, arm, capsys):
     assert main(["replay", *({"SAVED": saved, "ARM": arm}.get(word, word) for word in words)]) == 2
-    assert message in error_of(capsys)
+    assert not unnamed(error_of(capsys), facts)
 
 
 def test_replay_says_which_joints_were_locked(tmp_path, capsys):
@@ -359,7 +352,7 @@ def test_replay_says_which_joints_were_locked(tmp_path, capsys):
     q = 0.5 * np.add(*panda.position_limits)
     path = str(vp.simulate(vp.Scene(panda), q, np.zeros(7), dt=1e-3, steps=2).save(tmp_path / "a.npz"))
     assert main(["replay", path, "--html", str(tmp_path / "a.html")]) == 2
-    assert "lock them as they were, --lock panda_finger_joint1=VALUE" in error_of(capsys)
+    assert not unnamed(error_of(capsys), "--lock panda_finger_joint1=VALUE")
     words = ["--lock", "panda_finger_joint1=0.02", "--html", str(tmp_path / "a.html")]
     assert main(["replay", path, *words]) == 0
 
@@ -369,14 +362,14 @@ def test_outputs_are_checked_before_the_run(arm, tmp_path, capsys, monkeypatch):
     kept = str(tmp_path / "kept.npz")
     for option, path in (("--html", "/nowhere/a.html"), ("--plot", "/nowhere/a.png"), ("--save", str(tmp_path))):
         assert main(["simulate", arm, "--save", kept, option, path]) == 2
-        assert f"cannot write {path}" in error_of(capsys)
+        assert not unnamed(error_of(capsys), path)
     film = str(tmp_path / "kept.gif")
     assert main(["simulate", arm, "--video", film, "--save", film]) == 2
-    assert "--save must end in .npz" in error_of(capsys)
+    assert not unnamed(error_of(capsys), "--save", ".npz")
     (tmp_path / "same.html").symlink_to(tmp_path / "same.png")
     words = ["--plot", str(tmp_path / "same.png"), "--html", str(tmp_path / "same.html")]
     assert main(["simulate", arm, *words]) == 2
-    assert "two outputs cannot be one file" in error_of(capsys)
+    assert not unnamed(error_of(capsys), "one file")
 
 
 def test_output_that_fails_after_the_run_leaves_the_others(arm, tmp_path, capsys, monkeypatch):
@@ -416,7 +409,7 @@ def test_failed_step_keeps_what_was_before_it(arm, tmp_path, capsys, monkeypatch
 def test_hopeless_step_is_status_3(arm, tmp_path, capsys):
     path = tmp_path / "a.npz"
     assert main(["simulate", arm, "--dt", "1e4", "--steps", "3", "--v0", "1e3", "--quiet", "--save", str(path)]) == 3
-    assert error_of(capsys).startswith("varpin: error: step 0 (t = 0 s) cannot be trusted")
+    assert not unnamed(error_of(capsys), "varpin: error", "step 0", "t = 0 s")
     assert vp.Trajectory.load(path).steps == 0
 
 
@@ -450,11 +443,11 @@ def test_lack_of_memory_is_no_traceback(arm, capsys, monkeypatch):
 
     monkeypatch.setattr("varpin.cli.simulate.simulate", exhausted)
     assert main(["simulate", arm]) == 2
-    assert error_of(capsys) == "varpin: error: out of memory: Unable to allocate 7 TiB; take fewer steps"
+    assert not unnamed(error_of(capsys), "varpin: error", "Unable to allocate 7 TiB")
 
 
 def test_long_run_without_a_terminal_says_how_far_it_is(arm, capsys, monkeypatch):
-    monkeypatch.setattr(console._Bar, "PATIENCE", 0.0)
+    monkeypatch.setattr(console._Bar, "INTERVAL", 0.0)
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000"]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert "varpin: 15000 of 40000 steps" in lines
@@ -494,7 +487,7 @@ def test_inspect_prints_tables_and_then_warnings(capsys):
     lines = out.splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("warning: "))
     assert all(line.startswith("warning: ") for line in lines[first:])
-    assert "warning: joint 'panda_joint7' is locked at 0.5" in lines
+    assert naming(lines[first:], "'panda_joint7'", "0.5")
 
 
 def test_inspect_takes_a_curvature_of_rounding_for_none(capsys):
@@ -526,16 +519,16 @@ def test_inspect_takes_what_simulate_refuses(tmp_path, capsys):
         '<parent link="base"/><child link="ghost"/><axis xyz="0 0 1"/></joint></robot>'
     )
     assert main(["simulate", str(path)]) == 2
-    assert "motion of 'hinge' carries no inertia" in error_of(capsys)
+    assert not unnamed(error_of(capsys), "'hinge'")
     assert main(["inspect", str(path)]) == 0
     out = capsys.readouterr().out
-    assert "undefined: the mass matrix is singular" in out
-    assert "warning: link 'ghost' is massless, yet joint 'hinge' moves it; and it carries nothing" in out
+    assert not unnamed(out, "singular")
+    assert naming(out.splitlines(), "warning", "'ghost'", "'hinge'")
 
 
 def test_inspect_refuses_a_wrong_configuration(arm, capsys):
     assert main(["inspect", arm, "--q", "1", "2", "3"]) == 2
-    assert error_of(capsys) == "varpin: error: q must be one number or have shape (2,), got (3,)"
+    assert not unnamed(error_of(capsys), "varpin: error", "q", "(2,)", "(3,)")
 
 
 def test_version_and_help(capsys):
@@ -556,7 +549,7 @@ def test_paper_explains_itself(capsys):
         main(["paper", "--help"])
     assert stop.value.code == 0
     out = capsys.readouterr().out
-    for words in ("usage: varpin paper", "--quick", "--out FOLDER", "--quiet", "an interrupted run goes on"):
+    for words in ("usage: varpin paper", "--quick", "--out FOLDER", "--quiet", "an interrupted run continues"):
         assert words in " ".join(out.split())
 
 
@@ -565,7 +558,7 @@ def test_paper_refuses_a_folder_it_cannot_make(tmp_path, capsys, monkeypatch):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         assert main(["paper", "--quick", "--out", str(folder)]) == 2
-        assert error_of(capsys) == f"varpin: error: cannot make the folder {folder / 'cells'}: Not a directory"
+        assert not unnamed(error_of(capsys), "varpin: error", str(folder / "cells"), "Not a directory")
 
 
 def test_paper_prints_its_claims_and_where_the_report_is(tmp_path, capsys, monkeypatch):
@@ -653,14 +646,14 @@ def test_tradeoff_prints_a_table_and_goes_on_where_it_stopped(arm, tmp_path, cap
     printed, err = capsys.readouterr()
     # On a slow machine it says how far it is.
     assert all(re.fullmatch(r"varpin: \d+ of \d+ runs", line) for line in err.splitlines())
-    for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "good to"):
+    for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "accurate to"):
         assert words in printed
     assert sorted(path.name for path in out.iterdir()) == [f"tradeoff.{kind}" for kind in ("csv", "html", "npz", "png")]
     monkeypatch.setattr("varpin.study.tradeoff.precision._measure", lambda *_: pytest.fail("it is there already"))
     assert main(["tradeoff", arm, *options, "--quiet"]) == 0
     assert capsys.readouterr().out == ""
     assert main(["tradeoff", arm, *options, "--torque", "1"]) == 2
-    assert "holds runs of another motion" in error_of(capsys)
+    assert not unnamed(error_of(capsys), "another motion")
 
 
 def test_tradeoff_interrupted_is_status_130(arm, capsys, monkeypatch):
@@ -691,7 +684,7 @@ def test_advise_says_what_to_take(arm, tmp_path, capsys):
     assert main(["advise", arm, "--tolerance", "1e-20", *options]) == 3
     assert "not within reach" in capsys.readouterr().out
     assert main(["advise", arm, "--tolerance", "0"]) == 2
-    assert "tolerance must be positive" in error_of(capsys)
+    assert not unnamed(error_of(capsys), "tolerance")
 
 
 def test_advise_needs_one_wish(arm, capsys):
@@ -766,22 +759,22 @@ def test_scene_is_inspected(scene, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "facts"),
     [
-        (["simulate", "scene.toml", "--dt", "0.1"], "--dt has no place beside a scene file"),
-        (["simulate", "scene.toml", "--no-gravity"], "--no-gravity has no place"),
-        (["inspect", "scene.toml", "--lock", "dip=0"], "--lock has no place"),
-        (["solve", "finger"], "bundled scenes:"),
-        (["simulate", "scen.toml"], "no scene file 'scen.toml'"),
-        (["solve", "scene.toml", "--resume", "none.npz"], "there is no file none.npz"),
-        (["solve", "scene.toml", "--save", "no/plan.npz"], "there is no folder"),
-        (["solve", "broken.toml"], "broken.toml: robot.source: is missing"),
+        (["simulate", "scene.toml", "--dt", "0.1"], ("--dt", "scene file")),
+        (["simulate", "scene.toml", "--no-gravity"], ("--no-gravity", "scene file")),
+        (["inspect", "scene.toml", "--lock", "dip=0"], ("--lock", "scene file")),
+        (["solve", "finger"], "finger_tracking"),
+        (["simulate", "scen.toml"], "'scen.toml'"),
+        (["solve", "scene.toml", "--resume", "none.npz"], "none.npz"),
+        (["solve", "scene.toml", "--save", "no/plan.npz"], "folder"),
+        (["solve", "broken.toml"], "broken.toml: robot.source"),
     ],
 )
-def test_mistakes_about_scenes(arguments, words, scene, tmp_path, capsys):
+def test_mistakes_about_scenes(arguments, facts, scene, tmp_path, capsys):
     (tmp_path / "broken.toml").write_text("[robot]\n[horizon]\ndt = 1\nsteps = 1\n")
     assert main(arguments) == exits.MISTAKE
-    assert words in error_of(capsys)
+    assert not unnamed(error_of(capsys), facts)
 
 
 @pytest.mark.parametrize(("words", "speed"), [([], 0.5), (["--speed", "1"], 1.0), (["--speed", "0.25"], 0.25)])

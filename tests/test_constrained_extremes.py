@@ -148,8 +148,16 @@ def test_loops_at_their_extremes_move_as_index_reduced_equations_do(number):
 @pytest.mark.parametrize("number", range(len(LOOPS)))
 def test_loops_at_their_extremes_over_decades_of_steps(number):
     for integrator in (vp.Midpoint(), *(vp.Gauss(stages) for stages in (1, 2, 3, 4))):
-        went = [judged(number, integrator, steps) for steps in (3, 30, 300)]
-        assert all(went[1:])
+        assert all(judged(number, integrator, steps) for steps in (3, 30, 300))
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
+def test_light_links_that_carry_a_heavy_one_take_long_steps(integrator):
+    """In the metric of their kinetic energy a small turn is large; the loop is as far from a toggle as any."""
+    (number,) = (k for k, made in enumerate(LOOPS) if made().name == "links of 1e-06 and 10000 kg")
+    motion, off, rate_off = moved(number, integrator, 3)
+    assert motion.statistics.split_steps == 0
+    assert max(off, rate_off) < (2e-2 if integrator.order == 2 else 1e-4)
 
 
 @pytest.mark.parametrize(("integrator", "steps"), [(vp.Midpoint(), 60), (vp.Gauss(2), 30), (vp.Gauss(3), 15)])

@@ -8,7 +8,7 @@ import weakref
 import numpy as np
 import pinocchio as pin
 import pytest
-from refusals import refused
+from refusals import refused, unnamed
 from scipy.integrate import solve_ivp
 
 import varpin as vp
@@ -190,21 +190,19 @@ class TestLedger:
 
 class TestRefused:
     @pytest.mark.parametrize(
-        ("f", "words"),
+        ("f", "facts"),
         [
-            (lambda q, v: np.zeros(2), "must return real numbers of shape (3,)"),
-            (lambda q, v: None, "must return real numbers of shape (3,)"),
-            (lambda q, v: 1j * v, "must return real numbers"),
-            (lambda q, v: v / 0.0 if q[0] > 0.31 else v, "is not finite at q ="),
-            (lambda q, v: 1 / 0, "raised ZeroDivisionError"),
+            (lambda q, v: np.zeros(2), "(3,)"),
+            (lambda q, v: None, "(3,)"),
+            (lambda q, v: 1j * v, "real numbers"),
+            (lambda q, v: v / 0.0 if q[0] > 0.31 else v, ("finite", "q = ")),
+            (lambda q, v: 1 / 0, "ZeroDivisionError"),
         ],
     )
-    def test_what_is_no_force(self, f, words):
+    def test_what_is_no_force(self, f, facts):
         own = vp.Scene(ROBOT, forces=vp.CustomForce(f))
-        with pytest.raises(vp.ForceError) as info, np.errstate(all="ignore"):
+        with refused(vp.ForceError, "CustomForce <lambda>", facts) as info, np.errstate(all="ignore"):
             simulate(own)
-        assert words in str(info.value)
-        assert "CustomForce <lambda>" in str(info.value)
         assert info.value.trajectory.steps == info.value.step
 
     def test_steps_before_are_kept(self):
@@ -321,12 +319,9 @@ class TestDerivativesThatAreWrong:
             lambda own: simulate(own, integrator=vp.Reference()),
             lambda own: simulate(own, dt=None, steps=None, duration=0.1, tolerance=1e-4),
         ):
-            with pytest.raises(vp.CustomForceError) as info:
+            values = f"{exact + 0.3:.8g}", f"{exact:.8g}"
+            with refused(vp.CustomForceError, "CustomForce drag", "dF/dv[0, 1]", values, "q = [ 0.3 -0.4  0.5]"):
                 start(vp.Scene(ROBOT, forces=vp.CustomForce(drag, wrong)))
-            said = str(info.value)
-            assert "CustomForce drag" in said
-            assert f"dF/dv[0, 1] is {exact + 0.3:.8g}, and differences of f give {exact:.7g}" in said
-            assert "q = [ 0.3 -0.4  0.5]" in said
 
     def test_complex_steps_are_tried_where_the_motion_starts(self):
         """Beyond a threshold the function drops imaginary parts, and near zero it does not."""
@@ -361,8 +356,7 @@ class TestWhereItFails:
 
     def check(self, error):
         assert error.trajectory.steps == error.step > 0
-        assert "beyond the table" in str(error)
-        assert "q = [" in str(error)
+        assert not unnamed(str(error), "beyond the table", "q = [")
         assert error.time == error.trajectory.t[-1]
 
     def test_with_a_tolerance(self):

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from refusals import refused
+from refusals import naming, refused, unnamed
 from scipy.linalg import eigh
 
 import varpin as vp
@@ -58,42 +58,41 @@ def test_report_and_its_joints_are_frozen(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("links", "warning"),
+    ("links", "facts"),
     [
-        ((ROD, None), "link 'link2' is massless, yet joint 'joint2' moves it; and it carries nothing"),
-        ((None, ROD), "link 'link1' is massless, yet joint 'joint1' moves it; only what it carries gives the joint"),
-        ((ROD, inertial(1, 0, 0, 0)), "link 'link2' has a mass of 1 kg and no rotational inertia: a point mass"),
+        ((ROD, None), ("massless", "'link2'", "'joint2'", "nothing")),
+        ((None, ROD), ("massless", "'link1'", "'joint1'", "only")),
+        ((ROD, inertial(1, 0, 0, 0)), ("point mass", "'link2'", "1 kg")),
         (
             (ROD, inertial(1, -0.02, 0.08, 0.08)),
-            "link 'link2' has a non-physical inertia: it is not positive definite (principal moments -0.02, 0.08, 0.08",
+            ("non-physical inertia", "'link2'", "positive definite", "-0.02, 0.08, 0.08"),
         ),
         (
             (ROD, inertial(1, 0.01, 0.02, 0.08)),
-            "link 'link2' has a non-physical inertia: its principal moments 0.01, 0.02, 0.08 kg m^2 violate the "
-            "triangle inequality, 0.08 > 0.01 + 0.02",
+            ("non-physical inertia", "'link2'", "triangle inequality", "0.08 > 0.01 + 0.02"),
         ),
         (
             (ROD, inertial(5e-4, 1e-6, 1e-6, 1e-6)),
-            "the masses of neighbouring links 'link1' and 'link2' differ by a factor of 2e+03: 1 and 0.0005 kg",
+            ("masses", "'link1'", "'link2'", "2e+03", "0.0005 kg"),
         ),
         (
             (ROD, inertial(1e-2, 1e-8, 1e-8, 1e-8)),
-            "the moments of inertia of neighbouring links 'link1' and 'link2' differ by a factor of 8e+06",
+            ("moments of inertia", "'link1'", "'link2'", "8e+06"),
         ),
         (
             (ROD, inertial(1, 0.08, 0.08, 0.08, x=500)),
-            "link 'link2' has its centre of mass 500 m away from its frame, where the arm's joints span 1 m",
+            ("centre of mass", "'link2'", "500 m", "1 m"),
         ),
         (
             (ROD, inertial(1, 80, 80, 80)),
-            "link 'link2' has an implausibly large inertia: its radius of gyration is 8.94 m",
+            ("radius of gyration", "'link2'", "8.94 m"),
         ),
-        ((ROD, inertial(1, 1e-7, 1e-7, 1e-7)), "link 'link2' has an implausibly small inertia: 1 kg with principal"),
+        ((ROD, inertial(1, 1e-7, 1e-7, 1e-7)), ("inertia", "small", "'link2'", "1 kg")),
     ],
 )
-def test_faulty_link_is_named(tmp_path, links, warning):
+def test_faulty_link_is_named(tmp_path, links, facts):
     report = inspect_robot(write_arm(tmp_path, *links))
-    assert any(text.startswith(warning) for text in report.warnings), report.warnings
+    assert naming(report.warnings, facts), report.warnings
 
 
 def test_faulty_link_is_found_where_pinocchio_merges_it_into_a_sound_one(tmp_path):
@@ -101,7 +100,7 @@ def test_faulty_link_is_found_where_pinocchio_merges_it_into_a_sound_one(tmp_pat
     tool += '<joint name="weld" type="fixed"><parent link="link1"/><child link="tool"/></joint>'
     report = inspect_robot(write_arm(tmp_path, ROD, extra=tool))
     (warning,) = report.warnings
-    assert warning.startswith("link 'tool' has a non-physical inertia")
+    assert not unnamed(warning, "'tool'", "non-physical inertia")
 
 
 def test_rod_without_thickness_is_no_fault():
@@ -110,7 +109,7 @@ def test_rod_without_thickness_is_no_fault():
 
 def test_singular_mass_matrix_names_the_joint_and_has_no_largest_step(tmp_path):
     report = inspect_robot(write_arm(tmp_path, ROD, None))
-    assert any(text.startswith("the mass matrix is singular") and "'joint2'" in text for text in report.warnings)
+    assert naming(report.warnings, "mass matrix", "singular", "'joint2'")
     assert report.condition == np.inf
     assert report.scaled_condition == np.inf
     assert report.largest_step is None
@@ -139,39 +138,39 @@ def test_ill_conditioned_mass_matrix_is_said(tmp_path):
     path = tmp_path / "coaxial.urdf"
     path.write_text(f'<robot name="coaxial">{text}</robot>')
     report = inspect_robot(path)
-    assert any("the mass matrix is ill-conditioned" in text for text in report.warnings)
+    assert naming(report.warnings, "mass matrix", "ill-conditioned")
     # M = [[I + e, I], [I, I]] with I = 0.75 and e = 1e-7.
     assert report.scaled_condition == pytest.approx(4 * 0.75 / 1e-7, rel=1e-5)
 
 
 def test_limits_that_are_missing_or_leave_no_room(tmp_path):
     bare = inspect_robot(write_arm(tmp_path, ROD, ROD, joint='<limit lower="0" upper="0" effort="0" velocity="0"/>'))
-    assert "no velocity limit, or one of 0: 'joint1', 'joint2'" in bare.warnings
-    assert "no effort limit, or one of 0: 'joint1', 'joint2'" in bare.warnings
-    assert any("joint 'joint1' has limits 0 and 0, as if none were given" in warning for warning in bare.warnings)
+    assert naming(bare.warnings, "velocity limit", "'joint1', 'joint2'")
+    assert naming(bare.warnings, "effort limit", "'joint1', 'joint2'")
+    assert naming(bare.warnings, "'joint1'", "0 and 0")
     tight = inspect_robot(
         write_arm(tmp_path, ROD, ROD, joint='<limit lower="0.2" upper="0.2" effort="1" velocity="1"/>')
     )
-    assert "joint 'joint1' has no room to move: limits 0.2 and 0.2 rad" in tight.warnings
+    assert naming(tight.warnings, "'joint1'", "0.2 and 0.2 rad")
     chain = inspect_robot(vp.planar_chain(2))
-    assert "no position limit, or one of 0: 'joint1', 'joint2'" in chain.warnings
+    assert naming(chain.warnings, "position limit", "'joint1', 'joint2'")
 
 
 def test_configuration_outside_the_limits_is_said_where_one_is_given(tmp_path):
     path = write_arm(tmp_path, ROD, ROD)
-    assert "q puts joint 'joint2' at 3, outside its limits -1 and 2" in inspect_robot(path, q=[0.0, 3.0]).warnings
+    assert naming(inspect_robot(path, q=[0.0, 3.0]).warnings, "'joint2'", "3", "-1 and 2")
 
 
 def test_mimic_joints_locked_joints_and_damping_are_said():
     report = inspect_robot("panda", lock={"panda_joint7": 0.5})
     mimic = next(joint for joint in report.joints if joint.kind == "mimic")
     assert (mimic.name, mimic.follows, mimic.unit) == ("panda_finger_joint2", "1 * panda_finger_joint1", "m")
-    assert "joint 'panda_joint7' is locked at 0.5" in report.warnings
-    assert any(text.startswith("mimic joint 'panda_finger_joint2' is tied to its leader") for text in report.warnings)
-    assert any("takes as damping='robot'" in text and "'panda_joint1' 0.003" in text for text in report.warnings)
+    assert naming(report.warnings, "'panda_joint7'", "locked", "0.5")
+    assert naming(report.warnings, "'panda_finger_joint2'", "mimic")
+    assert naming(report.warnings, "damping='robot'", "'panda_joint1' 0.003")
     free = inspect_robot("panda", mimic="free")
     assert free.robot.dof == 9
-    assert any("mimics 'panda_finger_joint1', but was asked to be free" in text for text in free.warnings)
+    assert naming(free.warnings, "'panda_finger_joint1'", "free")
 
 
 def test_mimic_leader_that_does_not_exist_is_named(tmp_path):

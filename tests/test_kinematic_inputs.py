@@ -143,7 +143,7 @@ def test_linearizations_are_the_slopes_of_steps(integrator, links, interpolation
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_split_steps_are_linearized_in_their_parts(interpolation):
     scene, q, v = crank(links=4, interpolation=interpolation)
-    u = np.array([[q[0] + 0.3, 1.5]])[:, : scene.controls]
+    u = np.array([[q[0] + 0.5, 1.5]])[:, : scene.controls]
     motion = vp.simulate(scene, q, v, dt=0.15, steps=1, controls=u, check=False)
     assert motion.statistics.substeps[0] > 1
     np.testing.assert_allclose(motion.q[1, 0], u[0, 0], atol=1e-13)

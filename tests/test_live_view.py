@@ -207,12 +207,12 @@ def test_a_controllers_run_is_shown(opened, chain, scene):
 
 def test_the_camera_moves_back_from_what_leaves_the_view(opened, chain):
     view = opened(chain)
-    before = view._room
-    view._make_room(np.array([[9.0, 0.0, 0.0]]))
-    assert view._room.max() > 10.0
-    after = view._room
-    view._make_room(np.array([[9.5, 0.0, 0.0]]))
-    assert view._room is after is not before
+    before = view._in_view
+    view._keep_in_view(np.array([[9.0, 0.0, 0.0]]))
+    assert view._in_view.max() > 10.0
+    after = view._in_view
+    view._keep_in_view(np.array([[9.5, 0.0, 0.0]]))
+    assert view._in_view is after is not before
 
 
 def test_ctrl_c_ends_the_motion_and_not_the_view(opened, scene):
@@ -233,19 +233,19 @@ def test_ctrl_c_ends_the_motion_and_not_the_view(opened, scene):
 
 
 def test_a_server_that_dies_costs_the_picture_alone(opened, scene, caplog, monkeypatch):
-    monkeypatch.setattr(live, "_ANSWER", 0.2)
+    monkeypatch.setattr(live, "_ANSWER_LIMIT", 0.2)
     view = opened(scene, speed=None)
     view._window.server_proc.kill()
     with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
         motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-3, steps=10, progress=view.progress)
     assert motion.steps == 10
-    assert caplog.text.count("the computation goes on without a picture") == 1
+    assert caplog.text.count("the computation continues without it") == 1
 
 
 def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
     asked = []
     monkeypatch.setattr(viewer_module.webbrowser, "open", lambda url, new=0: asked.append(url) or True)
-    monkeypatch.setattr(live, "_COME", 0.1)
+    monkeypatch.setattr(live, "_BROWSER_LIMIT", 0.1)
     with vp.LiveView(scene) as view:
         assert asked == [view.url]
         assert f'<iframe src="{view.url}"' in view._repr_html_()

@@ -9,7 +9,7 @@ from mechanisms import random_tree
 from refusals import refused
 
 import varpin as vp
-from varpin.core import doubled_steps_agree, energy_turnover, fastest_damping, glance, longest_alternation, pulls_fast
+from varpin.core import energy_turnover, fastest_damping, glance, longest_alternation, pulls_fast, windows_agree
 
 LOOKS, EVEN, LITTLE, LIGHT = 16, 1e-3, 1e-2, 1e-2
 
@@ -156,15 +156,17 @@ def agreement(scene, q, v, begins, length, dt, again, way, velocity):
         for kind in (slides, ~slides):
             others = LITTLE * unit[:, kind].max(axis=1, initial=0.0)
             unit[:, kind] = np.maximum(unit[:, kind], np.minimum(others[:, None], least[:, kind]))
-        found.append((np.abs(other - own[:, 2::2]).max(axis=1) / (part * unit)).max())
+        every = length // other.shape[1]
+        found.append((np.abs(other - own[:, every::every]).max(axis=1) / (part * unit)).max())
     return max(found)
 
 
+@pytest.mark.parametrize("every", [1, 2])
 @pytest.mark.parametrize("which", ["way", "velocity"])
-def test_windows_agree_up_to_what_is_allowed(scene, motion, rng, which):
+def test_windows_agree_up_to_what_is_allowed(scene, motion, rng, which, every):
     length, begins = 8, np.array([0, 11, 32])
-    nodes = begins[:, None] + 2 * np.arange(1, length // 2 + 1)
-    again = [values[nodes] + rng.normal(0.0, 1e-3, (3, length // 2, 5)) for values in (motion.q, motion.v)]
+    nodes = begins[:, None] + np.arange(every, length + 1, every)
+    again = [values[nodes] + rng.normal(0.0, 1e-3, (3, length // every, 5)) for values in (motion.q, motion.v)]
     # What hardly moves is measured by others.
     q, v = motion.q.copy(), motion.v.copy()
     q[:, 1], v[:, 1] = q[0, 1], 1e-7 * v[:, 1]
@@ -172,7 +174,7 @@ def test_windows_agree_up_to_what_is_allowed(scene, motion, rng, which):
     worst = agreement(scene, q, v, begins, length, motion.dt, again, **parts)
     for scale, agrees in ((1.001, True), (0.999, False)):
         allowed = {name: scale * worst * part for name, part in parts.items()}
-        assert agrees == doubled_steps_agree(
+        assert agrees == windows_agree(
             scene.core, q, v, begins, length, motion.dt, *again, **allowed, little=LITTLE, light=LIGHT, even=EVEN
         )
 
@@ -181,11 +183,13 @@ def test_windows_that_are_no_numbers_do_not_agree(scene, motion):
     again = [values[None, 2:9:2].copy() for values in (motion.q, motion.v)]
     limits = {"way": 1.0, "velocity": 1.0, "little": LITTLE, "light": LIGHT, "even": EVEN}
     begins = np.zeros(1, dtype=np.int64)
-    assert doubled_steps_agree(scene.core, motion.q, motion.v, begins, 8, motion.dt, *again, **limits)
+    assert windows_agree(scene.core, motion.q, motion.v, begins, 8, motion.dt, *again, **limits)
     again[1][0, 2, 3] = np.nan
-    assert not doubled_steps_agree(scene.core, motion.q, motion.v, begins, 8, motion.dt, *again, **limits)
+    assert not windows_agree(scene.core, motion.q, motion.v, begins, 8, motion.dt, *again, **limits)
     with refused(ValueError, "motion"):
-        doubled_steps_agree(scene.core, motion.q, motion.v, begins + 33, 8, motion.dt, *again, **limits)
+        windows_agree(scene.core, motion.q, motion.v, begins + 33, 8, motion.dt, *again, **limits)
+    with refused(ValueError, "parts"):
+        windows_agree(scene.core, motion.q, motion.v, begins, 7, motion.dt, *again, **limits)
 
 
 def longest_in_numpy(v, u, counts, idle, even):

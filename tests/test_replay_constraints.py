@@ -152,7 +152,7 @@ def test_what_no_viewer_draws_is_left_out_with_a_word(plan, tmp_path, caplog):
         constraints=[vp.KeepInSphere(robot, "tip", [0.0, 0.0, 0.0], 1e20)],
     )  # fmt: skip
     replay(robot, [[0.3, 0.2]], dt=1.0, constraints=huge, html=tmp_path / "huge.html")
-    assert "'tip' is larger than what viewers draw" in caplog.text
+    assert "'tip' is too large for viewers" in caplog.text
 
 
 def test_what_moves_is_drawn_where_it_is():

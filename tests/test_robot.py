@@ -367,7 +367,7 @@ class TestLocking:
         model.appendBodyToJoint(base, random_inertia(rng), pin.SE3.Identity())
         elbow = model.addJoint(base, pin.JointModelRY(), pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])), "elbow")
         model.appendBodyToJoint(elbow, random_inertia(rng), pin.SE3.Identity())
-        with pytest.raises(vp.UnsupportedJoint, match=rf"'root' is a {kind.shortname()}.*lock=\{{'root': "):
+        with refused(vp.UnsupportedJoint, "'root'", kind.shortname(), "lock={'root': "):
             vp.load_robot(model)
         robot = vp.load_robot(model, lock={"root": position})
         assert robot.joint_names == ("elbow",)
@@ -567,7 +567,7 @@ class TestJoints:
     @pytest.mark.parametrize(("kind", "shown"), [("floating", "JointModelFreeFlyer"), ("planar", "JointModelPlanar")])
     def test_unsupported_in_a_urdf(self, tmp_path, kind, shown):
         path = write_urdf(tmp_path, link("a"), link("b"), joint("root", "base", "a", kind), joint("elbow", "a", "b"))
-        with pytest.raises(vp.UnsupportedJoint, match=f"'root' is a {shown}") as info:
+        with refused(vp.UnsupportedJoint, "'root'", shown) as info:
             vp.load_robot(path)
         assert (info.value.joint, info.value.kind) == ("root", shown)
         position = [0.0] * 6 + [1.0] if kind == "floating" else [0.0, 0.0, 1.0, 0.0]

@@ -14,15 +14,13 @@ import varpin as vp
 from varpin.control.solution_file import solution_trajectory
 
 UR5 = {"damping": 0.1, "stiffness": 2.0, "rest": 0.3, "noise": vp.AdditiveNoise(1e-3)}
-OTHERS = {
-    "damping was 0.1 at joint 'elbow_joint', and is 0.4 in the scene": {
-        "damping": [0.1, 0.1, 0.4, 0.1, 0.1, 0.1],
-    },
-    "stiffness was 2 at joint 'shoulder_pan_joint', and is 0 in the scene": {"stiffness": 0.0},
-    "rest was 0.3 at joint 'shoulder_pan_joint', and is 0.2 in the scene": {"rest": 0.2},
-    "gravity was (0, 0, -9.81) m/s^2, and is (0, 0, 0) in the scene": {"gravity": False},
-    "actuation differs in the scene": {"actuation": 2.0 * np.eye(6)},
-}
+OTHERS = [
+    ({"damping": [0.1, 0.1, 0.4, 0.1, 0.1, 0.1]}, ("damping", "0.1", "'elbow_joint'", "0.4")),
+    ({"stiffness": 0.0}, ("stiffness", "2", "'shoulder_pan_joint'", "0")),
+    ({"rest": 0.2}, ("rest", "0.3", "'shoulder_pan_joint'", "0.2")),
+    ({"gravity": False}, ("gravity", "(0, 0, -9.81)", "(0, 0, 0)")),
+    ({"actuation": 2.0 * np.eye(6)}, "actuation"),
+]
 
 
 def motion_of(scene, **options):
@@ -31,14 +29,14 @@ def motion_of(scene, **options):
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4()], ids=str)
-@pytest.mark.parametrize("words", OTHERS)
-def test_another_scene_is_refused_by_what_differs(load, words, integrator):
+@pytest.mark.parametrize(("change", "facts"), OTHERS)
+def test_another_scene_is_refused_by_what_differs(load, change, facts, integrator):
     robot = load("ur5")
     motion = motion_of(vp.Scene(robot, **UR5), integrator=integrator)
-    with pytest.raises(vp.InputError) as caught:
-        vp.linearize(vp.Scene(robot, **UR5 | OTHERS[words]), motion)
-    assert words in str(caught.value)
-    assert str(caught.value).count(" in the scene") == 1
+    with refused(vp.InputError, facts) as caught:
+        vp.linearize(vp.Scene(robot, **UR5 | change), motion)
+    named = [name for name in ("damping", "stiffness", "rest", "gravity", "actuation") if name in str(caught.value)]
+    assert named == list(change)
 
 
 def test_second_order_refuses_too(load):
@@ -116,7 +114,7 @@ def test_files_without_the_values_are_held_against_their_steps(load, tmp_path, i
         older = without_values(motion.save(tmp_path / "motion.npz"))
         assert not older.scene_values
         np.testing.assert_array_equal(vp.linearize(scene, older).A, vp.linearize(scene, motion).A)
-        for change in OTHERS.values():
+        for change, _ in OTHERS:
             if "actuation" not in change:
                 with refused(vp.InputError, "velocities"):
                     vp.linearize(vp.Scene(robot, **UR5 | change), older)

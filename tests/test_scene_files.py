@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from refusals import refused
+from refusals import refused, unnamed
 
 import varpin as vp
 from varpin.io.scenefile import scenes
@@ -438,7 +438,7 @@ MISTAKES = {
     "dt of zero": (changed("dt = 2e-3", "dt = 0"), "horizon.dt"),
     "steps and duration": (changed("duration = 0.1", "duration = 0.1\nsteps = 50"), "horizon"),
     "neither steps nor duration": (changed("duration = 0.1", ""), "horizon"),
-    "no whole number of steps": (
+    "not a whole number of steps": (
         changed("duration = 0.1", "duration = 0.101"),
         "horizon.duration",
     ),
@@ -561,19 +561,19 @@ def test_every_mistake_has_its_own_message(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("mistake", "words"),
+    ("mistake", "facts"),
     [
-        ("negative mass", "must be a finite number > 0 [kg], got -0.001"),
-        ("unknown key", "unknown key; did you mean 'mass'? keys: frame, mass, com, inertia"),
-        ("unknown cost", "there is no 'traking'; did you mean 'tracking'? allowed: tracking, velocity"),
-        ("force without a number", "is missing; a number for all, a list, or a table by name belongs here"),
-        ("no TOML", "at line 3"),
+        ("negative mass", ("[kg]", "-0.001")),
+        ("unknown key", ("'mass'", "frame, mass, com, inertia")),
+        ("unknown cost", ("'traking'", "'tracking'", "velocity")),
+        ("force without a number", ("number", "list", "table")),
+        ("no TOML", "line 3"),
     ],
 )
-def test_a_message_says_what_is_allowed(mistake, words, tmp_path):
+def test_a_message_says_what_is_allowed(mistake, facts, tmp_path):
     with pytest.raises(vp.SceneFileError) as caught:
         vp.load_scene(write(tmp_path, MISTAKES[mistake][0]))
-    assert words in caught.value.problem
+    assert not unnamed(caught.value.problem, facts)
 
 
 ODD = [
@@ -899,7 +899,7 @@ def keys_of(data, path=""):
 
 
 def test_documented_keys_are_those_there_are():
-    whole, references = documented()
+    whole, _, references = documented()
     allowed, free = allowed_keys(), {"robot.lock"}
     used = keys_of(tomllib.loads(whole))
     for path, keys in used:

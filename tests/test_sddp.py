@@ -1142,7 +1142,7 @@ def test_wrong_states_and_scenes():
     cost = vp.ControlCost(1.0)
     scene = vp.Scene(sliders(2))
     for q0, v0, name in (([0.0], [0, 0], "q0"), ([0, 0], [0, np.inf], "v0")):
-        with pytest.raises(vp.InputError, match=name):
+        with refused(vp.InputError, name):
             vp.OptimalControlProblem(scene, cost, q0, v0, dt=0.1, steps=2)
     with refused(vp.InputError, "cost"):
         vp.OptimalControlProblem(scene, "cheap", [0, 0], [0, 0], dt=0.1, steps=2)

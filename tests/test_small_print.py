@@ -50,7 +50,7 @@ def test_joints_locked_outside_their_limits_are_told_of(gripper, caplog):
         vp.load_robot("panda", lock={"panda_joint4": -1.0})
         assert "outside its limits" not in caplog.text
         vp.load_robot("panda", lock={"panda_joint4": 1.0})
-    assert "lock['panda_joint4'] = 1 holds the joint outside its limits, -3.07" in caplog.text
+    assert "lock['panda_joint4'] = 1 locks the joint outside its limits, -3.07" in caplog.text
 
 
 def mpc():

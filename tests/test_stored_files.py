@@ -267,7 +267,7 @@ def test_pickles_are_not_opened(name, tmp_path):
 @pytest.mark.parametrize(
     ("change", "fact"),
     [
-        (('"deep": false', '"deep": 0'), "cells[0].deep"),
+        (('"deep": false', '"deep": 0'), "deep"),
         (('"error": 0.0,', '"error": "small",'), "cells[0].error"),
         (('"said": []', '"said": [[]]'), "cells[0].said[0]"),
         (('"trial"', '"trail"'), "cells[0].trial"),

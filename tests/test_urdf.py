@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import threading
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import INERTIAL, arm, joint, link, mimic, write_urdf
-from refusals import refused
+from refusals import naming, refused, unnamed
 
 import varpin as vp
 from varpin.model import example_robot_data, geometry, readable_geometry
@@ -108,36 +107,36 @@ ODD = {
         "",
     ),
     "an encoding that it is not in": (lambda text: text.replace("?>", ' encoding="utf-16"?>', 1), ""),
-    "an unknown encoding": (lambda text: text.replace("?>", ' encoding="klingon"?>', 1), "'klingon' is unknown"),
-    "no inertia": (lambda text: text.replace(INERTIAL, HEAVY, 1), "link 'l1': its <inertial> has no <inertia>"),
-    "no ixy": (lambda text: text.replace('ixy="0.001" ', "", 1), "link 'l1': its <inertial> has no ixy"),
+    "an unknown encoding": (lambda text: text.replace("?>", ' encoding="klingon"?>', 1), "'klingon'"),
+    "no inertia": (lambda text: text.replace(INERTIAL, HEAVY, 1), ("'l1'", "<inertial>", "<inertia>")),
+    "no ixy": (lambda text: text.replace('ixy="0.001" ', "", 1), ("'l1'", "<inertial>", "ixy")),
     "no mass": (
         lambda text: text.replace('<mass value="1.3"/>', "", 1),
-        "link 'l1': its <inertial> has no <mass>: it is massless",
+        ("'l1'", "<inertial>", "<mass>"),
     ),
     "a mass that is none": (
         lambda text: text.replace('"1.3"', '"1.3 kg"', 1),
-        "link 'l1': its mass is '1.3 kg', no finite number: it is massless, as Pinocchio reads it",
+        ("'l1'", "mass", "'1.3 kg'"),
     ),
-    "an infinite mass": (lambda text: text.replace('"1.3"', '"inf"', 1), "link 'l1': its mass is 'inf', no finite"),
+    "an infinite mass": (lambda text: text.replace('"1.3"', '"inf"', 1), ("'l1'", "mass", "'inf'")),
     "a negative mass": (
         lambda text: '"-0.1"'.join(text.rsplit('"1.3"', 1)),
-        "link 'tool' has mass -0.1 < 0 [kg]",
+        ("'tool'", "mass", "-0.1"),
     ),
     "a moment that is none": (
         lambda text: text.replace('ixx="0.02"', 'ixx="nan"', 1),
-        "link 'l1': its <inertial> has ixx 'nan', no finite number: it is a point mass, as Pinocchio reads it",
+        ("'l1'", "ixx", "'nan'", "point mass"),
     ),
     "a centre of two numbers": (
         lambda text: text.replace('xyz="0.02 0.05 0.1"', 'xyz="0.02 0.05"', 1),
-        "link 'l1': the xyz of its <inertial> is '0.02 0.05', no three finite numbers: it is massless",
+        ("'l1'", "xyz", "'0.02 0.05'", "massless"),
     ),
     "a turn that is none": (
         lambda text: text.replace('rpy="0.3 0.2 0.1"', 'rpy="0 0 -inf"', 1),
-        "link 'l1': the rpy of its <inertial> is '0 0 -inf', no three finite numbers: it is massless",
+        ("'l1'", "rpy", "'0 0 -inf'", "massless"),
     ),
-    "an empty inertial": (lambda text: text.replace(INERTIAL, "<inertial/>", 1), "link 'l1': its <inertial> has no"),
-    "an ampersand": (lambda text: text.replace("</robot>", "<a>b & c</a></robot>"), "not well-formed XML"),
+    "an empty inertial": (lambda text: text.replace(INERTIAL, "<inertial/>", 1), ("'l1'", "<inertial>")),
+    "an ampersand": (lambda text: text.replace("</robot>", "<a>b & c</a></robot>"), "XML"),
     "something behind it": (lambda text: text + "<more/>", "junk after document element"),
 }
 
@@ -145,13 +144,13 @@ ODD = {
 class TestOdd:
     @pytest.mark.parametrize("kind", ODD)
     def test_files_load_as_pinocchio_reads_them(self, tmp_path, two, caplog, kind):
-        change, words = ODD[kind]
+        change, facts = ODD[kind]
         assert kind == "as it is" or change(two) != two
         path = written(tmp_path, change(two))
         with caplog.at_level(logging.WARNING):
             robot = vp.load_robot(path)
-        assert words in caplog.text
-        assert bool(words) == bool(caplog.records)
+        assert not facts or naming(caplog.messages, facts)
+        assert bool(facts) == bool(caplog.records)
         if kind not in ("entities", "utf-16"):  # of which Pinocchio's parser reads nothing
             assert_same(robot.free_model, pin.buildModelFromUrdf(str(path)))
         assert robot.joint_names == ("j1",)
@@ -161,7 +160,7 @@ class TestOdd:
         assert (found.ngeoms, missing) == (3, {})
         report = vp.inspect_robot(path)
         assert len(report.joints) == 2
-        assert not words or any(words in said for said in (*report.warnings, caplog.text))
+        assert not facts or naming((*report.warnings, *caplog.messages), facts)
 
     def test_masses_that_cancel_are_no_masses_that_are_lost(self, tmp_path, two):
         path = written(tmp_path, two.replace('"1.3"', '"-2.6"', 1))
@@ -222,13 +221,13 @@ class TestOdd:
 
 class TestInertia:
     @pytest.mark.parametrize(
-        ("ixx", "words"),
+        ("ixx", "facts"),
         [
-            (-0.05, "link 'l1' has a non-physical inertia: it is not positive definite .*-0.05, 0.1, 0.1 kg m"),
-            (0.5, "link 'l1' has a non-physical inertia: .* 0.1, 0.1, 0.5 kg m.2 violate the triangle .* 0.5 > 0.1"),
+            (-0.05, ("'l1'", "non-physical inertia", "positive definite", "-0.05, 0.1, 0.1 kg m^2")),
+            (0.5, ("'l1'", "non-physical inertia", "0.1, 0.1, 0.5 kg m^2", "0.5 > 0.1 + 0.1")),
         ],
     )
-    def test_that_no_body_has_is_told_at_load_and_in_the_report(self, tmp_path, caplog, ixx, words):
+    def test_that_no_body_has_is_told_at_load_and_in_the_report(self, tmp_path, caplog, ixx, facts):
         path = arm(tmp_path, THIN.format(ixx))
         robot = vp.load_robot(path)
         (record,) = caplog.records
@@ -236,7 +235,7 @@ class TestInertia:
         caplog.clear()
         vp.load_robot(pin.buildModelFromUrdf(str(path)))
         for text in (record.getMessage(), "".join(vp.inspect_robot(path).warnings), caplog.text):
-            assert re.search(words, text)
+            assert not unnamed(text, facts)
 
     def test_negative_inertia_is_told_from_none(self, tmp_path):
         """Of a joint, and of a motion of several; without a warning of NumPy's."""

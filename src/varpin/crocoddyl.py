@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.control.backward import states
 from varpin.control.problem import OptimalControlProblem, bind_cost
-from varpin.control.search import states
 from varpin.errors import InputError, VarpinError
 from varpin.integrators.base import open_loop
 from varpin.linearization import linearize_steps, velocity_at_nodes

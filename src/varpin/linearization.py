@@ -210,7 +210,8 @@ def second_order(
     """Second-order linearization of every step of a trajectory at dw = 0, contracted with vectors.
 
     Exact, and without a tensor: third derivatives of the Lagrangian enter through a derivative of the jet along one
-    direction. It is what full differential dynamic programming needs, with z the gradient of the value function.
+    direction. Under constraints by differences of the first derivatives, good to about 1e-8. It is what full
+    differential dynamic programming needs, with z the gradient of the value function.
 
     Main args:
         scene: The scene in which it was made.
@@ -239,8 +240,8 @@ def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrat
         raise InputError("second derivatives are not there for noise fields that depend on the velocity")
     n = scene.robot.dof
     H = integrator.contract(scene, trajectory, z)
-    B = scene.actuation
-    x, f = slice(0, 2 * n), slice(2 * n, 3 * n)
+    B = scene.transmission
+    x, f = slice(0, 2 * n), slice(2 * n, 2 * n + len(B))
     return Curvature(xx=H[:, x, x], ux=B.T @ H[:, f, x], uu=B.T @ H[:, f, f] @ B)
 
 

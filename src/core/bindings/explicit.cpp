@@ -104,11 +104,11 @@ std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, Explicit
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
     ExplicitStepper stepper(mechanism, method, true);
     stepper.ramp = ramp;
-    const std::size_t places = force.shape(1);
+    const std::size_t abscissae = force.shape(1);
     require(q, "q", {rows, n});
     require(v, "v", {rows, n});
-    if (places != 1) require(force, "force", {rows, static_cast<std::size_t>(stepper.places()), n});
-    require(force, "force", {rows, places, n});
+    if (abscissae != 1) require(force, "force", {rows, static_cast<std::size_t>(stepper.abscissae()), n});
+    require(force, "force", {rows, abscissae, n});
     double *in_x = nullptr, *in_force = nullptr;
     const Out Jx = array_for(in_x, {rows, 2 * n, 2 * n}), Jf = array_for(in_force, {rows, 2 * n, n});
     std::size_t s = 0;
@@ -118,7 +118,7 @@ std::tuple<Out, Out, std::size_t> linearize(const Mechanism& mechanism, Explicit
             std::copy_n(q.data() + s * n, n, stepper.q.data());
             std::copy_n(v.data() + s * n, n, stepper.v.data());
             if (!stepper.dynamics.at(q.data() + s * n, v.data() + s * n)) break;
-            if (!stepper.step(dt, force.data() + s * places * n, places > 1 ? static_cast<int>(n) : 0)) break;
+            if (!stepper.step(dt, force.data() + s * abscissae * n, abscissae > 1 ? static_cast<int>(n) : 0)) break;
             stepper.write_derivatives(dt, in_x + s * 4 * n * n, in_force + s * 2 * n * n);
         }
     }
@@ -143,8 +143,8 @@ void roll(BoundRollout& rollout, double dt, nb::handle commands, In<3> increment
           HeldWatch* watch, const std::optional<In<4>>& impulses) {
     ExplicitRollout& core = rollout.core;
     const double* kicks = impulses_of(*rollout.mechanism, impulses, nodes);
-    roll_paths(*rollout.mechanism, static_cast<std::size_t>(core.paths()), core.places(), commands, increments, drift,
-               nodes, [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
+    roll_paths(*rollout.mechanism, static_cast<std::size_t>(core.paths()), core.abscissae(), commands, increments,
+               drift, nodes, [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
                    core.roll(dt, by, dw, more, kicks, to, watch ? watch->of(to) : nullptr);
                });
 }

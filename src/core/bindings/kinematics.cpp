@@ -47,7 +47,7 @@ std::tuple<Out, Out, Out> place_frame(const Links& links, In<2> turned, In<1> sh
         const Placement offset{rotation_at(turned.data()), {shifted(0), shifted(1), shifted(2)}};
         std::vector<Placement> at(count);
         for (std::size_t s = 0; s < rows; ++s) {
-            place(links, q.data() + s * n, at.data());
+            forward_kinematics(links, q.data() + s * n, at.data());
             const Placement frame = at.back() * offset;
             write(frame.rotation, R + 9 * s);
             write(frame.position, p + 3 * s);

@@ -69,21 +69,22 @@ std::tuple<double, bool, bool, bool> glance_at(const Mechanism& mechanism, In<2>
     return {seen.fastest, seen.split, seen.steady, seen.pulled};
 }
 
-bool doubled_steps_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> begins, std::size_t length,
-                         double dt, In<3> again_q, In<3> again_v, double way, double velocity, double little,
-                         double light, double even) {
+bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> begins, std::size_t length, double dt,
+                   In<3> again_q, In<3> again_v, double way, double velocity, double little, double light,
+                   double even) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
-    const std::size_t nodes = q.shape(0), windows = begins.shape(0);
+    const std::size_t nodes = q.shape(0), windows = begins.shape(0), looks = again_q.shape(1);
     for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {nodes, n});
     for (const auto& [array, name] : {std::pair{&again_q, "again_q"}, {&again_v, "again_v"}})
-        require(*array, name, {windows, length / 2, n});
+        require(*array, name, {windows, looks, n});
+    if (looks == 0 || length % looks != 0) throw std::invalid_argument("a window is not of so many like parts");
     for (std::size_t w = 0; w < windows; ++w) {
         if (begins(w) < 0 || static_cast<std::size_t>(begins(w)) + length >= nodes)
             throw std::invalid_argument("a window is beyond the motion");
     }
     nb::gil_scoped_release release;
-    return agree_in_doubled_steps(mechanism, q.data(), v.data(), begins.data(), windows, length, dt, again_q.data(),
-                                  again_v.data(), {way, velocity, little, light, even});
+    return agree_in_windows(mechanism, q.data(), v.data(), begins.data(), windows, length, dt, again_q.data(),
+                            again_v.data(), looks, {way, velocity, little, light, even});
 }
 
 std::tuple<std::int64_t, std::int64_t, std::int64_t> alternation(In<2> v, std::optional<In<2>> u, double counts,
@@ -105,8 +106,8 @@ void register_look(nb::module_& m) {
     m.def("glance", &glance_at, "mechanism"_a, "q"_a, "v"_a, "u"_a, "substeps"_a, "dt"_a);
     m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "dt"_a, nb::kw_only(),
           "even"_a, "looks"_a);
-    m.def("doubled_steps_agree", &doubled_steps_agree, "mechanism"_a, "q"_a, "v"_a, "begins"_a, "length"_a, "dt"_a,
-          "again_q"_a, "again_v"_a, nb::kw_only(), "way"_a, "velocity"_a, "little"_a, "light"_a, "even"_a);
+    m.def("windows_agree", &windows_agree, "mechanism"_a, "q"_a, "v"_a, "begins"_a, "length"_a, "dt"_a, "again_q"_a,
+          "again_v"_a, nb::kw_only(), "way"_a, "velocity"_a, "little"_a, "light"_a, "even"_a);
 }
 
 }  // namespace varpin::border

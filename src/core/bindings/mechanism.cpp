@@ -131,9 +131,9 @@ Constraints constraints_of(const NamedConstraints& named, const std::vector<Body
     std::vector<VectorSum> sums;
     for (const NamedVector& parts : vectors) {
         VectorSum sum;
-        for (const auto& [body, direction, place] : parts) {
+        for (const auto& [body, direction, point] : parts) {
             require_below(body + 1, bodies.size() + 1);
-            sum.parts.push_back({body, {place[0], place[1], place[2]}, direction});
+            sum.parts.push_back({body, {point[0], point[1], point[2]}, direction});
         }
         sums.push_back(sum);
     }

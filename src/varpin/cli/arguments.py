@@ -1,4 +1,4 @@
-"""Words of the command line that several commands share: a robot, its motion, a scene file."""
+"""Arguments that several commands share: a robot, its motion, a scene file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from varpin.support.checks import JointValues, joint_array
 
 
 def add_robot(parser: argparse.ArgumentParser, *, scenes: bool = False) -> None:
-    """The robot by name or file, and the joints to lock."""
+    """Add the robot and the options with which it is loaded."""
     parser.add_argument(
         "robot",
         metavar="ROBOT",
@@ -33,12 +33,12 @@ def add_robot(parser: argparse.ArgumentParser, *, scenes: bool = False) -> None:
     add_robot_options(parser)
 
 
-# What :func:`add_robot_options` adds.
+# Options that :func:`add_robot_options` adds.
 ROBOT_OPTIONS = ("lock", "package_dir", "base", "armature")
 
 
 def add_robot_options(parser: argparse.ArgumentParser) -> None:
-    """How the robot is loaded: which joints are locked, and where its meshes are."""
+    """Add the options with which the robot is loaded: locked joints, meshes, base, armature."""
     parser.add_argument(
         "--lock",
         type=_lock,
@@ -46,22 +46,22 @@ def add_robot_options(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="JOINT=VALUE",
-        help="hold joints still [rad or m]",
+        help="lock joints at positions [rad or m]",
     )
     parser.add_argument(
         "--package-dir",
         action="append",
         metavar="DIR",
-        help="where package:// paths of meshes are looked up; repeatable",
+        help="folder in which package:// paths of meshes are looked up; repeatable",
     )
     parser.add_argument(
         "--base", choices=("planar",), help="put the robot on a base that slides along x and y and turns"
     )
-    add_vector(parser, "armature", "inertia of rotors that the joints feel [kg m^2 or kg]; default: the file's")
+    add_vector(parser, "armature", "rotor inertia reflected to the joints [kg m^2 or kg]; default: the file's")
 
 
 def robot_options(request: argparse.Namespace) -> dict[str, Any]:
-    """What :func:`varpin.load_robot` takes of :func:`add_robot_options`."""
+    """The options of :func:`add_robot_options` as arguments of :func:`varpin.load_robot`."""
     return {
         "package_dirs": request.package_dir,
         "lock": dict(request.lock),
@@ -71,7 +71,7 @@ def robot_options(request: argparse.Namespace) -> dict[str, Any]:
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
-    """Where a motion starts, and what acts on it."""
+    """Add the initial state of a motion, and the forces on it."""
     start = parser.add_argument_group("start")
     add_vector(start, "q0", "initial configuration [rad or m]; default: 0")
     add_vector(start, "v0", "initial velocity [rad/s or m/s]; default: 0")
@@ -80,19 +80,26 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     text = "viscous damping [N m s/rad or N s/m], or 'robot' for that of the robot's description; default: 0"
     add_vector(surroundings, "damping", text, _damping)
     add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
-    add_vector(surroundings, "rest", "where the springs are slack [rad or m]; default: 0")
+    add_vector(surroundings, "rest", "rest positions of the springs [rad or m]; default: 0")
     add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
 
 
 def add_vector(
     group: argparse._ActionsContainer, name: str, text: str, read: Callable[[str], object] | None = None
 ) -> None:
-    """An option of one number for all joints, one for each, or some by name; ``read`` takes one if it takes others."""
+    """Add an option: one number for all joints, one for each, or some by name.
+
+    Args:
+        group: Where to add it.
+        name: Name of the option.
+        text: Its help.
+        read: Conversion of a word, if others than numbers are allowed.
+    """
     group.add_argument(f"--{name}", type=read or _number, nargs="+", metavar="X", help=text)
 
 
 def add_integrator(parser: argparse.ArgumentParser) -> None:
-    """Which integrator to take."""
+    """Add the choice of the integrator."""
     group = parser.add_argument_group("integrator")
     group.add_argument(
         "--integrator",
@@ -101,10 +108,13 @@ def add_integrator(parser: argparse.ArgumentParser) -> None:
         "with 4 where springs are fast for the step, Radau(stages=4) where dampers are faster, Midpoint under noise",
     )
     group.add_argument(
-        "--stages", type=int, metavar="N", help="of Gauss, which it asks for: 1 to 6, of order twice as many"
+        "--stages",
+        type=int,
+        metavar="N",
+        help="stages of Gauss, which it selects: 1 to 6, for an order of twice as many",
     )
     group.add_argument(
-        "--alpha", type=float, metavar="A", help="of Midpoint, which it asks for, in [0, 1]: of second order at 0.5"
+        "--alpha", type=float, metavar="A", help="alpha of Midpoint, which it selects, in [0, 1]: second order at 0.5"
     )
 
 
@@ -112,13 +122,13 @@ def integrator_asked_for(request: argparse.Namespace) -> Integrator:
     """The integrator of the options that :func:`add_integrator` adds.
 
     Raises:
-        InputError: An unknown name, or an option that it does not have.
+        InputError: The name is unknown, or the integrator does not have the option.
     """
-    # An option by itself asks for who has it.
+    # An option without --integrator selects the integrator that has it.
     usual = "Gauss" if request.alpha is None else "Midpoint"
     text = (request.integrator or usual).strip()
     name, bracket, rest = text.partition("(")
-    # runge_kutta_4, RUNGEKUTTA4 and semi-implicit-euler are as good as the names of the classes.
+    # Names are compared by letters and digits alone: runge_kutta_4 and RUNGEKUTTA4 are RungeKutta4.
     plain = {_letters(member): member for member in BY_NAME}
     if _letters(name) not in plain:
         matches = difflib.get_close_matches(_letters(name), plain, n=1)
@@ -141,7 +151,7 @@ def _letters(name: str) -> str:
 
 
 def simulate_words(request: argparse.Namespace, integrator: Integrator, dt: float, steps: int) -> str:
-    """The command line that simulates the motion of ``request`` with an integrator and step."""
+    """The command line that simulates the motion of ``request`` with an integrator and a step [s]."""
     words = ["varpin", "simulate", request.robot, "--integrator", str(integrator), "--dt", repr(dt)]
     words += ["--steps", str(steps)]
     if request.lock:
@@ -160,7 +170,7 @@ def simulate_words(request: argparse.Namespace, integrator: Integrator, dt: floa
 
 
 def _text(value: object) -> str:
-    """A number, numbers or a joint's number as the command line takes them."""
+    """A number, numbers or a joint's number as a word of the command line."""
     if isinstance(value, tuple):
         return f"{value[0]}={_text(value[1])}"
     if isinstance(value, list):
@@ -169,7 +179,7 @@ def _text(value: object) -> str:
 
 
 def add_gravity(group: argparse._ActionsContainer) -> None:
-    """Gravity as a vector, or none."""
+    """Add gravity as a vector, or none."""
     gravity = group.add_mutually_exclusive_group()
     gravity.add_argument(
         "--gravity",
@@ -206,15 +216,15 @@ def _number(word: str) -> float | tuple[str, float]:
 
 
 def _damping(word: str) -> float | tuple[str, float] | str:
-    """As :func:`_number`, or the word for what the robot's description gives."""
+    """As :func:`_number`, or the word ``robot``."""
     return "robot" if word.strip() == "robot" else _number(word)
 
 
 def values_of(option: str, given: Sequence[float | tuple[str, float]] | None) -> JointValues | None:
-    """What an option of :func:`add_vector` says: None if it was not given, one number, several, or some by name.
+    """Value of an option of :func:`add_vector`: None if it was not given, one number, several, or some by name.
 
     Raises:
-        InputError: Names and numbers are mixed, or a name is there twice.
+        InputError: Names and numbers are mixed, or a name is given twice.
     """
     if given is None:
         return None
@@ -271,12 +281,21 @@ def names_scene(word: str) -> bool:
 
 
 def scene_file(request: argparse.Namespace, word: str, *given: str) -> SceneFile:
-    """The scene file, whose outputs stand in for those not asked for; ``given`` are options it leaves no room for."""
+    """Load a scene file. Its outputs replace those that the command line does not set.
+
+    Args:
+        request: The parsed command line.
+        word: Path or name of the scene.
+        *given: The command, then its options that exclude a scene file.
+
+    Raises:
+        InputError: An option that excludes a scene file is given.
+    """
     command, default = given[0], request.parser.parse_args(["robot"]) if len(given) > 1 else None
     for name in given[1:]:
         if getattr(request, name) != getattr(default, name):
             option = name.replace("_", "-") if getattr(request, name) is not False else f"no-{name}"
-            raise InputError(f"--{option} has no place beside a scene file: {command} {word} takes it from the file")
+            raise InputError(f"--{option} cannot be given with a scene file: {command} {word} takes it from the file")
     scene = load_scene(word)
     outputs = scene.spec.outputs
     for name in ("save", "plot", "html", "speed"):

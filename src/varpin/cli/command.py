@@ -1,4 +1,4 @@
-"""The parser, and the way into the commands."""
+"""The parser and the entry point of the commands."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ examples:
 
 
 def _parser() -> tuple[Parser, Mapping[str, Parser]]:
-    """The parser, and those of the commands by name."""
+    """The parser, and the parsers of the commands by name."""
     parser = Parser(
         prog="varpin",
         description="Variational integrators on Pinocchio.",
@@ -82,13 +82,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _request(words: Sequence[str]) -> argparse.Namespace:
-    """What the command line asks for; a mistake in it ends the process with status 2 and one line."""
+    """Parse the command line; a mistake in it ends the process with status 2 and one line."""
     parser, commands = _parser()
     if not words:
         parser.error(f"a command is missing; commands: {', '.join(commands)}")
     command = words[0]
     if command in commands:
-        # Before argparse, which would speak of what is missing instead of what is misspelled.
+        # Checked before argparse, which would report missing arguments instead of misspelled ones.
         known = _options(commands[command])
         if wrong := [word for word in words[1:] if word.startswith("--") and word.partition("=")[0] not in known]:
             commands[command].error(_not_an_option(wrong, known))
@@ -107,7 +107,7 @@ def _options(parser: argparse.ArgumentParser) -> list[str]:
 
 
 def _shielded(word: str) -> str:
-    """``word`` such that argparse takes it for no option: it knows -1 for a number, but not -1e-3 or -inf."""
+    """``word`` in a form that argparse takes for a number: it knows -1, but not -1e-3 or -inf."""
     try:
         float(word)
     except ValueError:
@@ -116,7 +116,7 @@ def _shielded(word: str) -> str:
 
 
 def _not_an_option(words: Sequence[str], known: Sequence[str]) -> str:
-    """What is wrong with words that no option takes, and the options they come closest to."""
+    """A message about unknown options, with similar ones."""
     message = f"unrecognized arguments: {' '.join(word.strip() for word in words)}"
     for word in words:
         name = word.partition("=")[0]

@@ -1,4 +1,4 @@
-"""What the command says: progress, the log and complaints."""
+"""Output of the commands on the console: progress, the log and errors."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from varpin.cli.exits import MISTAKE
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose complaints are one line, which no list of options stands before."""
+    """A parser whose errors are one line, without a list of options."""
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong, and where help is; exit with status 2."""
+        """Print the error and a hint at --help; exit with status 2."""
         self.exit(MISTAKE, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
@@ -32,16 +32,16 @@ def file_size(size: int) -> str:
 
 
 class _Bar:
-    """A progress callback that draws a bar on a terminal and writes a line now and then elsewhere."""
+    """A progress callback that draws a bar on a terminal, and prints a line from time to time elsewhere."""
 
-    PATIENCE = 10.0  # [s] between lines
+    INTERVAL = 10.0  # shortest time between two lines [s]
 
     def __init__(self, console: Console, steps: int, unit: str) -> None:
         self._console = console
         self._unit = unit
         self._bar: Progress | None = None
         self._task: TaskID | None = None
-        self._said = time.monotonic()
+        self._printed = time.monotonic()
         if console.is_terminal:
             columns = (TextColumn("varpin"), BarColumn(), TextColumn(f"{{task.completed}}/{{task.total}} {unit}"))
             self._bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
@@ -61,8 +61,8 @@ class _Bar:
     def __call__(self, done: int, steps: int) -> None:
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, completed=done, total=steps)
-        elif time.monotonic() - self._said >= self.PATIENCE:
-            self._said = time.monotonic()
+        elif time.monotonic() - self._printed >= self.INTERVAL:
+            self._printed = time.monotonic()
             say(self._console, f"{done} of {steps} {self._unit}")
 
 
@@ -70,7 +70,7 @@ class _Bar:
 def progress_bar(
     console: Console, steps: int, *, quiet: bool, unit: str = "steps"
 ) -> Iterator[Callable[[int, int], None]]:
-    """A progress callback that shows on ``console`` how far something is, unless ``quiet``."""
+    """A progress callback that shows progress on ``console``, unless ``quiet``."""
     if quiet:
         yield lambda _done, _steps: None
         return
@@ -91,7 +91,7 @@ class _ConsoleHandler(logging.Handler):
 
 @contextlib.contextmanager
 def logged(console: Console, level: int) -> Iterator[None]:
-    """The library's log from ``level`` on, on ``console`` within this context."""
+    """Print the library's log from ``level`` on to ``console`` within this context."""
     logger, handler = logging.getLogger("varpin"), _ConsoleHandler(console, level)
     logger.addHandler(handler)
     try:
@@ -102,7 +102,7 @@ def logged(console: Console, level: int) -> Iterator[None]:
 
 def complain(console: Console, error: object) -> None:
     """Print an error as one line."""
-    # NumPy breaks the lines of long arrays, and an error is one line.
+    # NumPy breaks lines in long arrays.
     say(console, " ".join(str(error).split()), prefix="varpin: error", style="red")
 
 

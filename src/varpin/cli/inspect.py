@@ -1,4 +1,4 @@
-"""``varpin inspect`` and ``varpin robots``: look into descriptions."""
+"""``varpin inspect`` and ``varpin robots``: report on robot descriptions."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def add_inspect(parser: argparse.ArgumentParser) -> None:
         "that the midpoint integrator's branch guard accepts, and whatever looks wrong. Takes robots that "
         "simulate refuses."
     )
-    # What loading warns of is among the report's own warnings.
+    # The report repeats the warnings of loading.
     parser.set_defaults(run=_inspect, log_level=logging.ERROR)
     add_robot(parser, scenes=True)
-    add_vector(parser, "q", "configuration to look at [rad or m]; default: 0")
-    add_vector(parser, "v", "velocity there [rad/s or m/s]; default: 0")
+    add_vector(parser, "q", "configuration of the report [rad or m]; default: 0")
+    add_vector(parser, "v", "velocity of the report [rad/s or m/s]; default: 0")
     add_gravity(parser)
 
 
@@ -78,7 +78,7 @@ def _inspect(request: argparse.Namespace, _errors: Console) -> int:
 def add_robots(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin robots``."""
     parser.description = (
-        "List the robots that every command takes by name: those that come with varpin, and the fixed-base ones of the "
+        "List the robots that every command takes by name: those bundled with varpin, and the fixed-base ones of the "
         "installed example-robot-data."
     )
     parser.set_defaults(run=_robots, log_level=logging.ERROR)
@@ -90,5 +90,5 @@ def _robots(_request: argparse.Namespace, _errors: Console) -> int:
         add_row(table, name, str(build_robot(name).dof))
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
     console.print(table)
-    say(console, "joints without those that mimic others; --lock holds some still", prefix="")
+    say(console, "joints without mimic joints; --lock locks some of them", prefix="")
     return 0

@@ -1,4 +1,4 @@
-"""Ctrl-C: the first is answered at once, the second does not take away what is being kept, the third ends it all."""
+"""Ctrl-C: the first stops the run and keeps its results, the second waits for files in progress, the third ends all."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _ENDING = "Ctrl-C a third time: ending"
 
 
 class Interrupts:
-    """Handles SIGINT within a ``with`` block, if that is in the main thread.
+    """Handler of SIGINT within a ``with`` block in the main thread.
 
-    Python runs a handler between two of its own instructions, and the core may run for seconds; so a thread says what
-    is going to happen, and the handler makes it happen. Outside :meth:`keeping` every Ctrl-C raises KeyboardInterrupt.
-    Within it the first does, unless files are being :meth:`written`; the second only asks to finish, and the third
-    raises again.
+    Python calls a signal handler between two of its instructions, and a call of the core may last for seconds. A thread
+    therefore prints an answer at once; the handler acts later. Outside :meth:`keeping` every Ctrl-C raises
+    KeyboardInterrupt. Within it the first one does, unless a file is being :meth:`written`; the second one sets
+    ``wanted``, and the third one raises again.
 
     Attributes:
-        wanted: Whether to finish what is being written, and to leave out the rest.
+        wanted: Whether to finish the current file and write no other.
         ended: Whether to write nothing more.
     """
 
@@ -36,13 +36,13 @@ class Interrupts:
         self.wanted = self.ended = False
         self._console = console
         self._keeping = self._writing = False
-        self._heard = self._handled = 0
+        self._received = self._handled = 0
         self._raised = False
         self._undo = contextlib.ExitStack()
 
     def __enter__(self) -> Interrupts:
-        ours = threading.current_thread() is threading.main_thread()
-        if ours and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        main = threading.current_thread() is threading.main_thread()
+        if main and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
             self._listen()
         return self
 
@@ -53,7 +53,7 @@ class Interrupts:
 
     @contextlib.contextmanager
     def keeping(self) -> Iterator[None]:
-        """What is computed in this block is kept if it is interrupted."""
+        """A block whose results are kept if it is interrupted."""
         self._keeping = True
         try:
             yield
@@ -62,7 +62,7 @@ class Interrupts:
 
     @contextlib.contextmanager
     def written(self) -> Iterator[None]:
-        """A file is written in this block, within :meth:`keeping`."""
+        """A block within :meth:`keeping` that writes one file."""
         self._writing = True
         try:
             yield
@@ -70,30 +70,30 @@ class Interrupts:
             self._writing = False
 
     def _listen(self) -> None:
-        ear, mouth = os.pipe()
-        os.set_blocking(mouth, False)
-        thread = threading.Thread(target=self._answer, args=(ear,), daemon=True)
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        thread = threading.Thread(target=self._answer, args=(reader,), daemon=True)
         thread.start()
-        self._undo.callback(os.close, ear)
+        self._undo.callback(os.close, reader)
         self._undo.callback(thread.join)
-        self._undo.callback(os.close, mouth)
-        before = signal.set_wakeup_fd(mouth, warn_on_full_buffer=False)
+        self._undo.callback(os.close, writer)
+        before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         self._undo.callback(signal.set_wakeup_fd, before)
         self._undo.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, self._handle))
 
-    def _answer(self, ear: int) -> None:
-        """Answer each SIGINT as soon as it comes, whatever the main thread is busy with."""
-        while number := os.read(ear, 1):
+    def _answer(self, reader: int) -> None:
+        """Print an answer to each SIGINT at once, even while the main thread is in the core."""
+        while number := os.read(reader, 1):
             if number[0] == signal.SIGINT:
-                self._heard += 1
+                self._received += 1
                 answer = _STOPPING
                 if self._keeping:
-                    answer = {1: _KEEPING, 2: _WAIT}.get(self._heard, _ENDING)
+                    answer = {1: _KEEPING, 2: _WAIT}.get(self._received, _ENDING)
                 say(self._console, answer)
 
     def _handle(self, _number: int, _frame: FrameType | None) -> None:
-        # Several within one call of the core come as one.
-        self._handled = max(self._handled + 1, self._heard)
+        # Python handles several signals within one call of the core as one.
+        self._handled = max(self._handled + 1, self._received)
         if self._keeping:
             self.ended = self._handled > 2
             self.wanted = self.ended or self._handled == 2 or self._writing

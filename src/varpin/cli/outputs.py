@@ -1,4 +1,4 @@
-"""Files that a command makes."""
+"""Files that a command writes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from varpin.trajectory import Trajectory
 
 
 def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
-    """Options for the files that can be made of a motion."""
+    """Add options for the files that a command writes."""
     outputs = parser.add_argument_group("outputs")
     outputs.add_argument("--save", type=Path, metavar="NPZ", help=f"write the {what}, for {what.title()}.load")
     outputs.add_argument("--plot", type=Path, metavar="PNG", help="draw an overview, as png, pdf or svg")
@@ -32,23 +32,23 @@ def add_outputs(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def add_replay_options(outputs: argparse._ActionsContainer) -> None:
-    """Options for the files that show a motion."""
+    """Add options for files that show a motion."""
     outputs.add_argument("--html", type=Path, metavar="HTML", help="write a replay that any browser opens")
     outputs.add_argument(
-        "--video", type=Path, metavar="MP4", help="film the replay, as mp4 or gif; needs varpin[video]"
+        "--video", type=Path, metavar="MP4", help="write the replay as a video, mp4 or gif; needs varpin[video]"
     )
     outputs.add_argument("--trace", nargs="+", default=[], metavar="FRAME", help="draw the paths of frames in it")
     outputs.add_argument(
         "--speed",
         type=float,
         metavar="X",
-        help="of the replay; 0.1 is ten times slower; default: the scene file's, or true speed",
+        help="speed of the replay; 0.1 is ten times slower; default: the scene file's, or 1",
     )
 
 
 @dataclass(frozen=True)
 class Output:
-    """A file to make of the trajectory."""
+    """A file to write from the trajectory."""
 
     path: Path
     write: Callable[[Robot, Trajectory], None]
@@ -58,27 +58,27 @@ Marks = Callable[[float], Mapping[str, Any]]
 
 
 def outputs_of(request: argparse.Namespace, marks: Marks | None = None) -> list[Output]:
-    """The files asked for, in the order of their worth; what writes them is imported now and not after the run.
+    """The requested files, the most important first. Their writers are imported now, so that errors precede the run.
 
     Args:
-        request: What was asked for.
-        marks: What a replay is to show of the task, for a motion of some duration [s].
+        request: The parsed command line.
+        marks: Function from the duration [s] of a motion to the marks of the task in its replay.
 
     Raises:
-        FileError: One of them cannot be written.
-        InputError: Two are the same file, or a format is unknown.
-        MissingDependency: A film needs what is not installed.
+        FileError: A file cannot be written.
+        InputError: Two files are the same, or a format is unknown.
+        MissingDependency: A package or program for videos is not installed.
     """
     outputs = []
     if request.save is not None:
         outputs.append(_record(writable(request.save)))
     if request.plot is not None:
         outputs.append(_figure(writable(request.plot)))
-    return _apart([*outputs, *replays_of(request, marks)])
+    return _distinct([*outputs, *replays_of(request, marks)])
 
 
 def replays_of(request: argparse.Namespace, marks: Marks | None = None) -> list[Output]:
-    """The page and the film asked for; errors as for :func:`outputs_of`."""
+    """The requested page and video; errors as for :func:`outputs_of`."""
     outputs = []
     for path, film in ((request.html, False), (request.video, True)):
         if path is not None:
@@ -88,10 +88,10 @@ def replays_of(request: argparse.Namespace, marks: Marks | None = None) -> list[
                 _require_ending("--html", path, (".html", ".htm"))
             speed = positive("--speed", 1.0 if request.speed is None else request.speed, "1")
             outputs.append(_replay(writable(path), speed, request.trace, film, marks))
-    return _apart(outputs)
+    return _distinct(outputs)
 
 
-def _apart(outputs: list[Output]) -> list[Output]:
+def _distinct(outputs: list[Output]) -> list[Output]:
     paths = [output.path.resolve() for output in outputs]
     for path in paths:
         if paths.count(path) > 1:
@@ -138,9 +138,9 @@ def _replay(path: Path, speed: float, frames: Sequence[str], film: bool, marks: 
 def write_all(
     errors: Console, files: Mapping[Path, Callable[[], object]], interrupts: Interrupts
 ) -> tuple[list[Path], int]:
-    """Write files, and complain of those that cannot be; the others, and the exit status.
+    """Write files, and print an error for each that cannot be written; the others, and the exit status.
 
-    A Ctrl-C in the meantime lets the file at hand be finished, and leaves out the rest.
+    Ctrl-C lets the current file be finished and leaves out the rest.
     """
     written: list[Path] = []
     status = 0
@@ -160,7 +160,7 @@ def write_all(
 
 
 def folder_at(path: Path) -> Path:
-    """``path`` as a folder, made if need be."""
+    """``path`` as a folder, created if necessary."""
     folder = path.expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""``varpin replay``: show a motion that was saved."""
+"""``varpin replay``: show a saved motion."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin replay``."""
     parser.description = (
         "Show a motion that simulate or solve has saved: in a window of the web browser, until Ctrl-C; or as a page "
-        "or a film."
+        "or a video."
     )
     parser.set_defaults(run=_replay, log_level=logging.WARNING)
     parser.add_argument("motion", type=Path, metavar="NPZ", help="a trajectory or a solution, as --save writes it")
@@ -39,11 +39,11 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
         "--robot",
         metavar="ROBOT",
         help="path of a URDF file, or name of a robot; or a scene file (TOML), or name of a scene, whose task is shown "
-        "too; default: the robot by whose name the motion goes",
+        "too; default: the robot named in the motion",
     )
     add_robot_options(parser)
     outputs = parser.add_argument_group("outputs")
-    outputs.add_argument("--open", action="store_true", help="open a window; what is done if no file is asked for")
+    outputs.add_argument("--open", action="store_true", help="open a window; the default without an output file")
     add_replay_options(outputs)
     outputs.add_argument("--ghost", type=Path, metavar="NPZ", help="a second motion of the robot, drawn translucent")
     outputs.add_argument("--frames", nargs="+", default=[], metavar="FRAME", help="draw frames as triads")
@@ -54,7 +54,7 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
 def _replay(request: argparse.Namespace, errors: Console) -> int:
     asked = request.html is not None or request.video is not None
     if asked and request.open:
-        raise InputError("--open shows a window, and --html and --video write files: ask for one or the other")
+        raise InputError("--open shows a window, and --html and --video write files: give one or the other")
     first = _motion(request.motion)
     robot, scene = _robot(request, first)
     motion = _motion(request.motion, robot)
@@ -97,18 +97,18 @@ def _window(
 
 
 def _motion(path: Path, robot: Robot | None = None) -> Trajectory:
-    """The trajectory in a file of a trajectory or of a solution."""
+    """The trajectory in a file, which contains a trajectory or a solution."""
     source = path_like("NPZ", path)
     solution = read_format(source).startswith("varpin.solution/")
     return solution_trajectory(source, robot) if solution else Trajectory.load(source, robot)
 
 
 def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, SceneFile | None]:
-    """The robot that the motion is of, and the scene, if the robot is that of one."""
+    """The robot of the motion, and its scene if ``--robot`` names one."""
     if request.robot is not None and names_scene(request.robot):
         if request.lock or request.package_dir or request.base or request.armature:
             raise InputError(
-                "--lock, --package-dir, --base and --armature have no place beside a scene file, which has its own"
+                "--lock, --package-dir, --base and --armature cannot be given with a scene file, which has its own"
             )
         scene = load_scene(request.robot)
         return scene.robot, scene
@@ -119,13 +119,13 @@ def _robot(request: argparse.Namespace, motion: Trajectory) -> tuple[Robot, Scen
         if request.robot is not None:
             raise
         raise InputError(
-            f"{request.motion} is of robot {motion.robot!r}, which is no name that varpin knows: give its URDF file, "
-            "or its scene file, as --robot"
+            f"{request.motion} is of robot {motion.robot!r}, a name that varpin does not know: give its URDF file or "
+            "its scene file as --robot"
         ) from error
     missing = [joint for joint in robot.joint_names if joint not in motion.joint_names]
     if missing and set(motion.joint_names) < set(robot.joint_names):
         raise FileError(
-            f"{request.motion} holds no motion of {', '.join(missing)}: lock them as they were, "
+            f"{request.motion} has no motion of {', '.join(missing)}: lock them as they were, "
             f"--lock {' '.join(f'{joint}=VALUE' for joint in missing)}, or give the scene file as --robot"
         )
     return robot, None

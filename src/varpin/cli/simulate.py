@@ -36,11 +36,11 @@ from varpin.support.checks import count, positive
 from varpin.support.tables import WIDTH, add_row, facts
 from varpin.trajectory import Trajectory
 
-# More steps than anyone can hold in memory, said before NumPy says it in its own words.
+# Largest number of steps; more do not fit into memory.
 MOST_STEPS = 10**9
-# The step where nothing is said of it [s].
+# Default time step [s].
 DT = 1e-3
-# Options that a scene file leaves no room for.
+# Options that exclude a scene file.
 _OF_MOTIONS = (
     *(*ROBOT_OPTIONS, "dt", "tolerance", "duration", "steps", "integrator", "alpha", "stages"),
     *("q0", "v0", "gravity", "damping", "stiffness", "rest", "torque"),
@@ -50,9 +50,9 @@ _OF_MOTIONS = (
 def add_simulate(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin simulate``."""
     parser.description = (
-        "Integrate a robot in time with a variational integrator; or a scene file, which says all of it itself. Of "
-        "numbers that belong to joints, one alone is taken for all of them, and JOINT=VALUE for those that it names. "
-        "Ctrl-C and a failed step keep what was computed before."
+        "Integrate a robot, or a scene file, in time with a variational integrator. An option with numbers of joints "
+        "takes one number for all joints, one for each, or JOINT=VALUE for some. Ctrl-C and a failed step keep the "
+        "motion up to there."
     )
     parser.set_defaults(run=_simulate, log_level=logging.WARNING)
     add_robot(parser, scenes=True)
@@ -61,8 +61,8 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
         "--tolerance",
         type=float,
         metavar="E",
-        help="the largest error in q allowed [rad or m], in place of --dt: the cheapest step, and integrator "
-        "if none is given, that keep to it are found out and taken",
+        help="largest allowed error in q [rad or m], instead of --dt: selects the cheapest step that meets it, and the "
+        "integrator if none is given",
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument(
@@ -105,7 +105,7 @@ def _run(
     run: Callable[[Callable[[int, int], None]], Trajectory],
     outputs: list[Output] | None = None,
 ) -> int:
-    """Simulate, and write and print what came out, a part of it if that is all."""
+    """Simulate; write and print the result, or the part before an interruption or failure."""
     outputs = outputs_of(request) if outputs is None else outputs
     robot = scene.robot
     frame_names("--trace", [robot], request.trace)
@@ -144,7 +144,7 @@ def _duration(request: argparse.Namespace) -> float:
 
 
 def _steps(request: argparse.Namespace) -> int | None:
-    """The number of steps; None where a tolerance decides."""
+    """The number of steps; None with a tolerance."""
     if request.tolerance is not None:
         positive("--tolerance", request.tolerance, "rad or m")
         for option in ("dt", "steps"):
@@ -160,12 +160,12 @@ def _steps(request: argparse.Namespace) -> int | None:
     else:
         steps = count("--steps", request.steps, 1)
     if steps > MOST_STEPS:
-        raise InputError(f"{steps} steps or more are asked for; a run has {MOST_STEPS} at most")
+        raise InputError(f"{steps} steps are too many; a run has {MOST_STEPS} at most")
     return steps
 
 
 def _summary(trajectory: Trajectory, asked: int | None, wall_time: float, driven: bool, files: Iterable[Path]) -> Table:
-    """What a run was, took and made."""
+    """A table of a run: its settings, work, result and files."""
     table = facts(f"{trajectory.robot}: {trajectory.integrator}")
     statistics, steps = trajectory.statistics, trajectory.steps
     of = f" of {asked}" if asked is not None and steps < asked else ""
@@ -177,7 +177,7 @@ def _summary(trajectory: Trajectory, asked: int | None, wall_time: float, driven
             table,
             "estimated error in q",
             f"{accuracy.error:.2g} rad or m{met} within {accuracy.tolerance:g}; "
-            f"finding out took {accuracy.search_steps} steps",
+            f"the search took {accuracy.search_steps} steps",
             style="" if accuracy.met else "bold yellow",
         )
     if steps:

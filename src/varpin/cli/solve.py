@@ -27,19 +27,21 @@ from varpin.support.tables import WIDTH, add_row, facts
 def add_solve(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin solve``."""
     parser.description = (
-        "Find the motion of least cost that a scene file asks for, by S-DDP. Ctrl-C keeps the best motion so far; "
-        "with --resume a saved solution goes on as if it had not stopped."
+        "Find the motion of least cost of a scene file by S-DDP. Ctrl-C keeps the best motion so far; with --resume a "
+        "saved solution continues as if it had not stopped."
     )
     parser.set_defaults(run=_solve, log_level=logging.WARNING)
     parser.add_argument("scene", metavar="SCENE", help="path of a scene file (TOML), or name of a scene of varpin")
-    parser.add_argument("--resume", type=Path, metavar="NPZ", help="go on from a solution that --save wrote")
-    parser.add_argument("--max-iterations", type=int, metavar="N", help="at most; default: the scene's, or 100")
+    parser.add_argument("--resume", type=Path, metavar="NPZ", help="continue from a solution that --save wrote")
+    parser.add_argument(
+        "--max-iterations", type=int, metavar="N", help="largest number of iterations; default: the scene's, or 100"
+    )
     parser.add_argument(
         "--true-cost",
         type=float,
         metavar="PART",
-        help="halve the scene's step until the plan's cost on the continuous system is this close to what the plan "
-        "says: 0.01 for a percent",
+        help="halve the scene's step until the plan's cost and its cost on the continuous system differ by less than "
+        "this share: 0.01 for a percent",
     )
     add_outputs(parser, "solution")
 

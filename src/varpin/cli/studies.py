@@ -22,9 +22,9 @@ from varpin.support.tables import WIDTH, add_row, table_of
 def add_tradeoff(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin tradeoff``."""
     parser.description = (
-        "Run a robot's motion with every integrator over many steps, and print and write their errors against an "
-        "accurate reference, and their wall times. What is in the folder already is not run again, so an interrupted "
-        "measurement goes on where it stopped."
+        "Run a robot's motion with every integrator and many time steps. Print and write errors against an accurate "
+        "reference, and wall times. Runs recorded in the folder are not repeated, so that an interrupted "
+        "measurement continues where it stopped."
     )
     parser.set_defaults(run=_tradeoff, log_level=logging.WARNING)
     add_robot(parser)
@@ -32,7 +32,9 @@ def add_tradeoff(parser: argparse.ArgumentParser) -> None:
         "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
     )
     parser.add_argument("--dt", type=float, nargs="+", metavar="S", help="time steps [s]; default: 0.04 and its halves")
-    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="of each run; default: %(default)d")
+    parser.add_argument(
+        "--repeats", type=int, default=3, metavar="N", help="repetitions of each run; default: %(default)d"
+    )
     add_motion(parser)
     outputs = parser.add_argument_group("outputs")
     outputs.add_argument(
@@ -69,7 +71,7 @@ def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
         for run in record.runs:
             add_row(table, *cells(record, run, run in front), style="bold" if run in front else "")
         console.print(table)
-        say(console, f"errors are against {record.reference}, good to {record.reference_error:.1e}", prefix="")
+        say(console, f"errors are against {record.reference}, accurate to {record.reference_error:.1e}", prefix="")
         for path in files:
             say(console, str(path), prefix="written")
     return INTERRUPTED if record.missing else 0
@@ -78,14 +80,14 @@ def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
 def add_advise(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin advise``."""
     parser.description = (
-        "Find the cheapest integrator and step that keep the error in q at the end of a robot's motion below a "
-        "tolerance, or the most accurate ones within a time, from short runs."
+        "Find, from short runs, the cheapest integrator and step that keep the error in q at the end of a robot's "
+        "motion below a tolerance, or the most accurate ones within a wall time."
     )
     parser.set_defaults(run=_advise, log_level=logging.WARNING)
     add_robot(parser)
-    wish = parser.add_mutually_exclusive_group(required=True)
-    wish.add_argument("--tolerance", type=float, metavar="E", help="the error to keep below [rad or m]")
-    wish.add_argument("--budget", type=float, metavar="S", help="the wall time to keep to [s]")
+    goal = parser.add_mutually_exclusive_group(required=True)
+    goal.add_argument("--tolerance", type=float, metavar="E", help="largest allowed error in q [rad or m]")
+    goal.add_argument("--budget", type=float, metavar="S", help="largest allowed wall time [s]")
     parser.add_argument(
         "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
     )
@@ -119,8 +121,8 @@ def _advise(request: argparse.Namespace, _errors: Console) -> int:
     console.print(table)
     say(console, f"(found in {advice.calibration:.2g} s)", prefix="")
     if folder is not None:
-        wish = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"
-        title = f"{scene.robot.name}: an integrator for {request.duration:g} s and {wish}"
+        goal = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"
+        title = f"{scene.robot.name}: an integrator for {request.duration:g} s and {goal}"
         for path in write_advice(folder, advice, title):
             say(console, str(path), prefix="written")
     return 0 if advice.reached else STEP_FAILED
@@ -130,13 +132,13 @@ def add_paper(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin paper``."""
     parser.description = (
         "Run the experiments of the paper on stochastic variational integrators and write tables (CSV), figures (PNG) "
-        "and a report (HTML) that holds each of its claims against what came out. What is in the folder already is not "
-        "computed again, so an interrupted run goes on where it stopped."
+        "and a report (HTML) that compares each of its claims with the measured result. Results in the folder are not "
+        "computed again, so that an interrupted run continues where it stopped."
     )
     parser.set_defaults(run=_paper, log_level=logging.ERROR)
     parser.add_argument("--quick", action="store_true", help="fewer time steps and one setting: about a minute")
     parser.add_argument(
-        "--out", type=Path, default=Path("paper"), metavar="FOLDER", help="where to write; default: %(default)s"
+        "--out", type=Path, default=Path("paper"), metavar="FOLDER", help="output folder; default: %(default)s"
     )
     parser.add_argument("--quiet", action="store_true", help="print nothing but the report's path")
 
@@ -159,9 +161,9 @@ def _paper(request: argparse.Namespace, errors: Console) -> int:
 def add_extremes(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin extremes``."""
     parser.description = (
-        "Run a robot's motions where it is hard with every integrator, and judge each by independent checks: accurate; "
-        "degraded, and varpin says so; refused; stopped; or silent wrong, which is a fault of varpin's. Exit status 1 "
-        "if anything is silent wrong."
+        "Run difficult motions of a robot with every integrator, and judge each by independent checks: accurate; "
+        "degraded with a warning; refused; stopped; or silent wrong, which is a bug of varpin. Exit status 1 if "
+        "anything is silent wrong."
     )
     parser.set_defaults(run=_extremes, log_level=logging.CRITICAL)
     add_robot(parser)
@@ -171,7 +173,7 @@ def add_extremes(parser: argparse.ArgumentParser) -> None:
 
 
 def _extremes(request: argparse.Namespace, errors: Console) -> int:
-    from varpin.show import extremes_report as report  # noqa: PLC0415 - most commands have no use for it
+    from varpin.show import extremes_report as report  # noqa: PLC0415 - most commands do not need it
     from varpin.study.extremes import Kind, check_robot  # noqa: PLC0415
 
     robot = load_robot(request.robot, **robot_options(request))

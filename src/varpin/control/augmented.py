@@ -107,6 +107,7 @@ class _Rounds:
         self.check = bool(self.options.pop("check", True))
         self.progress = self.options.pop("progress", None)
         self.controls = self.options.pop("controls", None)
+        self.states = self.options.pop("states", None)
         self.resumed: Solution | None = self.options.pop("resume", None)
         self.tolerance = self.options.pop("tolerance", 1e-7)
         self.most = count("max_iterations", self.options.pop("max_iterations", _MOST_ITERATIONS))
@@ -135,6 +136,7 @@ class _Rounds:
             options: dict[str, Any] = dict(self.options)
             if resume is None:
                 options["controls"] = self.controls if begun.round == 0 else found
+                options["states"] = self.states if begun.round == 0 else None
             else:
                 options["resume"] = replace(resume, problem=problem)
                 known -= done
@@ -171,7 +173,13 @@ class _Rounds:
         zeros = [np.zeros(item.shape) for item in self.bound]
         plain = penalized(self.problem, zeros, np.zeros(len(self.bound)), zeros)
         first = self.search(
-            plain, self.controls, tolerance=self.tolerance, max_iterations=0, check=False, **self.options
+            plain,
+            self.controls,
+            tolerance=self.tolerance,
+            max_iterations=0,
+            check=False,
+            states=self.states,
+            **self.options,
         )
         cost = abs(first.cost) or 1.0
         weights = np.array([cost / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
@@ -185,6 +193,8 @@ class _Rounds:
             raise InputError(f"resume must be a Solution, got {type(resumed).__name__}")
         if self.controls is not None:
             raise InputError("resume goes on from the solution's own controls: leave out either controls or resume")
+        if self.states is not None:
+            raise InputError("resume goes on from the solution's own states: leave out either states or resume")
         difference = self.problem.differs(resumed.problem)
         if difference:
             raise InputError(f"resume: the solution is of another problem: {difference}; give it as controls")
@@ -210,8 +220,8 @@ class _Rounds:
         if resumed is None or resumed.search is None or resumed.multipliers is None:
             return None
         begun = resumed.multipliers.iterations
-        own = [replace(item, index=item.index - begun) for item in resumed.search.history[begun:]]
-        return replace(resumed, search=replace(resumed.search, history=tuple(own)))
+        history = [replace(item, index=item.index - begun) for item in resumed.search.history[begun:]]
+        return replace(resumed, search=replace(resumed.search, history=tuple(history)))
 
     def _report(self, known: int, last: int, item: Iteration, motion: Trajectory) -> None:
         item = replace(item, index=item.index + known)

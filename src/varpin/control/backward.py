@@ -78,6 +78,12 @@ class Plan:
         return np.where(held, 0.0, self.gradient)
 
 
+def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
+    """X (N + 1, 2n): (q, p) or (q, v)."""
+    second = trajectory.p if problem.integrator.variational else trajectory.v
+    return np.hstack([trajectory.q, second])
+
+
 def noise_shares(
     problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, processes: NDArray[np.bool_] | None = None
 ) -> Floats:
@@ -174,7 +180,7 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
     it most. Where they do not settle, the best pass of them is taken, or the place that the steps have come to.
     """
     problem = along.problem
-    if not isinstance(problem, PenalizedProblem) or len(along.blocks) > 1:
+    if not (isinstance(problem, PenalizedProblem) and problem.passes) or len(along.blocks) > 1:
         return _within_limits(along, regularization, curvature)
     rows = _Rows(along, problem)
     held, best, least, last = rows.begun, None, 0.0, None
@@ -211,7 +217,7 @@ class _Rows:
         self.of_nodes = problem.penalties
         self.of_rate = tuple(item for item in problem.all_penalties if item.bound.of_controls)
         self.penalties = (*self.of_nodes, *self.of_rate)
-        self.own = problem.expand_own(motion)
+        self.unpenalized = problem.expand_cost(motion)
         self.signed = [item.signed(item.bound.value(q, v, u)) for item in self.penalties]
         self.begun = [item.held(s) for item, s in zip(self.penalties, self.signed, strict=True)]
         self.jacobians = [item.bound.jacobian(q, v) for item in self.of_nodes]
@@ -232,7 +238,7 @@ class _Rows:
         passing = copy(self.whole)
         vars(passing).pop("model", None)
         count = len(self.of_nodes)
-        passing.running = self.problem.with_held(self.own, self.signed[:count], self.jacobians, held[:count])
+        passing.running = self.problem.with_held(self.unpenalized, self.signed[:count], self.jacobians, held[:count])
         rate = self.problem.rate
         if isinstance(rate, PenalizedRate):
             u = self.whole.trajectory.u[:: self.problem.hold]

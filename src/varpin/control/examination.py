@@ -172,7 +172,7 @@ def _at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats 
     """Rows of an inequality of states at the start, which no plan can change; None for other constraints."""
     if bound.of_controls or bound.source.equality:
         return None
-    q, v = (np.tile(own, (problem.steps + 1, 1)) for own in (problem.q0, problem.v0))
+    q, v = (np.tile(state, (problem.steps + 1, 1)) for state in (problem.q0, problem.v0))
     c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
     return c
 
@@ -247,14 +247,14 @@ def _between(solution: Solution) -> list[Finding]:
     motion = kept
     found = []
     fine = problem.constraints_on(dt, problem.steps * PARTS, problem.hold * PARTS)
-    for bound, whole, own in zip(fine, problem.bound_constraints, solution.constraints, strict=True):
+    for bound, whole, record in zip(fine, problem.bound_constraints, solution.constraints, strict=True):
         if bound.of_controls or bound.source.equality:
             continue
         c = bound.value(motion.q, motion.v, motion.u)
         # Of what margins add, that of the node before.
-        c = c + (own.values - whole.value(solution.trajectory.q, solution.trajectory.v, solution.trajectory.u)).repeat(
-            PARTS, axis=0
-        )
+        c = c + (
+            record.values - whole.value(solution.trajectory.q, solution.trajectory.v, solution.trajectory.u)
+        ).repeat(PARTS, axis=0)
         outside = _at_start(problem, whole)
         if outside is not None:
             # What begins outside is so until the first node.
@@ -264,7 +264,7 @@ def _between(solution: Solution) -> list[Finding]:
             found.append(
                 Finding(
                     "constraints between nodes",
-                    f"{own.label} holds at the nodes, and between them {bound.rows[row]} is violated by "
+                    f"{record.label} holds at the nodes, and between them {bound.rows[row]} is violated by "
                     f"{c[place, row]:.2g} {bound.unit} at t = {bound.times[place]:.4g} s: a bound that is as much "
                     "narrower, or a smaller dt, keeps it there, too",
                 )

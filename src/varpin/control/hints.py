@@ -101,17 +101,17 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Limits of joints that look like degrees."""
     turning = _turning(problem.scene.robot)
-    for own in problem.constraints:
-        if not isinstance(own, WithinJointLimits):
+    for limits in problem.constraints:
+        if not isinstance(limits, WithinJointLimits):
             continue
         # Those of the robot's description are in radians, however wide.
-        given = np.isfinite(own.limits) & (own.limits != np.array(own.robot.position_limits))
-        wide = np.where(given, np.abs(own.limits), 0.0).max(axis=0) * turning
+        given = np.isfinite(limits.limits) & (limits.limits != np.array(limits.robot.position_limits))
+        wide = np.where(given, np.abs(limits.limits), 0.0).max(axis=0) * turning
         joint = int(np.argmax(wide))
         if wide[joint] > _TURNS:
             yield Finding(
                 "limits in degrees",
-                f"{own.label} lets {own.robot.joint_names[joint]} turn to {wide[joint]:.4g} rad, "
+                f"{limits.label} lets {limits.robot.joint_names[joint]} turn to {wide[joint]:.4g} rad, "
                 f"{wide[joint] / (2.0 * np.pi):.0f} turns: limits are in radians, np.deg2rad makes them of degrees",
             )
 
@@ -134,35 +134,35 @@ def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
                 f"{abs(end[joint]) / (2.0 * np.pi):.0f} turns: angles are in radians, np.deg2rad makes them of degrees",
             )
             continue
-        for own in problem.constraints:
-            if not isinstance(own, WithinJointLimits):
+        for limits in problem.constraints:
+            if not isinstance(limits, WithinJointLimits):
                 continue
-            beyond = np.maximum(end - own.limits[1], own.limits[0] - end)
+            beyond = np.maximum(end - limits.limits[1], limits.limits[0] - end)
             joint = int(np.argmax(beyond))
             if beyond[joint] > _SAME:
                 yield Finding(
                     "goal outside constraints",
                     f"the terminal TrackingCost wants {robot.joint_names[joint]} {beyond[joint]:.4g} rad or m outside "
-                    f"{own.label}, where the plan will not end",
+                    f"{limits.label}, where the plan will not end",
                 )
 
 
 def _overlaps(problem: OptimalControlProblem, bound: BoundConstraint) -> Iterator[Finding]:
     """Pairs of bodies that are too close in every posture."""
-    own = bound.source
-    if not isinstance(own, KeepClear):
+    constraint = bound.source
+    if not isinstance(constraint, KeepClear):
         return
     robot = problem.scene.robot
     shares = np.random.default_rng(0).random((_POSTURES, robot.dof))
     low, high = _range(robot)
     q = low + shares * (high - low)
     q[0] = problem.q0
-    missing = own.missing(q, bound.times[0])
+    missing = constraint.missing(q, bound.times[0])
     least = missing.min(axis=0)
     for pair in np.flatnonzero(least > 0.0):
         yield Finding(
             "pair always too close",
-            f"KeepClear: {own.pairs[pair]} are too close by {least[pair]:.2g} m or more in each of {_POSTURES} "
+            f"KeepClear: {constraint.pairs[pair]} are too close by {least[pair]:.2g} m or more in each of {_POSTURES} "
             "postures, so hardly any plan keeps them apart. A link is taken for a capsule, which holds more than the "
             "link: leave it out with links=, give it a smaller one with capsules=, or move the obstacle",
         )

@@ -69,10 +69,10 @@ def linear_steps(
     samples = len(problem.rule)
     of_sample = hessian.reshape(-1, samples, x + m, x + m) if len(hessian) > 1 else hessian[:, None]
     for s, (D, weight) in enumerate(zip(_sampled(problem, found), problem.rule[:, 0], strict=True)):
-        own = of_sample[:, s if of_sample.shape[1] > 1 else 0]
+        curvature = of_sample[:, s if of_sample.shape[1] > 1 else 0]
         across = weight * np.swapaxes(D, 1, 2)
         g[1:] += (across @ gradient[s::samples, :, None])[:, :, 0]
-        H[1:] += across @ (own @ D)
+        H[1:] += across @ (curvature @ D)
     if len(rate):
         change = np.concatenate([np.zeros((m, x)), -np.eye(m), np.eye(m)], axis=1)
         change = np.stack([np.where(np.arange(x + 2 * m) < x + m, 0.0, change), *[change] * N])
@@ -92,9 +92,9 @@ def _sampled(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]
     after = np.concatenate([found.A, found.begin, found.end], axis=2)
     parts = []
     for D, share in zip(at_samples(problem.rule, after, found.velocity), problem.places, strict=True):
-        own = np.zeros((len(D), m, x + 2 * m))
-        own[:, :, x : x + m], own[:, :, x + m :] = (1.0 - share) * np.eye(m), share * np.eye(m)
-        parts.append(np.concatenate([D, own], axis=1))
+        of_controls = np.zeros((len(D), m, x + 2 * m))
+        of_controls[:, :, x : x + m], of_controls[:, :, x + m :] = (1.0 - share) * np.eye(m), share * np.eye(m)
+        parts.append(np.concatenate([D, of_controls], axis=1))
     return parts
 
 
@@ -109,8 +109,8 @@ def at_samples(rule: Floats, J: Floats, velocity: Floats) -> list[Floats]:
     before[:, :, :x] = np.eye(x)
     # Of (q, v) at the nodes before and after a step.
     nodes = []
-    for end, own in enumerate((before, J)):
-        nodes += [own[:, :n], velocity[end : N + end] @ own if len(velocity) else own[:, n:]]
+    for end, slopes in enumerate((before, J)):
+        nodes += [slopes[:, :n], velocity[end : N + end] @ slopes if len(velocity) else slopes[:, n:]]
     parts = []
     for row in rule:
         D = np.zeros((N, x, size))

@@ -80,12 +80,12 @@ def noise_gradient(
             # Every other step begins at a moved state, and the node after it is where that leads.
             shares = np.empty(N)
             for first in range(min(2, N)):
-                own = slice(first, N, 2)
+                rows = slice(first, N, 2)
                 dx, du = np.zeros((N + 1, 2 * n)), np.zeros((N, m))
-                dx[:-1][own], du[own] = moved[: 2 * n], moved[2 * n :]
-                dx[1:][own] = here.J[own] @ moved
+                dx[:-1][rows], du[rows] = moved[: 2 * n], moved[2 * n :]
+                dx[1:][rows] = here.J[rows] @ moved
                 near = _steps_of(problem, _moved(trajectory, dx, du, slopes, variational), processes)
-                shares[own] = _shares(problem, near, W, C)[own]
+                shares[rows] = _shares(problem, near, W, C)[rows]
             change.append(shares)
         found[:, c] = (change[0] - change[1]) / (2.0 * shift[c])
     # The end's own Hessian depends on where it is, too.
@@ -136,14 +136,14 @@ def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory, processes:
     hessian = problem.expand_running(trajectory).hessian
     of_sample = hessian.reshape(-1, samples, x + m, x + m) if len(hessian) > 1 else hessian[:, None]
     cost, kicked = np.zeros((N, x + m, x + m)), np.zeros((N, x, x))
-    own = np.zeros((N, m, x + m))
-    own[:, :, x:] = np.eye(m)
+    of_controls = np.zeros((N, m, x + m))
+    of_controls[:, :, x:] = np.eye(m)
     after = np.broadcast_to(np.eye(x), (N, x, x))
     nothing = rule.copy()
     nothing[:, [1, 2, 5, 6]] = 0.0
     for s, (D, P) in enumerate(zip(at_samples(rule, J, velocity), at_samples(nothing, after, velocity), strict=True)):
         H = of_sample[:, s if of_sample.shape[1] > 1 else 0]
-        whole = np.concatenate([D, own], axis=1)
+        whole = np.concatenate([D, of_controls], axis=1)
         weight = h * rule[s, 0]
         cost += weight * np.swapaxes(whole, 1, 2) @ H @ whole
         if nothing[s, 1:].any():
@@ -207,16 +207,16 @@ def _values(
 def _covariances(problem: OptimalControlProblem, steps: _Steps, feedback: Feedback) -> Floats:
     """The covariances (N + 1, 2n + m, 2n + m) of (x, u) with which steps begin, and of the end."""
     N, x, m = problem.steps, steps.J.shape[1], problem.scene.controls
-    C, own = np.zeros((N + 1, x + m, x + m)), np.zeros((x + m, x + m))
+    C, covariance = np.zeros((N + 1, x + m, x + m)), np.zeros((x + m, x + m))
     for k in range(N):
         if k % problem.hold == 0:
             T = _decision(feedback, k // problem.hold, x, m)
-            own = T @ own @ T.T
-        C[k] = own
+            covariance = T @ covariance @ T.T
+        C[k] = covariance
         through = np.zeros((x + m, x + m))
         through[:x], through[x:, x:] = steps.J[k], np.eye(m)
         g, gz = steps.g[k], steps.gz[k]
-        own = through @ own @ through.T
-        own[:x, :x] += problem.dt * (g @ g.T + np.einsum("akz,zy,bky->ab", gz, C[k], gz, optimize=True))
-    C[N] = own
+        covariance = through @ covariance @ through.T
+        covariance[:x, :x] += problem.dt * (g @ g.T + np.einsum("akz,zy,bky->ab", gz, C[k], gz, optimize=True))
+    C[N] = covariance
     return C

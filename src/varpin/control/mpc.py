@@ -380,23 +380,23 @@ class Mpc:
 def _outside(held: Sequence[Kept]) -> tuple[Finding, ...]:
     """Says where the plant's motion violated a constraint, and in how many ticks there was no plan within them."""
     found = []
-    for own in held:
-        if own.infeasible.any():
-            tick = int(np.argmax(np.where(own.infeasible, own.planned, 0.0)))
+    for row in held:
+        if row.infeasible.any():
+            tick = int(np.argmax(np.where(row.infeasible, row.planned, 0.0)))
             found.append(
                 Finding(
                     "infeasible ticks",
-                    f"in {int(own.infeasible.sum())} of {len(own.planned)} ticks no plan was found that keeps to "
-                    f"{own.label}; in tick {tick} it is violated by {own.planned[tick]:.2g} {own.unit}, and the plan "
+                    f"in {int(row.infeasible.sum())} of {len(row.planned)} ticks no plan was found that keeps to "
+                    f"{row.label}; in tick {tick} it is violated by {row.planned[tick]:.2g} {row.unit}, and the plan "
                     "acts all the same: a longer horizon, wider limits or more iterations may help",
                 )
             )
-        if own.worst > own.tolerance:
-            when = own.t[int(np.argmax(own.moved))]
+        if row.worst > row.tolerance:
+            when = row.t[int(np.argmax(row.moved))]
             found.append(
                 Finding(
                     "motion outside constraints",
-                    f"the plant's motion violates {own.label} by {own.worst:.2g} {own.unit} at t = {when:.4g} s: a "
+                    f"the plant's motion violates {row.label} by {row.worst:.2g} {row.unit} at t = {when:.4g} s: a "
                     "bound that is as much narrower (of noise, a margin=), a smaller dt, more iterations or a longer "
                     "horizon keep it inside",
                 )

@@ -78,26 +78,26 @@ class PenalizedRate(Frozen):
     """What changes of the controls cost, the penalties of their limits included; as :class:`ControlRate`.
 
     Attributes:
-        own: Of the problem's cost; of weight zero where it has none.
+        plain: Of the problem's cost; of weight zero where it has none.
         penalties: Of limits of the rate.
     """
 
-    own: ControlRate
+    plain: ControlRate
     penalties: tuple[Penalty, ...]
 
     @property
     def weight(self) -> Floats:
         """That of the cost alone (m, m)."""
-        return self.own.weight
+        return self.plain.weight
 
     @property
     def before(self) -> Floats | None:
         """The control before the horizon (m,)."""
-        return self.own.before
+        return self.plain.before
 
     def shares(self, u: Floats, period: float) -> Floats:
         """See :meth:`ControlRate.shares`."""
-        found = self.own.shares(u, period)
+        found = self.plain.shares(u, period)
         for penalty in self.penalties:
             s = penalty.shifted(_rate_of(penalty).of_decisions(u))
             found[..., penalty.bound.places] += 0.5 * penalty.weight * (s * s).sum(axis=-1)
@@ -110,14 +110,14 @@ class PenalizedRate(Frozen):
 
     def expand(self, u: Floats, period: float, held: Sequence[Mask] | None = None) -> tuple[Floats, Floats]:
         """See :meth:`ControlRate.expand`; of penalties, those of ``held`` rows, which cost something if left out."""
-        gradient, hessian = self.own.expand(u, period)
+        gradient, hessian = self.plain.expand(u, period)
         for i, penalty in enumerate(self.penalties):
             bound = _rate_of(penalty)
             s, columns = penalty.signed(bound.of_decisions(u)), bound.limited
-            own = penalty.held(s) if held is None else held[i]
-            pull, count = np.where(own, s, 0.0), len(columns)
+            pushed = penalty.held(s) if held is None else held[i]
+            pull, count = np.where(pushed, s, 0.0), len(columns)
             gradient[np.ix_(bound.places, columns)] += penalty.weight / period * (pull[:, :count] - pull[:, count:])
-            curved = penalty.weight / period**2 * (own[:, :count].astype(float) + own[:, count:])
+            curved = penalty.weight / period**2 * (pushed[:, :count].astype(float) + pushed[:, count:])
             for c, column in enumerate(columns):
                 hessian[bound.places, column, column] += curved[:, c]
         return gradient, hessian
@@ -175,44 +175,44 @@ class PenalizedProblem(OptimalControlProblem):
 
     def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """See :meth:`OptimalControlProblem.model_samples`."""
-        own = self.samples(q, v, u)
+        samples = self.samples(q, v, u)
         nodes = (q[1:], v[1:], u)
         steps = self.steps
         joined = [
             np.concatenate([x.reshape(steps, -1, x.shape[-1]), y[:, None]], axis=1)
-            for x, y in zip(own, nodes, strict=True)
+            for x, y in zip(samples, nodes, strict=True)
         ]
         q, v, u = (x.reshape(-1, x.shape[-1]) for x in joined)
         return q, v, u
 
     def shares_along(self, q: Floats, v: Floats, u: Floats, compiled: Floats) -> Floats:
         """See :meth:`OptimalControlProblem.shares_along`."""
-        own = super().shares_along(q, v, u, compiled)
-        return np.concatenate([own, *(penalty.shares(q, v, u) for penalty in self.penalties)])
+        shares = super().shares_along(q, v, u, compiled)
+        return np.concatenate([shares, *(penalty.shares(q, v, u) for penalty in self.penalties)])
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
         """See :meth:`OptimalControlProblem.expand_running`; of penalties, the Hessians of Gauss and Newton."""
         q, v, u = trajectory.q, trajectory.v, trajectory.u
         s = [penalty.signed(penalty.bound.value(q, v, u)) for penalty in self.penalties]
-        held = [penalty.held(own) for penalty, own in zip(self.penalties, s, strict=True)]
+        held = [penalty.held(signed) for penalty, signed in zip(self.penalties, s, strict=True)]
         J = [
-            penalty.bound.jacobian(q, v) if own.any() else np.zeros(())
-            for penalty, own in zip(self.penalties, held, strict=True)
+            penalty.bound.jacobian(q, v) if mask.any() else np.zeros(())
+            for penalty, mask in zip(self.penalties, held, strict=True)
         ]
         return self.with_held(super().expand_running(trajectory), s, J, held)
 
-    def expand_own(self, trajectory: Trajectory) -> Expansion:
+    def expand_cost(self, trajectory: Trajectory) -> Expansion:
         """The expansion of the running costs at their own samples, without penalties."""
         return super().expand_running(trajectory)
 
     def with_held(
-        self, own: Expansion, shifted: Sequence[Floats], jacobians: Sequence[Floats], held: Sequence[Mask]
+        self, expansion: Expansion, shifted: Sequence[Floats], jacobians: Sequence[Floats], held: Sequence[Mask]
     ) -> Expansion:
         """The running costs' expansion with penalties of the rows that are ``held``, each (K, rows).
 
         ``shifted`` are what the penalties are squares of, and ``jacobians`` their derivatives.
         """
-        N, size, x = self.steps, own.gradient.shape[1], 2 * self.scene.robot.dof
+        N, size, x = self.steps, expansion.gradient.shape[1], 2 * self.scene.robot.dof
         gradient, hessian = np.zeros((N, size)), np.zeros((N, size, size))
         for penalty, s, J, rows in zip(self.penalties, shifted, jacobians, held, strict=True):
             if not rows.any():
@@ -222,8 +222,8 @@ class PenalizedProblem(OptimalControlProblem):
             hessian[steps, :x, :x] += penalty.weight * (np.swapaxes(J, 1, 2) @ (counted[:, :, None] * J))
         # Samples of the model all weigh the same.
         weight = self.dt * float(self.rule[0, 0])
-        gradients = np.concatenate([own.gradient.reshape(N, -1, size), gradient[:, None] / weight], axis=1)
-        there = np.broadcast_to(own.hessian, (len(own.gradient), size, size)).reshape(N, -1, size, size)
+        gradients = np.concatenate([expansion.gradient.reshape(N, -1, size), gradient[:, None] / weight], axis=1)
+        there = np.broadcast_to(expansion.hessian, (len(expansion.gradient), size, size)).reshape(N, -1, size, size)
         hessians = np.concatenate([there, hessian[:, None] / weight], axis=1)
         return Expansion(gradients.reshape(-1, size), hessians.reshape(-1, size, size))
 
@@ -254,17 +254,17 @@ def penalized(
         if parts[2] > 0.0
     ]
     on_rate = tuple(part for part in parts if part.bound.of_controls)
-    own: dict[str, object] = {
+    changes: dict[str, object] = {
         "penalties": tuple(part for part in parts if not part.bound.of_controls),
         "all_penalties": tuple(parts),
     }
-    own |= {"constraints": (), "bound_constraints": (), "quiet": quiet, "passes": passes}
+    changes |= {"constraints": (), "bound_constraints": (), "quiet": quiet, "passes": passes}
     if on_rate:
         rate = problem.rate
         if rate is None:
             m = problem.scene.controls
             rate = ControlRate(np.zeros((m, m)), _rate_of(on_rate[0]).before)
-        own["rate"] = PenalizedRate(rate, on_rate)
+        changes["rate"] = PenalizedRate(rate, on_rate)
     # Past the dataclass, which refuses assignments.
-    vars(made).update(vars(problem) | own)
+    vars(made).update(vars(problem) | changes)
     return made

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.control.backward import states
 from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.search import states
 from varpin.control.solution import Solution
 from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
@@ -47,8 +47,8 @@ def onto_constraints(
     best, worst = plan.trajectory, _worst(problem, plan.trajectory, backoff)
     trials, motion = Trials(problem), plan.trajectory
     active = [
-        np.full(own.shape, item.source.equality) | (own > 0.0)
-        for item, own in zip(problem.bound_constraints, multipliers, strict=True)
+        np.full(multiplier.shape, item.source.equality) | (multiplier > 0.0)
+        for item, multiplier in zip(problem.bound_constraints, multipliers, strict=True)
     ]
     for _ in range(_STEPS):
         if worst <= _DONE:
@@ -97,7 +97,7 @@ def _corrected(
     # Controls of large machines may change more than those of small ones.
     size = np.abs(u).max(axis=0)
     size = np.where(size > 0.0, size, max(float(size.max()), 1.0))
-    c = np.concatenate([own[rows] for own, rows in zip(values, active, strict=True)])
+    c = np.concatenate([value[rows] for value, rows in zip(values, active, strict=True)])
     change = np.zeros((R, m))
     for _ in range(_CLIPS):
         # What has met a limit stays there, and the others do its part.

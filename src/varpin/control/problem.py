@@ -363,8 +363,8 @@ class OptimalControlProblem(Frozen):
         if self.constraints and ("constraints" in changed or "t0" in changed):
             rate, t0 = changed.get("rate", self.rate), changed.get("t0", self.t0)
             grid = (t0, self.dt, self.steps, self.hold)
-            own = changed.get("constraints", self.constraints)
-            changed["bound_constraints"] = _bind_constraints(own, scene, *grid, rate)
+            constraints = changed.get("constraints", self.constraints)
+            changed["bound_constraints"] = _bind_constraints(constraints, scene, *grid, rate)
         problem = object.__new__(type(self))
         # Past the dataclass, which refuses assignments.
         vars(problem).update(vars(self) | changed)
@@ -561,8 +561,8 @@ class OptimalControlProblem(Frozen):
         # Both sums have their parts in the order of the cost's terms.
         found = []
         for total, at, at_end in ((self.running, along, False), (self.terminal, end, True)):
-            own = [term for term in terms if isinstance(term, Terminal) == at_end]
-            for term, part in zip(own, total.parts, strict=True):
+            placed = [term for term in terms if isinstance(term, Terminal) == at_end]
+            for term, part in zip(placed, total.parts, strict=True):
                 if not np.isfinite(part.value(*at)).all():
                     found.append(term)
         return tuple(found)

@@ -191,13 +191,13 @@ def kept(
     fine = problem.constraints_on(motion.dt, motion.steps, substeps)
     infeasible = np.array([plan.status is Status.INFEASIBLE for plan in plans])
     found = []
-    for i, own in enumerate(fine):
+    for i, bound in enumerate(fine):
         planned = np.array([plan.constraints[i].violation for plan in plans])
         moved, t = np.zeros(0), np.zeros(0)
-        if not own.source.equality:
-            c = own.value(motion.q, motion.v, motion.u)
-            moved, t = np.maximum(c, 0.0).max(axis=1), own.times
-        tolerance = TOLD * own.scale
+        if not bound.source.equality:
+            c = bound.value(motion.q, motion.v, motion.u)
+            moved, t = np.maximum(c, 0.0).max(axis=1), bound.times
+        tolerance = TOLD * bound.scale
         failed = infeasible & (planned > tolerance)
-        found.append(Kept(own.source.label, own.unit, tolerance, planned, moved, t, failed))
+        found.append(Kept(bound.source.label, bound.unit, tolerance, planned, moved, t, failed))
     return tuple(found)

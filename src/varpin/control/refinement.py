@@ -139,15 +139,17 @@ def start_of(problem: OptimalControlProblem, coarse: Solution) -> LinearPolicy:
     Raises:
         InputError: The policy does not get to the end there.
     """
-    own, n, m = problem.integrator, problem.scene.robot.dof, problem.scene.controls
-    on: Literal["momentum", "velocity"] = "momentum" if own.variational else "velocity"
+    integrator, n, m = problem.integrator, problem.scene.robot.dof, problem.scene.controls
+    on: Literal["momentum", "velocity"] = "momentum" if integrator.variational else "velocity"
     policy = coarse.policy_on(on, 2)
-    commands = policy.commands(problem.steps, m, n, own.variational, dt=problem.dt, stage_times=own.stage_times)
-    motion, failure = rollout(problem.scene, own, problem.q0, problem.v0, commands, problem.dt)
+    commands = policy.commands(
+        problem.steps, m, n, integrator.variational, dt=problem.dt, stage_times=integrator.stage_times
+    )
+    motion, failure = rollout(problem.scene, integrator, problem.q0, problem.v0, commands, problem.dt)
     if failure is not None:
         raise InputError(f"the plan before does not get to its end in half the step: {failure.reason}")
     u = problem.decided(motion)
-    x = np.hstack([motion.q, motion.p if own.variational else motion.v])[: -1 : problem.hold]
+    x = np.hstack([motion.q, motion.p if integrator.variational else motion.v])[: -1 : problem.hold]
     # Feedback keeps rounding small where motions are unstable; lines change their control too late for that.
     gains = np.zeros((len(x), m, 2 * n)) if problem.linear else np.repeat(policy.gains, len(x) // len(policy.gains), 0)
     return LinearPolicy(

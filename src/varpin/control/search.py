@@ -15,13 +15,14 @@ from dataclasses import dataclass, is_dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from varpin.control.backward import Along, Plan, backward, noise_shares
+from varpin.control.backward import Along, Plan, backward, noise_shares, states
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
+from varpin.control.multiple_shooting import GapClosing, path_of
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import refine
 from varpin.control.solution import Solution
@@ -83,6 +84,8 @@ _SHORTEST, _TRIALS = 1e-6, 40
 # nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
 _HALVINGS, _MORE_HALVINGS = 2, 3
 _PARTS = 3
+# What is at stake on a first motion that no pass has looked at.
+UNKNOWN = -1.0
 # A trial that costs more than any step may is given up; what rounding does to costs is far below this part of them.
 _DEARER = 1e-9
 
@@ -105,6 +108,7 @@ def solve(
     check: bool = True,
     true_cost: float | None = None,
     noise: Literal["held", "whole"] = "held",
+    states: ArrayLike | tuple[ArrayLike, ArrayLike] | Trajectory | None = None,
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
@@ -171,6 +175,12 @@ def solve(
             ends next to the minimum of the expected cost. ``"whole"``: from there it goes on to that minimum, a local
             one of the model, for 10 to 50 times the time. With ``second_order`` and within control limits it is held.
             Problems with constraints are solved for the least cost without noise; it shapes their feedback and margins.
+        states: To start from instead of a motion that the controls make: configurations at the nodes (N + 1, n), the
+            first one q0; a pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of
+            another planner will do, though no controls make it: forces on the joints hold the first motion on it, and
+            the first iterations take them away (multiple shooting). ``controls`` are then those that go with the
+            states; left out, they are the inverse dynamics' within their limits. Single shooting goes on from there.
+            Held controls only, and no :class:`KinematicInput`.
 
     Returns:
         The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
@@ -200,6 +210,10 @@ def solve(
     deadline = time.perf_counter() + checked_time(time_limit)
     fraction("armijo", armijo)
     max_iterations = count("max_iterations", max_iterations)
+    if states is not None and resume is not None:
+        raise InputError("resume goes on from the solution's own states: leave out either states or resume")
+    path = None if states is None else path_of(problem, states)
+    known = len(resume.search.history) if isinstance(resume, Solution) and resume.search is not None else 0
 
     def report(item: Iteration, motion: Trajectory) -> None:
         tell(item, motion)
@@ -227,19 +241,22 @@ def solve(
                 progress=progress,
                 check=False,
                 noise=noise,
+                states=states if start is None else None,
             )
 
         refined = refine(problem, once, positive("true_cost", true_cost, "1"), lambda: deadline - time.perf_counter())
         return looked_at(refined)[0] if check else refined
 
     search = _Search(problem, second_order, forward, armijo, backtracking, regularization, whole_noise=noise == "whole")
-    if resume is None:
-        search.begin(_first_commands(problem, controls))
-    else:
+    if resume is not None:
         search.resume(_search_of(problem, controls, resume))
-    known = len(search.history)
+    elif path is None:
+        search.begin(_first_commands(problem, controls))
+    closing = None if path is None else GapClosing(problem, path, _controls_along(problem, controls))
     try:
-        status = search.run(tolerance, max_iterations, deadline, report)
+        if closing is not None:
+            search.close(closing, max_iterations, deadline, report)
+        status = search.run(tolerance, max_iterations - (len(search.history) - known), deadline, report)
     except KeyboardInterrupt:
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     solution = search.solution(status)
@@ -295,8 +312,7 @@ def replan(
 
 
 def _first_commands(problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None) -> Commands:
-    R, m = problem.decisions, problem.scene.controls
-    variational = problem.integrator.variational
+    m, variational = problem.scene.controls, problem.integrator.variational
     if isinstance(controls, Solution):
         controls = controls.policy_on("momentum" if variational else "velocity")
     if controls is None:
@@ -305,8 +321,8 @@ def _first_commands(problem: OptimalControlProblem, controls: JointValues | Line
         if (hold := controls.hold_at(problem.dt)) != problem.hold:
             raise InputError(f"the policy holds its controls over {hold} steps, the problem {problem.hold}")
         if controls.linear != problem.linear:
-            policy, own = ("linear", "held") if controls.linear else ("held", "linear")
-            raise InputError(f"the policy's controls are {policy}, the problem's {own}")
+            policy, wanted = ("linear", "held") if controls.linear else ("held", "linear")
+            raise InputError(f"the policy's controls are {policy}, the problem's {wanted}")
         commands = controls.commands(
             problem.steps, m, problem.scene.robot.dof, variational, problem.dt, problem.integrator.stage_times
         )
@@ -317,11 +333,26 @@ def _first_commands(problem: OptimalControlProblem, controls: JointValues | Line
         if problem.rate is not None and problem.rate.before is not None:
             commands = commands._replace(before=problem.rate.before[None].copy())
         return commands._replace(limits=narrowed)
+    return _held(_rows_of(problem, controls), problem)
+
+
+def _controls_along(problem: OptimalControlProblem, controls: object) -> Floats | None:
+    """Controls (R, m) that go with given states, within their limits."""
+    if controls is None:
+        return None
+    if isinstance(controls, Solution | LinearPolicy):
+        raise InputError("controls that go with states are rows (R, m) or (m,), or by joint name, without feedback")
+    u = _rows_of(problem, controls)
+    return np.asarray(np.clip(u, *problem.control_limits), dtype=np.float64)
+
+
+def _rows_of(problem: OptimalControlProblem, controls: Any) -> Floats:
+    """Given controls as rows (R, m)."""
+    R, m = problem.decisions, problem.scene.controls
     if isinstance(controls, Mapping):
         controls = control_array("controls", controls, problem.scene.control_joints)
     rows = as_floats("controls", controls)
-    rows = finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m))
-    return _held(np.broadcast_to(rows, (R, m)), problem)
+    return np.broadcast_to(finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m)), (R, m))
 
 
 def _shifted_commands(problem: OptimalControlProblem, previous: Solution, decisions: int) -> Commands:
@@ -519,6 +550,17 @@ class _Search:
             culprits = " + ".join(map(repr, problem.not_finite(trajectory) or problem.cost.terms))
             raise CostError(culprits, f"the cost of the first motion is {self.cost}")
 
+    def close(self, closing: GapClosing, most: int, deadline: float, report: Report) -> None:
+        """Begin with what is found on the way from given states, in so many iterations at most."""
+        try:
+            closing.run(most, deadline, report)
+        finally:
+            self.history = list(closing.history)
+            self.begin(_first_commands(self.problem, closing.policy()))
+            # What is at stake is that of this motion, however many iterations it took.
+            self.first = UNKNOWN
+            self.state = self._state()
+
     def resume(self, state: SearchState) -> None:
         """Stand where ``state`` was taken."""
         self.trajectory, self.cost, self.above, self.first = state.trajectory, state.cost, state.above, state.first
@@ -564,7 +606,7 @@ class _Search:
                 self.reason = f"the regularization has reached {self.regularization:.1e} of the diagonal of Quu"
                 return Status.INDEFINITE
             self._compare_with_best(self.plan)
-            if not self.history:
+            if not self.history or self.first == UNKNOWN:
                 self.first = self._at_first()
             there = self._is_there(self.plan, tolerance)
             if self._turns_whole(there=there):
@@ -885,8 +927,8 @@ class _Search:
         found = backward(self.problem, trial, self.regularization)
         if found is None:
             return np.inf
-        own, held = (noise_shares(self.problem, trial, each, self.steered).sum() for each in (found, plan))
-        return float(own - held)
+        shares, held = (noise_shares(self.problem, trial, each, self.steered).sum() for each in (found, plan))
+        return float(shares - held)
 
     def _feedback(self, plan: Plan) -> Commands:
         """The commands of trials, but for the feed-forward part that theirs is on top of."""
@@ -952,9 +994,3 @@ def _previous_gains(problem: OptimalControlProblem, plan: Plan | None) -> Floats
         return None
     m = problem.scene.controls
     return np.zeros((problem.decisions, m, m)) if plan is None else plan.previous
-
-
-def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
-    """X (N + 1, 2n): (q, p) or (q, v)."""
-    second = trajectory.p if problem.integrator.variational else trajectory.v
-    return np.hstack([trajectory.q, second])

@@ -110,8 +110,8 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
         numbers["whole"] = int(state.whole)
         search = _Search(prefixes[id(state.trajectory)], gains=np.array(state.gains), **numbers)
         best = None if state.best is None else _Best(prefixes[id(state.best)])
-    own = ("search", "best", "refined", "refinement")
-    given = {item.name: solution[item.name] for item in fields(_Plan) if item.name not in own}
+    apart = ("search", "best", "refined", "refinement")
+    given = {item.name: solution[item.name] for item in fields(_Plan) if item.name not in apart}
     refinement: Refinement | None = solution["refinement"]
     if refinement is not None:
         given["refined"] = np.array(
@@ -161,11 +161,11 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
 
 
 def _refinement(source: Path, plan: _Plan) -> Refinement | None:
-    own, rows = plan.refinement, plan.refined
-    if own is None or rows is None:
+    refinement, rows = plan.refinement, plan.refined
+    if refinement is None or rows is None:
         return None
     whole, kinds = {"steps", "iterations"}, rows[:, -1]
-    if not (np.isin(kinds, np.arange(len(_STATUSES))).all() and 0 <= own.chosen <= len(rows)):
+    if not (np.isin(kinds, np.arange(len(_STATUSES))).all() and 0 <= refinement.chosen <= len(rows)):
         raise FileError(f"{source}: what a refinement tried does not fit together")
     tried = tuple(
         Refined(
@@ -174,7 +174,7 @@ def _refinement(source: Path, plan: _Plan) -> Refinement | None:
         )
         for row in rows.tolist()
     )
-    return Refinement(own.wish, bool(own.met), tried, own.chosen, own.reason)
+    return Refinement(refinement.wish, bool(refinement.met), tried, refinement.chosen, refinement.reason)
 
 
 def _search(
@@ -246,9 +246,9 @@ def _require_problem(source: Path, members: Members, problem: OptimalControlProb
         if name not in members or not np.array_equal(members[name], value):
             what = name.removeprefix("problem.")
             raise FileError(f"{source} is of a problem with {what} = {members.get(name, 'unknown')}, not {value}")
-    own, found = problem.described_constraints, str(members.get("problem.constraints", ""))
-    if own != found:
-        raise FileError(f"{source} is of a problem with constraints = {found or 'none'}, not {own or 'none'}")
+    described, found = problem.described_constraints, str(members.get("problem.constraints", ""))
+    if described != found:
+        raise FileError(f"{source} is of a problem with constraints = {found or 'none'}, not {described or 'none'}")
     _require_surroundings(source, members, problem, "noise.")
 
 

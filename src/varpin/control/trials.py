@@ -58,27 +58,27 @@ class Attempt:
 
     def trajectory(self) -> Trajectory:
         """Its motion, as far as it went."""
-        own, done = self.trials, int(self.written.done[0])
+        trials, done = self.trials, int(self.written.done[0])
         q, v, p, energy = (nodes[: done + 1] for nodes in self.nodes)
-        scene = own.problem.scene
+        scene = trials.problem.scene
         return Trajectory(
-            t=own.times[: done + 1],
+            t=trials.times[: done + 1],
             q=q,
             v=v,
             p=p,
             energy=energy,
             u=self.u[:done] if self.line is None else self.line.mean[:done],
-            dw=own.silence[:done],
-            masses=own.masses.copy(),
-            dt=own.problem.dt,
-            integrator=own.text,
+            dw=trials.silence[:done],
+            masses=trials.masses.copy(),
+            dt=trials.problem.dt,
+            integrator=trials.text,
             robot=scene.robot.name,
             joint_names=scene.robot.joint_names,
             statistics=statistics_of(self.written, 0, done, self.halvings),
             scene_values=scene.values,
             u_stages=np.zeros((done, 0, scene.controls)) if self.line is None else self.line.stages[:done],
             u_nodes=np.zeros((done + 1, 0)) if self.line is None else self.line.nodes[: done + 1],
-            constraint_forces=self.impulses[:done] / own.problem.dt,
+            constraint_forces=self.impulses[:done] / trials.problem.dt,
             constraint_labels=scene.constraint_labels,
         )
 

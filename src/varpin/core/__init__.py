@@ -24,7 +24,6 @@ from varpin.core._core import accelerations as accelerations
 from varpin.core._core import box_minimum as box_minimum
 from varpin.core._core import change_values as change_values
 from varpin.core._core import constrained_derivatives as constrained_derivatives
-from varpin.core._core import doubled_steps_agree as doubled_steps_agree
 from varpin.core._core import energy_turnover as energy_turnover
 from varpin.core._core import expand_changes as expand_changes
 from varpin.core._core import fastest_damping as fastest_damping
@@ -37,3 +36,4 @@ from varpin.core._core import sample_steps as sample_steps
 from varpin.core._core import variational_curvatures as variational_curvatures
 from varpin.core._core import variational_derivatives as variational_derivatives
 from varpin.core._core import variational_ends as variational_ends
+from varpin.core._core import windows_agree as windows_agree

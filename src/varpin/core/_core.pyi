@@ -540,7 +540,7 @@ def energy_turnover(
     largest; the largest work so far.
     """
 
-def doubled_steps_agree(
+def windows_agree(
     mechanism: Mechanism,
     q: Floats,
     v: Floats,

@@ -266,11 +266,11 @@ class _Chunk:
 
     def _located(self, group: slice, error: CustomForceError) -> VarpinError:
         """The error of a custom force, with the path and the step where it failed and the motion up to there."""
-        own, task = self.shared, self.task
+        shared, task = self.shared, self.task
         for i in range(group.start, group.stop):
-            (generator,) = own.seeds.generators(task.first + i, task.first + i + 1)
-            drawn = generator.standard_normal((own.steps, own.scene.processes)) * np.sqrt(own.dt)
-            given = own.scene, own.integrator, (task.q0[i], task.v0[i]), own.commands, own.dt
+            (generator,) = shared.seeds.generators(task.first + i, task.first + i + 1)
+            drawn = generator.standard_normal((shared.steps, shared.scene.processes)) * np.sqrt(shared.dt)
+            given = shared.scene, shared.integrator, (task.q0[i], task.v0[i]), shared.commands, shared.dt
             found = located(*given, drawn, error, f"path {task.first + i}: ")
             if found is not error:
                 return found

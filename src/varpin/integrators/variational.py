@@ -51,6 +51,11 @@ Floats = NDArray[np.float64]
 # Tolerance of an energy balance that is not checked.
 _UNCHECKED = 1e300
 
+# Second derivatives under constraints are differences of the first of fourth order: places and weights, in units of a
+# shift [rad or m, or of speed].
+_DIFFERENCES = ((1.0, 2.0 / 3.0), (-1.0, -2.0 / 3.0), (2.0, -1.0 / 12.0), (-2.0, 1.0 / 12.0))
+_SHIFT = 2.5e-4
+
 REASONS: dict[int, str] = {
     Outcome.diverged: "Newton's iteration does not contract, however small the substep",
     Outcome.not_finite: "the step equation gives values that are not finite",
@@ -100,7 +105,7 @@ class Guard:
     branch_margin: float = 0.5
     energy_balance: float = 0.005
     energy_budget: float = 0.02
-    max_halvings: int = 12
+    max_halvings: int = 20
 
     def __post_init__(self) -> None:
         if fraction("branch_margin", self.branch_margin) == 1.0:
@@ -319,12 +324,11 @@ class Variational(Integrator):
         steps = self._steps(scene, trajectory)
         guess = np.ascontiguousarray(self._guess(trajectory))
         if scene.constraints:
-            places = self._places(scene)
             cubic = [k for k, rate in enumerate(scene.rates) if rate >= 0]
             rates = np.zeros((trajectory.steps, len(scene.rates)))
             rates[:, cubic] = trajectory.u[:, [scene.rates[k] for k in cubic]]
             Jx, Jf, Jr, outcome, done = constrained_derivatives(
-                **steps, rates=rates, places=places, guess=guess, ramp=ramp
+                **steps, rates=rates, places=self._places(scene), guess=guess, ramp=ramp
             )
             if cubic:
                 Jf = np.concatenate([Jf, Jr[:, :, cubic]], axis=2)
@@ -332,6 +336,49 @@ class Variational(Integrator):
             Jx, Jf, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp)
         _require_solved(trajectory, outcome, done)
         return Jx, Jf
+
+    def _contract_by_differences(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
+        """:meth:`contract` under constraints: differences of the gradients z' J, whose derivatives J are exact.
+
+        In directions of like speeds: a momentum that suits the base moves a light wrist by rad/s.
+        """
+        n, N, cubic = scene.robot.dof, trajectory.steps, [k for k, rate in enumerate(scene.rates) if rate >= 0]
+        wide = 3 * n + len(cubic)
+        steps, guess = self._steps(scene, trajectory), np.ascontiguousarray(self._guess(trajectory))
+        rates = np.zeros((N, len(scene.rates)))
+        rates[:, cubic] = trajectory.u[:, [scene.rates[k] for k in cubic]]
+        M, _ = scene.core.jets(np.ascontiguousarray(trajectory.q[:-1]), np.ascontiguousarray(trajectory.v[:-1]))
+        S = np.zeros((N, wide, wide))
+        S[:] = np.eye(wide)
+        S[:, n : 2 * n, n : 2 * n] = M
+        S[:, 2 * n : 3 * n, 2 * n : 3 * n] = M / trajectory.dt
+        for c in scene.inputs.values():
+            # A position in place of a force.
+            S[:, 2 * n + c, 2 * n : 3 * n] = S[:, 2 * n : 3 * n, 2 * n + c] = 0.0
+            S[:, 2 * n + c, 2 * n + c] = 1.0
+        copies = len(_DIFFERENCES)
+        whole = {name: np.concatenate([steps[name]] * copies) for name in ("substeps", "halvings")}
+        whole |= {"guess": np.concatenate([guess] * copies), "places": self._places(scene)}
+        towards = np.empty((N, wide, wide))
+        for d in range(wide):
+            shift = np.concatenate([_SHIFT * share * S[:, :, d] for share, _ in _DIFFERENCES])
+            given = dict(steps)
+            given["q"] = np.concatenate([steps["q"]] * copies) + shift[:, :n]
+            given["p"] = np.concatenate([steps["p"]] * copies) + shift[:, n : 2 * n]
+            force = shift[:, 2 * n : 3 * n]
+            given["force"] = np.concatenate([steps["force"]] * copies)
+            given["force"] = given["force"] + (force if given["force"].ndim == 2 else force[:, None])
+            moved = np.concatenate([rates] * copies)
+            moved[:, cubic] += shift[:, 3 * n :]
+            Jx, Jf, Jr, outcome, done = constrained_derivatives(**(given | whole), rates=moved, ramp=False)
+            if outcome in REASONS:
+                raise LinearizationError(done % N, done % N * trajectory.dt, REASONS[outcome])
+            J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2).reshape(copies, N, 2 * n, wide)
+            weights = np.array([weight for _, weight in _DIFFERENCES]) / _SHIFT
+            towards[:, :, d] = np.einsum("k,Na,kNab->Nb", weights, z, J)
+        H = np.swapaxes(np.linalg.solve(np.swapaxes(S, 1, 2), np.swapaxes(towards, 1, 2)), 1, 2)
+        symmetric: Floats = 0.5 * (H + np.swapaxes(H, 1, 2))
+        return symmetric
 
     def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
         """See :meth:`Integrator.ramps`."""
@@ -341,11 +388,10 @@ class Variational(Integrator):
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; divided steps are treated as in :meth:`linearize`."""
-        refuse_constraints(
-            scene, "second_order", "varpin.linearize does, and varpin.solve does without second_order=True"
-        )
         if scene.custom is not None:
             raise InputError("second derivatives are not there for a scene with a CustomForce")
+        if scene.constraints:
+            return self._contract_by_differences(scene, trajectory, z)
         steps = self._steps(scene, trajectory)
         H, outcome, done = variational_curvatures(
             **steps, guess=np.ascontiguousarray(self._guess(trajectory)), z=np.ascontiguousarray(z)

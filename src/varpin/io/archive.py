@@ -1,8 +1,9 @@
 """Records in files: frozen dataclasses of arrays and plain values, as npz without pickle or as JSON.
 
-An entry of a file is a field of the record, under its name: ``dt``, ``statistics.jets`` of a record within the record,
-``runs.dt`` of a tuple of records as one array for each of their fields. The annotations of the fields say what an entry
-holds; a field with a default may be missing. Every file has a ``format``, a name and a version.
+An entry of a file is a field of the record, under its name: ``dt``. The entry of a field of a nested record is
+``statistics.jets``. A tuple of records has one array for each of their fields: ``runs.dt``. The annotations of the
+fields define type and shape of the entries; a field with a default may be missing. Every file has a ``format``: a name
+and a version.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Axes:
     """The shape of an array in a record, as the annotation of its field: ``Annotated[Floats, Axes("steps", 3)]``.
 
     Args:
-        axes: Lengths, or names: axes of one name have one length throughout the record.
+        axes: Lengths, or names: axes of the same name have the same length throughout the record.
         finite: Whether NaN and infinite entries are refused.
     """
 
@@ -57,7 +58,7 @@ def save_npz(path: str | os.PathLike[str], form: str, record: Any) -> Path:
 
 
 def load_npz(path: str | os.PathLike[str], form: str, kind: type[T]) -> T:
-    """The record of a ``kind`` that :func:`save_npz` wrote.
+    """Read a record of the dataclass ``kind`` that :func:`save_npz` wrote.
 
     Raises:
         FileError: As :func:`read_npz` and :func:`record_of`.
@@ -67,7 +68,7 @@ def load_npz(path: str | os.PathLike[str], form: str, kind: type[T]) -> T:
 
 
 def save_json(path: str | os.PathLike[str], form: str, record: Any) -> Path:
-    """Write a record of plain values as JSON; returns its path. NaN stands there as null, infinity as "inf".
+    """Write a record of plain values as JSON; returns its path. NaN is written as null, infinity as "inf".
 
     Raises:
         FileError: The path cannot be written.
@@ -79,10 +80,10 @@ def save_json(path: str | os.PathLike[str], form: str, record: Any) -> Path:
 
 
 def load_json(path: str | os.PathLike[str], form: str, kind: type[T]) -> T:
-    """The record of a ``kind`` that :func:`save_json` wrote.
+    """Read a record of the dataclass ``kind`` that :func:`save_json` wrote.
 
     Raises:
-        FileError: The file is missing, no JSON, of another format, or an entry is not what the record holds.
+        FileError: The file is missing, not JSON or of another format, or an entry does not fit the record.
     """
     source = path_like("path", path)
     if not is_file(source):
@@ -92,14 +93,14 @@ def load_json(path: str | os.PathLike[str], form: str, kind: type[T]) -> T:
     except OSError as error:
         raise FileError(f"cannot read {source}: {error.strerror or error}") from None
     except (ValueError, RecursionError) as error:
-        raise FileError(f"{source} is truncated, or no JSON file: {error}") from None
+        raise FileError(f"{source} is truncated or not a JSON file: {error}") from None
     _require_format(source, entries.get("format") if isinstance(entries, dict) else None, form)
     record: T = _Builder(source, {}).build(kind, entries, "")
     return record
 
 
 def write_npz(path: str | os.PathLike[str], form: str, members: Mapping[str, Any]) -> Path:
-    """Write arrays of the format ``form``; a file that is there is replaced only once the new one is whole.
+    """Write arrays of the format ``form``; an existing file is replaced only when the new one is complete.
 
     Raises:
         FileError: The path cannot be written.
@@ -110,10 +111,10 @@ def write_npz(path: str | os.PathLike[str], form: str, members: Mapping[str, Any
 
 
 def read_npz(source: Path, form: str | None = None) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file; of the format ``form``, if it is given.
+    """The arrays of an npz file, which must be of the format ``form`` if that is given.
 
     Raises:
-        FileError: The file is missing, no npz, truncated or damaged, holds pickled objects, or is of another format.
+        FileError: The file is missing, not npz, truncated or damaged, has pickled objects, or is of another format.
     """
     with _opened(source) as archive:
         members = {name.removesuffix(".npy"): _array(archive, name, source) for name in archive.namelist()}
@@ -145,30 +146,30 @@ def _opened(source: Path) -> Iterator[zipfile.ZipFile]:
         raise
     except OSError as error:
         raise FileError(f"cannot read {source}: {error.strerror or error}") from None
-    # A damaged archive raises whatever zipfile, zlib and numpy meet first.
+    # On a damaged archive zipfile, zlib and NumPy raise many kinds of errors.
     except Exception as error:
-        raise FileError(f"{source} is no npz file, or it is truncated or damaged: {error}") from None
+        raise FileError(f"{source} is not an npz file, or it is truncated or damaged: {error}") from None
 
 
 def _array(archive: zipfile.ZipFile, name: str, source: Path) -> NDArray[Any]:
-    # The whole entry at once: zipfile compares its checksum only at its end.
+    # Read the whole entry: zipfile compares the checksum only at its end.
     content = io.BytesIO(archive.read(name))
     try:
         return np.asarray(np.lib.format.read_array(content, allow_pickle=False), order="C")
     except ValueError as error:
-        raise FileError(f"{source}: {name.removesuffix('.npy')} is no array: {error}") from None
+        raise FileError(f"{source}: {name.removesuffix('.npy')} is not an array: {error}") from None
 
 
 def _require_format(source: Path, found: object, form: str) -> None:
     if str(found) != form:
         what = "it has no format" if found is None else f"its format is {reprlib.repr(str(found))}"
         raise FileError(
-            f"{source} is not a varpin {_noun(form)}: {what}, and should have {form!r}{_reader(str(found), form)}"
+            f"{source} is not a varpin {_noun(form)}: {what} instead of {form!r}{_reader(str(found), form)}"
         )
 
 
 def _reader(found: str, form: str) -> str:
-    """What reads a file of another kind than ``form``, for a message."""
+    """A hint for messages: the function that reads files of the format ``found``, if that is not ``form``'s."""
     readers = {"trajectory": "varpin.Trajectory.load(path)", "solution": "varpin.Solution.load(path, problem)"}
     name = None if _noun(found) == _noun(form) else readers.get(_noun(found))
     return f"; {name} reads such files" if name else ""
@@ -179,7 +180,7 @@ def _noun(form: str) -> str:
 
 
 def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
-    """The entries of a record in an npz file, each name after ``prefix``."""
+    """The entries of a record in an npz file, their names prefixed with ``prefix``."""
     members: dict[str, Any] = {}
     kind: Any = type(record)
     hints = _hints(kind)
@@ -202,18 +203,18 @@ def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
 def record_of(
     kind: type[T], members: Members, source: Path, *, prefix: str = "", sizes: Mapping[str, int] | None = None
 ) -> T:
-    """The record of a ``kind`` with the entries of an npz file whose names begin with ``prefix``.
+    """A record built from the entries of an npz file whose names begin with ``prefix``.
 
     Args:
-        kind: A dataclass.
+        kind: The dataclass of the record.
         members: The arrays of the file.
         source: The file, for errors.
-        prefix: Of the names of the entries, empty or with a dot at its end.
-        sizes: Lengths of named axes; those that are not given are found.
+        prefix: Prefix of the entry names, empty or ending with a dot.
+        sizes: Known lengths of named axes; others are taken from the arrays.
 
     Raises:
-        FileError: An entry is missing, or is not of the type, shape or values of its field: file, entry, and what
-            belongs there.
+        FileError: An entry is missing, or does not have the type, shape or values of its field. The message names the
+            file, the entry, and what is expected.
     """
     builder = _Builder(source, dict(sizes or {}))
     record: T = builder.build(kind, builder.tables(kind, members, prefix), prefix.removesuffix("."))
@@ -225,7 +226,7 @@ class _Builder:
 
     Attributes:
         source: The file, for errors.
-        sizes: Lengths of named axes, as far as they are known.
+        sizes: Known lengths of named axes; extended by each array that is read.
     """
 
     def __init__(self, source: Path, sizes: dict[str, int]) -> None:
@@ -233,7 +234,7 @@ class _Builder:
         self.sizes = sizes
 
     def tables(self, kind: Any, members: Members, prefix: str) -> dict[str, Any]:
-        """The entries of an npz file as JSON has them: a table for a record, a list of tables for a tuple of them."""
+        """The entries of an npz file in the structure of JSON: records are tables, tuples of records are lists."""
         tables: dict[str, Any] = {}
         hints = _hints(kind)
         for item in fields(kind):
@@ -260,10 +261,10 @@ class _Builder:
         return tables
 
     def error(self, entry: str, found: str, expected: str) -> FileError:
-        return FileError(f"{self.source}: {entry or 'the file'} is {found}, where {expected} belongs")
+        return FileError(f"{self.source}: {entry or 'the file'} is {found} instead of {expected}")
 
     def build(self, hint: Any, value: Any, entry: str) -> Any:
-        """``value``, an array or as JSON has it, as the annotation ``hint`` of a field."""
+        """Convert ``value``, an array or a value from JSON, to the type ``hint`` of a field."""
         hint, optional = _required(hint), hint
         if value is None and hint is not optional:
             return None
@@ -334,7 +335,7 @@ class _Builder:
 
 
 def _plain(value: Any) -> Any:
-    """A record as JSON has it."""
+    """A record as values for JSON."""
     if is_dataclass(value):
         return {_entry(item): _plain(getattr(value, item.name)) for item in fields(value)}
     if isinstance(value, tuple):
@@ -352,12 +353,12 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def _entry(item: Any) -> str:
-    """The name of a field in files: its own, or the one its metadata gives."""
+    """The name of a field in files: ``entry`` of its metadata, or else the name of the field."""
     return str(item.metadata.get("entry", item.name))
 
 
 def _required(hint: Any) -> Any:
-    """What an annotation allows beside None."""
+    """An annotation without None."""
     if typing.get_origin(hint) not in (UnionType, typing.Union):
         return hint
     (option,) = (option for option in typing.get_args(hint) if option is not NoneType)
@@ -365,7 +366,7 @@ def _required(hint: Any) -> Any:
 
 
 def _row(hint: Any) -> Any:
-    """The records of a tuple of records; None of others."""
+    """The dataclass of an annotation ``tuple[record, ...]``; None for other annotations."""
     first, *_ = typing.get_args(hint) or (None,)
     return first if typing.get_origin(hint) is tuple and is_dataclass(first) else None
 
@@ -385,7 +386,7 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         FileError: The path cannot be written.
     """
     target = writable(path)
-    # Not by tempfile, which gives files to their owner alone.
+    # Not tempfile, whose files only their owner can read.
     draft = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
     try:
         with draft.open("xb") as stream:

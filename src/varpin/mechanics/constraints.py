@@ -48,8 +48,8 @@ class Constraint(Frozen, ABC):
                 object.__setattr__(self, item.name, kept(item.name, value))
 
     def __repr__(self) -> str:
-        own = [(item, getattr(self, item.name)) for item in fields(self)]
-        given = [f"{item.name}={_shown(value)}" for item, value in own if item.repr and value is not None]
+        items = [(item, getattr(self, item.name)) for item in fields(self)]
+        given = [f"{item.name}={_shown(value)}" for item, value in items if item.repr and value is not None]
         return f"{type(self).__name__}({', '.join(given)})"
 
     @abstractmethod
@@ -124,10 +124,10 @@ class FrameOnFrame(Constraint):
             raise InputError("placement must be a matrix (4, 4) of a rotation and a place")
         (a, Ra, at), (b, Rb, there) = point_of("a", self.a, robot), point_of("b", self.b, robot)
         _require_movable(self, a, b, robot)
-        own, others = Ra @ R.T, Rb
+        axes, others = Ra @ R.T, Rb
         vectors: list[tuple[Carried, ...]] = [(Carried(a, False, _row(at)), Carried(b, False, _row(there + Rb @ x)))]
         vectors += [(Carried(-1, True, _row(axis)),) for axis in np.eye(3)]
-        vectors += [(Carried(a, True, _row(axis)),) for axis in own.T]
+        vectors += [(Carried(a, True, _row(axis)),) for axis in axes.T]
         vectors += [(Carried(b, True, _row(axis)),) for axis in others.T]
         # d(y_a . z_b) = (w_a - w_b) . (y_a x z_b), the turn about x.
         turns = [Product(4 + (k + 1) % 3, 7 + (k + 2) % 3, 1.0, 0.0) for k in range(3)]
@@ -333,30 +333,30 @@ def _called(name: str, call: Callable[[], ArrayLike], shape: tuple[int, ...], q:
 class _Values:
     """Checked g (r,) and dg/dq (r, n) of a custom constraint."""
 
-    own: CustomConstraint
+    custom: CustomConstraint
     dof: int
 
     def __call__(self, q: Floats) -> tuple[Floats, Floats]:
-        r = int(self.own.rows)
-        return _called("value", lambda: self.own.value(q), (r,), q), self.jacobian(q)
+        r = int(self.custom.rows)
+        return _called("value", lambda: self.custom.value(q), (r,), q), self.jacobian(q)
 
     def jacobian(self, q: Floats) -> Floats:
-        return _called("jacobian", lambda: self.own.jacobian(q), (int(self.own.rows), self.dof), q)
+        return _called("jacobian", lambda: self.custom.jacobian(q), (int(self.custom.rows), self.dof), q)
 
 
 @dataclass(frozen=True)
 class _Curvature:
     """Checked sum_k w_k d2 g_k/dq2 (n, n) of a custom constraint, by differences where the user gives none."""
 
-    own: CustomConstraint
+    custom: CustomConstraint
     dof: int
 
     def __call__(self, q: Floats, weights: Floats) -> Floats:
         n = self.dof
-        own = self.own.curvature
-        if own is not None:
-            return _called("curvature", lambda: own(q, weights), (n, n), q)
-        slope = _Values(self.own, n).jacobian
+        curvature = self.custom.curvature
+        if curvature is not None:
+            return _called("curvature", lambda: curvature(q, weights), (n, n), q)
+        slope = _Values(self.custom, n).jacobian
         H = np.empty((n, n))
         for c in range(n):
             size = 1e-3 * max(1.0, abs(q[c]))
@@ -385,15 +385,15 @@ def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:
     customs: list[tuple[int, CustomRows]] = []
     labels: list[str] = []
     aligned: list[tuple[int, int]] = []
-    for own in bound:
-        first, rows, row = len(vectors), own.rows, len(labels)
+    for constraint in bound:
+        first, rows, row = len(vectors), constraint.rows, len(labels)
         vectors += rows.vectors
         moved = [product._replace(x=product.x + first, y=product.y + first) for product in rows.products]
         products += [(row + k, product) for k, product in enumerate(moved)]
         ties += [(row + k, tie) for k, tie in enumerate(rows.ties)]
         customs += [(row, custom) for custom in rows.customs]
-        labels += own.labels
-        aligned += [(x + first, y + first) for x, y in own.aligned]
+        labels += constraint.labels
+        aligned += [(x + first, y + first) for x, y in constraint.aligned]
     core = [row for row, _ in products] + [row for row, _ in ties]
     core += [row + k for row, custom in customs for k in range(custom.rows)]
     together = ConstraintRows(
@@ -423,14 +423,16 @@ def _unit(name: str, value: ArrayLike) -> Floats:
     return given / length
 
 
-def _require_movable(own: Constraint, a: int, b: int, robot: Robot) -> None:
-    require_movable(own, a, b, robot)
+def _require_movable(constraint: Constraint, a: int, b: int, robot: Robot) -> None:
+    require_movable(constraint, a, b, robot)
     if a == b:
-        raise InputError(f"{type(own).__name__}: both ends are on one body, and no joint moves one against the other")
+        raise InputError(
+            f"{type(constraint).__name__}: both ends are on one body, and no joint moves one against the other"
+        )
 
 
-def _ends(own: Any, robot: Robot) -> tuple[Carried, Carried, Floats]:
+def _ends(constraint: Any, robot: Robot) -> tuple[Carried, Carried, Floats]:
     """The points a and b, and the rotation (3, 3) of b's frame on its body."""
-    (a, _, here), (b, turned, there) = point_of("a", own.a, robot), point_of("b", own.b, robot)
-    _require_movable(own, a, b, robot)
+    (a, _, here), (b, turned, there) = point_of("a", constraint.a, robot), point_of("b", constraint.b, robot)
+    _require_movable(constraint, a, b, robot)
     return Carried(a, False, _row(here)), Carried(b, False, _row(there)), turned

@@ -105,8 +105,8 @@ class CustomForce(Force):
         """
         n = q.size
         if callable(self.derivatives):
-            own = self.derivatives
-            value = self._called(lambda: own(q.copy(), v.copy()), "derivatives(q, v)", q, v)
+            derivatives = self.derivatives
+            value = self._called(lambda: derivatives(q.copy(), v.copy()), "derivatives(q, v)", q, v)
             if not isinstance(value, tuple | list) or len(value) != 2:
                 raise CustomForceError(
                     f"CustomForce {self.name}: derivatives(q, v) must return dF/dq and dF/dv, two matrices {(n, n)}, "
@@ -180,13 +180,13 @@ class CustomForce(Force):
         except CustomForceError:
             return
         try:
-            own = self.slopes(q, v)
+            slopes = self.slopes(q, v)
         except CustomForceError:
             if self.derivatives == "complex":
                 raise
             return
         scale = 1.0 + float(np.abs(force).max(initial=0.0))
-        for name, given, columns in zip(("dF/dq", "dF/dv"), own, found, strict=True):
+        for name, given, columns in zip(("dF/dq", "dF/dv"), slopes, found, strict=True):
             for c, (column, off) in enumerate(columns):
                 size = scale + np.abs(column)
                 wrong = ~(np.abs(given[:, c] - column) <= _DOUBT * off + _AGREES * size)

@@ -44,8 +44,8 @@ class Force(Frozen, ABC):
             object.__setattr__(self, item.name, kept(item.name, getattr(self, item.name)))
 
     def __repr__(self) -> str:
-        own = [(item.name, getattr(self, item.name)) for item in fields(self)]
-        given = [f"{name}={shown(value)}" for name, value in own if value is not None]
+        items = [(item.name, getattr(self, item.name)) for item in fields(self)]
+        given = [f"{name}={shown(value)}" for name, value in items if value is not None]
         return f"{type(self).__name__}({', '.join(given)})"
 
     @abstractmethod
@@ -430,7 +430,7 @@ def _along_axes(name: str, value: ArrayLike) -> Floats:
 
 def of_kind(elements: Iterable[Element], kind: str) -> tuple[Element, ...]:
     """The elements of one kind."""
-    return tuple(own for own in elements if own.kind == kind)
+    return tuple(element for element in elements if element.kind == kind)
 
 
 def drive_force(servo: Element, q: Floats, v: Floats, force: Floats) -> Floats:
@@ -454,9 +454,9 @@ def drive_force(servo: Element, q: Floats, v: Floats, force: Floats) -> Floats:
 def drive_forces(elements: Iterable[Element], q: Floats, v: Floats, force: Floats) -> Floats:
     """``force`` (K, n) [N m or N] with the columns of servos replaced by :func:`drive_force` at q and v (K, n)."""
     driven = force.copy()
-    for own in of_kind(elements, "PositionServo"):
-        c = own.coordinate
-        driven[:, c] = drive_force(own, q[:, c], v[:, c], force[:, c])
+    for servo in of_kind(elements, "PositionServo"):
+        c = servo.coordinate
+        driven[:, c] = drive_force(servo, q[:, c], v[:, c], force[:, c])
     return driven
 
 

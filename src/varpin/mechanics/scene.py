@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
@@ -562,10 +562,31 @@ class Scene(Frozen):
         return controls
 
 
+def quiet(scene: Scene) -> Scene:
+    """The scene without its noise."""
+    return _driven(scene, scene.actuation) if scene.processes else scene
+
+
+def assisted(scene: Scene) -> Scene:
+    """The scene without its noise and with n controls more, a force on each joint."""
+    return _driven(scene, np.hstack([scene.actuation, np.eye(scene.robot.dof)]))
+
+
+def _driven(scene: Scene, actuation: Floats) -> Scene:
+    """The scene with another actuation matrix (n, m) and without noise."""
+    actuation = actuation.copy()
+    actuation.setflags(write=False)
+    made = object.__new__(Scene)
+    # Past the dataclass, which refuses assignments, and without properties that are made on use.
+    own = {item.name: getattr(scene, item.name) for item in fields(Scene)}
+    vars(made).update(own | {"actuation": actuation, "noise": bind(None, actuation)})
+    return made
+
+
 def _unowned(rows: ConstraintRows) -> ConstraintRows:
     """Rows with weak references to their functions, which the scene owns."""
     return rows._replace(
-        customs=tuple(own._replace(value=Weak(own.value), curvature=Weak(own.curvature)) for own in rows.customs)
+        customs=tuple(row._replace(value=Weak(row.value), curvature=Weak(row.curvature)) for row in rows.customs)
     )
 
 
@@ -820,7 +841,7 @@ def _sole_control(actuation: Floats, c: int) -> int | None:
 
 def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
     """Refuse a KinematicInput whose joint has no control of its own, or also has a servo."""
-    served = {own.coordinate for own in of_kind(elements, "PositionServo")}
+    served = {servo.coordinate for servo in of_kind(elements, "PositionServo")}
     for tie in bound.rows.ties:
         if tie.follower != tie.leader or tie.coefficients:
             continue

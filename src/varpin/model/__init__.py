@@ -1,4 +1,4 @@
-"""Robots: found, parsed, locked and laid out as the flat tree that the core runs on."""
+"""Robots: finding and parsing their files, locking joints, and the flat tree that the core runs on."""
 
 from varpin.model.chain import planar_chain as planar_chain
 from varpin.model.combination import combine as combine

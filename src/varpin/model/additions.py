@@ -1,4 +1,4 @@
-"""What a robot is given beside its description: where its base stands or moves, rotors, inertias of its meshes."""
+"""Additions to a robot's description: base placement or planar base, armature, inertias from meshes."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -17,16 +17,17 @@ from varpin.support.checks import JointValues, as_floats, broadcast_array, finit
 Floats = NDArray[np.float64]
 Base: TypeAlias = Literal["planar"] | ArrayLike | pin.SE3 | None
 
-# Share of its area by which a mesh may be open.
+# A mesh is closed if the norm of its summed directed areas is at most this share of its area.
 _CLOSED = 1e-3
+# Joints of the planar base.
 PLANAR = ("base_x", "base_y", "base_turn")
 
 
 def on_base(description: Description, base: Base) -> Description:
-    """The robot on a base that stands elsewhere, (4, 4) or a pin.SE3, or moves in a plane.
+    """The robot on a placed base, (4, 4) or a pin.SE3, or on a base that moves in a plane.
 
     Raises:
-        InputError: It is none of these, or the robot has a joint of the name of one of the base.
+        InputError: ``base`` is none of these, or a joint of the robot has the name of a joint of the planar base.
     """
     if base is None:
         return description
@@ -45,7 +46,7 @@ def _transform(base: ArrayLike | pin.SE3) -> pin.SE3:
     rigid = np.isfinite(matrix).all() and np.abs(turn.T @ turn - np.eye(3)).max() < 1e-6 and np.linalg.det(turn) > 0.0
     if not rigid or (matrix[3] != [0.0, 0.0, 0.0, 1.0]).any():
         raise InputError("base must be a rotation and a translation, with 0 0 0 1 in its last row")
-    # Rounded figures of a rotation are made one.
+    # Orthonormalize a rotation of rounded numbers.
     u, _, v = np.linalg.svd(turn)
     return pin.SE3(u @ v, matrix[:3, 3])
 
@@ -69,7 +70,7 @@ def _on_base(description: Description, base: pin.SE3) -> Description:
 def _on_plane(description: Description) -> Description:
     old = description.model
     if taken := sorted(set(PLANAR) & set(old.names)):
-        raise InputError(f"base='planar' adds joints of the names {', '.join(PLANAR)}, and the robot has {taken[0]!r}")
+        raise InputError(f"base='planar' adds the joints {', '.join(PLANAR)}, but the robot already has {taken[0]!r}")
     root = zip(PLANAR, (pin.JointModelPX(), pin.JointModelPY(), pin.JointModelRZ()), strict=True)
     model = rebuild(old, range(1, old.njoints), lambda joint: old.joints[joint], tuple(root))
     shift = len(PLANAR)
@@ -85,12 +86,12 @@ def _on_plane(description: Description) -> Description:
 def with_rotors(
     model: pin.Model, armature: JointValues | None, coordinates: tuple[int, ...], others: Collection[str]
 ) -> None:
-    """Put the armature of coordinates, a number, (n,) or by joint name, in the place of the model's own.
+    """Replace the armature of the model's coordinates by a number, (n,) or values by joint name.
 
-    What is said of ``others``, joints that do not move any more, is passed over.
+    Values of ``others``, the locked joints, are ignored.
 
     Raises:
-        UnknownJoint: A name that is no coordinate's.
+        UnknownJoint: A name is of no coordinate.
         InputError: A value is negative or not finite.
     """
     if armature is None:
@@ -115,7 +116,7 @@ def with_rotors(
 
 
 def _gaps(shape: pin.coal.CollisionGeometry) -> float:
-    """The sum of a mesh's directed areas as a share of its area: 0 of a closed one."""
+    """Norm of the sum of a mesh's directed areas as a share of its area: 0 for a closed mesh."""
     if not isinstance(shape, pin.coal.BVHModelBase):
         return 0.0
     corners = np.asarray(shape.vertices(), dtype=float)[
@@ -127,15 +128,15 @@ def _gaps(shape: pin.coal.CollisionGeometry) -> float:
 
 
 def with_mesh_inertias(description: Description, density: float) -> Description:
-    """The robot with the inertias of their shapes, of an even density [kg/m^3], for links of a URDF that have none.
+    """Give the links of a URDF that have no inertia that of their visual shapes, at uniform density [kg/m^3].
 
     Raises:
-        InputError: It is read from no URDF, or the density is not positive.
+        InputError: The robot does not come from a URDF, or the density is not positive.
         RobotError: A mesh is missing, cannot be read, or bounds no volume; the message names link and file.
     """
     density = positive("density", density, "kg/m^3")
     if description.urdf is None:
-        raise InputError(f"inertia='meshes' is for links of URDF files; {description.name!r} is read from none")
+        raise InputError(f"inertia='meshes' needs a URDF file; {description.name!r} does not come from one")
     urdf = read_urdf(description.urdf, description.expanded)
     full = build_model(urdf)
     known = {inertial.link for inertial in description.inertials}
@@ -157,6 +158,6 @@ def with_mesh_inertias(description: Description, density: float) -> Description:
         body = pin.Inertia(density * volume, center, 0.5 * density * (moments + moments.T))
         model.appendBodyToJoint(index.get(full.names[shape.parentJoint], 0), body, shape.placement)
         masses[link] = masses.get(link, 0.0) + density * volume
-    told = ", ".join(f"{link!r} {mass:.3g} kg" for link, mass in masses.items())
-    remark = f"inertias of links without any are those of their shapes at {density:g} kg/m^3: {told}"
+    listed = ", ".join(f"{link!r} {mass:.3g} kg" for link, mass in masses.items())
+    remark = f"links without an inertia have that of their shapes at {density:g} kg/m^3: {listed}"
     return replace(description, model=model, remarks=(*description.remarks, remark) if masses else description.remarks)

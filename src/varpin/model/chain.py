@@ -1,4 +1,4 @@
-"""Planar chains of rods, the test bench of the field."""
+"""Planar chains of rods, the usual benchmark mechanisms."""
 
 from collections.abc import Sequence
 
@@ -13,13 +13,13 @@ from varpin.support.checks import count, finite_array, positive
 def planar_chain(links: int, *, length: float = 1.0, mass: float = 1.0) -> Robot:
     """A chain of uniform slender rods on parallel revolute joints, in the vertical x-z plane.
 
-    At q = 0 it lies stretched out along x; with gravity along -z it falls. Angles are relative to the link before
-    and turn about +y, so positive angles point down.
+    At q = 0 the chain is stretched out along x; with gravity along -z it falls. Angles are relative to the previous
+    link and turn about +y, so a positive angle points down.
 
     Args:
         links: Number of links and joints.
-        length: Of each link [m].
-        mass: Of each link [kg]; the rod's inertia is m l^2 / 12 about its middle.
+        length: Length of each link [m].
+        mass: Mass of each link [kg]; the rod's inertia is m l^2 / 12 about its middle.
 
     Raises:
         InputError: ``links`` < 1, or ``length`` or ``mass`` not positive and finite.
@@ -40,15 +40,15 @@ def rod_chain(
     """A chain like :func:`planar_chain` of unequal rods, some of them without length or mass.
 
     Args:
-        lengths: Of the links [m], >= 0.
-        masses: Of the links [kg], >= 0.
-        base: Where the first joint is (3,) [m].
-        armature: Of every joint [kg m^2 or kg].
-        rail: Mass of a carriage that slides along x and carries the first joint [kg]; none if left out.
+        lengths: Lengths of the links [m], >= 0.
+        masses: Masses of the links [kg], >= 0.
+        base: Position of the first joint (3,) [m].
+        armature: Armature of every joint [kg m^2 or kg].
+        rail: Mass of a carriage that slides along x and carries the first joint [kg]; no carriage if left out.
 
     Raises:
-        InputError: A value is negative or not finite, or there are not as many masses as lengths, one at least.
-        SingularMassMatrix: A joint moves nothing.
+        InputError: A value is negative or not finite, there is no link, or the numbers of masses and lengths differ.
+        SingularMassMatrix: A joint moves no inertia.
     """
     links = count("number of lengths", len(lengths), 1)
     sizes, weights = finite_array("lengths", lengths, (links,)), finite_array("masses", masses, (links,))

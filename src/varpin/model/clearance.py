@@ -1,4 +1,4 @@
-"""How far links are from each other and from obstacles, with derivatives by the points that are nearest."""
+"""Distances between links and to obstacles, with derivatives from the nearest points."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ coal = pin.coal
 
 @dataclass(frozen=True, eq=False)
 class Obstacle(Frozen):
-    """A body that stands in the world, or moves there. Made by :meth:`sphere`, :meth:`capsule` and :meth:`box`.
+    """A body in the world, fixed or moving. Made by :meth:`sphere`, :meth:`capsule` and :meth:`box`.
 
         ball = vp.Obstacle.sphere([0.5, 0.0, 0.4], 0.1).moving(lambda t: [0.0, 0.2 * np.sin(t), 0.0])
 
     Attributes:
-        name: For messages.
-        begin: One end of its axis (3,) [m]; of a sphere or a box its centre.
+        name: Name in messages.
+        begin: One end of its axis (3,) [m]; the centre of a sphere or a box.
         end: The other end (3,) [m].
-        radius: [m]; 0 of a box.
-        sides: Of a box (3,) [m], else None.
-        rotation: Of a box, its axes in the world (3, 3).
-        shift: Where it is at a time, from where the others say (3,) [m]; None where it stands.
+        radius: Radius [m]; 0 for a box.
+        sides: Sides of a box (3,) [m], else None.
+        rotation: Axes of a box in the world (3, 3).
+        shift: Displacement (3,) [m] at a time [s]; None if the obstacle is fixed.
     """
 
     name: str
@@ -51,19 +51,19 @@ class Obstacle(Frozen):
 
     @classmethod
     def sphere(cls, center: ArrayLike, radius: float, name: str = "sphere") -> Obstacle:
-        """A ball around ``center`` (3,) [m] of some ``radius`` [m]."""
+        """A ball with ``center`` (3,) [m] and ``radius`` [m]."""
         at = finite_array("sphere center", center, (3,))
         return cls(str(name), at, at, positive("sphere radius", radius, "m"), None, np.eye(3))
 
     @classmethod
     def capsule(cls, begin: ArrayLike, end: ArrayLike, radius: float, name: str = "capsule") -> Obstacle:
-        """All that is within ``radius`` [m] of the line from ``begin`` (3,) to ``end`` (3,) [m]."""
+        """The points within ``radius`` [m] of the segment from ``begin`` (3,) to ``end`` (3,) [m]."""
         first, last = finite_array("capsule begin", begin, (3,)), finite_array("capsule end", end, (3,))
         return cls(str(name), first, last, positive("capsule radius", radius, "m"), None, np.eye(3))
 
     @classmethod
     def box(cls, center: ArrayLike, sides: ArrayLike, rotation: ArrayLike | None = None, name: str = "box") -> Obstacle:
-        """A box with ``sides`` (3,) [m] around ``center`` (3,) [m], turned by a ``rotation`` (3, 3)."""
+        """A box with ``sides`` (3,) [m] and ``center`` (3,) [m], turned by a ``rotation`` (3, 3)."""
         at, size = finite_array("box center", center, (3,)), finite_array("box sides", sides, (3,))
         if not (size > 0.0).all():
             raise InputError(f"box sides must be > 0 [m], got {size}")
@@ -71,9 +71,9 @@ class Obstacle(Frozen):
         return cls(str(name), at, at, 0.0, size, R)
 
     def moving(self, shift: Callable[[float], ArrayLike]) -> Obstacle:
-        """The body on its way: at a time t [s] it is off the place it was described at by ``shift(t)`` (3,) [m].
+        """The obstacle displaced by ``shift(t)`` (3,) [m] from its described position at each time t [s].
 
-        It does not turn. A plan within constraints knows its way for the whole horizon.
+        It does not turn. A constrained plan uses its motion over the whole horizon.
 
         Raises:
             InputError: ``shift`` is no function, or the obstacle moves already.
@@ -85,10 +85,10 @@ class Obstacle(Frozen):
         return replace(self, shift=shift)
 
     def shifts(self, times: Floats) -> Floats:
-        """Of its way at some times (N,) [s]: (N, 3) [m], zero where it stands.
+        """Its displacement (N, 3) [m] at times (N,) [s]; zero if it is fixed.
 
         Raises:
-            InputError: Its function fails, or returns no place.
+            InputError: Its function fails, or does not return three finite numbers.
         """
         if self.shift is None:
             return np.zeros((len(times), 3))
@@ -109,11 +109,15 @@ class _Body:
     """A capsule or a box, on a link or in the world.
 
     Attributes:
-        name: Of the link or obstacle.
-        kinematics: Of the link's frame; None in the world.
-        rotation: Of a box, its axes (3, 3).
-        obstacle: What it is in the world; None of a link.
-        shifts: Of an obstacle that moves, at the times that are asked for (K, 3) [m].
+        name: Name of the link or obstacle.
+        kinematics: Kinematics of the link; None in the world.
+        begin: One end of its axis (3,) [m]; the centre of a box.
+        end: The other end (3,) [m].
+        radius: Radius [m]; 0 for a box.
+        sides: Sides of a box (3,) [m], else None.
+        rotation: Axes of a box (3, 3).
+        obstacle: The obstacle; None for a link.
+        shifts: Displacements of the obstacle at the times in question (K, 3) [m].
     """
 
     name: str
@@ -137,16 +141,17 @@ class Clearance(Frozen):
 
     @property
     def moves(self) -> bool:
-        """Whether an obstacle does."""
+        """Whether an obstacle moves."""
         return any(body.obstacle is not None and body.obstacle.shift is not None for body in self._bodies)
 
     def over(self, times: Floats) -> Clearance:
-        """The same with obstacles where they are at some times (K,) [s], to which configurations then belong.
+        """The same with the obstacles at times (K,) [s].
 
-        Of q (N, n), N is a multiple of K: row i is at the time i mod K.
+        The N rows of q passed to :meth:`distances` are then at these times: N is a multiple of K, and row i belongs to
+        the time i mod K.
 
         Raises:
-            InputError: The way of an obstacle fails.
+            InputError: The function of a moving obstacle fails.
         """
         if not self.moves:
             return self
@@ -161,7 +166,7 @@ class Clearance(Frozen):
         return self._measured(q)[0]
 
     def slopes(self, q: Floats) -> Floats:
-        """Its derivatives (N, pairs, n), by the points that are nearest to each other."""
+        """Derivatives of the distances in q (N, pairs, n), from the nearest points of each pair."""
         _, normal, first, second = self._measured(q)
         N, n = q.shape
         found = np.zeros((N, len(self._pairs), n))
@@ -203,7 +208,11 @@ _Placed = tuple[Floats, Floats, Floats]
 
 
 def _round(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
-    """Distances of two capsules: of their axes less both radii (Ericson, "Real-time collision detection", 5.1.9)."""
+    """Distances of two capsules: that of their axes less both radii (Ericson, "Real-time collision detection", 5.1.9).
+
+    Returns:
+        What :meth:`Clearance._measured` returns, for one pair.
+    """
     p1, p2 = here[0], there[0]
     d1, d2, r = here[1] - p1, there[1] - p2, p1 - p2
     a, e, b = ((x * y).sum(axis=1) for x, y in ((d1, d1), (d2, d2), (d1, d2)))
@@ -214,13 +223,13 @@ def _round(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Flo
     s = np.where(crossing, np.clip((b * f - c * e) / np.where(crossing, across, 1.0), 0.0, 1.0), 0.5 * (a > 0.0))
     t = np.where(e > 0.0, (b * s + f) / safe_e, 0.0)
     clipped = np.clip(t, 0.0, 1.0)
-    # Where the other's end is nearest, or it is a point, what is nearest to that on the first.
+    # Where an end of the second axis is nearest, or the second axis is a point: the nearest point of the first axis.
     again = (clipped != t) | (e == 0.0) | ~crossing
     s = np.where(again & (a > 0.0), np.clip((b * clipped - c) / safe_a, 0.0, 1.0), s)
     first, second = p1 + s[:, None] * d1, p2 + clipped[:, None] * d2
     way = second - first
     length = np.linalg.norm(way, axis=1)
-    # Axes that meet have no direction that is nearest.
+    # Axes that intersect have no direction of the shortest distance: take z.
     unit = np.where(length[:, None] > 0.0, way / np.where(length > 0.0, length, 1.0)[:, None], [0.0, 0.0, 1.0])
     return (
         length - one.radius - other.radius,
@@ -231,7 +240,7 @@ def _round(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Flo
 
 
 def _boxed(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
-    """The same of two bodies of which one is a box, by coal."""
+    """As :func:`_round`, for two bodies of which at least one is a box, computed by coal."""
     N = len(here[0])
     d, normal, first, second = np.empty(N), np.empty((N, 3)), np.empty((N, 3)), np.empty((N, 3))
     shapes = [_shape(body) for body in (one, other)]
@@ -270,16 +279,16 @@ def clearance(
     srdf: Path | None = None,
     capsules: Mapping[str, tuple[ArrayLike, ArrayLike, float]] | None = None,
 ) -> Clearance:
-    """Links of a robot, each in a capsule, beside obstacles and beside each other.
+    """Distances of a robot's links, each in a capsule, to obstacles and to each other.
 
     Args:
         robot: The robot.
-        obstacles: Of them the distance of every moving link is taken.
-        links: Which links; all that have shapes or a capsule given if left out.
-        itself: Take distances between links, too, but not of neighbours: links on one joint or on two that follow each
-            other, and those that overlap at q = 0.
-        srdf: A file whose ``disable_collisions`` say which pairs of links never count.
-        capsules: (begin, end, radius) in a link's own axes [m], in place of what is fitted around its shapes.
+        obstacles: Obstacles, each paired with every moving link.
+        links: Which links; if left out, all that have shapes or a given capsule.
+        itself: Also pair links with each other, except neighbours: links on the same joint or on successive joints, and
+            links that overlap at q = 0.
+        srdf: A file whose ``disable_collisions`` elements exclude pairs of links.
+        capsules: (begin, end, radius) in a link's own axes [m], instead of the capsule fitted around its shapes.
 
     Raises:
         RobotError: A mesh is missing, or the SRDF file cannot be read.
@@ -302,21 +311,21 @@ def clearance(
             shape = capsule_around(fitted[name])
         else:
             raise InputError(f"link {name!r} of robot {robot.name!r} has no shape; give capsules={{{name!r}: ...}}")
-        # A link that no joint moves stands in the world.
+        # A link that no joint moves is fixed in the world.
         if body < 0:
             _, R, p = place_of_frame(robot.free_model, name, robot.name)
             bodies.append((body, _Body(name, None, R @ shape[0] + p, R @ shape[1] + p, shape[2], None, np.eye(3))))
         else:
             bodies.append((body, _Body(name, frame_kinematics(robot, name), *shape, None, np.eye(3))))
-    parts = [own for _, own in bodies]
+    parts = [part for _, part in bodies]
     moving = [i for i, part in enumerate(parts) if part.kinematics is not None]
     pairs = []
     if itself:
         pairs = _of_links(robot, bodies, _disabled(srdf))
     for obstacle in obstacles:
         pairs += [(i, len(parts)) for i in moving]
-        own = (obstacle.begin, obstacle.end, obstacle.radius, obstacle.sides, obstacle.rotation)
-        parts.append(_Body(obstacle.name, None, *own, obstacle=obstacle))
+        solid = (obstacle.begin, obstacle.end, obstacle.radius, obstacle.sides, obstacle.rotation)
+        parts.append(_Body(obstacle.name, None, *solid, obstacle=obstacle))
     if not pairs:
         raise InputError(
             f"robot {robot.name!r} has nothing to keep clear of: give obstacles, or itself=True, and links with shapes "
@@ -328,8 +337,8 @@ def clearance(
 def _of_links(
     robot: Robot, bodies: Sequence[tuple[int, _Body]], disabled: set[frozenset[str]]
 ) -> list[tuple[int, int]]:
-    """Pairs of links that are no neighbours."""
-    parent, parts = robot.tree.parent, [own for _, own in bodies]
+    """Pairs of links that are not neighbours."""
+    parent, parts = robot.tree.parent, [part for _, part in bodies]
     found = []
     for i, (one, first) in enumerate(bodies):
         for k, (other, second) in enumerate(bodies[:i]):
@@ -344,7 +353,7 @@ def _of_links(
 
 
 def _disabled(srdf: Path | None) -> set[frozenset[str]]:
-    """Pairs of links that an SRDF file says never collide."""
+    """Pairs of links that an SRDF file excludes from collision checks."""
     if srdf is None:
         return set()
     try:
@@ -355,19 +364,19 @@ def _disabled(srdf: Path | None) -> set[frozenset[str]]:
 
 
 def _vertices(robot: Robot) -> dict[str, Floats]:
-    """Points (N, 3) [m] whose hull holds the shapes of each link, in the link's axes."""
+    """Points (N, 3) [m], in each link's axes, whose hull contains the shapes of the link."""
     found: dict[str, list[Floats]] = {}
     model = robot.free_model
     for shape in geometry(robot).geometryObjects:
         frame = model.frames[shape.parentFrame]
         place = frame.placement.inverse() * shape.placement
-        own = _corners(shape.geometry) * np.asarray(shape.meshScale)
-        found.setdefault(frame.name, []).append(own @ place.rotation.T + place.translation)
+        corners = _corners(shape.geometry) * np.asarray(shape.meshScale)
+        found.setdefault(frame.name, []).append(corners @ place.rotation.T + place.translation)
     return {name: np.vstack(parts) for name, parts in found.items()}
 
 
 def _corners(shape: Any) -> Floats:
-    """Points whose hull holds a shape."""
+    """Points (N, 3) whose hull contains a shape."""
     if hasattr(shape, "vertices"):
         return np.asarray(shape.vertices(), dtype=np.float64).reshape(-1, 3)
     if isinstance(shape, coal.ConvexBase):
@@ -378,7 +387,7 @@ def _corners(shape: Any) -> Floats:
 
 
 def capsule_around(points: Floats) -> tuple[Floats, Floats, float]:
-    """Ends and radius of a small capsule that holds points (N, 3): the smallest along one of their principal axes."""
+    """Ends and radius of the smallest capsule around points (N, 3) with its axis along one of their principal axes."""
     center = points.mean(axis=0)
     axes = np.linalg.svd(points - center, full_matrices=False)[2]
     best: tuple[Floats, Floats, float] | None = None

@@ -1,4 +1,4 @@
-"""Several robots as one tree: two arms that carry an object together, an arm beside a table that moves."""
+"""Several robots combined into one: two arms that carry an object, an arm beside a moving table."""
 
 from __future__ import annotations
 
@@ -24,44 +24,45 @@ def combine(
     placements: Sequence[ArrayLike | pin.SE3 | None] | None = None,
     prefixes: Sequence[str] | None = None,
 ) -> Robot:
-    """Several robots as one, whose coordinates are those of the first, then those of the second, and so on.
+    """Combine robots into one, whose coordinates are those of the first, then those of the second, and so on.
 
-    Nothing joins them but what a scene adds: a :class:`varpin.FrameOnFrame` between a frame of each closes the loop of
-    two arms that hold one object. Limits, damping, friction, armature, mimic joints, shapes and postures go along::
+    The robots are independent until a scene joins them: a :class:`varpin.FrameOnFrame` between a frame of each closes
+    the loop of two arms that hold one object. Limits, damping, friction, armature, mimic joints, shapes and postures
+    are kept::
 
         left, right = vp.load_robot("ur5"), vp.load_robot("ur5")
         pair = vp.combine(left, right, placements=[None, facing], prefixes=["left_", "right_"])
 
     Args:
-        robots: Two at least; one may be given twice.
-        placements: Where the world of each robot stands in the new one, a transform (4, 4) [m], a ``pin.SE3``, or None
-            for where it is; left out, where they are.
-        prefixes: What comes before the names of the joints and frames of each robot. Left out, nothing where no name is
-            there twice; else the robots' own names, or ``a_``, ``b_`` ... where those are alike.
+        robots: At least two; the same robot may be given twice.
+        placements: Placement of each robot's world in the combined world: a transform (4, 4) [m], a ``pin.SE3``, or
+            None for the identity. All are the identity if left out.
+        prefixes: Prefix of the joint and frame names of each robot. If left out: none if all names are unique, else the
+            robots' names, or ``a_``, ``b_`` ... if those leave duplicates.
 
     Raises:
-        InputError: Fewer than two robots, placements or prefixes of another number, a placement that is no rotation and
-            translation, or names that are still there twice.
+        InputError: There are fewer than two robots, placements or prefixes do not match their number, a placement is
+            not a rotation and a translation, or names are still duplicates.
     """
     if len(robots) < 2 or not all(isinstance(robot, Robot) for robot in robots):
-        raise InputError("combine takes two robots or more, as varpin.load_robot makes them")
+        raise InputError("combine takes two or more robots, as varpin.load_robot returns them")
     if placements is None:
         placements = [None] * len(robots)
     if isinstance(placements, str | pin.SE3) or len(placements) != len(robots):
         raise InputError(f"placements must be one for each of {len(robots)} robots")
     if any(isinstance(place, str) for place in placements):
-        raise InputError("placements are transforms: a base that moves is given to load_robot, base='planar'")
+        raise InputError("placements must be transforms; for a moving base, load the robot with base='planar'")
     given = _prefixes(robots) if prefixes is None else tuple(prefixes)
     if isinstance(prefixes, str) or len(given) != len(robots) or not all(isinstance(word, str) for word in given):
-        raise InputError(f"prefixes must be one word for each of {len(robots)} robots, got {prefixes!r}")
+        raise InputError(f"prefixes must be one string for each of {len(robots)} robots, got {prefixes!r}")
     if twice := _twice(robots, given):
-        raise InputError(f"with the prefixes {given} the name {twice[0]!r} is there twice")
+        raise InputError(f"with the prefixes {given} there are two joints or frames named {twice[0]!r}")
     model, ties, parts = pin.Model(), [], []
     model.gravity = robots[0].model.gravity
     for robot, place, prefix in zip(robots, placements, given, strict=True):
-        own = robot.free_model if place is None else _placed(robot, place)
+        part = robot.free_model if place is None else _placed(robot, place)
         shift = model.njoints - 1
-        rebuild(own, range(1, own.njoints), own.joints.__getitem__, onto=model, prefix=prefix)
+        rebuild(part, range(1, part.njoints), part.joints.__getitem__, onto=model, prefix=prefix)
         ties += [Tie(tie.follower + shift, tie.leader + shift, tie.ratio, tie.offset) for tie in robot.ties]
         moved = pin.SE3.Identity() if place is None else pin.SE3(_homogeneous(place))
         parts.append(Part(robot, prefix, shift, moved))
@@ -105,18 +106,18 @@ def _names(robot: Robot) -> set[str]:
 
 
 def _twice(robots: Sequence[Robot], prefixes: Sequence[str]) -> list[str]:
-    """Names that several robots have."""
+    """Names that several robots share."""
     seen: set[str] = set()
     twice = []
     for robot, prefix in zip(robots, prefixes, strict=True):
-        own = {prefix + name for name in _names(robot)}
-        twice += sorted(own & seen)
-        seen |= own
+        names = {prefix + name for name in _names(robot)}
+        twice += sorted(names & seen)
+        seen |= names
     return twice
 
 
 def _prefixes(robots: Sequence[Robot]) -> tuple[str, ...]:
-    """None where no name is there twice, else the robots' names, or letters."""
+    """Empty prefixes if names are unique, else the robots' names, or letters."""
     if not _twice(robots, [""] * len(robots)):
         return ("",) * len(robots)
     names = tuple(f"{robot.name}_" for robot in robots)

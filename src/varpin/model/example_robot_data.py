@@ -1,6 +1,6 @@
-"""Where the example-robot-data package keeps its robots.
+"""Files of the robots in the package example-robot-data.
 
-Its 6.x wheels carry the data alone, so the files are found through the installed distribution's metadata.
+Its 6.x wheels contain data and no Python module, so files are found through the metadata of the distribution.
 """
 
 import csv
@@ -11,7 +11,7 @@ from varpin.errors import RobotError
 
 DISTRIBUTION = "example-robot-data"
 
-# Names as in example_robot_data.load; paths below share/example-robot-data/robots.
+# Names as in example_robot_data.load; paths relative to share/example-robot-data/robots.
 FIXED_BASE: dict[str, str] = {
     "alex_nub_hands": "alex_description/urdf/alex_nub_hands.urdf",
     "alex_psyonic_hands": "alex_description/urdf/alex_psyonic_hands.urdf",
@@ -48,7 +48,7 @@ FIXED_BASE: dict[str, str] = {
     "z1": "z1_description/urdf/z1.urdf",
 }
 
-# SRDF files that give a robot's rotor inertias and gear ratios, from which the armature follows.
+# SRDF files with rotor inertias and gear ratios, which give the armature.
 ROTORS: dict[str, str] = {"talos_arm": "talos_data/srdf/talos.srdf"}
 
 # Robots that walk, fly or swim: example-robot-data gives them a free-flyer.
@@ -101,22 +101,22 @@ def locate(relative: str) -> Path:
     """The installed file at ``relative`` below the robots folder.
 
     Raises:
-        RobotError: example-robot-data is not installed, or its version does not hold the file.
+        RobotError: example-robot-data is not installed, or its version does not contain the file.
     """
     try:
         files = _files()
     except metadata.PackageNotFoundError:
         raise RobotError(
-            f"{relative} belongs to {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}"
+            f"{relative} is in {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}"
         ) from None
     for file in files:
         if file.endswith(f"example-robot-data/robots/{relative}"):
             return Path(str(metadata.distribution(DISTRIBUTION).locate_file(file))).resolve()
-    raise RobotError(f"the installed {DISTRIBUTION} {metadata.version(DISTRIBUTION)} does not hold {relative}")
+    raise RobotError(f"the installed {DISTRIBUTION} {metadata.version(DISTRIBUTION)} does not contain {relative}")
 
 
 def installed() -> tuple[str, ...]:
-    """Names of the fixed-base robots that the installed example-robot-data holds; none without it."""
+    """Names of the fixed-base robots in the installed example-robot-data; empty if it is not installed."""
     try:
         files = _files()
     except metadata.PackageNotFoundError:
@@ -126,7 +126,7 @@ def installed() -> tuple[str, ...]:
 
 
 def _files() -> list[str]:
-    """Its files as the installer recorded them; ``metadata.files`` makes a path of each first, which takes long.
+    """Files of the distribution as the installer recorded them; ``metadata.files`` takes longer.
 
     Raises:
         PackageNotFoundError: It is not installed.
@@ -136,5 +136,5 @@ def _files() -> list[str]:
 
 
 def package_dir(urdf: Path) -> Path:
-    """The folder below which ``package://example-robot-data/...`` paths of ``urdf`` are found."""
+    """The folder in which ``package://example-robot-data/...`` paths of ``urdf`` are looked up."""
     return next(parent.parent for parent in urdf.parents if parent.name == "example-robot-data")

@@ -1,4 +1,4 @@
-"""Inertias that no body can have."""
+"""Checks of masses and inertias."""
 
 from collections.abc import Iterable, Iterator
 
@@ -10,19 +10,20 @@ from varpin.model.urdf import Inertial
 
 Floats = NDArray[np.float64]
 
-# Rounded figures of a thin plate may miss the triangle inequality, which holds for it with equality, by this much.
+# Relative tolerance of the triangle inequality. A thin plate satisfies it with equality, and misses it by about this
+# much if its numbers are rounded.
 TRIANGLE_TOLERANCE = 1e-3
-# With a radius of gyration below a micrometre [m^2], a link is a point mass, and its moments are rounding.
+# Below this squared radius of gyration [m^2], a link is a point mass and its moments are rounding errors.
 POINT = 1e-12
 
 
 def principal_moments(inertia: Floats) -> Floats:
-    """Of an inertia (3, 3): (3,), ascending [kg m^2]."""
+    """Principal moments (3,), ascending [kg m^2], of an inertia (3, 3)."""
     return np.asarray(np.linalg.eigvalsh(inertia), dtype=np.float64)
 
 
 def fault(link: str, mass: float, moments: Floats) -> str:
-    """What is wrong with a link's mass [kg] or principal moments (3,), ascending [kg m^2]; empty if nothing is."""
+    """The fault of a link's mass [kg] or principal moments (3,), ascending [kg m^2]; empty if there is none."""
     if mass < 0.0:
         return f"link {link!r} has mass {mass:g} < 0 [kg]"
     if np.abs(moments).max() <= POINT * mass:
@@ -42,11 +43,11 @@ def fault(link: str, mass: float, moments: Floats) -> str:
 
 
 def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
-    """What is wrong with inertias of links that joints of a model move.
+    """Faults of the inertias of a model's moving links, in words.
 
     Args:
-        model: Every joint on its own.
-        inertials: Of links of a URDF; without any, the bodies of the model are looked at.
+        model: The model without mimic joints.
+        inertials: Inertias of the links of a URDF; if none of them moves, those of the model's bodies are checked.
     """
     links = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
     if not (found := [(x.link, x.mass, x.inertia) for x in inertials if links.get(x.link, 0)]):
@@ -54,5 +55,5 @@ def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
         bodies = [(names.get(j, model.names[j]), model.inertias[j]) for j in range(1, model.njoints)]
         found = [(name, body.mass, np.array(body.inertia)) for name, body in bodies]
     for name, mass, inertia in found:
-        if np.isfinite(inertia).all() and (said := fault(name, mass, principal_moments(inertia))):
-            yield said
+        if np.isfinite(inertia).all() and (found_fault := fault(name, mass, principal_moments(inertia))):
+            yield found_fault

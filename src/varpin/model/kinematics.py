@@ -1,4 +1,4 @@
-"""Where a frame is and what carries it, at many configurations at once."""
+"""Placements and Jacobians of frames at many configurations at once."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class Links(Frozen):
     """Some bodies of a robot's tree with all their ancestors, each on one joint.
 
     Attributes:
-        parent: Index among these bodies (c,), -1 at a root; parents come first.
+        parent: Parent of each body, as an index among these bodies (c,), -1 at a root; parents come first.
         prismatic: 1 for a prismatic joint, 0 for a revolute one (c,).
-        rotation: Of the joint's frame in its parent's at joint position 0 (c, 3, 3).
-        translation: The same (c, 3) [m].
-        coordinate: Which one moves the joint (c,), among all n.
-        ratio: Of the joint's position to the coordinate (c,).
-        offset: The joint's position where the coordinate is 0 (c,) [rad or m].
-        mass: Of each body (c,) [kg].
-        center: Its centre of mass in its own frame (c, 3) [m].
+        rotation: Rotation of the joint frame in its parent's frame at joint position 0 (c, 3, 3).
+        translation: Translation of the joint frame, likewise (c, 3) [m].
+        coordinate: Index, among all n, of the coordinate that moves the joint (c,).
+        ratio: Ratio of the joint position to the coordinate (c,).
+        offset: Joint position where the coordinate is 0 (c,) [rad or m].
+        mass: Mass of each body (c,) [kg].
+        center: Centre of mass in the body's own frame (c, 3) [m].
         dof: n.
     """
 
@@ -49,12 +49,12 @@ class Links(Frozen):
 
     @cached_property
     def core(self) -> Core:
-        """The same for the compiled core."""
+        """These links as the compiled core takes them."""
         return Core.make(**{name: getattr(self, name) for name in _BODY}, dof=self.dof)
 
     @cached_property
     def key(self) -> bytes:
-        """The same for bodies that are the same."""
+        """A key that is equal for equal links."""
         return b"".join(getattr(self, name).tobytes() for name in _BODY)
 
 
@@ -62,7 +62,7 @@ _BODY = ("parent", "prismatic", "rotation", "translation", "coordinate", "ratio"
 
 
 def links(tree: Tree, body: int | None = None) -> Links:
-    """The bodies from the root to one of them, or all of them."""
+    """The bodies from the root to ``body``, or all bodies if left out."""
     if body is None:
         members = np.arange(tree.parent.size)
     else:
@@ -80,10 +80,10 @@ class FrameKinematics(Frozen):
     """A frame of a robot. Made by :func:`frame_kinematics`.
 
     Attributes:
-        frame: Its name.
-        links: The bodies from the root to the one that carries it.
-        rotation: Its orientation in that body (3, 3).
-        translation: Its place there (3,) [m].
+        frame: Name of the frame.
+        links: The bodies from the root to the one that carries the frame.
+        rotation: Rotation of the frame in that body (3, 3).
+        translation: Position of the frame in that body (3,) [m].
     """
 
     frame: str
@@ -93,7 +93,7 @@ class FrameKinematics(Frozen):
 
     @cached_property
     def key(self) -> bytes:
-        """The same for frames that are the same."""
+        """A key that is equal for equal frames."""
         return self.links.key + self.rotation.tobytes() + self.translation.tobytes()
 
     def placements(self, q: Floats) -> tuple[Floats, Floats]:
@@ -101,7 +101,7 @@ class FrameKinematics(Frozen):
         return self._placements(q, jacobian=False)[:2]
 
     def jacobians(self, q: Floats) -> tuple[Floats, Floats, Floats]:
-        """:meth:`placements`, and the frame's Jacobian (N, 6, n): linear over angular velocity in world axes, in v."""
+        """:meth:`placements` and the frame's Jacobian (N, 6, n): linear, then angular velocity, in world axes."""
         return self._placements(q, jacobian=True)
 
     def _placements(self, q: Floats, *, jacobian: bool) -> tuple[Floats, Floats, Floats]:
@@ -120,11 +120,11 @@ def frame_kinematics(robot: Robot, frame: str) -> FrameKinematics:
 
 
 def mass_carriers(robot: Robot) -> Links:
-    """The links that joints move, all of them, whose centre of mass a cost may be of.
+    """All links that joints move, for the robot's centre of mass.
 
     Raises:
         InputError: They have no mass.
     """
     if not robot.tree.mass.sum() > 0.0:
-        raise InputError(f"the links of robot {robot.name!r} have no mass, so no centre of it")
+        raise InputError(f"the links of robot {robot.name!r} have no mass, so there is no centre of mass")
     return links(robot.tree)

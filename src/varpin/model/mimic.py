@@ -1,7 +1,7 @@
-"""Mimic joints: which joint follows which, and Pinocchio models with and without the tie.
+"""Mimic joints: leaders and followers, and Pinocchio models with and without the ties between them.
 
-Pinocchio computes no RNEA derivatives on a model with mimic joints, so varpin keeps the model in which every
-joint stands on its own beside the one in which followers are tied to their leaders.
+Pinocchio computes no RNEA derivatives of a model with mimic joints. varpin therefore keeps two models: one in which
+followers are tied to their leaders, and a free one in which every joint is independent.
 """
 
 import logging
@@ -17,7 +17,7 @@ from varpin.model.urdf import Mimic
 
 logger = logging.getLogger(__name__)
 
-# What a model has one number of for each degree of freedom.
+# Attributes of a pin.Model with one number for each degree of freedom.
 JOINT_PARAMETERS = (
     "lowerVelocityLimit",
     "upperVelocityLimit",
@@ -34,7 +34,7 @@ JOINT_PARAMETERS = (
 
 @dataclass(frozen=True)
 class Tie:
-    """Joint ``follower`` stands at ratio * (position of joint ``leader``) + offset. Joints by Pinocchio index."""
+    """Joint ``follower`` is at ratio * (position of joint ``leader``) + offset. Joints are Pinocchio indices."""
 
     follower: int
     leader: int
@@ -43,15 +43,15 @@ class Tie:
 
 
 def joint_index(model: pin.Model) -> dict[str, int]:
-    """Index of each joint by name, the universe left out."""
+    """Index of each joint by name, without the universe."""
     return {name: i for i, name in enumerate(model.names) if i > 0}
 
 
 def ties_of(mimics: Mapping[str, Mimic], model: pin.Model) -> tuple[Tie, ...]:
-    """The ties that a URDF's mimic elements ask for.
+    """The ties of a URDF's mimic elements.
 
     A follower whose leader is not in the robot stays free, with a warning in the log: some published models
-    name leaders that do not exist. A leader that is itself a follower is followed to its own leader.
+    name leaders that do not exist. Where a leader is itself a follower, the tie is to the leader of that one.
 
     Raises:
         RobotError: Joints follow each other in a loop.
@@ -67,11 +67,11 @@ def ties_of(mimics: Mapping[str, Mimic], model: pin.Model) -> tuple[Tie, ...]:
             )
             continue
         ties[index[name]] = Tie(index[name], index[mimic.leader], mimic.ratio, mimic.offset)
-    return tuple(_to_the_end(tie, ties, model) for tie in ties.values())
+    return tuple(_to_free_leader(tie, ties, model) for tie in ties.values())
 
 
-def _to_the_end(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
-    """The tie to the free joint at the end of a chain of leaders."""
+def _to_free_leader(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
+    """The tie to the free joint at the end of the chain of leaders."""
     for _ in range(len(ties) + 1):
         if tie.leader not in ties:
             _require_usable(tie, model)
@@ -82,33 +82,29 @@ def _to_the_end(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:
 
 
 def _require_usable(tie: Tie, model: pin.Model) -> None:
-    """Refuse a tie that takes inertias, which count by the square of its ratio, beyond floating-point numbers."""
+    """Refuse a tie whose offset, or squared ratio (the factor of inertias), is not finite."""
     if math.isfinite(tie.ratio * tie.ratio) and math.isfinite(tie.offset):
         return
     raise RobotError(
         f"joint {model.names[tie.follower]!r} mimics {model.names[tie.leader]!r} with multiplier {tie.ratio:g} and "
-        f"offset {tie.offset:g}: the offset must be finite, and the multiplier's square, by which inertia counts"
+        f"offset {tie.offset:g}: the offset and the square of the multiplier must be finite"
     )
 
 
 def tied_model(model: pin.Model, ties: Sequence[Tie]) -> pin.Model:
-    """``model`` with its followers as Pinocchio mimic joints.
-
-    Raises:
-        RobotError: A leader comes after its follower, which Pinocchio cannot express.
-    """
+    """``model`` with its followers as Pinocchio mimic joints."""
     for tie in ties:
         model = pin.transformJointIntoMimic(model, tie.leader, tie.follower, tie.ratio, tie.offset)
     return model
 
 
 def depth_first(model: pin.Model, ties: Sequence[Tie]) -> list[int]:
-    """The joints in an order that Pinocchio's algorithms can take: every subtree together, leaders before followers.
+    """An order of the joints that Pinocchio's algorithms accept: subtrees contiguous, leaders before followers.
 
-    It is the order they have wherever that will do.
+    The given order is kept where it qualifies.
 
     Raises:
-        RobotError: A follower carries its own leader, or branches follow each other crosswise.
+        RobotError: A follower carries its own leader, or each of two branches follows the other.
     """
     parents = list(model.parents)
 
@@ -157,7 +153,7 @@ def reordered(model: pin.Model, ties: Sequence[Tie], order: Sequence[int]) -> tu
 
 
 def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
-    """A model without mimic joints, and the ties that ``model`` had."""
+    """``model`` without mimic joints, and the ties that it had."""
     ties = []
     mimics = [j for j in range(1, model.njoints) if model.joints[j].nv == 0 and "Mimic" in model.joints[j].shortname()]
     if not mimics:
@@ -170,8 +166,8 @@ def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
         follower = model.joints[joint].extract()
         if follower.scaling == 0.0:
             raise RobotError(
-                f"joint {model.names[joint]!r} mimics {model.names[leaders[joint]]!r} with multiplier 0, and Pinocchio "
-                "then keeps no axis of it: make it a fixed joint, or load the URDF file by path"
+                f"joint {model.names[joint]!r} mimics {model.names[leaders[joint]]!r} with multiplier 0, for which "
+                "Pinocchio keeps no axis: make it a fixed joint, or load the URDF file by path"
             )
         data = model.joints[joint].createData()
         model.joints[joint].calc(data, pin.neutral(model))
@@ -187,7 +183,7 @@ def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
 
 
 def joint_frames(model: pin.Model) -> list[int]:
-    """Indices of the frames that are joints' own."""
+    """Indices of the frames of joints: of type JOINT, with the name of their joint."""
     return [
         index
         for index, frame in enumerate(model.frames)
@@ -203,11 +199,17 @@ def rebuild(
     onto: pin.Model | None = None,
     prefix: str = "",
 ) -> pin.Model:
-    """``model`` with its joints added again in ``order``, each as ``joint_of`` gives it.
+    """``model`` rebuilt with its joints in another order or of another kind.
 
-    Links, frames, limits and armature go along. The universe is not in ``order``. Joints of ``root``, by name, carry
-    one another, and the last of them what stood in the universe. Where a model is given to put it ``onto``, it stands
-    in that one's universe, after what is there; names of joints and frames get a ``prefix``.
+    Links, frames, limits and armature are kept.
+
+    Args:
+        model: The model.
+        order: Its joints in the new order, without the universe.
+        joint_of: The new joint model of each joint.
+        root: Names and models of joints to insert in series between the universe and the model's root joints.
+        onto: A model to append to, after its joints; a new one if left out.
+        prefix: Prefix of the names of joints and frames.
     """
     new = pin.Model() if onto is None else onto
     if onto is None:
@@ -234,7 +236,7 @@ def rebuild(
                 getattr(new, limits)[copy.idx_v : copy.idx_v + copy.nv] = getattr(model, limits)[
                     old.idx_v : old.idx_v + old.nv
                 ]
-    # Joint frames first: pin.buildReducedModel looks for a frame's joint among the frames before it.
+    # Joint frames first: pin.buildReducedModel looks for a frame's joint among the preceding frames.
     old_frames = {model.frames[index].parentJoint: index for index in joint_frames(model)}
     new_frames, frames = {0: 0}, {0: 0}
     for joint in range(1, len(root) + 1):
@@ -261,10 +263,10 @@ def rebuild(
 
 
 def repair_velocity_limits(model: pin.Model) -> None:
-    """Put -upper for a lower velocity limit above the upper one.
+    """Replace a lower velocity limit above the upper one by -upper.
 
-    Pinocchio's addJoint sets the lower one to the largest double of the wrong sign, and its buildReducedModel then
-    refuses the model.
+    Pinocchio's addJoint sets the lower limit to the largest double with the wrong sign, and its buildReducedModel then
+    rejects the model.
     """
     lower, upper = np.array(model.lowerVelocityLimit), np.array(model.upperVelocityLimit)
     model.lowerVelocityLimit = np.where(lower > upper, -upper, lower)

@@ -1,8 +1,8 @@
-"""Reading an MJCF file: Pinocchio's parser makes the model, of a text in which nothing is left that it reads otherwise.
+"""Reading MJCF files: the file is rewritten in a form that Pinocchio's parser reads as MuJoCo does.
 
-Pinocchio drops the place of a body that hangs on the world without a joint, reads no second body on the world, no
-``<include>`` and not every default, and has the joints of a body with several as one. So the file is written out plain
-before: includes in their place, defaults at each element, rotations as quaternions, one joint a body.
+Pinocchio drops the placement of a body that is fixed to the world, reads only one body of the world, no ``<include>``
+and not every default, and makes one joint of several in a body. The rewritten text therefore has includes expanded,
+defaults at each element, rotations as quaternions, and one joint a body.
 """
 
 import logging
@@ -26,21 +26,21 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-# What makes bodies of others, and would have to be carried out here.
+# Elements that generate bodies; they are refused.
 _MACROS = {"attach", "composite", "flexcomp", "replicate"}
-# A frame is as good as a body without joint or mass.
+# A frame is read as a body without joint or mass.
 _BODIES = {"body", "frame"}
 _IN_FRAMES = {"body", "camera", "frame", "light", "site"}
-# How many numbers belong to an attribute that the model depends on.
+# Allowed numbers of values of the attributes that the model depends on.
 _SIZES = {
     "armature": (1,), "axis": (3,), "density": (1,), "diaginertia": (3,), "frictionloss": (1,), "fromto": (6,),
     "fullinertia": (6,), "mass": (1,), "pos": (3,), "quat": (4,), "range": (2,), "ref": (1,), "size": (1, 2, 3),
     "springdamper": (2,), "xyaxes": (6,), "zaxis": (3,),
 }  # fmt: skip
 _ROTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
-# Half the thickness of a drawn plane [m].
+# Half the thickness of the plate that shows a plane [m].
 _PLATE = 5e-4
-# What acts on a robot beside its inertia, joint dampers and dry friction.
+# Elements with forces that the model leaves out.
 _LEFT_OUT = {"equality": "equality constraints", "tendon": "tendons", "deformable": "deformable bodies"}
 
 
@@ -49,9 +49,9 @@ class Mjcf:
     """An MJCF file, read by :func:`read_mjcf`.
 
     Attributes:
-        path: Of the file.
-        dynamics: What Pinocchio makes a model of, as text.
-        looks: What Pinocchio makes shapes of, as text; its meshes are absolute paths.
+        path: Path of the file.
+        dynamics: The MJCF text from which Pinocchio builds the model.
+        looks: The MJCF text from which Pinocchio builds the shapes; its mesh paths are absolute.
         remarks: What the model leaves out, in words.
     """
 
@@ -63,7 +63,7 @@ class Mjcf:
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """What holds for a whole file."""
+    """Settings and defaults of a file, and counts of what is left out."""
 
     path: Path
     compiler: Mapping[str, str]
@@ -72,7 +72,7 @@ class _Reader:
 
     @property
     def angle_unit(self) -> float:
-        """An angle of 1 in the file [rad]."""
+        """The file's unit of angles [rad]."""
         return 1.0 if self.compiler.get("angle") == "radian" else np.pi / 180.0
 
     def fault(self, what: str) -> RobotError:
@@ -86,11 +86,13 @@ class _Reader:
         if len(values) not in sizes or not np.isfinite(values).all():
             name = element.get("name", "")
             size = " or ".join(map(str, sizes))
-            raise self.fault(f"<{element.tag}> {name!r}: its {key} is {element.get(key)!r}, no {size} finite number(s)")
+            raise self.fault(
+                f"<{element.tag}> {name!r}: its {key} must be {size} finite number(s), got {element.get(key)!r}"
+            )
         return values
 
     def resolved(self, element: ET.Element, childclass: str) -> ET.Element:
-        """A copy of an element without its children, its defaults written out."""
+        """A copy of an element without its children, with its defaults."""
         name = element.get("class", childclass)
         if name not in self.classes:
             raise self.fault(f"<{element.tag}> {element.get('name', '')!r}: there is no default class {name!r}")
@@ -101,7 +103,7 @@ class _Reader:
         return ET.Element(element.tag, {**given, **attributes})
 
     def look(self, geom: ET.Element, childclass: str) -> list[ET.Element]:
-        """A geom as :meth:`resolved`; a plane, which coal has without an edge, as a thin plate if the file ends it."""
+        """A geom as :meth:`resolved`; a bounded plane becomes a thin plate, as coal's planes are infinite."""
         plain = self.resolved(geom, childclass)
         if plain.get("type") != "plane":
             return [plain]
@@ -113,7 +115,7 @@ class _Reader:
         return [plain]
 
     def turned(self, element: ET.Element) -> dict[str, str]:
-        """The attributes of an element, its rotation in a form that Pinocchio reads as MuJoCo does."""
+        """The attributes of an element, with its rotation in a form that Pinocchio reads as MuJoCo does."""
         attributes = {key: value for key, value in element.items() if key not in ("class", "childclass")}
         for key in attributes:
             if element.tag in ("body", "frame", "geom", "inertial", "joint") and key in _SIZES:
@@ -129,7 +131,7 @@ class _Reader:
         elif "euler" in attributes:
             sequence = self.compiler.get("eulerseq", "xyz")
             if len(sequence) != 3 or set(sequence.lower()) - set("xyz"):
-                raise self.fault(f"eulerseq is {sequence!r}, where three of x, y and z belong")
+                raise self.fault(f"eulerseq must be three of x, y and z, got {sequence!r}")
             rotation = np.eye(3)
             for letter, angle in zip(sequence, self.numbers(element, "euler", (3,)), strict=True):
                 turn = pin.AngleAxis(unit * angle, np.eye(3)["xyz".index(letter.lower())]).matrix()
@@ -140,12 +142,12 @@ class _Reader:
 
 
 def is_mjcf(path: Path) -> bool:
-    """Whether a file is one by its root element; only ``.xml`` and ``.mjcf`` files are looked into."""
+    """Whether a file is an MJCF by its root element; only ``.xml`` and ``.mjcf`` files are opened."""
     return path.suffix in (".xml", ".mjcf") and root_tag(path) == "mujoco"
 
 
 def root_tag(path: Path) -> str:
-    """The root element of a file; empty if the file is no well-formed XML.
+    """Tag of the root element of a file; empty if the file is not well-formed XML.
 
     Raises:
         FileError: The file cannot be read.
@@ -160,8 +162,8 @@ def read_mjcf(path: Path) -> Mjcf:
     """Read an MJCF file.
 
     Raises:
-        FileError: The file, or one that it includes, cannot be read.
-        RobotError: It is no MJCF, or has what Pinocchio cannot read.
+        FileError: The file, or an included one, cannot be read.
+        RobotError: It is not an MJCF, or has elements that Pinocchio cannot read.
     """
     root = _included(path, path.parent, ())
     compiler = {key: value for part in root.findall("compiler") for key, value in part.items()}
@@ -195,7 +197,7 @@ def read_mjcf(path: Path) -> Mjcf:
             if not dynamics:
                 plain.append(_assets(root, reader))
             world = ET.SubElement(plain, "worldbody")
-            # Pinocchio takes the first body for the world, and reads no other.
+            # Pinocchio takes the first body of <worldbody> for the world and ignores the others.
             stand = ET.SubElement(world, "body", {"name": "world"})
             for part in root.iterfind("worldbody/*"):
                 if part.tag in _BODIES:
@@ -218,8 +220,8 @@ def build_mjcf_model(path: Path, text: str) -> pin.Model:
     """Pinocchio's model of a file.
 
     Args:
-        path: Of the file.
-        text: Its dynamics, or its looks, whose joints are the same and whose masses are not.
+        path: Path of the file.
+        text: ``dynamics`` or ``looks`` of :class:`Mjcf`: their joints are the same, their masses are not.
 
     Raises:
         RobotError: Pinocchio cannot read it.
@@ -231,7 +233,7 @@ def build_mjcf_shapes(path: Path, looks: str, model: pin.Model) -> pin.GeometryM
     """The visual geometry of a file, as Pinocchio reads it.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         looks: As in :class:`Mjcf`.
         model: From :func:`build_mjcf_model`.
 
@@ -246,13 +248,13 @@ def build_mjcf_shapes(path: Path, looks: str, model: pin.Model) -> pin.GeometryM
         for body in root.iter("body")
         if (geoms := body.findall("geom"))
     }
-    if told := "; ".join(f"link {name!r}: {what}" for name, what in lacking.items() if what):
-        raise RobotError(f"meshes of {path} are not there: {told}")
+    if links := "; ".join(f"link {name!r}: {what}" for name, what in lacking.items() if what):
+        raise RobotError(f"meshes of {path} are missing: {links}")
     return _read(path, looks, lambda file: pin.buildGeomFromMJCF(model, file, pin.GeometryType.VISUAL))
 
 
 def _read(path: Path, text: str, read: Callable[[str], T]) -> T:
-    """What Pinocchio's parser, which takes files alone, makes of a text."""
+    """What Pinocchio's parser ``read``, which takes the path of a file, returns for a text."""
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder, "plain.xml")
         plain.write_text(text, encoding="utf-8")
@@ -261,14 +263,14 @@ def _read(path: Path, text: str, read: Callable[[str], T]) -> T:
                 result = read(str(plain))
             except (ValueError, RuntimeError, IndexError) as error:
                 detail = "; ".join(complaints()) or " ".join(str(error).rpartition("message:")[2].split())
-                raise RobotError(f"{path} is no MJCF that Pinocchio can read: {detail}") from None
+                raise RobotError(f"Pinocchio cannot read the MJCF file {path}: {detail}") from None
             for line in complaints():
                 logger.warning("%s: %s", path, line)
     return result
 
 
 def _included(path: Path, folder: Path, above: tuple[Path, ...]) -> ET.Element:
-    """The root element of a file, with those of the files that it includes in their places."""
+    """The root element of a file, with its includes expanded."""
     if path in above:
         raise RobotError(f"{path} includes itself")
     try:
@@ -286,7 +288,7 @@ def _included(path: Path, folder: Path, above: tuple[Path, ...]) -> ET.Element:
 
 
 def _classes(root: ET.Element, reader: _Reader) -> dict[str, dict[str, dict[str, str]]]:
-    """The attributes of each default class by tag, those of the classes around it included."""
+    """The attributes of each default class by tag, including those of its enclosing classes."""
     classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
 
     def read(element: ET.Element, name: str, around: Mapping[str, Mapping[str, str]]) -> None:
@@ -321,7 +323,7 @@ def _assets(root: ET.Element, reader: _Reader) -> ET.Element:
 
 
 def _body(body: ET.Element, childclass: str, reader: _Reader, *, moving: bool, dynamics: bool) -> ET.Element:
-    """A body written out plain; several joints as a chain of bodies, the last of which is the body itself."""
+    """A body in rewritten form. Several joints become a chain of bodies, the last of which is the body itself."""
     childclass = body.get("childclass", childclass)
     whole = reader.turned(body)
     if dynamics and "gravcomp" in whole and reader.numbers(body, "gravcomp", (1,)).any():
@@ -337,7 +339,7 @@ def _body(body: ET.Element, childclass: str, reader: _Reader, *, moving: bool, d
     if name:
         last.set("name", name)
     moving = moving or bool(joints)
-    # Lists, as an error in a generator would come out as a TypeError.
+    # Lists: `extend` turns an error in a generator into a TypeError.
     last.extend([reader.resolved(part, childclass) for part in body.findall("site")])
     if not dynamics:
         last.extend([look for part in body.findall("geom") for look in reader.look(part, childclass)])
@@ -352,7 +354,7 @@ def _joint(joint: ET.Element, childclass: str, reader: _Reader, dynamics: bool) 
     plain = reader.resolved(joint, childclass)
     if plain.get("limited") == "false":
         plain.attrib.pop("range", None)
-    # Pinocchio takes the range of a slide for degrees, too, and the position of reference off every range.
+    # Pinocchio takes the range of a slide joint for degrees, too, and subtracts `ref` from every range.
     unit = 1.0 if plain.get("type") == "slide" else reader.angle_unit
     ref = np.zeros(1)
     if "ref" in plain.attrib:
@@ -361,7 +363,7 @@ def _joint(joint: ET.Element, childclass: str, reader: _Reader, dynamics: bool) 
     if "range" in plain.attrib:
         numbers = unit * reader.numbers(plain, "range", (2,)) + ref
         plain.set("range", " ".join(repr(float(number)) for number in numbers))
-    # Linear coefficients, and from MuJoCo 4 on those of higher powers.
+    # Linear coefficients; from MuJoCo 4 on also those of higher powers.
     stiffness, damping = (
         reader.numbers(plain, key, (1, 2, 3)) if key in plain.attrib else np.zeros(1)
         for key in ("stiffness", "damping")
@@ -376,7 +378,7 @@ def _joint(joint: ET.Element, childclass: str, reader: _Reader, dynamics: bool) 
 
 
 def _masses(body: ET.Element, name: str, childclass: str, reader: _Reader) -> list[ET.Element]:
-    """The inertia of a body that moves, or the shapes that it follows from."""
+    """The inertia of a moving body, or the shapes from which it is computed."""
     inertial, from_shapes = body.find("inertial"), reader.compiler.get("inertiafromgeom", "auto")
     lowest, highest = reader.numbers(
         ET.Element("compiler", {"inertiagrouprange": "0 5", **reader.compiler}), "inertiagrouprange", (2,)
@@ -395,12 +397,12 @@ def _masses(body: ET.Element, name: str, childclass: str, reader: _Reader) -> li
             continue
         if plain.get("mesh") or plain.get("type") in ("mesh", "sdf", "hfield"):
             raise reader.fault(
-                f"body {name!r} has no <inertial>, and its mass follows from a mesh, which Pinocchio takes otherwise "
-                "than MuJoCo: give it an <inertial>, from body_mass, body_ipos, body_iquat and body_inertia of MuJoCo"
+                f"body {name!r} has no <inertial>, and Pinocchio computes the mass of a mesh differently from MuJoCo: "
+                "give it an <inertial>, from body_mass, body_ipos, body_iquat and body_inertia of MuJoCo"
             )
         if plain.get("shellinertia") == "true":
             raise reader.fault(f"body {name!r}: its mass is on the surface of a shape, which Pinocchio does not read")
-        # To Pinocchio a shape that nothing touches has no mass.
+        # Pinocchio gives no mass to a shape that collides with nothing.
         for key in ("contype", "conaffinity"):
             plain.attrib.pop(key, None)
         shapes.append(plain)

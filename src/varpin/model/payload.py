@@ -1,4 +1,4 @@
-"""Loads that a robot carries, as part of the link they hang on."""
+"""Payloads: rigid bodies added to the links that carry them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ class Payload:
 
     Attributes:
         frame: Name of the frame.
-        mass: [kg], > 0.
-        center: Its centre of mass (3,) in the frame [m].
-        inertia: About its centre of mass, in the frame's axes [kg m^2]: 0 for a point mass, (3,) principal moments
-            along the axes, or (3, 3).
+        mass: Mass [kg], > 0.
+        center: Centre of mass (3,) in the frame [m].
+        inertia: Inertia about the centre of mass, in the frame's axes [kg m^2]: 0 for a point mass, (3,) principal
+            moments along the axes, or (3, 3).
     """
 
     frame: str
@@ -41,7 +41,7 @@ class Payload:
         """The inertia as a matrix (3, 3).
 
         Raises:
-            InputError: It is no inertia of a rigid body: not symmetric, negative, or against the triangle inequality.
+            InputError: No rigid body has it: it is not symmetric, is negative, or violates the triangle inequality.
         """
         given = require_finite("payload inertia", as_floats("payload inertia", self.inertia))
         if given.shape not in ((), (3,), (3, 3)) or (given.ndim == 0 and given != 0.0):
@@ -56,14 +56,14 @@ class Payload:
         moments = np.linalg.eigvalsh(matrix)
         if moments[0] < -1e-9 * size or moments[0] + moments[1] < moments[2] - 1e-3 * size:
             raise InputError(
-                "payload inertia is of no rigid body: principal moments must be >= 0, and none larger than the other "
-                f"two together, got {', '.join(f'{moment:g}' for moment in moments)}"
+                "no rigid body has the payload inertia: principal moments must be >= 0, and none larger than the sum "
+                f"of the other two, got {', '.join(f'{moment:g}' for moment in moments)}"
             )
         return np.asarray(matrix)
 
 
 def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
-    """Add loads to the links of ``model`` that they hang on.
+    """Add payloads to the links of ``model``.
 
     Raises:
         UnknownFrame: The model has no such frame.
@@ -71,12 +71,14 @@ def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
     """
     for part in payload:
         if not isinstance(part, Payload):
-            raise InputError(f"payload must be of varpin.Payload, got {type(part).__name__}")
+            raise InputError(f"payload must be a varpin.Payload or a sequence of them, got {type(part).__name__}")
         names = [frame.name for frame in model.frames]
         if part.frame not in names:
             raise UnknownFrame(part.frame, names, robot)
         frame = model.frames[names.index(part.frame)]
         if frame.parentJoint == 0:
-            raise InputError(f"payload of robot {robot!r}: frame {part.frame!r} is part of the base, which carries it")
+            raise InputError(
+                f"payload of robot {robot!r}: frame {part.frame!r} belongs to the base, which does not move"
+            )
         body = pin.Inertia(float(part.mass), np.array(part.center, dtype=float), part.moments())
         model.appendBodyToJoint(frame.parentJoint, body, frame.placement)

@@ -32,7 +32,7 @@ from varpin.model.tree import (
     to_pinocchio,
     tree_mass_matrix,
 )
-from varpin.model.urdf import build_model, build_shapes, missing_meshes, read_urdf, tell_missing
+from varpin.model.urdf import build_model, build_shapes, missing_meshes, missing_meshes_message, read_urdf
 from varpin.support.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed, table
@@ -41,7 +41,7 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-# How far outside its limits a joint may be locked without a word [rad or m].
+# Locking a joint further outside its limits than this gives a warning [rad or m].
 _OUTSIDE = 1e-6
 
 
@@ -49,9 +49,9 @@ class Part(NamedTuple):
     """A robot within a combined one."""
 
     robot: "Robot"
-    prefix: str  # of the names of its joints and frames
-    shift: int  # from the index of a joint of its own to that in the combined model
-    place: pin.SE3  # of its world
+    prefix: str  # prefix of its joint and frame names in the combined model
+    shift: int  # joint index in the combined model minus joint index in the robot
+    place: pin.SE3  # placement of its world in the combined world
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,21 +62,21 @@ class Robot(Frozen):
     Pinocchio's order: an angle [rad] for a revolute or continuous joint, a displacement [m] for a prismatic one.
 
     Attributes:
-        name: Where it came from, in a word.
-        model: The Pinocchio model, mimic joints tied to their leaders; ``model.nv == dof``. A continuous joint
+        name: Name of the file, the bundled robot or the model.
+        model: The Pinocchio model with mimic joints tied to their leaders; ``model.nv == dof``. A continuous joint
             takes two entries of Pinocchio's configuration: see :meth:`configuration`.
-        joint_names: The joints that are coordinates, in order.
-        free_model: The same with mimic joints on their own, on which Pinocchio computes every derivative.
+        joint_names: Names of the joints that are coordinates, in order.
+        free_model: The model with mimic joints independent, on which Pinocchio computes every derivative.
         ties: The mimic joints, by index in ``free_model``.
         tree: Flat arrays for the core.
-        locked: Joints that were locked, and where.
+        locked: Locked joints and their positions [rad or m].
         urdf: The URDF or xacro file the robot was read from, or None.
-        expanded: The URDF that a xacro file stands for, or what the shapes of an MJCF file are made of.
+        expanded: The URDF text of a xacro file, or the text from which the shapes of an MJCF file are built.
         mjcf: The MJCF file the robot was read from, or None.
-        package_dirs: Where its meshes are looked up.
+        package_dirs: Folders in which meshes are looked up.
         visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
-        group_states: What :meth:`posture` reads.
-        parts: The robots that it was combined of, see :func:`combine`; none for any other.
+        group_states: The postures that :meth:`posture` reads.
+        parts: The robots of a combined robot, see :func:`combine`; empty for others.
     """
 
     name: str
@@ -95,8 +95,8 @@ class Robot(Frozen):
     parts: tuple[Part, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
-        held = f", {len(self.locked)} locked" if self.locked else ""
-        return f"Robot({self.name}: {', '.join(self.joint_names)}{held})"
+        locked = f", {len(self.locked)} locked" if self.locked else ""
+        return f"Robot({self.name}: {', '.join(self.joint_names)}{locked})"
 
     def _repr_html_(self) -> str:
         lower, upper = self.position_limits
@@ -136,25 +136,23 @@ class Robot(Frozen):
     def posture(self, name: str, *, group: str | None = None, others: JointValues = 0.0) -> Floats:
         """A posture of the robot's SRDF file (its ``group_state``), or a reference configuration of its model.
 
-        Joints of the posture that are no coordinates here (locked, mimicking, or of a part that the robot has not) are
-        passed over.
+        Joints of the posture that are not coordinates of the robot (locked, mimic or absent joints) are ignored.
 
         Main args:
-            name: Of the posture: ``"home"``.
+            name: Name of the posture: ``"home"``.
 
         Other Args:
-            group: The group of joints whose posture is meant, where several have one of that name; left out, the
-                postures of all of them together.
-            others: Positions of the joints of which the posture says nothing: a number, (n,), or by joint name
-                [rad or m].
+            group: The joint group to take the posture of, where several groups have one of this name. If left out, the
+                postures of all these groups together.
+            others: Positions of the joints that the posture does not set: a number, (n,), or by joint name [rad or m].
 
         Returns:
             Configuration (n,) [rad or m].
 
         Raises:
-            UnknownPosture: There is none of that name; the message lists the names.
-            InputError: There is none of that group, or groups put a joint in two places.
-            UnknownJoint: ``others`` names a joint that is not there.
+            UnknownPosture: There is no posture of this name; the message lists the names.
+            InputError: The group has no posture of this name, or groups give a joint two positions.
+            UnknownJoint: ``others`` names a joint that the robot does not have.
         """
         q = joint_array("others", others, self.joint_names, uniform=True)
         found = [state for state in self.group_states if state.name == name]
@@ -162,13 +160,13 @@ class Robot(Frozen):
             raise UnknownPosture(name, self.postures, self.name)
         groups = ", ".join(state.group for state in found)
         if group is not None and not (found := [state for state in found if state.group == group]):
-            raise InputError(f"posture {name!r} is one of the groups {groups}; there is none of group {group!r}")
+            raise InputError(f"group {group!r} has no posture {name!r}; the groups {groups} have one")
         positions: dict[str, float] = {}
         for joint, position in (entry for state in found for entry in state.positions):
             if joint in self.joint_names:
                 if positions.setdefault(joint, position) != position:
                     raise InputError(
-                        f"the postures {name!r} put joint {joint!r} in two places: give group=, of {groups}"
+                        f"the postures {name!r} give joint {joint!r} two positions: choose a group= of {groups}"
                     )
                 q[self.coordinate(joint)] = position
         return q
@@ -196,13 +194,13 @@ class Robot(Frozen):
 
     @property
     def end_effector(self) -> str:
-        """Name of the last frame on the joint that has the most joints before it; the last of such joints."""
+        """Name of the last frame on the joint with the most ancestors, or on the last of several such joints."""
         depths = [len(path) for path in self.free_model.supports]
         last = max(range(self.free_model.njoints), key=lambda j: (depths[j], j))
         return str([frame.name for frame in self.free_model.frames if frame.parentJoint == last][-1])
 
     def frame_positions(self, q: ArrayLike, frame: str | None = None) -> Floats:
-        """Positions [m] in the world of a frame, or of :attr:`end_effector`: (N, 3) at ``q`` (N, n), (3,) at one (n,).
+        """World positions [m] of a frame, or of :attr:`end_effector`: (N, 3) for ``q`` (N, n), (3,) for ``q`` (n,).
 
         Raises:
             InputError: ``q`` is neither (N, n) nor (n,), or there is no such frame.
@@ -222,7 +220,7 @@ class Robot(Frozen):
 
     @property
     def unbounded(self) -> NDArray[np.bool_]:
-        """Which coordinates (n,) are angles without limits."""
+        """Whether each coordinate (n,) is an angle without limits."""
         lower, upper = self.position_limits
         return ~self.slides & np.isinf(lower) & np.isinf(upper)
 
@@ -230,7 +228,7 @@ class Robot(Frozen):
     def position_limits(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
 
-        Where both are 0, which is how a URDF has it that gives none, there are none; to hold a joint still, lock it.
+        Two bounds of 0 count as none, since a URDF without limits is read so; to hold a joint still, lock it.
         """
         lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
         joints, lowest, highest = self.model.joints, self.model.lowerPositionLimit, self.model.upperPositionLimit
@@ -238,7 +236,7 @@ class Robot(Frozen):
             joint = joints[self.model.getJointId(name)]
             if joint.nq == 1:
                 lower[c], upper[c] = lowest[joint.idx_q], highest[joint.idx_q]
-        # Pinocchio writes the absence of a limit as the largest double, a URDF as 0 and 0.
+        # No limit is the largest double in Pinocchio, and 0 and 0 in a URDF.
         none = (lower == 0.0) & (upper == 0.0)
         lower[none | (lower <= -1e300)], upper[none | (upper >= 1e300)] = -np.inf, np.inf
         for limit in (lower, upper):
@@ -257,22 +255,22 @@ class Robot(Frozen):
 
     @property
     def damping(self) -> Floats:
-        """Viscous damping that the description gives (n,) [N m s/rad or N s/m]; ``Scene(damping="robot")`` takes it.
+        """Viscous damping in the description (n,) [N m s/rad or N s/m]; ``Scene(damping="robot")`` uses it.
 
-        With that of mimic joints, which their leaders move.
+        The damping of a mimic joint is added to that of its leader.
         """
-        return self._felt(self.free_model.damping, self.tree.ratio**2)
+        return self._at_coordinates(self.free_model.damping, self.tree.ratio**2)
 
     @cached_property
     def slides(self) -> NDArray[np.bool_]:
-        """Which coordinates (n,) are in [m], those of joints that slide; what mimics a joint has no say."""
+        """Whether each coordinate (n,) belongs to a prismatic joint and is in [m]."""
         index = joint_index(self.model)
         sliding = np.array([joint_axis(self.model, index[name])[0] for name in self.joint_names], dtype=bool)
         sliding.setflags(write=False)
         return sliding
 
     def built_like(self, other: "Robot") -> bool:
-        """Whether another robot's joints lie as this one's do, but for rounding; masses may differ."""
+        """Whether another robot has the same joints at the same places, up to rounding; masses may differ."""
         mine, its = self.tree, other.tree
         if self is other or mine is its:
             return True
@@ -284,19 +282,19 @@ class Robot(Frozen):
 
     @property
     def friction(self) -> Floats:
-        """Dry friction that the description gives (n,) [N m or N]; ``CoulombFriction(robot.friction)`` takes it."""
-        return self._felt(self.free_model.friction, np.abs(self.tree.ratio))
+        """Dry friction in the description (n,) [N m or N], for ``CoulombFriction(robot.friction)``."""
+        return self._at_coordinates(self.free_model.friction, np.abs(self.tree.ratio))
 
-    def _felt(self, values: ArrayLike, weights: Floats) -> Floats:
-        """What the coordinates (n,) feel of what the joints of ``free_model`` have, each with its weight."""
-        felt = np.bincount(self.tree.coordinate, np.asarray(values, dtype=float) * weights, minlength=self.dof)
-        return np.asarray(felt, dtype=np.float64)
+    def _at_coordinates(self, values: ArrayLike, weights: Floats) -> Floats:
+        """Weighted sums (n,) over the joints of ``free_model`` that each coordinate moves."""
+        sums = np.bincount(self.tree.coordinate, np.asarray(values, dtype=float) * weights, minlength=self.dof)
+        return np.asarray(sums, dtype=np.float64)
 
     def _limit(self, attribute: str) -> Floats:
         index = joint_index(self.model)
         values = np.asarray(getattr(self.model, attribute), dtype=float)
         limit = np.array([values[self.model.joints[index[name]].idx_v] for name in self.joint_names])
-        # Pinocchio writes the absence of a limit as the largest double or as infinity, a URDF as 0.
+        # No limit is the largest double or infinity in Pinocchio, and 0 in a URDF.
         limit = np.where((limit >= 1e300) | ~(limit > 0.0), np.inf, limit)
         limit.setflags(write=False)
         return limit
@@ -332,49 +330,47 @@ def load_robot(
 ) -> Robot:
     """Load an arm.
 
-    Any URDF that Pinocchio reads will do. What a file leaves out, and inertias that no body can have, are told in the
-    log with the link and its numbers.
+    Any URDF that Pinocchio reads is accepted. The log reports what the file leaves out, and inertias that no body can
+    have, with the link and its numbers.
 
     Main args:
-        source: Path of a URDF file, of a xacro file (``arm.urdf.xacro``) that stands for one, or of an MJCF file
-            (``arm.xml``); name of a bundled robot (``"finger"``); name of a fixed-base robot of example-robot-data
-            (``"ur5"``); name of a robot of the package robot_descriptions (``"iiwa14_description"``), which downloads
-            it on first use; a ``pin.Model``; or a ``RobotWrapper``. :func:`varpin.robot_names` lists the names that
-            need no download.
-        lock: Joints to hold still, by name, and where: ``{"panda_finger_joint1": 0.02}`` [rad or m]. They are
-            removed before anything is computed. A joint that is not one-axis (a free-flyer, say) takes its
-            Pinocchio configuration.
+        source: Path of a URDF file, of a xacro file (``arm.urdf.xacro``) or of an MJCF file (``arm.xml``); name of a
+            bundled robot (``"finger"``); name of a fixed-base robot of example-robot-data (``"ur5"``); name of a robot
+            of the package robot_descriptions (``"iiwa14_description"``), which downloads it on first use; a
+            ``pin.Model``; or a ``RobotWrapper``. :func:`varpin.robot_names` lists the names that need no download.
+        lock: Joints to lock and their positions by name: ``{"panda_finger_joint1": 0.02}`` [rad or m]. They are removed
+            from the model. A joint with several axes (a free-flyer, say) takes its Pinocchio configuration.
 
     Other Args:
-        package_dirs: Where ``package://`` mesh paths, and ``$(find package)`` in xacro files, are looked up. The
-            file's own folder, and those beside the ROS packages that it lies in, are always searched.
+        package_dirs: Folders in which ``package://`` mesh paths, and ``$(find package)`` in xacro files, are looked up.
+            The file's own folder, and the folders that contain its ROS packages, are always searched.
         mimic: ``"tied"`` moves a mimic joint with its leader; ``"free"`` makes it a coordinate of its own.
-        payload: What the robot carries; it becomes part of the links that it hangs on.
+        payload: Bodies that the robot carries; they become part of its links.
         xacro_args: Arguments of a xacro file by name: ``{"prefix": "left_"}``.
-        srdf: The SRDF file, or the xacro file of one, that :meth:`Robot.posture` reads; left out, the one of the file's
-            name in its folder or in a folder ``srdf`` beside that, if there is one.
-        base: Where the robot's base stands in the world, a transform (4, 4) [m] or a ``pin.SE3``; or ``"planar"`` for
-            one that moves, with the joints ``base_x``, ``base_y`` [m] and ``base_turn`` [rad] before the robot's own
-            and with the mass of its first link. Left out, at the world's origin.
-        armature: Inertia of rotors that the joints feel [kg m^2 or kg], >= 0: a number for all coordinates, (n,), or by
-            joint name. It replaces what the file has; joints that are not named keep theirs.
-        inertia: ``"meshes"`` gives links of a URDF that have no mass that of their visual shapes, which must be closed.
-        density: Of those [kg/m^3].
+        srdf: The SRDF file, or xacro file of an SRDF, that :meth:`Robot.posture` reads. If left out, the SRDF with the
+            name of the robot's file, in the same folder or in a sibling folder ``srdf``, if there is one.
+        base: Placement of the robot's base in the world, a transform (4, 4) [m] or a ``pin.SE3``; or ``"planar"`` for a
+            moving base, which adds the joints ``base_x``, ``base_y`` [m] and ``base_turn`` [rad] before the robot's own
+            and has the mass of its first link. At the world's origin if left out.
+        armature: Rotor inertia reflected to the joints [kg m^2 or kg], >= 0: a number for all coordinates, (n,), or by
+            joint name. It replaces that of the file; joints that are not named keep theirs.
+        inertia: ``"meshes"`` gives massless links of a URDF the inertia of their visual shapes, which must be closed.
+        density: Density of these shapes [kg/m^3].
 
     Returns:
-        The robot, its geometry not yet read.
+        The robot; its geometry is read when it is needed.
 
     Raises:
-        RobotNotFound: No such file or name; close matches are listed.
-        RobotError: The file is not a URDF, its XML is broken, or a mass, an inertia or a mimic multiplier is no
-            number of use. Of a URDF only what Pinocchio does not read: masses and inertias that it leaves out, and
-            negative ones, are told in the log.
+        RobotNotFound: There is no such file or name; close matches are listed.
+        RobotError: The file is not a URDF, its XML is broken, or a mass, an inertia or a mimic multiplier is not a
+            usable number. Masses and inertias that Pinocchio leaves out of a URDF, and negative ones, are reported in
+            the log instead.
         UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
-        UnknownJoint: ``lock`` or ``armature`` names a joint that is not there.
-        UnknownFrame: A payload hangs on a frame that is not there.
+        UnknownJoint: ``lock`` or ``armature`` names a joint that the robot does not have.
+        UnknownFrame: A payload names a frame that the robot does not have.
         MissingDependency: A xacro file needs the package xacro (extra ``xacro``); a name needs robot_descriptions
             (extra ``descriptions``).
-        InputError: A xacro file has no argument of that name; a base or an armature that is none.
+        InputError: A xacro file has no argument of that name, or a base or an armature is invalid.
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
     if not is_one_of(inertia, ("file", "meshes")):
@@ -401,7 +397,7 @@ def build_robot(
     base: Base = None,
     armature: JointValues | None = None,
 ) -> Robot:
-    """:func:`load_robot` without its checks of inertia, for looking into faulty models."""
+    """:func:`load_robot` without its checks of inertia, to inspect faulty models."""
     return _built(source, package_dirs, lock, mimic, payload, xacro_args, srdf, base, armature, None)[0]
 
 
@@ -417,7 +413,7 @@ def _built(
     armature: JointValues | None,
     density: float | None,
 ) -> tuple[Robot, Description]:
-    """The robot, and what its source says."""
+    """The robot and the description of its source."""
     if not is_one_of(mimic, ("tied", "free")):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     description = describe(source, package_dirs, mimic=mimic == "tied", xacro_args=xacro_args, srdf=srdf)
@@ -477,7 +473,7 @@ def _lock(
         joint = index[name]
         if joint in leaders:
             leader = model.names[leaders[joint].leader]
-            raise InputError(f"lock: joint {name!r} mimics {leader!r}; lock {leader!r}, and it is locked along")
+            raise InputError(f"lock: joint {name!r} mimics {leader!r}; locking {leader!r} locks both")
         positions[joint] = _locked_position(model, joint, value)
         locked[name] = float(positions[joint][0]) if positions[joint].size == 1 else tuple(positions[joint].tolist())
     for tie in description.ties:
@@ -509,9 +505,9 @@ def _lock(
 
 
 def _unwound(model: pin.Model, ties: tuple[Tie, ...]) -> pin.Model:
-    """``model`` with the continuous joints among leaders and followers as plain revolute ones without limits.
+    """``model`` with the continuous joints among leaders and followers as revolute joints without limits.
 
-    A (cos, sin) pair forgets whole turns, which a gear does not; and Pinocchio ties no such joint to one of another
+    A (cos, sin) pair loses whole turns, which matter to a gear, and Pinocchio cannot tie such a joint to one of another
     kind.
     """
     geared = {joint for tie in ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
@@ -537,7 +533,7 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
         low, high = (float(limits[kind.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
         if low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
             logger.warning(
-                "%s = %g holds the joint outside its limits, %g and %g [rad or m]", name, position[0], low, high
+                "%s = %g locks the joint outside its limits, %g and %g [rad or m]", name, position[0], low, high
             )
     if kind.nv > 1:
         reference = pin.neutral(model)
@@ -552,7 +548,7 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
 
 
 def geometry(robot: Robot) -> pin.GeometryModel:
-    """The robot's visual geometry, read from its meshes now; empty where the source gives none.
+    """Read the robot's visual geometry from its meshes; empty where the source has none.
 
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
@@ -572,11 +568,11 @@ def geometry(robot: Robot) -> pin.GeometryModel:
 
 
 def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
-    """What there is of :func:`geometry`, link by link.
+    """The readable part of :func:`geometry`, link by link.
 
     Returns:
-        The shapes of the links that can be read; and by name of each other link, its joint in ``free_model`` and what
-        is wrong with it: of meshes that are not there, all of them together.
+        The shapes of the links that can be read, and for each other link by name, its joint in ``free_model`` and its
+        fault in words; missing meshes share one message.
     """
     if robot.parts:
         found = [readable_geometry(part.robot) for part in robot.parts]
@@ -596,7 +592,6 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
         return geometry(robot), {}
     urdf = read_urdf(robot.urdf, robot.expanded)
     full = build_model(urdf)
-    # Reads no mesh twice.
     loader = pin.coal.CachedMeshLoader()
     try:
         return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader)), {}
@@ -604,7 +599,7 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
         problem = str(error)
     found, missing = pin.GeometryModel(), {}
     absent = missing_meshes(urdf, robot.package_dirs)
-    told = tell_missing(urdf, absent, robot.package_dirs)
+    absent_message = missing_meshes_message(urdf, absent, robot.package_dirs)
     for link in urdf.elements("link"):
         name = link.get("name", "")
         if link.find("visual") is None:
@@ -613,7 +608,7 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
             part = _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader, name))
         except RobotError as error:
             frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
-            missing[name] = frame.parentJoint, told if name in absent else str(error)
+            missing[name] = frame.parentJoint, absent_message if name in absent else str(error)
         else:
             for shape in part.geometryObjects:
                 found.addGeometryObject(shape)
@@ -625,8 +620,8 @@ def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[
 def _of_parts(robot: Robot, shapes: Sequence[pin.GeometryModel]) -> pin.GeometryModel:
     """The shapes of each part of a combined robot on its joints."""
     together, model = pin.GeometryModel(), robot.free_model
-    for part, own in zip(robot.parts, shapes, strict=True):
-        for given in own.geometryObjects:
+    for part, geometry in zip(robot.parts, shapes, strict=True):
+        for given in geometry.geometryObjects:
             shape = given.copy()
             link = part.robot.free_model.frames[given.parentFrame]
             shape.name = part.prefix + given.name
@@ -647,11 +642,11 @@ def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin
     """The shapes of a robot's file on the joints of the robot.
 
     Args:
-        robot: Some of its joints may be locked, or in another order than in the file.
-        full: Its URDF's model, nothing locked.
+        robot: The robot; some joints may be locked, or in another order than in the file.
+        full: The model of its file, without locked joints.
         visuals: Shapes on ``full``.
     """
-    # By name, and locked joints through their frame.
+    # Joints are matched by name, locked joints through their frame.
     index = joint_index(robot.free_model)
     for shape in visuals.geometryObjects:
         link = full.frames[shape.parentFrame]
@@ -660,7 +655,7 @@ def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin
         if name in index:
             shape.parentJoint = index[name]
         elif not shape.parentJoint:
-            # What the file has in the world stands, or moves, with the robot's base.
+            # Shapes of the file's world belong to the robot's base.
             joint_frame = robot.free_model.frames[frame]
             shape.placement = joint_frame.placement * link.placement.inverse() * shape.placement
             shape.parentJoint = joint_frame.parentJoint
@@ -673,11 +668,11 @@ def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin
 
 
 def check_inertia(robot: Robot) -> None:
-    """Refuse a robot whose mass matrix is singular at rest or at a few seeded random configurations.
+    """Refuse a robot whose mass matrix is singular at q = 0 or at a few seeded random configurations.
 
     Raises:
-        SingularMassMatrix: Naming the joints whose motion carries no inertia.
-        RobotError: It is not finite.
+        SingularMassMatrix: The mass matrix is singular; the message names the joints that move no inertia.
+        RobotError: The mass matrix is not finite.
     """
     rng = np.random.default_rng(0)
     for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:

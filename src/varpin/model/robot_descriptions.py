@@ -1,4 +1,4 @@
-"""Robots that go by a name of the package robot_descriptions, which downloads their git repositories on first use."""
+"""Robots of the package robot_descriptions, which downloads their git repositories on first use."""
 
 import importlib
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from varpin.errors import MissingDependency, RobotError
 
 SUFFIX = "_description"
 
-# Tags of robots that walk or fly, unless they are arms as well.
+# Tags of robots with a floating base, and tags that override them.
 _FLOATING, _FIXED = {"biped", "drone", "humanoid", "quadruped"}, {"arm", "dual_arm", "end_effector"}
 
 
@@ -18,12 +18,12 @@ class Downloaded:
     """The files of a robot.
 
     Attributes:
-        path: Of the URDF, xacro or MJCF file.
-        package_dirs: Where its meshes are looked up.
-        xacro_args: What the package gives to the xacro file.
+        path: Path of the URDF, xacro or MJCF file.
+        package_dirs: Folders in which meshes are looked up.
+        xacro_args: Arguments that the package gives to the xacro file.
         packages: Folders of ROS packages by name.
         srdf: The SRDF or xacro file of its postures, if it has one.
-        srdf_args: What the package gives to that xacro file.
+        srdf_args: Arguments that the package gives to that xacro file.
     """
 
     path: Path
@@ -35,7 +35,7 @@ class Downloaded:
 
 
 def names() -> tuple[str, ...]:
-    """Names of the installed package; none without it."""
+    """Names of the robots in the installed package; empty if it is not installed."""
     try:
         return tuple(importlib.import_module("robot_descriptions").DESCRIPTIONS)
     except ImportError:
@@ -47,7 +47,7 @@ def download(name: str) -> Downloaded:
 
     Raises:
         MissingDependency: The package is not installed.
-        RobotError: The download fails; or the robot walks or flies, or comes as no URDF, xacro or MJCF file.
+        RobotError: The download fails, the robot walks or flies, or it has no URDF, xacro or MJCF file.
     """
     try:
         package = importlib.import_module("robot_descriptions")
@@ -56,15 +56,15 @@ def download(name: str) -> Downloaded:
         raise MissingDependency(f"robot {name!r}", [missing], 'pip install "varpin[descriptions]"') from None
     try:
         module = importlib.import_module(f"robot_descriptions.{name}")
-    except Exception as error:  # The module downloads while it is imported, by git.
+    except Exception as error:  # Importing the module runs git, which may fail in any way.
         what = " ".join(str(error).split())
         raise RobotError(
-            f"robot {name!r} cannot be downloaded by robot_descriptions, which keeps what it has in "
+            f"robot {name!r} cannot be downloaded by robot_descriptions, whose cache is "
             f"$ROBOT_DESCRIPTIONS_CACHE or ~/.cache/robot_descriptions: {type(error).__name__}: {what}"
         ) from None
     found = next((value for key in ("URDF_PATH", "XACRO_PATH", "MJCF_PATH") if (value := getattr(module, key, ""))), "")
     if not found:
-        raise RobotError(f"robot {name!r} of robot_descriptions comes as no URDF, xacro or MJCF file")
+        raise RobotError(f"robot {name!r} of robot_descriptions has no URDF, xacro or MJCF file")
     tags = set(package.DESCRIPTIONS[name].tags)
     if tags & _FLOATING and not tags & _FIXED:
         raise RobotError(

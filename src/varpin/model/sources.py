@@ -1,4 +1,4 @@
-"""From what a user names to a Pinocchio model: files, bundled robots, example-robot-data, models in memory."""
+"""Sources of robots: files, bundled robots, example-robot-data, robot_descriptions, models in memory."""
 
 import logging
 import os
@@ -31,20 +31,20 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Description:
-    """A robot as its source describes it, before anything is locked.
+    """A robot as its source describes it, before joints are locked.
 
     Attributes:
-        name: Of the file, the bundled robot or the model.
-        model: Every joint on its own.
+        name: Name of the file, the bundled robot or the model.
+        model: The model without mimic joints.
         ties: Mimic joints.
         urdf: The URDF or xacro file, if there is one.
-        expanded: The URDF that a xacro file stands for, or what the shapes of an MJCF file are made of.
+        expanded: The URDF text of a xacro file, or the text from which the shapes of an MJCF file are built.
         mjcf: The MJCF file, if there is one.
-        package_dirs: Where ``package://`` paths are looked up.
-        visuals: Geometry handed over with a RobotWrapper.
-        inertials: Of the links in a URDF, which the model has merged into bodies.
+        package_dirs: Folders in which ``package://`` paths are looked up.
+        visuals: Geometry of a RobotWrapper.
+        inertials: Inertias of the links of a URDF, which the model merges into bodies.
         remarks: What the source leaves out, in words.
-        postures: Of the joints of ``model``.
+        postures: Postures of the joints of ``model``.
     """
 
     name: str
@@ -70,14 +70,14 @@ def models_dir() -> Path:
 
 
 def bundled_robots() -> dict[str, Path]:
-    """The robots that come with varpin, by name."""
+    """Files of the robots bundled with varpin, by name."""
     return {path.stem: path for path in sorted(models_dir().glob("*.urdf"))}
 
 
 def robot_names() -> tuple[str, ...]:
     """The names that :func:`varpin.load_robot` takes: varpin's own robots, then those of example-robot-data.
 
-    Of example-robot-data, the fixed-base robots that the installed version holds; none where it is not installed.
+    The latter are the fixed-base robots in the installed version of example-robot-data, if it is installed.
     """
     return (*bundled_robots(), *example_robot_data.installed())
 
@@ -96,7 +96,7 @@ def describe(
         raise InputError(f"xacro_args must be a mapping of names to values, got {xacro_args!r}")
     description = _found(source, folders, xacro_args or {}, mimic=mimic)
     if xacro_args and (description.urdf is None or description.expanded is None):
-        raise InputError(f"xacro_args are given, but {description.name!r} is read from no xacro file")
+        raise InputError(f"xacro_args need a xacro file; {description.name!r} does not come from one")
     if srdf is None:
         return description
     if not isinstance(srdf, str | os.PathLike):
@@ -126,14 +126,14 @@ def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, ob
         return _of_example(text, folders, mimic=mimic)
     if text in example_robot_data.FLOATING_BASE:
         raise RobotError(
-            f"{text!r} stands on a free-flyer in example-robot-data, and varpin models fixed bases; "
+            f"{text!r} has a free-flyer base in example-robot-data, and varpin models fixed bases; "
             "to pin its base to the world, load its URDF file by path"
         )
     downloadable = robot_descriptions.names()
     if text in downloadable or (not downloadable and not is_path and text.endswith(robot_descriptions.SUFFIX)):
         return _of_downloaded(text, folders, xacro_args, mimic=mimic)
     if is_path and path.is_dir():
-        raise RobotError(f"{path} is a folder, not a URDF file; it holds {_urdf_files(path)}")
+        raise RobotError(f"{path} is a folder, not a URDF file; it contains {_urdf_files(path)}")
     note = "" if path.suffix not in (".urdf", ".xacro") else f" (looked in {path.absolute().parent})"
     raise RobotNotFound(text, [*bundled, *example_robot_data.installed(), *downloadable], note)
 
@@ -160,12 +160,14 @@ def _urdf_files(folder: Path) -> str:
 
 def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) -> Description:
     _check_model(model, name)
-    # Copies: what the user does to the model afterwards must not reach the robot.
+    # Copies, so that later changes of the user's model do not change the robot.
     free, ties = untied_model(model.copy())
     shapes = visuals.copy() if visuals is not None else None
     for shape in shapes.geometryObjects if shapes is not None else ():
         if shape.parentJoint >= free.njoints:
-            raise RobotError(f"shape {shape.name!r} hangs on joint {shape.parentJoint}, which model {name!r} has not")
+            raise RobotError(
+                f"shape {shape.name!r} has the parent joint {shape.parentJoint}, which model {name!r} does not have"
+            )
     order = depth_first(free, ties)
     in_order = order == sorted(order)
     if not (in_order and _has_joint_frames(free)):
@@ -173,7 +175,7 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
         for shape in shapes.geometryObjects if shapes is not None else ():
             shape.parentJoint = [0, *order].index(shape.parentJoint)
     if not in_order:
-        # Pinocchio lets joints be added in any order, and then computes another mass matrix without a word.
+        # Pinocchio accepts joints in any order, but then computes a wrong mass matrix silently.
         logger.warning(
             "the joints of model %r were not added subtree by subtree, as Pinocchio's algorithms need: reordered to %s",
             name,
@@ -186,10 +188,10 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
 
 
 def _check_model(model: pin.Model, name: str) -> None:
-    """Refuse a model whose parts do not fit together: Pinocchio's algorithms do not look, and end the process.
+    """Refuse an inconsistent model: Pinocchio's algorithms do not check it, and crash the process.
 
     Raises:
-        RobotError: Naming the part.
+        RobotError: The model is inconsistent; the message names the attribute.
     """
     n, nq, nv = model.njoints, model.nq, model.nv
     sizes = dict.fromkeys(("joints", "names", "parents", "inertias", "jointPlacements"), n)
@@ -197,27 +199,27 @@ def _check_model(model: pin.Model, name: str) -> None:
     sizes |= dict.fromkeys(JOINT_PARAMETERS, nv)
     for part, size in sizes.items():
         if (found := len(getattr(model, part))) != size:
-            raise RobotError(f"model {name!r} is damaged: its {part} has {found} entries, where {size} belong")
+            raise RobotError(f"model {name!r} is damaged: its {part} has {found} entries instead of {size}")
     q, v = 0, 0
     for joint in range(1, n):
         kind, parent = model.joints[joint], model.parents[joint]
         if parent >= joint:
             raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} comes before its parent")
-        # A mimic joint has no coordinates of its own and stands at its leader's.
+        # A mimic joint has no coordinates of its own; its indices are those of its leader.
         if kind.id != joint or (kind.nv and (kind.idx_q, kind.idx_v) != (q, v)) or kind.idx_v >= nv:
-            raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} is not at the place it has")
+            raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} has wrong indices")
         q, v = q + kind.nq, v + kind.nv
     if (q, v) != (nq, nv):
         raise RobotError(f"model {name!r} is damaged: its joints have {q} and {v} coordinates, not nq and nv")
     for frame in model.frames:
         if frame.parentJoint >= n or frame.parentFrame >= model.nframes:
-            raise RobotError(f"model {name!r} is damaged: frame {frame.name!r} hangs on what is not there")
+            raise RobotError(f"model {name!r} is damaged: the parent of frame {frame.name!r} does not exist")
 
 
 def _has_joint_frames(model: pin.Model) -> bool:
-    """Whether every joint has its frame, and it comes before what hangs on it, as pin.buildReducedModel needs.
+    """Whether every joint has its frame, before other frames on the joint, as pin.buildReducedModel needs.
 
-    It reads beyond its arrays where one is missing.
+    pin.buildReducedModel reads out of bounds where a joint frame is missing.
     """
     frame_of = {model.frames[index].parentJoint: index for index in joint_frames(model)}
     if len(frame_of) < model.njoints - 1:
@@ -226,7 +228,7 @@ def _has_joint_frames(model: pin.Model) -> bool:
 
 
 def hang_shapes(shapes: pin.GeometryModel, old: pin.Model, new: pin.Model) -> None:
-    """Hang shapes from the frames of ``old`` on those of ``new``, and where there is none on their joint's."""
+    """Reattach shapes from the frames of ``old`` to those of ``new``, or else to their joint's frame."""
     for shape in shapes.geometryObjects:
         frame = new.nframes
         if shape.parentFrame < old.nframes:
@@ -287,7 +289,7 @@ def _of_mjcf(path: Path, name: str) -> Description:
 
 
 def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
-    """Where the packages of a file are looked up: where the user says, beside the packages it lies in, beside it."""
+    """Folders in which the packages of a file are looked up: ``folders``, those of its enclosing packages, its own."""
     around = (str(package.parent) for package in enclosing_packages(path).values())
     return tuple(dict.fromkeys((*folders, *around, str(path.parent))))
 
@@ -298,7 +300,7 @@ def _of_urdf(
     urdf = read_urdf(path, expanded)
     model, mimics, remarks = build_model(urdf), urdf.mimics, urdf.remarks
     if urdf.root is None:
-        remarks = (*remarks, f"{urdf.fault}; varpin has it as Pinocchio's parser, which is more lenient, reads it")
+        remarks = (*remarks, f"{urdf.fault}; varpin uses what Pinocchio's parser, which is more lenient, reads")
         mimics = _mimics_of(build_model(urdf, mimic=True))
     ties: tuple[Tie, ...] = ()
     if mimic:
@@ -311,7 +313,7 @@ def _of_urdf(
         try:
             postures = read_postures(srdf)
         except (RobotError, FileError) as error:
-            # Nobody has asked for it.
+            # Not an error: the user did not ask for this file.
             remarks = (*remarks, f"{error}; the robot has no postures")
     return Description(
         name=name,
@@ -329,7 +331,7 @@ def _of_urdf(
 def _postures(
     path: Path, folders: tuple[str, ...], arguments: Mapping[str, object], packages: Mapping[str, str] | None = None
 ) -> tuple[Posture, ...]:
-    """The postures in an SRDF file, or in the xacro file of one; the robot's arguments need not be the file's."""
+    """The postures in an SRDF file or its xacro file, which need not take all of the robot's arguments."""
     text = expand(path, arguments, _places(path, folders), packages, strict=False) if is_xacro(path) else None
     return read_postures(path, text)
 

@@ -18,11 +18,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Posture:
-    """Positions of joints under a name.
+    """Named positions of joints.
 
     Attributes:
-        name: Of the posture.
-        group: Of the joints, as the file calls them; empty if it does not.
+        name: Name of the posture.
+        group: Name of the group of joints; empty if there is none.
         positions: Joints and their positions [rad or m].
     """
 
@@ -32,9 +32,9 @@ class Posture:
 
 
 def beside(path: Path, robot: str) -> Path | None:
-    """The SRDF file of a robot in the folder of its file, or in a folder ``srdf`` beside that.
+    """The SRDF file of a robot in the folder of its file ``path``, or in a sibling folder ``srdf``.
 
-    It has the file's name; failing that, it is the only one for a robot of the name that the file gives, ``robot``.
+    It is the one with the name of the robot's file, or else the only one whose robot is named ``robot``.
     """
     found = sorted([*path.parent.glob("*.srdf"), *path.parent.parent.glob("srdf/*.srdf")])
     for file in found:
@@ -48,12 +48,12 @@ def read_postures(path: Path, text: str | None = None) -> tuple[Posture, ...]:
     """The postures in an SRDF file.
 
     Args:
-        path: Of the file.
-        text: What it stands for, if that is not its content.
+        path: Path of the file.
+        text: The SRDF text, if not the file's content.
 
     Raises:
         FileError: The file cannot be read.
-        RobotError: It is no SRDF, or a position in it is no number.
+        RobotError: It is not an SRDF, or a position in it is not a number.
     """
     try:
         root = parsed(decoded(path)[0] if text is None else text)
@@ -68,14 +68,14 @@ def read_postures(path: Path, text: str | None = None) -> tuple[Posture, ...]:
             where = f"{path}: posture {name!r}: the position of joint {joint.get('name')!r}"
             words = joint.get("value", "").split()
             numbers = [finite_number(word, where) for word in words or [""]]
-            if len(numbers) <= 2:  # More are those of a joint that is no coordinate, a free-flyer's.
+            if len(numbers) <= 2:  # More numbers belong to a joint with several axes, such as a free-flyer.
                 positions.append((joint.get("name", ""), _angle(numbers)))
         postures.append(Posture(name, state.get("group", ""), tuple(positions)))
     return tuple(postures)
 
 
 def reference_postures(model: pin.Model) -> tuple[Posture, ...]:
-    """The reference configurations of a model, each for all of its one-axis joints."""
+    """The reference configurations of a model as postures of its one-axis joints."""
     postures = []
     for entry in model.referenceConfigurations:
         name, q = entry.key(), entry.data()
@@ -88,17 +88,17 @@ def reference_postures(model: pin.Model) -> tuple[Posture, ...]:
 
 
 def of_joints(postures: Iterable[Posture], joints: Sequence[str]) -> tuple[Posture, ...]:
-    """The postures that say something of some of ``joints``."""
+    """The postures that set some of ``joints``."""
     return tuple(posture for posture in postures if any(joint in joints for joint, _ in posture.positions))
 
 
 def _angle(numbers: Sequence[float]) -> float:
-    """The position of a one-axis joint, which may be written as cosine and sine."""
+    """The position of a one-axis joint from one number, or from cosine and sine."""
     return float(numbers[0]) if len(numbers) == 1 else math.atan2(numbers[1], numbers[0])
 
 
 def _robot_of(path: Path) -> str:
-    """The robot that a file names; empty if it cannot be read."""
+    """The name of the robot in a file; empty if the file cannot be read."""
     try:
         return parsed(decoded(path)[0]).get("name", "")
     except (expat.ExpatError, OSError):

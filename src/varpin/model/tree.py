@@ -1,4 +1,4 @@
-"""From a Pinocchio model to flat arrays: every joint turned so that it moves about or along its own z axis."""
+"""A Pinocchio model as flat arrays, with joint frames turned so that every joint axis is z."""
 
 import math
 
@@ -19,9 +19,9 @@ def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
     """Whether a one-axis joint is prismatic, and its unit axis (3,) in the joint's frame.
 
     Raises:
-        UnsupportedJoint: The joint has another number of degrees of freedom, screws, or is a composite with a
+        UnsupportedJoint: The joint has another number of degrees of freedom, is a screw, or is a composite with a
             placement of its own.
-        RobotError: Its axis is zero or no unit vector.
+        RobotError: Its axis is zero or not a unit vector.
     """
     kind = model.joints[joint]
     name = model.names[joint]
@@ -37,10 +37,10 @@ def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:
     axis = angular if angular.any() else linear
     if not (np.isfinite(axis).all() and axis.any()):
         raise RobotError(f"joint {name!r} has no axis: its direction is zero or not finite")
-    # Pinocchio makes unit vectors of axes, but not of those whose squares are beyond floating point.
+    # Pinocchio normalizes axes, except those whose squares overflow or underflow.
     length = float(np.linalg.norm(axis))
     if abs(length - 1.0) > 1e-6:
-        raise RobotError(f"joint {name!r} has an axis of length {length:g}, which Pinocchio makes no unit vector of")
+        raise RobotError(f"joint {name!r} has an axis of length {length:g}, which Pinocchio cannot normalize")
     return bool(linear.any()), axis / length
 
 
@@ -52,7 +52,7 @@ def is_unbounded(model: pin.Model, joint: int) -> bool:
 def z_to(axis: Floats) -> Floats:
     """A rotation matrix (3, 3) whose third column is ``axis``, exact for the coordinate axes."""
     a, b, c = (float(part) for part in axis)
-    # Across the coordinate axis that is farthest from this one.
+    # Perpendicular to the coordinate axis that is least aligned with this axis.
     x = [(0.0, -c, b), (c, 0.0, -a), (-b, a, 0.0)][int(np.argmin(np.abs(axis)))]
     u, v, w = (part / math.hypot(*x) for part in x)
     return np.array([[u, b * w - c * v, a], [v, c * u - a * w, b], [w, a * v - b * u, c]])
@@ -69,13 +69,13 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
     """The tree of a model whose joints all have one axis.
 
     Args:
-        model: Every joint on its own, mimic or not.
-        ties: Which joints follow which.
+        model: The model without mimic joints.
+        ties: Mimic joints.
         coordinates: Indices of the joints that are generalized coordinates, in their order.
 
     Raises:
         UnsupportedJoint: A joint has no single axis.
-        RobotError: A link's mass, centre or inertia is NaN or infinite, or a joint's placement is no rotation and
+        RobotError: A link's mass, centre or inertia is NaN or infinite, or a joint's placement is not a rotation and a
             translation.
     """
     bodies = model.njoints - 1
@@ -98,7 +98,7 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         before = turn[model.parents[joint]]
         placement = model.jointPlacements[joint]
         if not _is_rigid(placement):
-            raise RobotError(f"the placement of joint {model.names[joint]!r} is no finite rotation and translation")
+            raise RobotError(f"the placement of joint {model.names[joint]!r} must be a finite rotation and translation")
         prismatic[body] = slides
         rotation[body] = before.T @ placement.rotation @ turn[joint]
         translation[body] = before.T @ placement.translation
@@ -143,7 +143,7 @@ def frame_index(model: pin.Model, frame: str, robot: str) -> int:
     """Index of a frame by its name.
 
     Raises:
-        UnknownFrame: There is none.
+        UnknownFrame: There is no such frame.
     """
     names = [item.name for item in model.frames]
     if not isinstance(frame, str) or frame not in names:
@@ -152,11 +152,11 @@ def frame_index(model: pin.Model, frame: str, robot: str) -> int:
 
 
 def frame_on_body(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
-    """The body of the flat tree that carries a frame, and the frame's rotation (3, 3) and place (3,) in it.
+    """The body of the flat tree that carries a frame, and the frame's rotation (3, 3) and position (3,) in it.
 
     Raises:
         UnknownFrame: There is no such frame.
-        InputError: It is fixed to the base, and no joint moves it.
+        InputError: The frame is fixed to the base.
     """
     found = model.frames[frame_index(model, frame, robot)]
     joint = found.parentJoint
@@ -167,7 +167,7 @@ def frame_on_body(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats
 
 
 def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:
-    """As :func:`frame_on_body`; of a frame that is fixed to the base -1, and where it stands in the world.
+    """As :func:`frame_on_body`; for a frame that is fixed to the base, -1 and its placement in the world.
 
     Raises:
         UnknownFrame: There is no such frame.
@@ -179,7 +179,7 @@ def place_of_frame(model: pin.Model, frame: str, robot: str) -> tuple[int, Float
 
 
 def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...]) -> Floats:
-    """Armature (n,) seen by each coordinate: its own and its followers', by the square of their ratios."""
+    """Armature (n,) of each coordinate: its own and that of its followers times the squares of their ratios."""
     of_model = np.asarray(model.armature, dtype=float)
     armature = np.array([of_model[model.joints[joint].idx_v] for joint in coordinates])
     for tie in ties:
@@ -192,9 +192,9 @@ def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tu
 
 
 def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
-    """Joint positions (..., k), one a joint, as configurations (..., model.nq) of a model without mimic joints.
+    """Joint positions (..., k) as configurations (..., model.nq) of a model without mimic joints.
 
-    A continuous joint's angle becomes Pinocchio's (cos, sin).
+    The angle of a continuous joint becomes Pinocchio's (cos, sin).
     """
     configuration = np.empty((*positions.shape[:-1], model.nq))
     for k, joint in enumerate(model.joints[1:]):
@@ -207,7 +207,7 @@ def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
 
 
 def origins(parent: Integers, prismatic: Integers) -> Integers:
-    """Which bodies (b,) have no joint above them that turns: 1 or 0."""
+    """Whether each body (b,) has only prismatic joints above its own: 1 or 0."""
     origin = np.ones(len(parent), dtype=np.int64)
     for body, above in enumerate(parent):
         if above >= 0:
@@ -215,17 +215,17 @@ def origins(parent: Integers, prismatic: Integers) -> Integers:
     return origin
 
 
-# A part is light if it has less than this part of the inertia about a joint above it.
+# A part is light if its share of the inertia about a joint above it is below this.
 LIGHT = 0.005
 
 
 def ancestors(parent: Integers) -> NDArray[np.bool_]:
-    """Which bodies are on the way from the root to each (b, b), itself included: [j, a] for a on the way to j."""
-    on_way = np.eye(len(parent), dtype=bool)
+    """Ancestors of each body (b, b), itself included: [j, a] is True where a is an ancestor of j or j itself."""
+    is_ancestor = np.eye(len(parent), dtype=bool)
     for body, above in enumerate(parent):
         if above >= 0:
-            on_way[body] |= on_way[above]
-    return on_way
+            is_ancestor[body] |= is_ancestor[above]
+    return is_ancestor
 
 
 def light_parts(
@@ -238,51 +238,51 @@ def light_parts(
     inertia: Floats,
     dof: int,
 ) -> tuple[Integers, Integers]:
-    """Parts whose energy would be lost in that of what carries them.
+    """Light subtrees, whose energy is negligible beside that of the bodies that carry them.
 
-    Inertias are compared with all joints stretched out, which is a bound for both.
+    Their inertia is compared with that of their carrier with all joints stretched out, which bounds both.
 
     Args:
-        parent: Of each body (b,), -1 at a root.
-        coordinate: Of each body (b,).
-        prismatic: 1 where the joint of a body slides (b,).
-        translation: Of each joint in its parent's frame (b, 3) [m].
-        mass: Of each body (b,) [kg].
-        center: Of mass in each body's frame (b, 3) [m].
-        inertia: Of each body about its centre (b, 6) [kg m^2].
+        parent: Parent of each body (b,), -1 at a root.
+        coordinate: Coordinate that moves each body (b,).
+        prismatic: 1 where the joint of a body is prismatic (b,).
+        translation: Position of each joint in its parent's frame (b, 3) [m].
+        mass: Mass of each body (b,) [kg].
+        center: Centre of mass in each body's frame (b, 3) [m].
+        inertia: Inertia of each body about its centre of mass (b, 6) [kg m^2].
         dof: n.
 
     Returns:
-        The bodies with which they begin (l,), and which coordinates move with each (l, n): 1 or 0.
+        The root body of each light subtree (l,), and whether each coordinate moves within it (l, n): 1 or 0.
     """
     bodies = len(parent)
-    on_way = ancestors(parent)
-    way = np.zeros(bodies)  # along the offsets between joints, from the root
+    is_ancestor = ancestors(parent)
+    path = np.zeros(bodies)  # length along the offsets between joints, from the root
     for b in range(bodies):
-        way[b] = np.linalg.norm(translation[b]) + (way[parent[b]] if parent[b] >= 0 else 0.0)
+        path[b] = np.linalg.norm(translation[b]) + (path[parent[b]] if parent[b] >= 0 else 0.0)
     # [a, b]: inertia of body b about the joint of its ancestor a.
     with np.errstate(over="ignore", invalid="ignore"):
-        reach = np.linalg.norm(center, axis=1) + way - way[:, None]
+        reach = np.linalg.norm(center, axis=1) + path - path[:, None]
         slides = prismatic[:, None] == 1
         about = mass * np.where(slides, 1.0, reach**2)
         about += np.where(slides, 0.0, inertia[:, [0, 2, 5]].sum(axis=1) / 2.0)
-        about[~on_way.T] = 0.0
-        # [a, j]: of all that joint j carries.
-        carries = about @ on_way
+        about[~is_ancestor.T] = 0.0
+        # [a, j]: inertia, about joint a, of all bodies that joint j carries.
+        carries = about @ is_ancestor
         light = carries < LIGHT * np.diag(carries)[:, None]
-    carrier = np.full(bodies, -1)  # the light part a body is in
+    carrier = np.full(bodies, -1)  # root of the light subtree that a body is in
     joints, rows = [], []
     movers = np.zeros((bodies, dof))
     movers[np.arange(bodies), coordinate] = 1.0
-    movable = on_way.T.astype(float) @ movers  # [j, c]: how many bodies that joint j carries coordinate c moves
+    movable = is_ancestor.T.astype(float) @ movers  # [j, c]: how many bodies that joint j carries coordinate c moves
     elsewhere = movers.sum(axis=0) - movable
     for j in range(bodies):
         if parent[j] < 0:
             continue
         carrier[j] = carrier[parent[j]]
-        if ((movable[j] > 0) & (elsewhere[j] > 0)).any():  # a mimic joint elsewhere moves along
+        if ((movable[j] > 0) & (elsewhere[j] > 0)).any():  # a mimic joint outside the subtree moves, too
             continue
-        above = np.flatnonzero(on_way[j])[:-1]
+        above = np.flatnonzero(is_ancestor[j])[:-1]
         if light[above[carrier[above] == carrier[j]], j].any():
             carrier[j] = j
             joints.append(j)
@@ -292,19 +292,19 @@ def light_parts(
 
 
 def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Floats, dof: int) -> Integers:
-    """Which coordinates (n,) bring every joint they move back by a whole turn: 1 or 0."""
+    """Whether a whole turn of each coordinate (n,) is a whole turn of every joint that it moves: 1 or 0."""
     periodic = np.ones(dof, dtype=np.int64)
     periodic[coordinate[(prismatic == 1) | (ratio != np.rint(ratio))]] = 0
     return periodic
 
 
 def require_sound(tree: Tree) -> None:
-    """Refuse arrays that do not fit each other or point beyond their ends.
+    """Refuse a tree of inconsistent arrays or with indices out of range.
 
-    :func:`flatten` makes none; a tree that was changed afterwards may be one.
+    :func:`flatten` returns none; a tree that was changed afterwards may be inconsistent.
 
     Raises:
-        RobotError: Naming the array.
+        RobotError: The tree is inconsistent; the message names the array.
     """
     b, n = np.size(tree.parent), np.size(tree.armature)
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
@@ -321,7 +321,7 @@ def require_sound(tree: Tree) -> None:
             raise RobotError(f"the robot's tree is damaged: its {name} is no array {shape} of {np.dtype(kind)}")
         if kind is np.float64 and not np.isfinite(array).all():
             raise RobotError(f"the robot's tree is damaged: its {name} is not finite")
-    # (name, lowest, beyond the highest)
+    # (name, lowest value, highest value + 1)
     for name, low, high in (
         ("parent", -1, np.arange(b)),
         ("coordinate", 0, n),
@@ -330,16 +330,16 @@ def require_sound(tree: Tree) -> None:
     ):
         values = getattr(tree, name)
         if ((values < low) | (values >= high)).any():
-            raise RobotError(f"the robot's tree is damaged: its {name} points to what is not there")
+            raise RobotError(f"the robot's tree is damaged: its {name} has an index out of range")
     known = block_ends(tree.group)
     if not isinstance(tree.ends, np.ndarray) or tree.ends.dtype != np.int64 or not np.array_equal(tree.ends, known):
-        raise RobotError("the robot's tree is damaged: its blocks do not end where groups do")
+        raise RobotError("the robot's tree is damaged: its blocks do not end where its groups end")
 
 
 def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
-    """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for an ancestor i of j, or j itself; see jet.hpp.
+    """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for i an ancestor of j, or j itself; see jet.hpp.
 
-    In plain NumPy and n^2 memory, where Pinocchio's data take n^3.
+    Plain NumPy needs n^2 memory, Pinocchio's data n^3.
     """
     bodies = tree.parent.size
     rotation, position = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
@@ -355,7 +355,7 @@ def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
     z = rotation[:, :, 2]
     axis = np.hstack([np.where(turns, np.cross(position, z), z), np.where(turns, z, 0.0)])
     center = position + np.einsum("bij,bj->bi", rotation, tree.center)
-    lever = np.zeros((bodies, 3, 3))  # across a centre of mass
+    lever = np.zeros((bodies, 3, 3))  # cross product with the centre of mass
     lever[:, [2, 0, 1], [1, 2, 0]] = center
     lever -= lever.transpose(0, 2, 1)
     about_center = tree.inertia[:, [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
@@ -381,7 +381,7 @@ def _turn(angle: float) -> Floats:
 
 
 def place_on_body(tree: Tree, q: Floats, body: int, point_on_body: Floats) -> Floats:
-    """Where a place (3,) on a body is in the world (N, 3) [m], at configurations q (N, n)."""
+    """World positions (N, 3) [m] of a point (3,) on a body at configurations q (N, n)."""
     at = q[:, tree.coordinate] * tree.ratio + tree.offset
     point = np.broadcast_to(point_on_body, (len(q), 3))
     while body >= 0:
@@ -397,11 +397,11 @@ def place_on_body(tree: Tree, q: Floats, body: int, point_on_body: Floats) -> Fl
 
 
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:
-    """Which coordinates (n,) move each other: labels from 0 of the groups that inertia or mimic joints tie together.
+    """Groups of coordinates coupled by inertia or mimic joints: a label (n,) from 0 on for each coordinate.
 
     Args:
-        parent: Of each body (b,), -1 at a root.
-        coordinate: Of each body (b,).
+        parent: Parent of each body (b,), -1 at a root.
+        coordinate: Coordinate that moves each body (b,).
         dof: n.
     """
     tied = parent >= 0
@@ -413,7 +413,7 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
 
 
 def path_coordinates(tree: Tree, body: int) -> Integers:
-    """The coordinates that move a body; none move the world, -1."""
+    """The coordinates that move a body; empty for the world, -1."""
     found = []
     while body >= 0:
         found.append(int(tree.coordinate[body]))
@@ -422,12 +422,12 @@ def path_coordinates(tree: Tree, body: int) -> Integers:
 
 
 def block_ends(group: Integers) -> Integers:
-    """Where runs of coordinates end that hold whole groups (c,).
+    """Ends (c,) of the shortest runs of coordinates that consist of whole groups.
 
-    Mostly each group is one run; groups whose coordinates take turns share one.
+    Usually each group is one run; groups whose coordinates alternate share one.
 
     Args:
-        group: Of each coordinate (n,), from :func:`independent_groups`.
+        group: Group of each coordinate (n,), from :func:`independent_groups`.
     """
     n = group.size
     last = np.zeros(n, dtype=np.int64)

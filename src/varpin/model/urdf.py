@@ -1,8 +1,8 @@
-"""Reading a URDF file: Pinocchio's parser makes the model, and what it drops is read here or told of.
+"""Reading URDF files: Pinocchio's parser builds the model; what it drops is read here or reported.
 
 Pinocchio drops what it cannot read (an inertia that is not a number, a joint that closes a loop) with at most a line on
-stderr, and goes on with another robot than the file describes. It merges links on fixed joints into one body, and it
-refuses some mimic elements that are of use.
+stderr, and returns a robot that differs from the file. It merges links on fixed joints into one body, and it refuses
+some useful mimic elements.
 """
 
 import codecs
@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
-# The numbers that Python and C++ read alike.
+# Numbers that Python and C++ parse to the same value.
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 _BYTE_ORDER_MARKS = (
@@ -49,17 +49,17 @@ _BYTE_ORDER_MARKS = (
 _DECLARED = re.compile(rb"\s*<\?xml[^>]*?encoding\s*=\s*[\"']([\w.:-]+)[\"']")
 _COMMENT = re.compile(r"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
 
-# Pinocchio's parser goes down a tree by recursion, and takes some 2.5 kB of stack a link. Trees of more links than
-# _DEEP get a stack of their own.
+# Pinocchio's parser is recursive and needs some 2.5 kB of stack a link. Files of more than _DEEP links are parsed in a
+# thread with _STACK_OF_LINK bytes of stack a link.
 _DEEP, _STACK_OF_LINK = 1000, 10_000
 
-# Threads take turns at the process's stderr.
+# One thread at a time redirects the stderr of the process.
 _STDERR = threading.Lock()
 
 
 @dataclass(frozen=True)
 class Mimic:
-    """A mimic element: the joint stands at ratio * (position of joint ``leader``) + offset."""
+    """A mimic element: the joint is at ratio * (position of joint ``leader``) + offset."""
 
     leader: str
     ratio: float
@@ -71,10 +71,10 @@ class Inertial:
     """Mass and inertia of a link, as Pinocchio reads them.
 
     Attributes:
-        link: Its name.
-        mass: [kg].
+        link: Name of the link.
+        mass: Mass [kg].
         center: Centre of mass (3,) in the link's frame [m].
-        inertia: (3, 3) about the centre of mass, in the link's axes [kg m^2].
+        inertia: Inertia (3, 3) about the centre of mass, in the link's axes [kg m^2].
     """
 
     link: str
@@ -88,14 +88,14 @@ class Urdf:
     """A URDF file, read by :func:`read_urdf`.
 
     Attributes:
-        path: Of the file.
-        text: Its content.
-        root: Its ``<robot>`` element, with names as they are written, prefix and all. None if the text is no
-            well-formed XML, which Pinocchio's parser may read all the same; nothing below is known then.
-        inertials: Of the links that have one.
+        path: Path of the file.
+        text: URDF text.
+        root: The ``<robot>`` element, with prefixes of names as written. None if the text is not well-formed XML, which
+            Pinocchio's parser may still read; the next two are then empty.
+        inertials: Inertias of the links that have one.
         mimics: Mimic elements by joint.
-        remarks: What the file leaves out, and what it is read as, in words.
-        fault: What is wrong with the XML, if something is.
+        remarks: What the file leaves out and how it is read, in words.
+        fault: The fault of the XML, in words; empty if there is none.
     """
 
     path: Path
@@ -114,15 +114,15 @@ class Urdf:
 def read_urdf(path: Path, text: str | None = None) -> Urdf:
     """Read a URDF file.
 
-    XML is read leniently: prefixes need no namespace, and comments may hold ``--``.
+    XML is read leniently: prefixes need no namespace, and comments may contain ``--``.
 
     Args:
-        path: Of the file.
-        text: What it stands for, if that is not its content.
+        path: Path of the file.
+        text: The URDF text, if not the file's content.
 
     Raises:
         FileError: The file cannot be read.
-        RobotError: It is no URDF, or not one of a tree of bodies, or a number of a mimic element is none.
+        RobotError: It is not a URDF, its bodies do not form a tree, or a number in a mimic element is invalid.
     """
     text, remarks = decoded(path) if text is None else (text, [])
     if not text.strip("\0 \t\r\n"):
@@ -141,10 +141,10 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
 
 
 def build_model(urdf: Urdf, *, mimic: bool = False) -> pin.Model:
-    """Pinocchio's model of a file, every joint on its own unless ``mimic`` leaves those that mimic to Pinocchio.
+    """Pinocchio's model of a file; mimic joints are independent unless ``mimic`` is set.
 
     Raises:
-        RobotError: Pinocchio cannot read it, or reads less than there is.
+        RobotError: Pinocchio cannot read the file, or drops mass.
     """
     massive = {inertial.link for inertial in urdf.inertials}
     text = urdf.text if urdf.root is None else _written(urdf, _dynamics(urdf.root, massive))
@@ -176,9 +176,9 @@ def build_shapes(
     Args:
         urdf: The file.
         model: From :func:`build_model`.
-        package_dirs: Where ``package://`` paths are looked up.
-        loader: Reads meshes, and may keep them.
-        link: The only one wanted, if there is one; only in well-formed XML.
+        package_dirs: Folders in which ``package://`` paths are looked up.
+        loader: Loader of the meshes.
+        link: Read only this link, which needs well-formed XML; all links if left out.
 
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
@@ -187,7 +187,7 @@ def build_shapes(
     if urdf.root is not None:
         absent = missing_meshes(urdf, package_dirs)
         if absent := {name: files for name, files in absent.items() if link in (None, name)}:
-            raise RobotError(tell_missing(urdf, absent, package_dirs))
+            raise RobotError(missing_meshes_message(urdf, absent, package_dirs))
         looks, textures = _looks(urdf, urdf.root, package_dirs, link)
         text = _written(urdf, looks)
 
@@ -212,7 +212,7 @@ def build_shapes(
 
 
 def missing_meshes(urdf: Urdf, package_dirs: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """The visual meshes that are not there, as the file names them, by link."""
+    """The missing visual meshes by link, as the file names them."""
     missing = {}
     for element in urdf.elements("link"):
         files = [mesh.get("filename", "") for mesh in element.iterfind("visual/geometry/mesh")]
@@ -221,18 +221,18 @@ def missing_meshes(urdf: Urdf, package_dirs: Sequence[str]) -> dict[str, tuple[s
     return missing
 
 
-def tell_missing(urdf: Urdf, missing: Mapping[str, Sequence[str]], package_dirs: Sequence[str]) -> str:
-    """What there is to be said of meshes from :func:`missing_meshes`."""
+def missing_meshes_message(urdf: Urdf, missing: Mapping[str, Sequence[str]], package_dirs: Sequence[str]) -> str:
+    """The error message for meshes from :func:`missing_meshes`."""
     links = "; ".join(f"link {link!r}: {', '.join(files)}" for link, files in missing.items())
     places = ", ".join(_places(package_dirs)) or "no folder"
     return (
-        f"meshes of {urdf.path} are not there: {links}; package:// was looked up in {places}, other paths beside the "
-        "file; package_dirs=[...] adds folders that hold packages"
+        f"meshes of {urdf.path} are missing: {links}; package:// was looked up in {places}, other paths beside the "
+        "file; package_dirs=[...] adds folders that contain packages"
     )
 
 
 def decoded(path: Path) -> tuple[str, list[str]]:
-    """A file's text in the encoding that it declares, and what is to be said of it.
+    """A file's text, decoded as the file declares, and remarks about its encoding.
 
     Raises:
         FileError: The file cannot be read.
@@ -252,12 +252,12 @@ def decoded(path: Path) -> tuple[str, list[str]]:
             remarks.append(f"its encoding {encoding!r} is unknown; it is read as utf-8")
             encoding = "utf-8"
         else:
-            # Whose declaration can be read byte by byte is not in an encoding of two or four bytes.
+            # A declaration that is readable byte by byte cannot be in UTF-16 or UTF-32.
             encoding = "utf-8" if name.startswith(("utf-16", "utf-32")) else encoding
     try:
         text = content.decode(encoding)
     except (UnicodeError, LookupError) as error:
-        remarks.append(f"it is not {encoding} as it should be ({error}); what cannot be read is replaced by \ufffd")
+        remarks.append(f"it is not valid {encoding} ({error}); what cannot be read is replaced by \ufffd")
         text = content.decode("utf-8", errors="replace")
     return text.lstrip("\ufeff \t\r\n"), remarks
 
@@ -268,7 +268,7 @@ def parsed(text: str) -> ET.Element:
     Raises:
         ExpatError: The text is not well-formed.
     """
-    # Comments go, as "--" may not stand in them in XML but often does; their lines stay, for messages.
+    # Comments are removed: they often contain "--", which XML forbids. Their line breaks stay, for line numbers.
     text = _COMMENT.sub(lambda found: found[1] or "\n" * found[0].count("\n"), text)
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
     parser.buffer_text = True
@@ -296,7 +296,7 @@ def _require_robot(root: ET.Element, path: Path) -> None:
 
 
 def _xacro(root: ET.Element) -> str:
-    """The first thing that xacro would have replaced, if there is one."""
+    """The first element or attribute that xacro would replace; empty if there is none."""
     prefixes = {"xacro"} | {key.removeprefix("xmlns:") for key, value in root.items() if "wiki/xacro" in value}
     for element in root.iter():
         prefix, colon, _ = element.tag.partition(":")
@@ -338,7 +338,7 @@ def _require_tree(root: ET.Element, path: Path) -> None:
 def _inertial(link: ET.Element, remarks: list[str]) -> Inertial | None:
     """Mass and inertia of a link as Pinocchio reads them, or None if it has none.
 
-    What is left out of the link's ``<inertial>``, or is no number, is added to ``remarks``.
+    A remark is added for each missing or invalid number of the link's ``<inertial>``.
     """
     inertial = link.find("inertial")
     if inertial is None:
@@ -378,12 +378,12 @@ def _inertial(link: ET.Element, remarks: list[str]) -> Inertial | None:
 
 
 def _words(moments: ET.Element | None) -> dict[str, str]:
-    """Those of an ``<inertia>`` that are given."""
+    """The given moments of an ``<inertia>``, as text."""
     return {} if moments is None else {key: moments.get(key, "") for key in _MOMENTS if moments.get(key) is not None}
 
 
 def _moments(moments: ET.Element | None) -> list[float] | None:
-    """The six numbers of an ``<inertia>``; None, which is a point mass, unless all of them are there and finite."""
+    """The six numbers of an ``<inertia>``; None, for a point mass, unless all are given and finite."""
     numbers = [number for word in _words(moments).values() if (number := _finite(word)) is not None]
     return numbers if len(numbers) == len(_MOMENTS) else None
 
@@ -402,16 +402,16 @@ def _mimic(joint: ET.Element, path: Path) -> Mimic:
 
 
 def _finite(word: str | None) -> float | None:
-    """The number that a word is, if it is a finite one."""
+    """A word as a finite number; None if it is not one."""
     number = float(word) if word is not None and _NUMBER.fullmatch(word.strip()) else math.nan
     return number if math.isfinite(number) else None
 
 
 def finite_number(word: str, what: str) -> float:
-    """The finite number that a word is.
+    """A word as a finite number.
 
     Raises:
-        RobotError: It is none; the message calls it ``what``.
+        RobotError: It is not one; the message calls it ``what``.
     """
     if (value := _finite(word)) is None:
         raise RobotError(f"{what} is {reprlib.repr(word)}, where a finite number belongs")
@@ -419,7 +419,7 @@ def finite_number(word: str, what: str) -> float:
 
 
 def _dynamics(root: ET.Element, massive: Collection[str]) -> ET.Element:
-    """What Pinocchio makes a model of: links, the massive ones with their inertias, and joints."""
+    """The part of a URDF for Pinocchio's model: joints and links, with the inertias of the links ``massive``."""
     small = ET.Element("robot", {"name": root.get("name", "")})
     for link in root.findall("link"):
         part = ET.SubElement(small, "link", _named(link))
@@ -432,12 +432,18 @@ def _dynamics(root: ET.Element, massive: Collection[str]) -> ET.Element:
 def _looks(
     urdf: Urdf, root: ET.Element, package_dirs: Sequence[str], only: str | None
 ) -> tuple[ET.Element, dict[str, str]]:
-    """What Pinocchio makes shapes of: links with their visuals, of all or of one, and joints; and shapes' textures.
+    """The part of a URDF for Pinocchio's shapes: joints, and links with their visuals; and the textures of shapes.
 
-    Meshes go by their absolute paths: Pinocchio takes a relative one for one from the working folder.
+    Mesh paths are made absolute, as Pinocchio resolves relative ones against the working folder.
 
-    Pinocchio knows no textures, and takes a material without a colour for black. Such a material is left out, as is
-    black beside a texture, where a converter had no colour: the mesh then keeps the colours of its file.
+    Pinocchio ignores textures and shows a material without a colour in black. Such a material is left out, as is black
+    beside a texture, which converters write for want of a colour: the mesh then keeps the colours of its file.
+
+    Args:
+        urdf: The file.
+        root: Its root element.
+        package_dirs: Folders in which ``package://`` paths are looked up.
+        only: Name of the only link with visuals; all links if None.
     """
     small = ET.Element("robot", {"name": root.get("name", "")})
     shared = {material.get("name"): material for material in root.findall("material")}
@@ -450,11 +456,11 @@ def _looks(
             material = declared if declared is None or len(declared) else shared.get(declared.get("name"), declared)
             texture = None if material is None else material.find("texture")
             if texture is not None and texture.get("filename"):
-                # Pinocchio's name of the shape.
+                # The name that Pinocchio gives to the shape.
                 textures[f"{link.get('name')}_{k}"] = texture.get("filename", "")
             plain = ET.SubElement(part, "visual", visual.attrib)
             plain.extend(
-                _with_places(child, urdf, package_dirs)
+                _with_absolute_paths(child, urdf, package_dirs)
                 for child in visual
                 if child is not declared or (material is not None and _has_color(material))
             )
@@ -462,8 +468,8 @@ def _looks(
     return small, textures
 
 
-def _with_places(part: ET.Element, urdf: Urdf, package_dirs: Sequence[str]) -> ET.Element:
-    """A part of a visual, a mesh in it by its absolute path."""
+def _with_absolute_paths(part: ET.Element, urdf: Urdf, package_dirs: Sequence[str]) -> ET.Element:
+    """A part of a visual with absolute mesh paths."""
     if part.find("mesh") is None:
         return part
     resolved = copy.deepcopy(part)
@@ -481,20 +487,20 @@ def _has_color(material: ET.Element) -> bool:
 
 
 def _located(name: str, urdf: Path, package_dirs: Sequence[str]) -> Path | None:
-    """The file that a URDF names; None if it is not there."""
+    """The path of a file named in a URDF; None if it does not exist."""
     scheme, separator, rest = name.partition("://")
     if not separator:
         paths = [urdf.parent / name, Path(name)]
     elif scheme == "file":
         paths = [Path(rest)]
     else:
-        # Gazebo writes model:// for package://.
+        # Gazebo uses model:// for package://.
         paths = [Path(folder, rest) for folder in _places(package_dirs)] if scheme in ("package", "model") else []
     return next((path.absolute() for path in paths if path.is_file()), None)
 
 
 def _places(package_dirs: Sequence[str]) -> list[str]:
-    """Where packages are looked up: as told, and where a ROS that is sourced has them."""
+    """Folders in which packages are looked up: ``package_dirs``, then those of a sourced ROS."""
     ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
     ament = [folder for folder in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if folder]
     return [*package_dirs, *ros, *(f"{folder}/share" for folder in ament)]
@@ -505,7 +511,7 @@ def _named(link: ET.Element) -> dict[str, str]:
 
 
 def _tidy(inertial: ET.Element) -> ET.Element:
-    """The ``<inertial>`` of a massive link, whole and without white space that Pinocchio would stumble over."""
+    """The complete ``<inertial>`` of a massive link, without white space that Pinocchio cannot parse."""
     tidy = ET.Element("inertial")
     mass, moments, origin = inertial.find("mass"), inertial.find("inertia"), inertial.find("origin")
     if origin is not None:
@@ -524,11 +530,11 @@ def _written(urdf: Urdf, root: ET.Element) -> str:
 
 
 def _on_a_stack(urdf: Urdf, read: Callable[[], T]) -> T:
-    """What ``read`` returns, run on a stack that Pinocchio's parser gets to the end of the tree on."""
+    """What ``read`` returns, run on a stack that is large enough for Pinocchio's recursive parser."""
     links = urdf.text.count("<link")
     if links <= _DEEP:
         return read()
-    # The size is that of threads that start from now on, whose stacks may well be larger.
+    # This sets the size for all threads that start from now on, until it is restored; a larger one does no harm.
     before = threading.stack_size(max(links * _STACK_OF_LINK // 4096 * 4096, 16 * 2**20))
     try:
         with ThreadPoolExecutor(1) as thread:
@@ -539,7 +545,7 @@ def _on_a_stack(urdf: Urdf, read: Callable[[], T]) -> T:
 
 @contextlib.contextmanager
 def captured_stderr() -> Iterator[Callable[[], list[str]]]:
-    """Catch what Pinocchio's C++ parser writes to the process's stderr; yields a function that returns its messages."""
+    """Capture what Pinocchio's C++ parser writes to stderr; yields a function that returns the messages."""
     with _STDERR, tempfile.TemporaryFile() as sink:
         sys.stderr.flush()
         saved = os.dup(2)
@@ -548,7 +554,7 @@ def captured_stderr() -> Iterator[Callable[[], list[str]]]:
         def messages() -> list[str]:
             sink.seek(0)
             lines = [line.strip() for line in sink.read().decode(errors="replace").splitlines()]
-            # Every message is followed by the line of the parser's C++ source that it comes from.
+            # The parser follows each message by a line with its place in the C++ source.
             return [line.removeprefix("Error:").strip() for line in lines if line and not line.startswith("at line ")]
 
         try:

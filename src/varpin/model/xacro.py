@@ -1,4 +1,4 @@
-"""Xacro files: expanded to the URDF or SRDF that they stand for, by the package xacro, with or without ROS."""
+"""Xacro files: expanded to URDF or SRDF by the package xacro, with or without ROS."""
 
 import contextlib
 import importlib
@@ -18,33 +18,33 @@ from varpin.errors import InputError, MissingDependency, RobotError
 
 logger = logging.getLogger(__name__)
 
-# The package keeps its state in its modules, so expansions take turns.
-_TURN = threading.Lock()
+# The package xacro keeps its state in its modules: one expansion at a time.
+_LOCK = threading.Lock()
 
 
 class _Arguments(dict[str, str]):
-    """Arguments of an expansion, which note those that the file asks for."""
+    """Arguments of an expansion, with a record of those that the file uses."""
 
     def __init__(self, given: Mapping[str, str]) -> None:
         super().__init__(given)
-        self.asked: set[str] = set()
+        self.used: set[str] = set()
 
     def __contains__(self, name: object) -> bool:
-        self.asked.add(str(name))
+        self.used.add(str(name))
         return super().__contains__(name)
 
     def __getitem__(self, name: str) -> str:
-        self.asked.add(name)
+        self.used.add(name)
         return super().__getitem__(name)
 
 
 def is_xacro(path: Path) -> bool:
-    """Whether a file is one by its name."""
+    """Whether a file is a xacro file by its suffix."""
     return path.suffix == ".xacro"
 
 
 def plain_name(path: Path) -> str:
-    """The name of a file without its suffixes: ``arm`` of ``arm.urdf.xacro``."""
+    """The name of a file without its suffixes: ``arm`` for ``arm.urdf.xacro``."""
     return Path(path.name.removesuffix(".xacro")).stem if is_xacro(path) else path.stem
 
 
@@ -56,14 +56,14 @@ def expand(
     *,
     strict: bool = True,
 ) -> str:
-    """The XML that a xacro file stands for.
+    """The XML to which a xacro file expands.
 
     Args:
-        path: Of the file.
-        arguments: Its arguments by name: texts, numbers or truth values.
-        package_dirs: Where ``$(find package)`` is looked up, after the folders above the file.
-        packages: Folders of packages by name, known beforehand.
-        strict: Whether an argument that the file does not ask for is an error.
+        path: Path of the file.
+        arguments: Its arguments by name: strings, numbers or booleans.
+        package_dirs: Folders in which ``$(find package)`` is looked up, after those that contain the file.
+        packages: Known folders of packages by name.
+        strict: Whether an argument that the file does not use is an error.
 
     Raises:
         MissingDependency: The package xacro is not installed.
@@ -73,25 +73,25 @@ def expand(
     xacro, substitution = _package(path)
     given = _Arguments({name: _word(value) for name, value in arguments.items()})
     notes = io.StringIO()
-    with _TURN, contextlib.redirect_stderr(notes), _finding(substitution, path, package_dirs, packages or {}):
+    with _LOCK, contextlib.redirect_stderr(notes), _finding(substitution, path, package_dirs, packages or {}):
         try:
             text = str(xacro.process_file(str(path), mappings=given).toxml())
-        except Exception as error:  # The file's expressions are evaluated, and may fail in any way.
-            said = len(notes.getvalue())
+        except Exception as error:  # Expressions in the file may raise anything.
+            before = len(notes.getvalue())
             xacro.print_location()
-            where = "; ".join(line.strip() for line in notes.getvalue()[said:].splitlines())
+            where = "; ".join(line.strip() for line in notes.getvalue()[before:].splitlines())
             where = "" if where == f"when processing file: {path}" else f" ({where})"
-            raise RobotError(f"{path} cannot be expanded: {', '.join(_told(error))}{where}") from None
+            raise RobotError(f"{path} cannot be expanded: {', '.join(_messages(error))}{where}") from None
     for line in filter(None, map(str.strip, notes.getvalue().splitlines())):
         logger.warning("%s: %s", path, line)
-    if strict and (unknown := sorted(set(arguments) - given.asked)):
-        known = ", ".join(sorted(given.asked)) or "none"
+    if strict and (unknown := sorted(set(arguments) - given.used)):
+        known = ", ".join(sorted(given.used)) or "none"
         raise InputError(f"{path} has no xacro argument {', '.join(map(repr, unknown))}; it takes: {known}")
     return text
 
 
 def enclosing_packages(path: Path) -> dict[str, Path]:
-    """The ROS packages that a file lies in, innermost first: folders with a ``package.xml``, by the name it gives."""
+    """The ROS packages (folders with a ``package.xml``) that contain a file, by name, innermost first."""
     found: dict[str, Path] = {}
     for folder in path.absolute().parents:
         manifest = folder / "package.xml"
@@ -109,17 +109,17 @@ def _package(path: Path) -> tuple[ModuleType, Any]:
         raise MissingDependency(f"the xacro file {path}", [str(error.name)], 'pip install "varpin[xacro]"') from None
 
 
-def _told(error: BaseException) -> list[str]:
-    """What an error says, and those that it wraps, each thing once and without names of Python's classes."""
+def _messages(error: BaseException) -> list[str]:
+    """Messages of an error and of those that it wraps, without duplicates and names of Python classes."""
     if isinstance(error, OSError) and error.strerror:
         return [f"{error.strerror}: {error.filename}"]
     if isinstance(error, expat.ExpatError):
         return [f"it is not well-formed XML: {error}"]
     inner = getattr(error, "exc", None)
-    said = [str(error.args[0] or "") if error.args else ""] if hasattr(error, "exc") else [str(error)]
-    said += [] if inner is None else _told(inner) if isinstance(inner, BaseException) else [str(inner)]
-    said.append(str(getattr(error, "suffix", None) or ""))
-    plain = [" ".join(re.sub(r"<class '[^']*'>:?", "", words).split()) for words in said]
+    messages = [str(error.args[0] or "") if error.args else ""] if hasattr(error, "exc") else [str(error)]
+    messages += [] if inner is None else _messages(inner) if isinstance(inner, BaseException) else [str(inner)]
+    messages.append(str(getattr(error, "suffix", None) or ""))
+    plain = [" ".join(re.sub(r"<class '[^']*'>:?", "", words).split()) for words in messages]
     return list(dict.fromkeys(filter(None, plain))) or [type(error).__name__]
 
 
@@ -129,7 +129,7 @@ def _word(value: object) -> str:
 
 @contextlib.contextmanager
 def _finding(substitution: Any, path: Path, package_dirs: Sequence[str], packages: Mapping[str, str]) -> Iterator[None]:
-    """Look packages up around the file first, and where ROS has them only then."""
+    """Make xacro look packages up in the folders around the file first, and by ROS only after them."""
     enclosing = enclosing_packages(path)
     by_ros: Callable[[str], str] = substitution._eval_find
 
@@ -145,7 +145,7 @@ def _finding(substitution: Any, path: Path, package_dirs: Sequence[str], package
                 return str(folder)
         try:
             return by_ros(name)
-        except Exception:  # No ROS, or another package that is not there: each version has an error of its own.
+        except Exception:  # There is no ROS or no such package; the exception depends on the version of ROS.
             looked = ", ".join(map(os.fspath, package_dirs)) or "no package_dirs"
             raise substitution.SubstitutionException(
                 f"no package {name!r} above the file nor in {looked}; give the folder that holds it as package_dirs"

@@ -1,1 +1,1 @@
-"""Pictures: replays in meshcat, figures, tables of a robot."""
+"""Replays in meshcat, figures, and reports on robots."""

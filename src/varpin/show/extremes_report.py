@@ -1,4 +1,4 @@
-"""What came of a robot at the extremes as a page (HTML): a heat map of motions and integrators, without scripts."""
+"""Results of ``check_robot`` as an HTML page: a heat map of motions and integrators, without scripts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from varpin.study.extremes.record import LEVELS
 from varpin.support.checks import writable
 from varpin.support.markup import page
 
-# What a kind looks like: a letter for those who see no colours, and a colour for those who do (after Okabe and Ito).
+# Letter and terminal style of each kind of result.
 LETTERS = {Kind.ACCURATE: "A", Kind.DEGRADED: "D", Kind.REFUSED: "R", Kind.STOPPED: "S", Kind.WRONG: "W"}
 STYLES = {
     Kind.ACCURATE: "green",
@@ -24,10 +24,10 @@ STYLES = {
 }
 _MEANING = {
     Kind.ACCURATE: "every check passes; the number is the error, in units of the motion",
-    Kind.DEGRADED: "varpin itself says that something is not as it should be; the error is given",
-    Kind.REFUSED: "a named error before anything ran",
-    Kind.STOPPED: "a named error on the way; the motion so far is kept",
-    Kind.WRONG: "a check fails, and varpin says nothing",
+    Kind.DEGRADED: "varpin warns that the result is inaccurate; the number is the error",
+    Kind.REFUSED: "a named error before the first step",
+    Kind.STOPPED: "a named error during the run; the motion up to there is kept",
+    Kind.WRONG: "a check fails, and varpin gives no warning",
 }
 _STYLE = """
 body { font-size: 15px; max-width: 88rem; }
@@ -45,12 +45,12 @@ dt { padding: 0 0.5rem; } dd { margin: 0; }
 
 
 def entry(cell: Cell) -> str:
-    """A cell in a few signs: its letter and its error, or how far it came."""
+    """Short text of a cell: its letter with the error, or with the number of steps done."""
     if cell.kind is Kind.STOPPED:
         return f"S {cell.done}/{cell.steps}"
     if cell.kind is Kind.REFUSED:
         return "R"
-    # The energy's error stands where no exact motion is known.
+    # The error of the energy, where no exact motion is known.
     known = (
         f" {cell.error:.0e}"
         if not math.isnan(cell.error)
@@ -94,9 +94,9 @@ def _page(record: Record) -> str:
     )
     missing = f" An interruption left out {record.missing} cells." if record.missing else ""
     body = f"""<p>varpin {html.escape(record.version)}.
-Errors are the largest distance in q from the exact motion, in units of how far that motion goes; E stands before the
-error of the energy balance over the whole run, in units of the energy there is to turn over, where no exact motion is
-known. Point at a cell for all of its measures.{missing}</p>
+Errors are the largest distance in q from the exact motion, relative to the travel of that motion. Where no exact motion
+is known, E marks the error of the energy balance over the whole run, relative to the energy that the motion can
+exchange. Point at a cell for all of its measures.{missing}</p>
 <dl>{legend}</dl>
 <table><thead><tr><th>motion</th>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table>"""
     return page(f"Varpin at the extremes: {record.robot}", body, _STYLE)

@@ -1,4 +1,4 @@
-"""What a robot description holds, and what looks wrong in it."""
+"""Inspection of robot descriptions: their content, and warnings about what looks wrong."""
 
 from __future__ import annotations
 
@@ -25,15 +25,16 @@ from varpin.support.checks import JointValues, joint_array
 
 Floats = NDArray[np.float64]
 
-# Beyond what any of example-robot-data's arms shows: masses there differ by up to 320 between neighbours, principal
-# moments by 2e5, and M scaled to a unit diagonal has a condition number of up to 830.
+# Thresholds of warnings: ratios of masses and of principal moments of neighbouring links, and the condition number of M
+# with a unit diagonal. The largest values among the arms of example-robot-data are 320, 2e5 and 830.
 MASS_RATIO = 1e3
 INERTIA_RATIO = 1e6
 CONDITION = 1e6
-# Lengths of a link's inertia in units of the arm's reach, and [m] where there is no reach to compare with.
+# Largest plausible radius of gyration and centre of mass distance of a link, as a multiple of the arm's reach, and [m]
+# for an arm with all joints in one place.
 LENGTH_RATIO = 2.0
 LENGTH = 10.0
-# [kg/m^3] of osmium, the densest element.
+# Density of osmium, the densest element [kg/m^3].
 DENSITY = 22_600.0
 
 
@@ -49,13 +50,13 @@ def inspect_robot(
     base: Base = None,
     armature: JointValues | None = None,
 ) -> RobotReport:
-    """Look into a robot description, sound or faulty.
+    """Report on a robot description, valid or faulty.
 
     Main args:
-        source: What :func:`varpin.load_robot` takes, or a robot it made.
-        lock: Joints to hold still, as for :func:`varpin.load_robot`.
-        q: Configuration to look at, one number, (n,) or by joint name [rad or m]; 0 if left out.
-        v: Velocity there, the same [rad/s or m/s]; 0 if left out.
+        source: A source as for :func:`varpin.load_robot`, or a loaded robot.
+        lock: Joints to lock, as for :func:`varpin.load_robot`.
+        q: Configuration of the report: one number, (n,) or by joint name [rad or m]; 0 if left out.
+        v: Velocity of the report, likewise [rad/s or m/s]; 0 if left out.
 
     Other Args:
         package_dirs: As for :func:`varpin.load_robot`.
@@ -65,14 +66,14 @@ def inspect_robot(
         armature: As for :func:`varpin.load_robot`.
 
     Raises:
-        RobotError: As for :func:`varpin.load_robot`, singular mass matrices excepted.
-        InputError: ``q`` or ``v`` has a wrong shape or is not finite; an option of loading, ``lock`` for one, is given
-            with a robot that is loaded already.
+        RobotError: As for :func:`varpin.load_robot`, except for singular mass matrices.
+        InputError: ``q`` or ``v`` has a wrong shape or is not finite, or an option of loading, such as ``lock``, is
+            given with a loaded robot.
     """
     if isinstance(source, Robot):
         if lock or package_dirs or mimic != "tied" or base is not None or armature is not None:
             raise InputError(
-                "lock, package_dirs, mimic, base and armature belong to loading; the robot given is loaded already"
+                "lock, package_dirs, mimic, base and armature are options of loading; the given robot is already loaded"
             )
         robot = source
     else:
@@ -83,9 +84,7 @@ def inspect_robot(
     with np.errstate(all="ignore"):
         jet = lagrangian_jet(scene, configuration, velocity, backend="pinocchio")
     if not all(np.isfinite(array).all() for array in (jet.Lvv, jet.Lqq)):
-        raise RobotError(
-            f"robot {robot.name!r} cannot be looked into: its mass matrix or its derivatives are not finite"
-        )
+        raise RobotError(f"robot {robot.name!r} cannot be inspected: its mass matrix or its derivatives are not finite")
     margin = Guard().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
     urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
@@ -163,7 +162,7 @@ def _joints(robot: Robot) -> tuple[JointReport, ...]:
 
 
 def _limit(value: float) -> float:
-    """A limit, infinite where Pinocchio writes its absence as the largest double."""
+    """A limit; infinite for the largest double, which is no limit in Pinocchio."""
     return float(np.copysign(np.inf, value)) if abs(value) >= 1e300 else float(value)
 
 
@@ -171,7 +170,7 @@ def _links(robot: Robot, urdf: Urdf | None) -> tuple[LinkReport, ...]:
     if urdf is None or urdf.root is None:
         bodies = range(1, robot.free_model.njoints)
         return tuple(_body(robot, joint) for joint in bodies)
-    # Pinocchio merges links on fixed joints into one body, in which a faulty inertia can hide.
+    # The links of the URDF: Pinocchio merges links on fixed joints into one body, which can hide a faulty inertia.
     model = robot.free_model
     joints = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
     return tuple(
@@ -198,13 +197,13 @@ _KINDS: dict[pin.FrameType, FrameKind] = {
 def _frames(robot: Robot) -> tuple[FrameReport, ...]:
     model, reports = robot.free_model, {}
     for index, frame in enumerate(model.frames):
-        # The first is the world itself; of frames of one name varpin finds the first.
+        # The first frame is the world. Of several frames with the same name, varpin finds the first.
         if index == 0 or frame.name in reports:
             continue
         kind: FrameKind = _KINDS.get(frame.type, "frame")
         joint = model.names[frame.parentJoint] if frame.parentJoint else ""
         on = model.frames[frame.parentFrame].name if frame.parentFrame else ""
-        # A frame that was added by hand may name no parent but the world, and yet move with a joint.
+        # A frame that a user has added may have the world as its parent frame and yet move with a joint.
         reports[frame.name] = FrameReport(frame.name, kind, on or ("" if kind == "joint" else joint), joint)
     return tuple(reports.values())
 
@@ -222,7 +221,7 @@ def _body(robot: Robot, joint: int) -> LinkReport:
 
 
 def _body_name(robot: Robot, joint: int) -> str:
-    """The first link on a joint, or the joint's own name if the model names no links."""
+    """Name of the first link on a joint, or of the joint if the model has no links there."""
     for frame in robot.free_model.frames:
         if frame.parentJoint == joint and frame.type == pin.FrameType.BODY:
             return str(frame.name)
@@ -233,7 +232,7 @@ def _mass_warnings(robot: Robot) -> Iterator[str]:
     for body, mass in enumerate(robot.tree.mass):
         if mass == 0.0:
             name, joint = _body_name(robot, body + 1), robot.free_model.names[body + 1]
-            carries = "only what it carries gives the joint inertia"
+            carries = "only the links that it carries give the joint inertia"
             if body not in robot.tree.parent:
                 carries = "and it carries nothing"
             yield f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
@@ -247,8 +246,8 @@ def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[str
     for link in links:
         if not link.joint or not link.inertia.any():
             continue
-        if said := fault(link.name, link.mass, link.moments):
-            yield said
+        if warning := fault(link.name, link.mass, link.moments):
+            yield warning
         elif link.mass > 0.0:
             # A ball has the least inertia of all bodies of a given mass and density.
             moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
@@ -274,12 +273,12 @@ def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[str
 
 
 def _reach(robot: Robot) -> float:
-    """The longest way from a root of the tree to a joint, along the offsets between joints [m]."""
-    way = np.zeros(len(robot.tree.parent))
+    """The longest path from a root of the tree to a joint, along the offsets between joints [m]."""
+    path = np.zeros(len(robot.tree.parent))
     for body, parent in enumerate(robot.tree.parent):
         if parent >= 0:
-            way[body] = way[parent] + np.linalg.norm(robot.tree.translation[body])
-    return float(way.max())
+            path[body] = path[parent] + np.linalg.norm(robot.tree.translation[body])
+    return float(path.max())
 
 
 def _against_reach(robot: Robot) -> str:
@@ -333,8 +332,8 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
     for joint in bounded:
         if joint.lower == joint.upper == 0.0:
             yield (
-                f"joint {joint.name!r} has limits 0 and 0, as if none were given: they are taken for none; "
-                "lock a joint that is not to move"
+                f"joint {joint.name!r} has the limits 0 and 0, which count as none, as in a URDF without limits; "
+                "lock a joint to keep it from moving"
             )
         elif joint.lower >= joint.upper:
             yield f"joint {joint.name!r} has no room to move: limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
@@ -350,7 +349,7 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
 def _mimic_warnings(robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool) -> Iterator[str]:
     for joint in joints:
         if joint.follows:
-            yield f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}; it is no coordinate"
+            yield f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}; it is not a coordinate"
     if urdf is None:
         return
     index = joint_index(robot.free_model)
@@ -361,22 +360,22 @@ def _mimic_warnings(robot: Robot, urdf: Urdf | None, joints: Sequence[JointRepor
         if mimic.leader not in moving:
             yield f"joint {name!r} mimics {mimic.leader!r}, which is not a moving joint of the robot: it stays free"
         elif not tied:
-            yield f"joint {name!r} mimics {mimic.leader!r}, but was asked to be free"
+            yield f"joint {name!r} mimics {mimic.leader!r}, but mimic='free' makes it free"
 
 
 def _damping_warnings(robot: Robot) -> Iterator[str]:
-    for what, values, unit, means in (
-        ("damping", robot.damping, "N m s/rad or N s/m", "which a scene takes as damping='robot', or as numbers"),
+    for what, values, unit, usage in (
+        ("damping", robot.damping, "N m s/rad or N s/m", "which a scene uses with damping='robot'"),
         (
             "dry friction",
             robot.friction,
             "N m or N",
-            "which a scene takes as forces=[varpin.CoulombFriction(robot.friction)]",
+            "which a scene uses with forces=[varpin.CoulombFriction(robot.friction)]",
         ),
     ):
         given = ", ".join(f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value)
         if given:
-            yield f"the description gives joint {what} [{unit}], {means}: {given}"
+            yield f"the description gives joint {what} [{unit}], {usage}: {given}"
 
 
 def _position(value: float | tuple[float, ...]) -> str:

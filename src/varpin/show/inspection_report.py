@@ -1,4 +1,4 @@
-"""What inspection finds of a robot, and its tables in plain text and in notebooks."""
+"""The report on a robot, with tables in plain text and in notebooks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
 FrameKind = Literal["link", "joint", "fixed joint", "frame"]
 
-# The largest step is no limit beyond this [s].
+# A largest step beyond this counts as no limit [s].
 _ANY_STEP = 100.0
 
 
@@ -30,15 +30,15 @@ class JointReport(Frozen):
     """A joint that moves.
 
     Attributes:
-        name: Its name.
-        kind: Revolute, prismatic, continuous (revolute without end stops) or mimic.
+        name: Name of the joint.
+        kind: Revolute, prismatic, continuous (revolute without limits) or mimic.
         axis: Unit axis (3,) in the joint's own frame.
-        unit: Of its position, rad or m.
+        unit: Unit of its position, rad or m.
         lower: Lower position limit [rad or m], -inf if none.
         upper: Upper position limit [rad or m], inf if none.
         velocity: Velocity limit [rad/s or m/s], inf if none.
         effort: Effort limit [N m or N], inf if none.
-        follows: For a mimic joint, what it does: its leader, ratio and offset in words; else empty.
+        follows: Leader, ratio and offset of a mimic joint, in words; empty for others.
     """
 
     name: str
@@ -54,14 +54,14 @@ class JointReport(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class LinkReport(Frozen):
-    """A link with mass or inertia; for a model in memory, a joint's links taken together.
+    """A link with mass or inertia; for a model in memory, all links on a joint together.
 
     Attributes:
-        name: Its name.
+        name: Name of the link.
         joint: The joint that moves it, or empty for a link of the base.
-        mass: [kg].
+        mass: Mass [kg].
         center: Centre of mass (3,) in the link's frame [m].
-        inertia: (3, 3) about the centre of mass [kg m^2].
+        inertia: Inertia (3, 3) about the centre of mass [kg m^2].
         moments: Principal moments of inertia (3,), ascending [kg m^2].
     """
 
@@ -75,11 +75,11 @@ class LinkReport(Frozen):
 
 @dataclass(frozen=True)
 class FrameReport:
-    """A frame, whose name costs, traces and payloads take.
+    """A frame, for the names that costs, traces and payloads take.
 
     Attributes:
-        name: Its name.
-        kind: A link's, a joint's, a fixed joint's, or one by itself.
+        name: Name of the frame.
+        kind: Whether it belongs to a link, a joint, a fixed joint, or none of them.
         parent: The link or frame that it is attached to, or empty for the world.
         joint: The joint that moves it, or empty if it is fixed to the base.
     """
@@ -92,22 +92,22 @@ class FrameReport:
 
 @dataclass(frozen=True, eq=False)
 class RobotReport(Frozen):
-    """A robot as its description has it, and what looks wrong; ``print`` shows all of it in tables.
+    """The content of a robot description, and warnings; ``print`` shows it in tables.
 
     Attributes:
         robot: The robot, possibly one that :func:`varpin.load_robot` refuses.
-        joints: Every joint that moves, mimic joints included, in Pinocchio's order.
-        links: Every link with mass or inertia.
-        frames: Every frame by whose name varpin finds it, in Pinocchio's order.
-        locked: Joints held still, and where [rad or m].
-        total_mass: Of everything that moves [kg].
-        q: The configuration looked at (n,) [rad or m].
-        v: The velocity there (n,) [rad/s or m/s].
+        joints: Moving joints, mimic joints included, in Pinocchio's order.
+        links: Links with mass or inertia.
+        frames: Frames that varpin finds by name, in Pinocchio's order.
+        locked: Locked joints and their positions [rad or m].
+        total_mass: Mass of all moving links [kg].
+        q: Configuration of the report (n,) [rad or m].
+        v: Velocity of the report (n,) [rad/s or m/s].
         condition: Condition number of M(q); it mixes units if there are prismatic joints. Infinite if singular.
-        scaled_condition: Condition number of M(q) with rows and columns scaled to a unit diagonal, which depends
-            on no unit. Infinite if singular.
+        scaled_condition: Condition number of M(q) with rows and columns scaled to a unit diagonal, which does not
+            depend on units. Infinite if singular.
         largest_step: Largest dt [s] whose step the midpoint integrator's branch guard accepts around (q, v); infinite
-            where no direction is unstable, None where M is singular. It says nothing about accuracy.
+            where no direction is unstable, None where M is singular. It is not a measure of accuracy.
         branch_margin: The guard's margin, for which ``largest_step`` holds.
         warnings: What looks wrong, in words that name the joint or link.
     """
@@ -135,10 +135,10 @@ class RobotReport(Frozen):
 
     @property
     def step_in_words(self) -> str:
-        """The largest step the guard accepts around (q, v)."""
+        """The largest step that the guard accepts around (q, v), in words."""
         if self.largest_step is None:
             return "undefined: the mass matrix is singular"
-        # A description's own rounding, a frame turned by 1.5708, makes directions unstable that are not.
+        # Rounded numbers in a description, such as a turn by 1.5708, make neutral directions slightly unstable.
         step = "any: nothing is unstable" if self.largest_step > _ANY_STEP else f"{self.largest_step:.3g} s"
         return f"{step} at this q, {'at rest' if not self.v.any() else 'and this v'}"
 
@@ -155,7 +155,7 @@ class RobotReport(Frozen):
         ]
         links = [(x.name, x.joint or "the base", x.mass, "  ".join(f"{m:.3g}" for m in x.moments)) for x in self.links]
         return markup.facts(
-            f"Robot {self.robot.name}, looked into",
+            f"Robot {self.robot.name}",
             rows,
             markup.table(("joint", "kind", "lower [rad or m]", "upper", "velocity [1/s]", "effort [N m or N]"), joints),
             markup.folded(
@@ -172,7 +172,7 @@ class RobotReport(Frozen):
 
 
 def parts_of(report: RobotReport) -> Iterator[RenderableType]:
-    """Tables of joints, links, frames and the whole, and the warnings below them."""
+    """Tables of joints, links, frames and the whole robot, then the warnings."""
     yield _joint_table(report)
     yield _link_table(report)
     yield _frame_table(report)
@@ -248,6 +248,6 @@ def _report_table(report: RobotReport) -> Table:
     tables.add_row(
         table, "condition of M(q)", f"{report.condition:.3g}; {report.scaled_condition:.3g} with a unit diagonal"
     )
-    remark = f"(branch margin {report.branch_margin:g}; says nothing of accuracy)"
+    remark = f"(branch margin {report.branch_margin:g}; not a measure of accuracy)"
     tables.add_row(table, "largest step accepted", f"{report.step_in_words} {remark}")
     return table

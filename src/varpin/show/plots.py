@@ -20,7 +20,7 @@ from varpin.model import Robot
 from varpin.trajectory import Trajectory, moved_by_hand
 
 if TYPE_CHECKING:
-    # Plotting a joint needs no optimizer.
+    # Imported for types alone: plotting a joint needs no optimizer.
     from varpin.study.tradeoff import Advice, OptimalControlTradeoff, WorkPrecision
     from varpin.study.tradeoff.precision import Quantity
 
@@ -29,11 +29,11 @@ Floats = NDArray[np.float64]
 # Okabe and Ito's palette for colour-blind readers, without its yellow, which is faint on white.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (9, 3)))
-# Of lines that have run out of dashes, too.
+# Line widths: the second is for lines beyond all combinations of colours and dashes.
 _WIDTHS = (1.4, 0.7)
-# More rows than this make the legend two columns wide.
+# Rows of a column of the legend.
 _LEGEND_ROWS = 20
-# Points a line is drawn with at most; between them its extremes are kept.
+# Largest number of points of a line; thinning keeps the extremes.
 _POINTS = 8000
 
 
@@ -45,8 +45,8 @@ def plot_joints(
     Args:
         trajectory: The motion.
         axes: Where to draw; a new figure if left out.
-        robot: The robot of the motion. With it joints are labelled in their own units, rad or m, and limits that the
-            motion comes near are drawn, dotted.
+        robot: The robot of the motion. With it, labels have the units of the joints, rad or m, and limits near the
+            motion are dotted lines.
 
     Returns:
         The figure and its axes.
@@ -73,18 +73,18 @@ def plot_controls(
     robot: Robot | None = None,
     labels: Sequence[str] | None = None,
 ) -> tuple[Figure | SubFigure, Axes]:
-    """Controls over time, as the steps they are.
+    """Controls over time, as step functions.
 
-    Those of position servos, and of joints that are moved by hand, are commanded positions [rad or m]; the second ones
-    of cubic inputs are velocities [rad/s or m/s].
+    Controls of position servos and kinematic inputs are commanded positions [rad or m]; the second control of a cubic
+    input is a velocity [rad/s or m/s].
 
     Args:
         trajectory: The motion.
         axes: Where to draw; a new figure if left out.
-        robot: The robot of the motion. With it the controls of joints are labelled in N m or N, and limits that they
-            come near are drawn, dotted: of efforts, or of the positions of servos.
-        labels: Names of the m controls. Left out, they are named after the joints if there are as many, which is
-            right where every joint is actuated, and u1, u2, ... if not.
+        robot: The robot of the motion. With it, labels have the units of the controls, N m or N, and limits near the
+            controls are dotted lines: efforts, or positions for servos.
+        labels: Names of the m controls. If left out, the joints' names where there are as many, which is right if every
+            joint is actuated, else u1, u2, ...
 
     Returns:
         The figure and its axes.
@@ -196,7 +196,7 @@ def plot_trajectory(
     elif labels is not None and len(labels) != trajectory.u.shape[1]:
         raise InputError(f"labels must be {trajectory.u.shape[1]}, one a control, got {len(labels)}")
     plot_energy_error(trajectory, panels[-1])
-    # The same joints have the same colours in all panels, so one legend serves them.
+    # Joints have the same colours in all panels and share one legend.
     handles, names = panels[0].get_legend_handles_labels()
     mixed = len({joint is None for joint in _served(trajectory)}) > 1
     for panel in panels[1:-1]:
@@ -204,7 +204,7 @@ def plot_trajectory(
         if panel.get_legend() is not None and (panel is panels[1] or (same and labels is None)):
             panel.get_legend().remove()
     if axes is None and panels[0].get_legend() is not None:
-        # The figure's legend takes its room beside all panels; that of one panel would push the others apart.
+        # A legend of the figure, as that of one panel would push the others apart.
         panels[0].get_legend().remove()
         new.legend(handles, names, loc="outside right upper", frameon=False, fontsize="small")
     for panel in panels[:-1]:
@@ -217,15 +217,15 @@ def plot_trajectory(
 def plot_work_precision(
     record: WorkPrecision, axes: Axes | None = None, *, quantity: Quantity = "q"
 ) -> tuple[Figure | SubFigure, Axes]:
-    """Error over wall time, one line an integrator, one point a step; the Pareto front is ringed and joined.
+    """Error over wall time: a line for each integrator, a point for each step, circles and a line on the Pareto front.
 
-    Errors that the reference cannot tell from zero stand on the grey line that marks its own.
+    Errors below that of the reference are drawn on the grey line, which marks the reference's error.
 
     Args:
         record: From :func:`varpin.work_precision`.
         axes: Where to draw; a new figure if left out.
-        quantity: ``"q"``, the largest error in q over the motion; ``"end"``, at its end; ``"energy"``, for a motion
-            that keeps its energy; ``"tip"``, of the end effector.
+        quantity: ``"q"``, the largest error in q over the motion; ``"end"``, that at its end; ``"energy"``, the
+            energy error of a conservative motion; ``"tip"``, the error of the end effector.
 
     Returns:
         The figure and its axes.
@@ -252,9 +252,9 @@ def plot_work_precision(
 
 
 def plot_advice(advice: Advice, axes: Axes | None = None) -> tuple[Figure | SubFigure, Axes]:
-    """Predicted error over predicted time of the advised choice, ringed, and of the best of every other method.
+    """Predicted error over predicted time of the advised choice, circled, and of the best of every other method.
 
-    A grey line is the tolerance or the budget that was asked for.
+    A grey line marks the requested tolerance or budget.
 
     Args:
         advice: From :func:`varpin.advise`.
@@ -286,7 +286,7 @@ def plot_advice(advice: Advice, axes: Axes | None = None) -> tuple[Figure | SubF
 def plot_optimal_control_tradeoff(
     record: OptimalControlTradeoff, axes: Axes | None = None
 ) -> tuple[Figure | SubFigure, Axes]:
-    """True cost of the plans over the time it took to find them, with the Pareto front; arguments as above.
+    """True cost of plans over their solve time, with the Pareto front; arguments as for :func:`plot_work_precision`.
 
     Raises:
         InputError: No run has a true cost.
@@ -299,7 +299,7 @@ def plot_optimal_control_tradeoff(
 
 
 def apply_style(axes: Axes) -> None:
-    """Give axes the look of varpin's figures: a faint grid below everything, no frame at the top and the right."""
+    """Apply the style of varpin's figures: a faint grid below everything, no frame at the top and the right."""
     axes.set_prop_cycle(color=COLORS)
     axes.grid(visible=True, color="0.92", linewidth=0.8)
     axes.set_axisbelow(True)
@@ -322,7 +322,7 @@ def _plot_trade(
         axes.plot(*zip(*curve, strict=True), label=name, marker="o", markersize=4, **style)
     ring: dict[str, Any] = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "color": "0.3", "zorder": 1}
     axes.plot(*zip(*front, strict=True), linestyle="none", **ring)
-    # Of those that are as fast but for the spread of their times, the line joins the best.
+    # The line connects only the points whose error is below that of all faster ones.
     best = [(seconds, value) for k, (seconds, value) in enumerate(front) if all(value < v for _, v in front[:k])]
     axes.plot(*zip(*best, strict=True), label=front_name, linewidth=0.8, **ring)
     axes.set_xscale("log")
@@ -340,7 +340,7 @@ def _plot_nodes(
     robot: Robot | None,
     limits: tuple[Floats, Floats] | None,
 ) -> tuple[Figure | SubFigure, Axes]:
-    """One line a joint over the nodes; ``units`` are a revolute and a prismatic joint's."""
+    """One line for each joint over the nodes; ``units`` are those of a revolute and of a prismatic joint."""
     slides = _slides(trajectory, robot)
     figure, axes = _axes(axes)
     names, unit = _labels(trajectory.joint_names, units, slides)
@@ -353,7 +353,7 @@ def _plot_nodes(
 
 
 def _control_limits(robot: Robot | None, joints: Sequence[int | None]) -> tuple[Floats, Floats] | None:
-    """Of controls (m,): a servo's are its joint's positions, of one control a joint they are efforts; else None."""
+    """Limits of the controls (m,), (m,): positions if all are servos, efforts if each joint has one; else None."""
     if robot is None or not joints:
         return None
     served = [joint for joint in joints if joint is not None]
@@ -366,9 +366,9 @@ def _control_limits(robot: Robot | None, joints: Sequence[int | None]) -> tuple[
 
 
 def _draw_limits(axes: Axes, values: Floats, limits: tuple[Floats, Floats]) -> None:
-    """Limits as dotted lines, in the colours of their joints, where values (N, k) come near them or pass them.
+    """Draw limits as dotted lines in the colours of their joints, if values (N, k) come near them or pass them.
 
-    Others would only press the motion flat.
+    Distant limits would compress the motion.
     """
     if not values.size:
         return
@@ -379,7 +379,7 @@ def _draw_limits(axes: Axes, values: Floats, limits: tuple[Floats, Floats]) -> N
             if low - near <= limit <= high + near:
                 across = axes.get_yaxis_transform()
                 look = {"color": style["color"], "linewidth": 0.9, "linestyle": (0, (1, 2)), "zorder": 1}
-                # Not among the axes' lines, which are the joints.
+                # hlines adds a collection: the axes' lines are the joints.
                 axes.hlines(limit, 0.0, 1.0, transform=across, **look)
 
 
@@ -391,7 +391,7 @@ def _axes(axes: Axes | None) -> tuple[Figure | SubFigure, Axes]:
 
 
 def _slides(trajectory: Trajectory, robot: Robot | None) -> NDArray[np.bool_] | None:
-    """Which coordinates (n,) are prismatic, or None without a robot to ask."""
+    """Whether each coordinate (n,) is prismatic; None without a robot."""
     if robot is None:
         return None
     if robot.joint_names != trajectory.joint_names:
@@ -403,7 +403,7 @@ def _slides(trajectory: Trajectory, robot: Robot | None) -> NDArray[np.bool_] | 
 
 
 def _labels(names: Sequence[str], units: tuple[str, str], slides: NDArray[np.bool_] | None) -> tuple[list[str], str]:
-    """Legend entries and the unit on the axis; entries carry their own unit where joints differ."""
+    """Legend entries and the unit of the axis; entries have units of their own where joints differ."""
     if slides is None:
         return list(names), " or ".join(units)
     if slides.all() or not slides.any():
@@ -412,7 +412,7 @@ def _labels(names: Sequence[str], units: tuple[str, str], slides: NDArray[np.boo
 
 
 def _served(trajectory: Trajectory) -> list[int | None]:
-    """For each control (m,) the joint that is to be there, by a servo or by hand; None for others, and if unknown."""
+    """For each control (m,), the joint whose position it commands, by a servo or as a kinematic input; else None."""
     found: list[int | None] = [None] * trajectory.u.shape[1]
     values = trajectory.scene_values
     if "actuation" not in values:
@@ -421,7 +421,7 @@ def _served(trajectory: Trajectory) -> list[int | None]:
     joints = range(min(len(trajectory.joint_names), len(actuation)))
     servos = values.get("PositionServo", np.zeros((0, 1)))
     for joint in [*(servos[:, 0].tolist() if servos.size else ()), *moved_by_hand(trajectory)[:, 0].tolist()]:
-        # A file may hold anything.
+        # A file may have invalid joints.
         drives = np.flatnonzero(actuation[int(joint)]) if joint in joints else np.zeros(0, dtype=np.int64)
         if len(drives) and drives[0] < len(found):
             found[int(drives[0])] = int(joint)
@@ -429,7 +429,7 @@ def _served(trajectory: Trajectory) -> list[int | None]:
 
 
 def _rates(trajectory: Trajectory) -> dict[int, int]:
-    """Controls that are velocities of cubic inputs, which drive nothing, and their joints."""
+    """Controls that are velocities of cubic inputs, whose columns of the actuation are 0, and their joints."""
     actuation = trajectory.scene_values.get("actuation", np.zeros((0, 0)))
     if actuation.ndim != 2 or actuation.shape[1] != trajectory.u.shape[1]:
         return {}
@@ -443,7 +443,7 @@ def _position_unit(joint: int, slides: NDArray[np.bool_] | None) -> str:
 
 
 def _styles(lines: int) -> list[dict[str, Any]]:
-    """Line styles that stay apart: all colours, then all colours dashed, and so on, and all of that thinner."""
+    """Distinct line styles: all colours, then all colours dashed, and so on, then all of these thinner."""
     kinds = (
         {"color": color, "linestyle": dash, "linewidth": width}
         for width in cycle(_WIDTHS)
@@ -460,7 +460,7 @@ def _finish(axes: Axes, trajectory: Trajectory, label: str, lines: int) -> None:
     if trajectory.duration > 0.0:
         axes.set_xlim(trajectory.t[0], trajectory.t[-1])
     else:
-        # A line through one node would not be seen.
+        # A line with one point is invisible without a marker.
         for line in axes.lines:
             if np.size(line.get_xdata()) == 1:
                 line.set_marker("o")
@@ -475,7 +475,7 @@ def _finish(axes: Axes, trajectory: Trajectory, label: str, lines: int) -> None:
 
 
 def _thin(t: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """A line of at most some thousand points that looks like the whole: the extremes of each stretch are kept."""
+    """A line thinned to about ``_POINTS`` points, with the extremes of each stretch."""
     if len(t) <= _POINTS:
         return t, values
     stretch = -(-2 * len(t) // _POINTS)
@@ -488,7 +488,7 @@ def _thin(t: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def _thin_steps(t: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Where a step function over the intervals of ``t`` (N + 1,) changes, and to what; its last value is repeated."""
+    """Changes of a step function over the intervals of ``t`` (N + 1,): times and values, the last value repeated."""
     if not len(values):
         return t, np.zeros(len(t))
     changes = np.flatnonzero(np.concatenate([[True], np.diff(values) != 0.0]))

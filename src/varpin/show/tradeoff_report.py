@@ -1,4 +1,4 @@
-"""A measured trade, or an advice, as files: a table (CSV), a figure (PNG) and one page (HTML) that holds both."""
+"""Work-precision records and advice as files: a table (CSV), a figure (PNG) and a page (HTML) with both."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from varpin.study.tradeoff import Advice, WorkPrecision, WorkPrecisionRun
 from varpin.study.tradeoff.advice import COLUMNS as _ADVICE_COLUMNS
 from varpin.support.markup import page, picture
 
-# Heading and text of a run in the table.
+# Columns of the table of runs.
 COLUMNS = ("integrator", "dt [s]", "wall time [s]", "error in q", "energy error [J]", "end effector [m]", "note")
 
 _STYLE = "tr.front { background: #dff2e1; }"
 
 
 def cells(record: WorkPrecision, run: WorkPrecisionRun, front: bool) -> tuple[str, ...]:
-    """A run as the entries of :data:`COLUMNS`; ``front`` says whether nothing beats it."""
+    """A run as entries of :data:`COLUMNS`; ``front`` tells whether it is on the Pareto front."""
     notes = []
     if front:
         notes.append("Pareto")
@@ -40,7 +40,7 @@ def cells(record: WorkPrecision, run: WorkPrecisionRun, front: bool) -> tuple[st
 
 
 def write_report(folder: Path, record: WorkPrecision, title: str) -> list[Path]:
-    """Write ``tradeoff.csv``, ``tradeoff.png`` and ``tradeoff.html`` into a folder that is there; their paths.
+    """Write ``tradeoff.csv``, ``tradeoff.png`` and ``tradeoff.html`` into an existing folder; returns their paths.
 
     The figure is left out where no run has an error.
 
@@ -58,7 +58,7 @@ def write_report(folder: Path, record: WorkPrecision, title: str) -> list[Path]:
 
 
 def write_advice(folder: Path, advice: Advice, title: str) -> list[Path]:
-    """Write ``advice.png`` and ``advice.html`` into a folder that is there; their paths.
+    """Write ``advice.png`` and ``advice.html`` into an existing folder; returns their paths.
 
     The figure is left out where no choice has a known error.
 
@@ -71,9 +71,9 @@ def write_advice(folder: Path, advice: Advice, title: str) -> list[Path]:
     if any(math.isfinite(choice.error) and choice.error > 0.0 for choice in choices):
         image = _write_image(figure, plot_advice(advice)[0])
     rows = [(choice.cells(), choice is advice.best and advice.reached) for choice in choices]
-    said = "</p><p>".join(html.escape(line) for line in advice.reason.splitlines())
-    text = f"""{said}</p>
-<p>varpin {__version__}. Times are predicted for this machine, on one thread, without the look at the finished
+    reason = "</p><p>".join(html.escape(line) for line in advice.reason.splitlines())
+    text = f"""{reason}</p>
+<p>varpin {__version__}. Times are predicted for this machine, on one thread, without the checks of the finished
 motion."""
     with atomic_file(document) as file:
         file.write(_document(title, text, "predicted error over time", image, _ADVICE_COLUMNS, rows).encode())
@@ -91,10 +91,10 @@ def _write_image(path: Path, figure: Figure | SubFigure) -> bytes:
 def _page(record: WorkPrecision, title: str, image: bytes) -> str:
     front = record.pareto()
     missing = f" An interruption left out {record.missing} runs." if record.missing else ""
-    text = f"""varpin {__version__}. Wall times are of one machine and one run, on one thread. Errors in q are the
+    text = f"""varpin {__version__}. Wall times were measured once, on one machine and one thread. Errors in q are the
 largest over the joints and {record.samples} times [rad or m], against {html.escape(record.reference)}, which differs
-from the same at a ten times looser tolerance by {record.reference_error:.1e}. Nothing beats the runs on green in both
-time and error.{missing}"""
+from the same at a ten times looser tolerance by {record.reference_error:.1e}. Runs on green are on the Pareto front: no
+other run has both a smaller time and a smaller error.{missing}"""
     rows = [(cells(record, run, run in front), run in front) for run in record.runs]
     return _document(title, text, "error over time", image, COLUMNS, rows)
 
@@ -107,7 +107,7 @@ def _document(
     columns: Sequence[str],
     rows: Sequence[tuple[tuple[str, ...], bool]],
 ) -> str:
-    """A page of a paragraph, which is markup, a picture and a table, some of whose rows stand out."""
+    """A page with a paragraph ``text`` (HTML), a picture, and a table of (entries, whether the row is marked)."""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
     body = "".join(_row(entries, marked) for entries, marked in rows)
     figure = picture(image, caption) if image else ""

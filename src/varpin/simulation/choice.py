@@ -53,6 +53,8 @@ def usual_integrator(
 
 def changes_along(scene: Scene) -> bool:
     """Whether a motion without noise may ask for another integrator than its start."""
+    if not scene.elements and not scene.couplings:
+        return False
     stiffens = scene.couplings or of_kind(scene.elements, "JointStop")
     return bool((stiffens or scene.dissipates) and scene.custom is None and scene.robot.dof <= _ASKED)
 
@@ -94,25 +96,19 @@ def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float, *, ahead: b
     if not scene.dissipates or scene.custom is not None or len(q0) > _ASKED:
         return False
     # At rest dry friction is fastest; servos do not saturate where they are.
-    q = _starts(scene, q0, ahead=ahead)
+    q = np.concatenate([np.tile(q0, (2, 1)), stops_ahead(scene, q0)]) if ahead else np.tile(q0, (2, 1))
     v = np.zeros_like(q)
     v[0] = v0
-    return fastest_damping(scene.core, q, v, _held(scene, q0, len(q)), rate) > 0.0
+    forces = np.tile(scene.actuation @ scene.command_at(q0), (len(q), 1))
+    return fastest_damping(scene.core, q, v, forces, rate) > 0.0
 
 
 def _swings_faster(scene: Scene, q0: Floats, rate: float, *, ahead: bool) -> bool:
     """Whether springs, servos or gravity make a mode faster than a rate [rad/s] at rest at the start."""
     if scene.custom is not None or len(q0) > _ASKED:
         return False
-    q = _starts(scene, q0, ahead=ahead)[1:]
-    return bool(pulls_fast(scene.core, q, np.zeros_like(q), _held(scene, q0, len(q)), 1.0 / rate))
-
-
-def _starts(scene: Scene, q0: Floats, *, ahead: bool) -> Floats:
-    """The start twice, and with each joint in its stops."""
-    return np.concatenate([np.tile(q0, (2, 1)), stops_ahead(scene, q0)] if ahead else [np.tile(q0, (2, 1))])
-
-
-def _held(scene: Scene, q0: Floats, rows: int) -> Floats:
-    """Forces (rows, n) of the controls that let servos stay."""
-    return np.tile(scene.actuation @ scene.command_at(q0), (rows, 1))
+    q = np.concatenate([q0[None], stops_ahead(scene, q0)]) if ahead else q0[None]
+    forces = (scene.actuation @ scene.command_at(q0))[None]
+    if ahead:
+        forces = np.tile(forces, (len(q), 1))
+    return bool(pulls_fast(scene.core, q, np.zeros_like(q), forces, 1.0 / rate))

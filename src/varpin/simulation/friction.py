@@ -43,8 +43,8 @@ def stops(scene: Scene, velocities: Floats) -> list[Stop]:
     ``velocities`` are those of the nodes (N + 1, n).
     """
     found = []
-    for own in of_kind(scene.elements, "CoulombFriction"):
-        c, width = own.coordinate, own.values[1]
+    for element in of_kind(scene.elements, "CoulombFriction"):
+        c, width = element.coordinate, element.values[1]
         v = velocities[:, c]
         before, after = v[:-1], v[1:]
         # The velocity changes its sign, or another step like this one would take it there.

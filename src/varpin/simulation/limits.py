@@ -33,7 +33,7 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
     if not any(scene.bounded):
         return
     robot, t = scene.robot, trajectory.t
-    stopped = {own.coordinate for own in of_kind(scene.elements, "JointStop")}
+    stopped = {element.coordinate for element in of_kind(scene.elements, "JointStop")}
     for bounded, (kind, why, of, (least, most), beyond, units) in zip(
         scene.bounded,
         (

@@ -30,6 +30,8 @@ _SHOWS = 0.02
 # By how much an oscillation has to turn over the motion [rad]; what turns by less loses nothing that shows. A joint
 # that nothing holds has the eigenvalue zero twice, which rounding splits into slow modes of any height.
 _TURNS = 1.0
+# What is told of modes at the ends of a motion tells of all the others if they turn by this part of what is spoken of.
+_NOTHING = 0.25
 # Forces that make oscillations; under gravity alone fast motions are chaotic, and slow ones lose little.
 _SPRINGS = ("JointSpring", "JointStop", "PositionServo", "FrameSpring", "FrameLengthSpring", "FrameTurnSpring")
 
@@ -70,30 +72,48 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         return None
     h = trajectory.dt / float(np.maximum(trajectory.statistics.substeps, 1).mean())
     # No mode is faster than this, and no slower one loses more as long as it turns by little in a step.
-    fastest = np.sqrt(np.abs(aq).sum(axis=2).max()) + np.abs(av).sum(axis=2).max()
+    bounds = np.sqrt(np.abs(aq).sum(axis=2).max(axis=1)) + np.abs(av).sum(axis=2).max(axis=1)
+    fastest = float(bounds.max())
     drift = _drift(integrator, np.array([1j * fastest]), h)
     if drift is None or (h * fastest < 1.0 and abs(drift[0]) * trajectory.t[-1] < _SHOWS):
         return None
     way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
     # A robot held in equilibrium has accelerations of rounding, and swings as little.
     rounding = ROUNDING * (1.0 + np.abs(q).max())
-    worst = None
-    for k, node in enumerate(at):
-        A = np.block([[np.zeros((n, n)), np.eye(n)], [aq[k], av[k]]])
+    worst, most, ends = None, 0.0, (0, len(at) - 1)
+    with np.errstate(over="ignore"):
+        slowest = np.maximum(bounds[list(ends)].min(), np.finfo(np.float64).tiny)
+        growth = float((fastest / slowest) ** (integrator.order + 1))
+    alike = _damped_alike(scene, av)
+    A = np.zeros((2 * n, 2 * n))
+    A[:n, n:] = np.eye(n)
+    for k in dict.fromkeys([*ends, *range(len(at))]):
+        # Modes that are damped as those at the ends, and hardly faster, turn by nearly as little.
+        if k not in ends and alike and most * growth < _NOTHING * _SHOWS:
+            break
+        node, A[n:, :n], A[n:, n:] = at[k], aq[k], av[k]
         try:
             rates, modes = np.linalg.eig(A)
             parts = np.linalg.solve(modes, np.append(v[k], a[k]))
         except np.linalg.LinAlgError:
+            most = np.inf
             continue
-        swings = rates.imag > np.maximum(np.abs(rates.real), _TURNS / trajectory.t[-1])
-        rates, heights = rates[swings], 2.0 * np.abs(modes[:n, swings] * (parts[swings] / rates[swings]))
+        turns = rates.imag > _TURNS / trajectory.t[-1]
+        rates, modes, parts = rates[turns], modes[:n, turns], parts[turns]
+        heights = 2.0 * np.abs(modes * (parts / rates))
         drift = _drift(integrator, rates, h)
         if drift is None or not rates.size or not np.isfinite(drift).all():
+            most = np.inf if rates.size else most
             continue
         # What dies out, or grows, was not there before; what swings at the start is still there at the end.
         lasting = np.minimum(trajectory.t[-1 if node == 0 else node], 1.0 / np.maximum(np.abs(rates.real), 1e-300))
         left = np.exp(np.minimum(rates.real, 0.0) * lasting) if node == 0 else np.ones(rates.size)
         turned = np.minimum(np.abs(np.expm1(drift * lasting)), 2.0)
+        most = max(most, float(turned.max()))
+        swings = rates.imag > np.abs(rates.real)
+        if not swings.any():
+            continue
+        rates, heights, left, turned = rates[swings], heights[:, swings], left[swings], turned[swings]
         off = heights * (left * turned)
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.where(off > rounding, off / way[:, None], 0.0)
@@ -102,6 +122,14 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         if share >= _SHOWS and (worst is None or share > worst.share):
             worst = Loss(int(joint), float(off[joint, mode]), share, float(rates[mode].imag), float(turned[mode]))
     return worst
+
+
+def _damped_alike(scene: Scene, av: Floats) -> bool:
+    """Whether all joints are damped at some nodes (K, n, n) nearly as at the first and the last, and no stop acts."""
+    damped = -np.diagonal(av, axis1=1, axis2=2)
+    ends = damped[[0, -1]].max(axis=0)
+    stopped = any(element.kind == "JointStop" for element in scene.elements)
+    return not stopped and bool((2.0 * damped >= ends).all())
 
 
 def _asks(scene: Scene, trajectory: Trajectory) -> bool:

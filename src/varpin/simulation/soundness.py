@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.core import doubled_steps_agree, energy_turnover, glance
+from varpin.core import energy_turnover, glance, windows_agree
 from varpin.integrators import ExplicitEuler, Integrator, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
@@ -68,6 +68,8 @@ WORK, LEAST_WORK = 50, 256
 # Windows that are taken again in steps of twice the length, beside those where velocities change most; and how many
 # times the error of a window counts, for over a period it grows.
 _WINDOWS, _MARGIN = 16, 8.0
+# The least steps of a window that another method takes; and how many times errors of velocities count after jumps.
+_SHORT, _PASSING = 16, 1.25
 # Stages of what they are taken again with where dampers are faster than the step.
 _STOPPING = 3
 # Steps from where a joint comes to rest that are taken again with it, and in how many parts each; in more if it fails.
@@ -250,7 +252,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         found.extend(_not_told(scene, integrator, trajectory))
     if not found:
         found.extend(_adding_up(scene, integrator, trajectory))
-    return (*found, *(own for own in unsettled if own.kind not in {other.kind for other in found}))
+    return (*found, *(finding for finding in unsettled if finding.kind not in {other.kind for other in found}))
 
 
 def _not_told(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -480,29 +482,29 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     if isinstance(integrator, Reference) or not steps or scene.noise.diffusion is None:
         return False
     noisy = bool(trajectory.dw.any())
-    # Windows of like lengths, which are even.
-    pieces = min(-(-steps // WINDOW), _WINDOWS)
-    length = min(WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2)
     fastest, split, steady, pulled = glance(scene.core, q, v, u, trajectory.statistics.substeps, trajectory.dt)
     if not fastest > _STILL:
         return True
-    # Springs far faster than the step do as little in two.
-    if split or pulled:
+    if split:
         return False
-    # So do dampers, but not where what they stop is at rest after a step, whatever its length. Other methods are held
-    # against that in steps as long as theirs.
     damped = bool(_fast_damping(scene, trajectory).rate)
     # Under constraints nothing stops what dampers do in one step; and what a hand does in two is another motion.
     if scene.inputs or (scene.constraints and damped):
         return False
     if steps == 1:
-        return not (damped or noisy) and _halves_agree(scene, integrator, trajectory)
-    foreign = damped and not integrator.l_stable
-    other, times = stopping(scene, _STOPPING) if foreign else integrator, 1 if foreign else 2
-    apart = max(pieces, 1 + steps % 2) - 1
-    begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
-    if pieces == _WINDOWS:
-        begins = np.union1d(begins, blows(v, length))
+        return not (damped or noisy or pulled) and _halves_agree(scene, integrator, trajectory)
+    # Springs and dampers far faster than the step do as little in two, and controls that jump at nodes are others
+    # there, which methods for such dampers follow. A better method is held against that in steps as long as theirs.
+    jumps = not (steady or trajectory.u_stages.shape[1])
+    other, times = integrator, 2
+    if damped and not (integrator.l_stable or pulled):
+        other, times = stopping(scene, _STOPPING), 1
+    elif pulled or (damped and jumps):
+        better = finer(integrator, trajectory, damped=damped, pulled=pulled)
+        if better.parts != 1:
+            return False
+        other, times = better.method, 1
+    begins, length = _windows(trajectory, every=times == 2)
     commands, drift = open_loop(u[:length:times]), np.zeros((0, 0, scene.robot.dof))
     if not steady:
         # Commands are the same for all paths; their forces need not be.
@@ -513,11 +515,34 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
         again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks)
     else:
         again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt, kicks)
-    if times == 1 and again is not None:
+    if times == 1 and not (jumps or pulled) and again is not None:
+        # What a start off the slow motion leaves of itself after a single step is not to be held against it.
         again = np.ascontiguousarray(again[0][:, 1::2]), np.ascontiguousarray(again[1][:, 1::2])
-    # How much less the error is in steps of half the length; of another method nothing is known.
-    gain = (1.0 if damped else 2.0**integrator.order - 1.0) / _MARGIN
-    return again is not None and _agree(scene, (q, v), begins, length, trajectory.dt, again, gain)
+    # How much less the error is in steps of half the length; of another method nothing is known. What jumps do to
+    # velocities that are damped is over soon, and does not grow; what lasts moves joints.
+    gain = (1.0 if damped or times == 1 else 2.0**integrator.order - 1.0) / _MARGIN
+    gain_of_velocity = 1.0 / _PASSING if damped and jumps and not pulled else gain
+    return again is not None and _agree(scene, (q, v), begins, length, trajectory.dt, again, gain, gain_of_velocity)
+
+
+def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
+    """Where windows of a motion begin (K,), and how many steps each has: of like lengths, which are even.
+
+    All over the motion, up to a number of them; or some of it, where it takes longer than half of the motion to take
+    them again.
+    """
+    steps, v = trajectory.steps, trajectory.v
+    if every:
+        pieces = min(-(-steps // WINDOW), _WINDOWS)
+        length = min(WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2)
+    else:
+        pieces = min(max(2, steps // (4 * WINDOW)), _WINDOWS)
+        length = min(WINDOW, max(_SHORT, 2 * (steps // 12)), steps - steps % 2)
+    apart = max(pieces, 1 + steps % 2) - 1
+    begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
+    if pieces == _WINDOWS or not every:
+        begins = np.union1d(begins, blows(v, length)[: None if pieces == _WINDOWS else 1])
+    return begins, length
 
 
 def _kicks_of(
@@ -554,19 +579,23 @@ def _agree(
     begins: Integers,
     length: int,
     dt: float,
-    doubled: tuple[Floats, Floats],
+    again: tuple[Floats, Floats],
     gain: float,
+    gain_of_velocity: float,
 ) -> bool:
-    """Whether steps of twice the length make the same of windows of q and v, within so much of what is wrong."""
-    return doubled_steps_agree(
+    """Whether windows of q and v are what was made of them ``again``, within so much of what is wrong.
+
+    That has nodes after each step, or after each second one.
+    """
+    return windows_agree(
         scene.core,
         *nodes,
         begins,
         length,
         dt,
-        *doubled,
+        *again,
         way=gain * WRONG_MOTION,
-        velocity=gain * WRONG_VELOCITY,
+        velocity=gain_of_velocity * WRONG_VELOCITY,
         little=LITTLE,
         light=LIGHT,
         even=EVEN,
@@ -585,7 +614,7 @@ def _halves_agree(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         return False
     fine = np.concatenate([q[:1], again[0][0]]), np.concatenate([v[:1], again[1][0]])
     gain = (1.0 - 2.0**-integrator.order) / _MARGIN
-    return _agree(scene, fine, _FROM_START, 2, half, (q[None, 1:], v[None, 1:]), gain)
+    return _agree(scene, fine, _FROM_START, 2, half, (q[None, 1:], v[None, 1:]), gain, gain)
 
 
 def _windows_under(
@@ -605,8 +634,8 @@ def _windows_under(
         commands = changing(in_parts(values, mine, 1, at) if times == 1 else in_pairs(values, mine, at), at)
         node = slice(begin, begin + 1)
         given = commands, np.zeros((0, 0, scene.robot.dof)), times * trajectory.dt
-        own = None if kicks is None else kicks[window : window + 1]
-        again = other.motions(scene, trajectory.q[node], trajectory.v[node], *given, own)
+        kick = None if kicks is None else kicks[window : window + 1]
+        again = other.motions(scene, trajectory.q[node], trajectory.v[node], *given, kick)
         if again is None:
             return None
         found.append(again)

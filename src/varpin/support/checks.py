@@ -56,9 +56,9 @@ def tuple_of(name: str, given: Any, kind: type, note: str = "") -> tuple[Any, ..
     found = (given,) if isinstance(given, kind) else given
     if isinstance(found, str) or not isinstance(found, Sequence):
         raise InputError(f"{name} must be a list of varpin's {name}, got {type(given).__name__}{note}")
-    for own in found:
-        if not isinstance(own, kind):
-            raise InputError(f"{name} must be a list of varpin's {name}, got {own!r} in it{note}")
+    for item in found:
+        if not isinstance(item, kind):
+            raise InputError(f"{name} must be a list of varpin's {name}, got {item!r} in it{note}")
     return tuple(found)
 
 

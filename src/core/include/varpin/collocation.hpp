@@ -49,10 +49,10 @@ struct Effort {
 
 // The start of a step.
 struct Start {
-    const Place* place = nullptr;    // (n)
-    const Compensated* p = nullptr;  // (n)
-    const double* force = nullptr;   // (n) of controls and drift of noise, or (s, n) at the stages
-    int stride = 0;                  // distance of rows; 0 for a constant force
+    const Coordinate* position = nullptr;  // (n)
+    const Compensated* p = nullptr;        // (n)
+    const double* force = nullptr;         // (n) of controls and drift of noise, or (s, n) at the stages
+    int stride = 0;                        // distance of rows; 0 for a constant force
 
     const double* force_at(int stage) const { return force + stage * stride; }
 };
@@ -384,7 +384,7 @@ class Collocation {
             for (int c = 0; c < n; ++c) {
                 double total = 0.0;
                 for (int j = 0; j < stages; ++j) total += tableau.a[i * stages + j] * V[j * n + c];
-                Q[i * n + c] = start.place[c].place.high + (start.place[c].place.low + h * total);
+                Q[i * n + c] = start.position[c].value.high + (start.position[c].value.low + h * total);
             }
         }
     }

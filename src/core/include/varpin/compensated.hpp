@@ -24,9 +24,9 @@ struct Compensated {
     }
 };
 
-// A coordinate within one turn, and its whole turns.
-struct Place {
-    Compensated place;
+// A coordinate: its value within one turn, and its whole turns.
+struct Coordinate {
+    Compensated value;
     double turns = 0.0;
 
     // A turn in two parts, the first with so few digits that its multiples are exact (Cody and Waite 1980).
@@ -36,15 +36,15 @@ struct Place {
 
     // Remove whole turns.
     void unwind() {
-        if (std::abs(place.high) <= turn) return;
-        const double whole = std::floor(place.high / turn + 0.5);
-        place = place.plus(-whole * turn_high).plus(-whole * turn_low);
+        if (std::abs(value.high) <= turn) return;
+        const double whole = std::floor(value.high / turn + 0.5);
+        value = value.plus(-whole * turn_high).plus(-whole * turn_low);
         turns += whole;
     }
 
     double shown() const {
-        if (turns == 0.0) return place.high;
-        return turns * turn_high + (place.high + (turns * turn_low + place.low));
+        if (turns == 0.0) return value.high;
+        return turns * turn_high + (value.high + (turns * turn_low + value.low));
     }
 };
 

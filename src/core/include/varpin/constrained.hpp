@@ -149,7 +149,7 @@ class ConstrainedStepper {
     bool begin_at(const double* q, const double* p, ConstrainedState& state, bool project = true) {
         PathState& path = state.path;
         for (int i = 0; i < n; ++i) {
-            path.place[i] = {{q[i], 0.0}, 0.0};
+            path.position[i] = {{q[i], 0.0}, 0.0};
             unwind(i, path);
             path.q[i] = q[i];
             path.p[i] = {p[i], 0.0};
@@ -162,7 +162,7 @@ class ConstrainedStepper {
         state.rank = here.rank();
         for (const DrivenRow& own : mechanism.constraints.driven()) state.rate[own.row] = path.v[own.coordinate];
         if (project) absorb(state);
-        for (int i = 0; i < n; ++i) unit[i] = path.place[i].place.high;
+        for (int i = 0; i < n; ++i) unit[i] = path.position[i].value.high;
         energy_guard.velocity(path.momentum.data(), path.v.data());
         energy_guard.begin(unit.data(), path.momentum.data(), path.v.data(), path.energies);
         return true;
@@ -178,7 +178,7 @@ class ConstrainedStepper {
 
     // The constraints and the factors of M at a path's node.
     bool look_at(ConstrainedState& state) {
-        for (int i = 0; i < n; ++i) unit[i] = state.path.place[i].place.high;
+        for (int i = 0; i < n; ++i) unit[i] = state.path.position[i].value.high;
         if (!find_basis(unit.data(), state.rank, here)) return false;
         energy_guard.velocity(state.path.momentum.data(), state.path.v.data());
         return true;
@@ -190,7 +190,7 @@ class ConstrainedStepper {
         for (int i = 0; i < n; ++i) {
             path.p[i] = path.p[i].plus(push[i]);
             path.momentum[i] = path.p[i].high;
-            unit[i] = path.place[i].place.high;
+            unit[i] = path.position[i].value.high;
         }
         absorb(state);
         energy_guard.kicked(unit.data(), path.momentum.data(), path.v.data(), path.energies);
@@ -371,7 +371,7 @@ class ConstrainedStepper {
             }
         }
         exchange(here, origin);
-        project_derivatives(h, path, Goal::place, Jx, Jf);
+        project_derivatives(h, path, Goal::position, Jx, Jf);
         if (!curved_paths) return;
         for (int end = 0; end < 2; ++end) {
             project_derivatives(h, path, end == 0 ? Goal::begin : Goal::end, by_rates[end].data(),
@@ -458,7 +458,7 @@ class ConstrainedStepper {
     }
 
     // Of what a joint's course depends on: the goal, or the rates at both ends of a cubic.
-    enum class Goal { place, begin, end };
+    enum class Goal { position, begin, end };
 
     // Shares of a joint's position, from where it begins, in the way to its goal; in its rates there and at the goal,
     // times the time that is left.
@@ -529,7 +529,7 @@ class ConstrainedStepper {
     void project_derivatives(double h, const PathState& path, Goal what, double* Jx, double* Jf) {
         const auto end = [&](int row, int c) -> double& { return entry(Jx, Jf, row, c); };
         const int r = here.rank();
-        for (int i = 0; i < n; ++i) unit[i] = path.place[i].place.high;
+        for (int i = 0; i < n; ++i) unit[i] = path.position[i].value.high;
         Jet<double>& jet = equation.stage[0];
         lagrangian_jet(mechanism, unit.data(), path.v.data(), jet);
         std::vector<double> bend(m * n), curvature(n * n), z(n), along(r), dq(n), turned(n);
@@ -547,7 +547,7 @@ class ConstrainedStepper {
                 if (const int d = driven_of(here.order[k]); d >= 0) {
                     const int moved = mechanism.constraints.driven()[d].coordinate;
                     const Way pace = pace_at(d, share);
-                    if (what == Goal::place) {
+                    if (what == Goal::position) {
                         own += pace.ahead * share / h * ((c == 2 * n + moved) - (c == moved));
                     } else if (c == 2 * n + moved) {
                         own += what == Goal::begin ? pace.begin : pace.end;
@@ -574,7 +574,7 @@ class ConstrainedStepper {
         return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i) && !mechanism.couplings.has_outer();
     }
     void unwind(int i, PathState& path) const {
-        if (unwinds(i)) path.place[i].unwind();
+        if (unwinds(i)) path.position[i].unwind();
     }
 
     // M's factors and C at q, the `rank` rows that are farthest from depending on each other, or, for -1, all that do
@@ -681,9 +681,9 @@ class ConstrainedStepper {
 
     // How much of the time that is left to its goal has gone at Lobatto point k of the part.
     double way_to(int k) const {
-        double place = 0.0;
-        for (int j = 0; j < stages; ++j) place += at[k * stages + j];
-        return share * place;
+        double sum = 0.0;
+        for (int j = 0; j < stages; ++j) sum += at[k * stages + j];
+        return share * sum;
     }
 
     // Lam (m) with C M^-1 (p - C' Lam) = rate, of the basis' rows; zero of others.
@@ -761,7 +761,7 @@ class ConstrainedStepper {
         if (!(here.least > near_toggle) && m > 0 && here.rank() > 0) return Outcome::toggle;
         for (std::size_t d = 0; d < goal.size(); ++d) begun[d] = state.rate[mechanism.constraints.driven()[d].row];
         if (curved_paths) {
-            for (int i = 0; i < n; ++i) from_q[i] = path.place[i].place.high;
+            for (int i = 0; i < n; ++i) from_q[i] = path.position[i].value.high;
             std::copy(path.v.begin(), path.v.end(), from_v.begin());
         }
         const Outcome solved = solve(h, path, jets_wanted);
@@ -778,9 +778,9 @@ class ConstrainedStepper {
         rate.assign(m, 0.0);
         for (std::size_t d = 0; d < goal.size(); ++d) {
             const DrivenRow& own = mechanism.constraints.driven()[d];
-            rate[own.row] = rate_at(static_cast<int>(d), share, h, path.place[own.coordinate].place.high);
+            rate[own.row] = rate_at(static_cast<int>(d), share, h, path.position[own.coordinate].value.high);
         }
-        for (int i = 0; i < n; ++i) unit[i] = trial.place[i].place.high;
+        for (int i = 0; i < n; ++i) unit[i] = trial.position[i].value.high;
         // The last Lobatto point is the end.
         if (!jets_wanted) exchange(there.jet, point.back());
         if (!find_basis(unit.data(), state.rank, there, !jets_wanted)) return Outcome::singular;
@@ -796,7 +796,7 @@ class ConstrainedStepper {
             for (int r = 0; r < m; ++r) last[r] += total[r];
         }
         for (std::size_t d = 0; d < goal.size(); ++d) add_work(static_cast<int>(d), h, path);
-        const Outcome outcome = energy_guard.settle(guards, tableau, path.energies, path.place, path.v, trial, true);
+        const Outcome outcome = energy_guard.accept(guards, tableau, path.energies, path.position, path.v, trial, true);
         if (outcome != Outcome::solved) return outcome;
         effort.branch_margin = std::min(effort.branch_margin, margin);
         ++effort.substeps;
@@ -805,17 +805,17 @@ class ConstrainedStepper {
             for (int k = 0; k < stages; ++k) sum += impulse[k * m + r];
             state.impulse[r] -= sum;
         }
-        std::swap(path.place, trial.place);
+        std::swap(path.position, trial.position);
         std::swap(path.p, trial.p);
         state.rate = rate;
         exchange(origin, here);
         exchange(here, there);
         bool turned = false;
         for (int i = 0; i < n; ++i) {
-            const double turns = path.place[i].turns;
+            const double turns = path.position[i].turns;
             unwind(i, path);
-            turned = turned || path.place[i].turns != turns;
-            path.q[i] = path.place[i].shown();
+            turned = turned || path.position[i].turns != turns;
+            path.q[i] = path.position[i].shown();
         }
         std::copy(trial.momentum.begin(), trial.momentum.end(), path.momentum.begin());
         std::copy(trial.v.begin(), trial.v.end(), path.v.begin());
@@ -827,7 +827,7 @@ class ConstrainedStepper {
     // and a correction that is sure to be the last one is not looked at again unless `jets_wanted`. It then ends with
     // jets of the root, and with C at all points; else with those of the last iterate.
     Outcome solve(double h, const PathState& path, bool jets_wanted) {
-        const Start start{path.place.data(), path.p.data(), force.data(), stride};
+        const Start start{path.position.data(), path.p.data(), force.data(), stride};
         // In units of these the matrix has entries about 1.
         for (int c = 0; c < n; ++c) scaled[c] = 1.0 / std::sqrt(mass_diagonal(c));
         for (int r = 0; r < m; ++r) row_scale[r] = 1.0 / std::max(norm(&here.rows[r * n]), nothing);
@@ -916,7 +916,7 @@ class ConstrainedStepper {
     // What moves a joint by hand does this work: its impulses, the first of which meets the velocity before it, too.
     void add_work(int d, double h, const PathState& path) {
         const DrivenRow& own = mechanism.constraints.driven()[d];
-        const double from = path.place[own.coordinate].place.high;
+        const double from = path.position[own.coordinate].value.high;
         for (int k = 0; k <= stages; ++k) {
             const double Lam = k < stages ? impulse[k * m + own.row] : last[own.row];
             double velocity = rate_at(d, way_to(k), h, from);
@@ -932,16 +932,16 @@ class ConstrainedStepper {
             for (int c = 0; c < n; ++c) {
                 double sum = 0.0;
                 for (int j = 0; j < stages; ++j) sum += at[k * stages + j] * equation.V[j * n + c];
-                Qk[c] = start.place[c].place.high + (start.place[c].place.low + h * sum);
+                Qk[c] = start.position[c].value.high + (start.position[c].value.low + h * sum);
             }
             mechanism.constraints.at(Qk.data(), point[k - 1]);
             for (std::size_t d = 0; d < goal.size(); ++d) {
                 const DrivenRow& own = mechanism.constraints.driven()[d];
-                const Place& from = start.place[own.coordinate];
+                const Coordinate& from = start.position[own.coordinate];
                 const Way way = way_at(static_cast<int>(d), way_to(k));
-                const double ahead = goal[d] - from.place.high, swing = begun[d] * way.begin + goal_rate[d] * way.end;
+                const double ahead = goal[d] - from.value.high, swing = begun[d] * way.begin + goal_rate[d] * way.end;
                 const double moved = way.ahead * ahead + h / share * swing;
-                point[k - 1].g[own.row] = Qk[own.coordinate] - (from.place.high + (from.place.low + moved));
+                point[k - 1].g[own.row] = Qk[own.coordinate] - (from.value.high + (from.value.low + moved));
                 point[k - 1].scale[own.row] =
                     std::abs(Qk[own.coordinate]) + std::abs(ahead) + h / share * std::abs(swing);
             }
@@ -1068,23 +1068,57 @@ class ConstrainedStepper {
         }
     }
 
-    // By how much the rows at `here` have turned on the way to another point: the distance of C0 M^-1 C1' (C0 M^-1
-    // C0')^-1 from one. Beyond one, a root may belong to another assembly.
+    // By how much the rows at `here` have turned on the way to another point: the distance of C0 W C1' (C0 W C0')^-1
+    // from one, W = M^-1 or, where that is less, the squares of what each joint moves at most. While it is below one
+    // for any W, rows stay independent, and a root belongs to the same assembly. Where light joints carry heavy ones, a
+    // small turn of the rows is large in the metric of the kinetic energy.
     double turn_to(const ConstraintJet& jet) {
         const int r = here.rank();
-        double sum = 0.0;
         for (int a = 0; a < r; ++a) {
             whiten(here, &jet.C[here.order[a] * n], white.data());
             for (int k = 0; k < r; ++k) product[k * r + a] = inner(&here.Q[k * n], white.data());
         }
-        // X R = product, column by column.
+        const double turn = from_one(r, here.R.data());
+        return turn <= most_turn ? turn : std::min(turn, even_turn_to(jet));
+    }
+
+    double even_turn_to(const ConstraintJet& jet) {
+        const int r = here.rank();
+        // Gram and Schmidt on the rows at `here`; R stands where the branch margin puts its own matrices later.
+        std::vector<double>&Q = rest, &R = curved;
+        for (int c = 0; c < n; ++c) {
+            double most = 0.0;
+            for (const int row : here.order)
+                most = std::max({most, std::abs(here.jet.C[row * n + c]), std::abs(jet.C[row * n + c])});
+            unit[c] = most > 0.0 ? 1.0 / most : 0.0;
+        }
+        for (int k = 0; k < r; ++k) {
+            double* own = &Q[k * n];
+            for (int c = 0; c < n; ++c) own[c] = unit[c] * here.jet.C[here.order[k] * n + c];
+            for (int b = 0; b < k; ++b) {
+                R[b * r + k] = inner(&Q[b * n], own);
+                for (int c = 0; c < n; ++c) own[c] -= R[b * r + k] * Q[b * n + c];
+            }
+            R[k * r + k] = norm(own);
+            for (int c = 0; c < n; ++c) own[c] /= R[k * r + k];
+        }
+        for (int a = 0; a < r; ++a) {
+            for (int c = 0; c < n; ++c) white[c] = unit[c] * jet.C[here.order[a] * n + c];
+            for (int k = 0; k < r; ++k) product[k * r + a] = inner(&Q[k * n], white.data());
+        }
+        return from_one(r, R.data());
+    }
+
+    // The distance of X from one, X' R = product.
+    double from_one(int r, const double* R) {
         for (int k = 0; k < r; ++k) {
             for (int a = 0; a < r; ++a) {
                 double own = product[k * r + a];
-                for (int b = 0; b < a; ++b) own -= product[k * r + b] * here.R[b * r + a];
-                product[k * r + a] = own / here.R[a * r + a];
+                for (int b = 0; b < a; ++b) own -= product[k * r + b] * R[b * r + a];
+                product[k * r + a] = own / R[a * r + a];
             }
         }
+        double sum = 0.0;
         for (int k = 0; k < r; ++k) {
             for (int a = 0; a < r; ++a) {
                 const double off = product[k * r + a] - (k == a ? 1.0 : 0.0);
@@ -1177,7 +1211,8 @@ class ConstrainedStepper {
         for (int c = 0; c < n; ++c) {
             double move = 0.0, sum = 0.0, across_rows = 0.0;
             trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
-            const double distance = std::min(std::abs(path.place[c].place.high), unwinds(c) ? Place::turn : infinity);
+            const double distance =
+                std::min(std::abs(path.position[c].value.high), unwinds(c) ? Coordinate::turn : infinity);
             for (int i = 0; i < stages; ++i) {
                 const double share = h * tableau.b[i], velocity = equation.V[i * n + c];
                 const JointForce<double>& element = equation.acting[i * n + c];
@@ -1192,7 +1227,7 @@ class ConstrainedStepper {
                                       tableau.b[i] * std::abs(equation.stage[i].Lq[c]) * distance +
                                       push_size[i * n + c] * std::abs(velocity);
             }
-            trial.place[c] = {path.place[c].place.plus(h * move), path.place[c].turns};
+            trial.position[c] = {path.position[c].value.plus(h * move), path.position[c].turns};
             trial.p[c] = path.p[c].plus(h * sum - across_rows);
         }
     }

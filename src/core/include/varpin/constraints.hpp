@@ -26,7 +26,7 @@ namespace varpin {
 // A point relative to its body's joint [m], or a direction, in body axes; in the world for body -1.
 struct CarriedVector {
     int body = -1;
-    Vec3<double> place{};
+    Vec3<double> point{};
     bool direction = false;
 };
 
@@ -140,7 +140,7 @@ class Constraints {
     void at(const double* q, ConstraintJet& w) const {
         fit(w);
         std::copy(q, q + n_, w.at_q.begin());
-        place(links_, q, w.at.data());
+        forward_kinematics(links_, q, w.at.data());
         std::size_t leg = 0;
         for (std::size_t a = 0; a < vectors_.size(); ++a) move_vector(q, a, leg, w);
         std::fill(w.C.begin(), w.C.end(), 0.0);
@@ -323,9 +323,9 @@ class Constraints {
             const double side = part == 0 ? 1.0 : -1.0;
             auto& levers = w.levers[leg];
             levers.clear();
-            Vec3<double> x = carried.place;
+            Vec3<double> x = carried.point;
             if (carried.body >= 0) {
-                x = w.at[carried.body].rotation * carried.place;
+                x = w.at[carried.body].rotation * carried.point;
                 if (!carried.direction) x += w.at[carried.body].position;
             }
             w.value[a] += side * x;

@@ -169,7 +169,7 @@ class CostSample {
         for (std::size_t f = 0; f < frames_.size(); ++f) {
             const auto& [links, offset, center] = costs_.frames[f];
             FrameAt& here = frames_[f];
-            place(links, q, here.joints.data());
+            forward_kinematics(links, q, here.joints.data());
             if (center) {
                 double* J = slopes ? here.jacobian.data() : nullptr;
                 here.placement.position = center_of_mass(links, here.joints.data(), loads_.data(), J);

@@ -34,7 +34,7 @@ namespace varpin {
 // A point, relative to the joint of its body in body axes, or in the world for body -1. Or a direction.
 struct Anchor {
     int body = -1;
-    Vec3<double> place{};  // [m]; a unit vector for a direction
+    Vec3<double> point{};  // [m]; a unit vector for a direction
     bool direction = false;
 };
 
@@ -170,7 +170,7 @@ struct CouplingWorkspace {
     std::vector<PlacementOf<T>> at;
     std::vector<Arm<T>> arms;
     std::vector<Vec3<T>> change;  // derivative of the velocity of d in the coordinate of each arm
-    Vec3<T> place[2];             // of the points of the current coupling
+    Vec3<T> point[2];             // of the current coupling
     Mat3<T> rotation{};           // of a's body
 };
 
@@ -226,8 +226,8 @@ class Couplings {
                 [&](const auto& element) {
                     if constexpr (has_potential<std::decay_t<decltype(element)>>) {
                         write_arms(element, joined, workspace);
-                        const VectorPotential<T> potential = element.potential(workspace.place[0] - workspace.place[1]);
-                        const double far = detail::size_of(workspace.place[0]) + detail::size_of(workspace.place[1]);
+                        const VectorPotential<T> potential = element.potential(workspace.point[0] - workspace.point[1]);
+                        const double far = detail::size_of(workspace.point[0]) + detail::size_of(workspace.point[1]);
                         visit(std::as_const(workspace.arms), potential, element.scale(far),
                               std::abs(value_of(potential.energy)) + detail::size_of(potential.slope) * far);
                     }
@@ -311,7 +311,7 @@ class Couplings {
     template <class T>
     void update_placements(const T* q, CouplingWorkspace<T>& workspace) const {
         fit(workspace);
-        place(links_, q, workspace.at.data());
+        forward_kinematics(links_, q, workspace.at.data());
     }
 
     template <class T, class Element>
@@ -319,11 +319,11 @@ class Couplings {
         workspace.arms.clear();
         const Anchor* const anchors[2] = {&element.a, &element.b};
         for (int point = 0; point < 2; ++point) {
-            const auto& [body, place, direction] = *anchors[point];
-            Vec3<T>& x = workspace.place[point];
-            x = {T(place.x), T(place.y), T(place.z)};
+            const auto& [body, offset, direction] = *anchors[point];
+            Vec3<T>& x = workspace.point[point];
+            x = {T(offset.x), T(offset.y), T(offset.z)};
             if (body < 0) continue;
-            x = workspace.at[body].rotation * place;
+            x = workspace.at[body].rotation * offset;
             if (!direction) x += workspace.at[body].position;
             if (point == 0) workspace.rotation = workspace.at[body].rotation;
             for (int j : joined.path[point]) {

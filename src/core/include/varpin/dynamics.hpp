@@ -117,12 +117,12 @@ class ForwardDynamics {
         for (int j = 0; j < tree.size(); ++j) {
             const Body& link = tree.bodies[j];
             auto& here = jet_.body[j];
-            detail::place(tree, j, q, jet_);
+            detail::place_body(tree, j, q, jet_);
             detail::move(tree, j, v, jet_);
             here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
             here.momentum = here.inertia * here.velocity;
             body_[j].inertia = here.inertia;
-            if (articulated_) articulated_->place(j, link.ratio * here.axis, here.inertia);
+            if (articulated_) articulated_->set_body(j, link.ratio * here.axis, here.inertia);
             accelerate(j, v, nullptr);
         }
         for (int c = 0; c < jet_.dof && articulated_; ++c) momentum_[c] = tree.armature[c] * v[c];

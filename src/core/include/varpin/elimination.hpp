@@ -228,7 +228,7 @@ class ArticulatedBodies {
 
     // Factor M at q, with potential energies in `jet`; false at a pivot that is not positive.
     bool at(const Mechanism& mechanism, const double* q, Jet<double>& jet) {
-        const auto visit = [&](int j) { place(j, tree_->bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia); };
+        const auto visit = [&](int j) { set_body(j, tree_->bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia); };
         inertias(mechanism, q, jet, visit, [](int) {});
         for (int j = tree_->size() - 1; j >= 0; --j) {
             if (!eliminate(j)) return false;
@@ -237,7 +237,7 @@ class ArticulatedBodies {
     }
 
     // Set the axis and the inertia of body j alone.
-    void place(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
+    void set_body(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
         detail::write(axis, body_[j].axis);
         body_[j].inertia = inertia;
         if (!tied_) return;
@@ -459,7 +459,7 @@ class Elimination {
             double* X = symmetric_.of(j);
             detail::add_symmetric_product<12>(X, row, u);
             const double pivot = diagonal[link.coordinate] + detail::product<12>(row, u);
-            masses_.place(j, state.axis, state.inertia);
+            masses_.set_body(j, state.axis, state.inertia);
             if (!(pivot > 0.0) || !masses_.eliminate(j)) return 0.0;
             least = std::min(least, pivot / masses_.pivot(j));
             if (link.parent < 0) continue;

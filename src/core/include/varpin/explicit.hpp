@@ -27,8 +27,8 @@ enum class ExplicitMethod { euler, semi_implicit, runge_kutta };
 struct Nystroem {
     int stages = 1;
     double reach[4] = {};                           // c
-    int place[4] = {};                              // which of the different c a stage has
-    int places = 1;                                 // how many there are
+    int abscissa[4] = {};                           // which of the different c a stage has
+    int abscissae = 1;                              // how many there are
     double stage_q[4][4] = {}, stage_v[4][4] = {};  // k, l
     double end_q[4] = {}, end_v[4] = {1.0};         // x, y
 };
@@ -81,16 +81,16 @@ class ExplicitStepper {
 
     int stages() const { return coefficients_.stages; }
     // At how many different times of a step its stages are.
-    int places() const { return coefficients_.places; }
+    int abscissae() const { return coefficients_.abscissae; }
 
-    // From the state that `dynamics` is at, under a force (n), or with a `stride` of n one (places, n) for each time;
-    // false where a mass matrix on the way is not positive definite.
+    // From the state that `dynamics` is at, under a force (n), or with a `stride` of n one (abscissae, n) for each
+    // time; false where a mass matrix on the way is not positive definite.
     bool step(double h, const double* force, int stride = 0) {
         for (int i = 0; i < stages(); ++i) {
             move(h, coefficients_.reach[i], coefficients_.stage_q[i], coefficients_.stage_v[i], i, stage_q_.data(),
                  stage_v_.data());
             if (i > 0 && !dynamics.at(stage_q_.data(), stage_v_.data())) return false;
-            dynamics.acceleration(force + coefficients_.place[i] * stride, a_[i].data());
+            dynamics.acceleration(force + coefficients_.abscissa[i] * stride, a_[i].data());
             if (derivatives_) differentiate(h, i);
         }
         move(h, 1.0, coefficients_.end_q, coefficients_.end_v, stages(), q.data(), v.data());
@@ -197,7 +197,7 @@ class ExplicitRollout {
           paths_(paths),
           center_(q.size() * mechanism.diffusion.processes),
           stepper_(mechanism, method, false),
-          force_(stepper_.places() * mechanism.dof()),
+          force_(stepper_.abscissae() * mechanism.dof()),
           jump_(mechanism.dof()) {
         for (std::int64_t i = 0; i < paths; ++i) diffusion_centers(mechanism, q0 + i * mechanism.dof(), center(i));
     }
@@ -206,7 +206,7 @@ class ExplicitRollout {
 
     std::int64_t paths() const { return paths_; }
     int dof() const { return mechanism_->dof(); }
-    int places() const { return stepper_.places(); }
+    int abscissae() const { return stepper_.abscissae(); }
 
     // The node that each path starts at; false where a mass matrix is not positive definite.
     bool first_nodes(const Nodes& nodes) {
@@ -264,9 +264,9 @@ class ExplicitRollout {
         std::vector<double>& at_v = stepper_.v;
         double* u = nodes.u + path * nodes.steps * m;
         apply_policy(commands, path, s, n, at_q.data(), at_v.data(), u);
-        const double* within = stage_controls(commands, path, s, stepper_.places(), u, line_);
+        const double* within = stage_controls(commands, path, s, stepper_.abscissae(), u, line_);
         u += s * m;
-        stage_forces(*mechanism_, drift, within ? within : u, within ? stepper_.places() : 1, force_.data());
+        stage_forces(*mechanism_, drift, within ? within : u, within ? stepper_.abscissae() : 1, force_.data());
         if (!regular) return Outcome::singular;
         const bool beside = method_ == ExplicitMethod::euler;
         if (kicks) kick(kicks);

@@ -77,44 +77,44 @@ struct Ties {
     }
 };
 
-// The storage places in which bodies sum the contributions of their subtrees, from the last body to the first. Places
-// are reused: a chain needs one, which stays in the cache. The fixed base has a place after those of bodies, for ties.
+// The storage cells in which bodies sum the contributions of their subtrees, from the last body to the first. Cells
+// are reused: a chain needs one, which stays in the cache. The fixed base has a cell after those of bodies, for ties.
 struct Gathering {
     explicit Gathering(const Tree& tree)
-        : ties(tree), place(tree.size() + 1, -1), joins(tree.size(), 0), leaf(tree.size() + 1, 1) {
+        : ties(tree), cell(tree.size() + 1, -1), joins(tree.size(), 0), leaf(tree.size() + 1, 1) {
         std::vector<int> free;
         for (int j = tree.size() - 1; j >= 0; --j) {
-            if (place[j] < 0) {
-                if (free.empty()) free.push_back(places++);
-                place[j] = free.back();
+            if (cell[j] < 0) {
+                if (free.empty()) free.push_back(cells++);
+                cell[j] = free.back();
                 free.pop_back();
             }
             int k = tree.bodies[j].parent;
             if (k < 0 && ties.slots > 0) k = tree.size();
-            if (k >= 0 && place[k] < 0) {
-                place[k] = place[j];
+            if (k >= 0 && cell[k] < 0) {
+                cell[k] = cell[j];
                 leaf[k] = 0;
                 continue;
             }
             joins[j] = k >= 0;
-            free.push_back(place[j]);
+            free.push_back(cell[j]);
         }
     }
 
     Ties ties;
-    int places = 0;
-    std::vector<int> place;   // of each body; a first child has the place of its parent
-    std::vector<char> joins;  // has a place of its own, which is added to that of its parent
-    std::vector<char> leaf;   // has no children: its place is empty
+    int cells = 0;
+    std::vector<int> cell;    // of each body; a first child has the cell of its parent
+    std::vector<char> joins;  // has a cell of its own, which is added to that of its parent
+    std::vector<char> leaf;   // has no children: its cell is empty
 };
 
 namespace detail {
 
-// The contributions of subtrees during elimination, `entries` numbers at each place.
+// The contributions of subtrees during elimination, `entries` numbers in each cell.
 class Gathered {
   public:
     Gathered(std::shared_ptr<const Gathering> order, int entries)
-        : order_(std::move(order)), entries_(entries), at_(order_->places * entries) {}
+        : order_(std::move(order)), entries_(entries), at_(order_->cells * entries) {}
 
     // The sum of the children of body j.
     double* of(int j) {
@@ -122,9 +122,9 @@ class Gathered {
         if (order_->leaf[j]) std::fill(entries, entries + entries_, 0.0);
         return entries;
     }
-    double* of_again(int j) { return at_.data() + order_->place[j] * entries_; }
+    double* of_again(int j) { return at_.data() + order_->cell[j] * entries_; }
     // The sum of the roots, for ties.
-    double* of_ground() { return at_.data() + order_->place.back() * entries_; }
+    double* of_ground() { return at_.data() + order_->cell.back() * entries_; }
     // Pass the contribution of body j to its parent.
     void hand_on(int j, int parent) {
         if (!order_->joins[j]) return;

@@ -32,7 +32,7 @@ struct Guards {
     double branch_margin = 0.5;     // required distance of a root from the fold, in [0, 1)
     double energy_balance = 0.005;  // largest energy error of a substep, in units of the energy it turns over
     double energy_budget = 0.02;    // largest sum of errors, in units of the largest energy moved in a substep so far
-    int most_halvings = 12;
+    int most_halvings = 20;
 
     // Most halvings of a part that is repeated; none without guards.
     int halvings_again() const { return active ? most_halvings : 0; }
@@ -90,8 +90,8 @@ struct Energies {
 
 // A node that a substep has reached.
 struct Trial {
-    explicit Trial(int n) : place(n), p(n), at(n), momentum(n), v(n), work(n), dissipated(n), magnitude(n) {}
-    std::vector<Place> place;
+    explicit Trial(int n) : position(n), p(n), at(n), momentum(n), v(n), work(n), dissipated(n), magnitude(n) {}
+    std::vector<Coordinate> position;
     std::vector<Compensated> p;
     std::vector<double> at, momentum;  // (n) rounded, for sweeps
     std::vector<double> v;             // (n) M^-1 p
@@ -252,10 +252,12 @@ class EnergyGuard {
     }
 
     // Velocity and energy at the end of a substep, and whether its energy balance closes; if so, updates the ledgers.
-    Outcome settle(const Guards& guards, const Tableau& tableau, Energies& energies, const std::vector<Place>& from,
-                   const std::vector<double>& from_v, Trial& trial, bool factored = false) {
+    // `factored`: the factors of M at the end are known.
+    Outcome accept(const Guards& guards, const Tableau& tableau, Energies& energies,
+                   const std::vector<Coordinate>& from, const std::vector<double>& from_v, Trial& trial,
+                   bool factored = false) {
         for (int i = 0; i < n; ++i) {
-            trial.at[i] = trial.place[i].place.high;
+            trial.at[i] = trial.position[i].value.high;
             trial.momentum[i] = trial.p[i].high;
         }
         if (factored) {
@@ -453,7 +455,7 @@ class EnergyGuard {
     }
 
     // Whether the balance of light part r closes over a substep; writes its ledger into `part`.
-    bool part_balanced(const Limit& limit, const Energies& energies, const std::vector<Place>& from,
+    bool part_balanced(const Limit& limit, const Energies& energies, const std::vector<Coordinate>& from,
                        const std::vector<double>& from_v, const Trial& trial, std::size_t r) {
         const PartLedger& old = energies.part[r];
         PartLedger& ledger = part[r];
@@ -465,7 +467,7 @@ class EnergyGuard {
                 turned += varied(energies, c);
                 continue;
             }
-            const Compensated &now = trial.place[c].place, &then = from[c].place;
+            const Compensated &now = trial.position[c].value, &then = from[c].value;
             const double by_position =
                 0.5 * (old.Lq[c] + ledger.Lq[c]) * ((now.high - then.high) + (now.low - then.low));
             const double by_rate = 0.5 * (old.Lv[c] + ledger.Lv[c]) * (trial.v[c] - from_v[c]);

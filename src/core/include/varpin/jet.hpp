@@ -132,7 +132,7 @@ double norm1(const Vec3<T>& a) {
 // Orientation, position and axis of a body. Functions that every sweep calls for every body are forced inline, which
 // saves 15 % of a sweep.
 template <class T, class Size>
-[[gnu::always_inline]] inline void place(const Tree& tree, int j, const T* q, Jet<T, Size>& w) {
+[[gnu::always_inline]] inline void place_body(const Tree& tree, int j, const T* q, Jet<T, Size>& w) {
     using std::cos, std::sin;
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
@@ -386,7 +386,7 @@ void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, S
     for (int j = 0; j < bodies; ++j) {
         const Body& link = tree.bodies[j];
         auto& here = w.body[j];
-        detail::place(tree, j, q, w);
+        detail::place_body(tree, j, q, w);
         detail::move(tree, j, v, w);
         here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
         here.momentum = here.inertia * here.velocity;
@@ -417,7 +417,7 @@ void first_order(const Mechanism& mechanism, const double* q, const double* v, J
     for (int j = 0; j < bodies; ++j) {
         const Body& link = tree.bodies[j];
         auto& here = w.body[j];
-        detail::place(tree, j, q, w);
+        detail::place_body(tree, j, q, w);
         detail::move(tree, j, v, w);
         const Vec3<double> center = here.position + here.rotation * link.center;
         here.inertia.mass = link.mass;
@@ -453,7 +453,7 @@ void inertias(const Mechanism& mechanism, const double* q, Jet<double, Size>& w,
     for (int j = 0; j < bodies; ++j) {
         const Body& link = tree.bodies[j];
         auto& here = w.body[j];
-        detail::place(tree, j, q, w);
+        detail::place_body(tree, j, q, w);
         here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
         visit(j);
     }

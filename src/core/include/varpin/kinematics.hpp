@@ -65,7 +65,7 @@ class LinkCollector {
 
 // The placement of every body at q.
 template <class T>
-void place(const Links& links, const T* q, PlacementOf<T>* at) {
+void forward_kinematics(const Links& links, const T* q, PlacementOf<T>* at) {
     using std::cos, std::sin;
     for (int j = 0; j < links.size(); ++j) {
         const Body& link = links.bodies[j];

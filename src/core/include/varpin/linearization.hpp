@@ -124,7 +124,7 @@ class VariationalLinearization {
 
     // A part of a step that has been solved.
     struct Substep {
-        std::vector<Place> place;
+        std::vector<Coordinate> position;
         std::vector<Compensated> p;
         std::vector<double> V;      // (s, n) at its root
         double begin = 0.0;         // in units of the step
@@ -136,7 +136,7 @@ class VariationalLinearization {
     [[no_unique_address]] Size n;
     [[no_unique_address]] Stages stages;
     PathState state;
-    std::vector<Place> from;  // where the last part began
+    std::vector<Coordinate> from;  // where the last part began
     std::vector<Compensated> from_p;
     std::vector<double> dV;  // (s, n, 3n)
     std::vector<double> dQ;  // (n, 3n) of one stage
@@ -170,20 +170,21 @@ class VariationalLinearization {
     // The root from the guess in the step equation.
     Outcome root_at(double h, const double* q, const double* p, const double* force) {
         for (int i = 0; i < n; ++i) {
-            state.place[i] = {{q[i], 0.0}, 0.0};
+            state.position[i] = {{q[i], 0.0}, 0.0};
             stepper.unwind(i, state);
             state.p[i] = {p[i], 0.0};
         }
         stepper.take_force(force, varies);
         return stepper.step_equation.solve(
-            h, {state.place.data(), state.p.data(), stepper.force.data(), stepper.stride}, loose, true, stepper.effort);
+            h, {state.position.data(), state.p.data(), stepper.force.data(), stepper.stride}, loose, true,
+            stepper.effort);
     }
 
     Outcome root_of(double h, const Substep& part) {
         stepper.force_in_part(part.begin, part.length / h);
         std::copy(part.V.begin(), part.V.end(), stepper.step_equation.V.begin());
         return stepper.step_equation.solve(part.length,
-                                           {part.place.data(), part.p.data(), stepper.force.data(), stepper.stride},
+                                           {part.position.data(), part.p.data(), stepper.force.data(), stepper.stride},
                                            loose, true, stepper.effort);
     }
 
@@ -195,7 +196,7 @@ class VariationalLinearization {
         stepper.take_force(force, varies);
         if (!stepper.begin_at(q, p, state)) return Outcome::singular;
         return parts_again(halvings, stepper.guards.halvings_again(), [&](int level, double begin) {
-            from = state.place;
+            from = state.position;
             from_p = state.p;
             const Outcome outcome = stepper.part(h, level, begin, state);
             if (outcome == Outcome::solved) visit(begin, length_of(h, level));

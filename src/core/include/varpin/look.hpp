@@ -1,5 +1,5 @@
 // Checks of a finished motion: the energy that it turns over, rates of the scene that its steps cannot resolve, and
-// whether steps of twice the length give the same motion. The caller sets the thresholds.
+// whether other steps give the same motion. The caller sets the thresholds.
 #pragma once
 
 #include <algorithm>
@@ -245,17 +245,17 @@ struct Allowed {
 };
 
 // Whether windows of a motion, `length` steps of h [s] from the nodes `begins` on, agree with the results `again_q` and
-// `again_v` (windows, length / 2, n) of steps of twice the length.
-inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, const double* v,
-                                   const std::int64_t* begins, std::size_t windows, std::size_t length, double h,
-                                   const double* again_q, const double* again_v, const Allowed& allowed) {
+// `again_v` (windows, looks, n) of other steps, at `looks` evenly spaced nodes of each window.
+inline bool agree_in_windows(const Mechanism& mechanism, const double* q, const double* v, const std::int64_t* begins,
+                             std::size_t windows, std::size_t length, double h, const double* again_q,
+                             const double* again_v, std::size_t looks, const Allowed& allowed) {
     const int n = mechanism.dof();
     std::vector<char> slides(n);
     for (const Body& body : mechanism.tree.bodies) {
         if (body.prismatic) slides[body.coordinate] = true;
     }
     Inertias inertias(mechanism);
-    std::vector<Extent> place(n), speed(n);
+    std::vector<Extent> position(n), speed(n);
     std::vector<double> off_q(n), off_v(n), root(n), unit(n);
     // Whether errors are within the allowed share of `unit`, which has lower bounds: `least`, and a share of the
     // largest unit of the same kind.
@@ -272,18 +272,18 @@ inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, 
     for (std::size_t w = 0; w < windows; ++w) {
         const double* const first_q = q + begins[w] * n;
         const double* const first_v = v + begins[w] * n;
-        std::fill(place.begin(), place.end(), Extent{});
+        std::fill(position.begin(), position.end(), Extent{});
         std::fill(speed.begin(), speed.end(), Extent{});
         std::fill(off_q.begin(), off_q.end(), 0.0);
         std::fill(off_v.begin(), off_v.end(), 0.0);
         for (std::size_t k = 0; k <= length; ++k) {
             for (int c = 0; c < n; ++c) {
-                place[c].add(first_q[k * n + c]);
+                position[c].add(first_q[k * n + c]);
                 speed[c].add(first_v[k * n + c]);
             }
         }
-        for (std::size_t k = 0; k < length / 2; ++k) {
-            const std::size_t row = (w * (length / 2) + k) * n, whole = 2 * (k + 1) * n;
+        for (std::size_t k = 0; k < looks; ++k) {
+            const std::size_t row = (w * looks + k) * n, whole = (k + 1) * (length / looks) * n;
             for (int c = 0; c < n; ++c) {
                 off_q[c] = larger(off_q[c], std::abs(again_q[row + c] - first_q[whole + c]));
                 off_v[c] = larger(off_v[c], std::abs(again_v[row + c] - first_v[whole + c]));
@@ -299,7 +299,7 @@ inline bool agree_in_doubled_steps(const Mechanism& mechanism, const double* q, 
         const double rounding = 1e3 * std::numeric_limits<double>::epsilon() * (1.0 + far);
         for (int c = 0; c < n; ++c) {
             if (off_q[c] <= rounding) off_q[c] = 0.0;
-            unit[c] = place[c].width();
+            unit[c] = position[c].width();
         }
         if (!within(off_q, allowed.way, energy, static_cast<double>(length) * h)) return false;
         for (int c = 0; c < n; ++c) unit[c] = speed[c].magnitude;

@@ -15,6 +15,10 @@ namespace varpin {
 // The length h / 2^level of a part.
 inline double length_of(double h, int level) { return h / static_cast<double>(std::int64_t{1} << level); }
 
+// A step that needs more parts than so many is given up. Few steps need short parts all over: dry friction that turns
+// round within a step needs a few of them, however short.
+constexpr std::size_t most_parts = 4096;
+
 struct Division {
     Outcome outcome = Outcome::solved;
     int deepest = 0;  // halvings of the shortest part
@@ -28,21 +32,21 @@ template <class Attempt>
 Division divide(int level, bool extrapolated, int most_halvings, std::vector<std::uint8_t>& halvings,
                 const Attempt& attempt) {
     int deepest = level;
-    std::int64_t place = 0;  // in units of 1 / 2^level
+    std::int64_t begin = 0;  // in units of 1 / 2^level
     halvings.clear();
-    while (place < (std::int64_t{1} << level)) {
-        const Outcome outcome = attempt(level, length_of(static_cast<double>(place), level), extrapolated);
+    while (begin < (std::int64_t{1} << level)) {
+        const Outcome outcome = attempt(level, length_of(static_cast<double>(begin), level), extrapolated);
         if (outcome == Outcome::solved) {
             if (level > 0) halvings.push_back(static_cast<std::uint8_t>(level));
-            ++place;
-            if (level > 0 && place % 2 == 0) {
+            ++begin;
+            if (level > 0 && begin % 2 == 0) {
                 --level;
-                place /= 2;
+                begin /= 2;
             }
         } else if (!(extrapolated && outcome != Outcome::energy)) {
-            if (level >= most_halvings) return {outcome, deepest};
+            if (level >= most_halvings || halvings.size() >= most_parts) return {outcome, deepest};
             ++level;
-            place *= 2;
+            begin *= 2;
         }
         deepest = std::max(deepest, level);
         extrapolated = false;

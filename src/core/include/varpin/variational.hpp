@@ -23,7 +23,7 @@ struct PathState {
     static constexpr int most_misses = 3;
 
     PathState(const Mechanism& mechanism, int stages)
-        : place(mechanism.dof()),
+        : position(mechanism.dof()),
           p(mechanism.dof()),
           q(mechanism.dof()),
           momentum(mechanism.dof()),
@@ -35,7 +35,7 @@ struct PathState {
           past_end(mechanism.dof()),
           past_force(mechanism.dof()) {}
 
-    std::vector<Place> place;
+    std::vector<Coordinate> position;
     std::vector<Compensated> p;
     std::vector<double> q;         // (n) rounded, with whole turns
     std::vector<double> momentum;  // (n) p, rounded
@@ -130,7 +130,7 @@ class VariationalStepper {
     // Start a path at (q, p) without history; false where M(q) is not positive definite.
     bool begin_at(const double* q, const double* p, PathState& state) {
         for (int i = 0; i < n; ++i) {
-            state.place[i] = {{q[i], 0.0}, 0.0};
+            state.position[i] = {{q[i], 0.0}, 0.0};
             unwind(i, state);
             state.q[i] = q[i];
             state.p[i] = {p[i], 0.0};
@@ -154,7 +154,7 @@ class VariationalStepper {
 
     // Factor M at a path's node, for kicks and guesses.
     bool look_at(PathState& state) {
-        for (int i = 0; i < n; ++i) at[i] = state.place[i].place.high;
+        for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
         return energy_guard.node(at.data(), state.momentum.data(), state.v.data());
     }
 
@@ -163,7 +163,7 @@ class VariationalStepper {
         for (int i = 0; i < n; ++i) {
             state.p[i] = state.p[i].plus(impulse[i]);
             state.momentum[i] = state.p[i].high;
-            at[i] = state.place[i].place.high;
+            at[i] = state.position[i].value.high;
         }
         energy_guard.kicked(at.data(), state.momentum.data(), state.v.data(), state.energies);
     }
@@ -264,7 +264,7 @@ class VariationalStepper {
     }
 
     void unwind(int i, PathState& state) const {
-        if (unwinds(i)) state.place[i].unwind();
+        if (unwinds(i)) state.position[i].unwind();
     }
 
   private:
@@ -283,21 +283,21 @@ class VariationalStepper {
     // One substep from the guess in step_equation.V; advances the path only if the substep is accepted.
     Outcome attempt(double h, PathState& state, bool jets_wanted) {
         auto& equation = step_equation;
-        const Outcome solved = equation.solve(h, {state.place.data(), state.p.data(), force.data(), stride}, tolerance,
-                                              jets_wanted, effort);
+        const Outcome solved = equation.solve(h, {state.position.data(), state.p.data(), force.data(), stride},
+                                              tolerance, jets_wanted, effort);
         if (solved != Outcome::solved) return solved;
         const double margin = guards.active ? energy_guard.branch_margin(h, guards, equation) : infinity;
         if (!(margin > 0.0)) return Outcome::fold;
         equation.stages == 1 ? advance(1, h, state) : advance(equation.stages, h, state);
-        const Outcome outcome = energy_guard.settle(guards, tableau, state.energies, state.place, state.v, trial);
+        const Outcome outcome = energy_guard.accept(guards, tableau, state.energies, state.position, state.v, trial);
         if (outcome != Outcome::solved) return outcome;
         effort.branch_margin = std::min(effort.branch_margin, margin);
         ++effort.substeps;
-        std::swap(state.place, trial.place);
+        std::swap(state.position, trial.position);
         std::swap(state.p, trial.p);
         for (int i = 0; i < n; ++i) {
             unwind(i, state);
-            state.q[i] = state.place[i].shown();
+            state.q[i] = state.position[i].shown();
         }
         std::copy(trial.momentum.begin(), trial.momentum.end(), state.momentum.begin());
         std::copy(trial.v.begin(), trial.v.end(), state.v.begin());
@@ -311,7 +311,8 @@ class VariationalStepper {
             double move = 0.0, impulse = 0.0;
             trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
             // The rounding of q is proportional to its distance from 0, without whole turns.
-            const double distance = std::min(std::abs(state.place[c].place.high), unwinds(c) ? Place::turn : infinity);
+            const double distance =
+                std::min(std::abs(state.position[c].value.high), unwinds(c) ? Coordinate::turn : infinity);
             for (int i = 0; i < stages; ++i) {
                 const double share = h * tableau.b[i], velocity = equation.V[i * n + c];
                 const JointForce<double>& element = equation.acting[i * n + c];
@@ -325,7 +326,7 @@ class VariationalStepper {
                 trial.magnitude[c] +=
                     share * scale * std::abs(velocity) + tableau.b[i] * std::abs(equation.stage[i].Lq[c]) * distance;
             }
-            trial.place[c] = {state.place[c].place.plus(h * move), state.place[c].turns};
+            trial.position[c] = {state.position[c].value.plus(h * move), state.position[c].turns};
             trial.p[c] = state.p[c].plus(h * impulse);
         }
     }

@@ -121,8 +121,8 @@ class PlanConstraint(Frozen, ABC):
 
     def __repr__(self) -> str:
         """All that tells it from others of its kind, to the last digit."""
-        own = {name: value for name, value in vars(self).items() if not isinstance(value, Robot) and name[0] != "_"}
-        told = (f"{name}={_told(value)}" for name, value in own.items() if name != "kinematics")
+        values = {name: value for name, value in vars(self).items() if not isinstance(value, Robot) and name[0] != "_"}
+        told = (f"{name}={_told(value)}" for name, value in values.items() if name != "kinematics")
         return f"{type(self).__name__}({', '.join(told)})"
 
 
@@ -138,13 +138,13 @@ def require_robot(constraint: PlanConstraint, robot: object) -> Robot:
     return robot
 
 
-def require_same(constraint: PlanConstraint, own: Robot, horizon: Horizon) -> None:
+def require_same(constraint: PlanConstraint, made_for: Robot, horizon: Horizon) -> None:
     """Refuse a constraint that was made for another robot than the problem's."""
     robot = horizon.robot
-    if own.joint_names != robot.joint_names or not own.built_like(robot):
+    if made_for.joint_names != robot.joint_names or not made_for.built_like(robot):
         raise InputError(
-            f"{constraint.label} is for robot {own.name!r} with {own.dof} coordinates, another one than the problem's "
-            f"{robot.name!r} with {robot.dof}, or one of other lengths; make it with scene.robot"
+            f"{constraint.label} is for robot {made_for.name!r} with {made_for.dof} coordinates, another one than the "
+            f"problem's {robot.name!r} with {robot.dof}, or one of other lengths; make it with scene.robot"
         )
 
 

@@ -70,7 +70,7 @@ class _WithinLimits(PlanConstraint):
         """
         self.robot = require_robot(self, robot)
         name = type(self).__name__
-        given = self._own(robot) if limits is None else limits
+        given = self._limits_of(robot) if limits is None else limits
         self.limits = named_limits(f"{name} limits", given, robot.joint_names, robot.dof)
         if not np.isfinite(self.limits).any():
             raise InputError(f"{name}: robot {robot.name!r} has no such limits; give limits=(lower, upper)")
@@ -78,7 +78,7 @@ class _WithinLimits(PlanConstraint):
 
     @staticmethod
     @abstractmethod
-    def _own(robot: Robot) -> tuple[Floats, Floats]:
+    def _limits_of(robot: Robot) -> tuple[Floats, Floats]:
         """The robot's limits."""
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
@@ -116,7 +116,7 @@ class WithinJointLimits(_WithinLimits):
     in_velocity = False
 
     @staticmethod
-    def _own(robot: Robot) -> tuple[Floats, Floats]:
+    def _limits_of(robot: Robot) -> tuple[Floats, Floats]:
         return robot.position_limits
 
 
@@ -129,7 +129,7 @@ class WithinVelocityLimits(_WithinLimits):
     in_velocity = True
 
     @staticmethod
-    def _own(robot: Robot) -> tuple[Floats, Floats]:
+    def _limits_of(robot: Robot) -> tuple[Floats, Floats]:
         return -robot.velocity_limit, robot.velocity_limit
 
 
@@ -163,8 +163,8 @@ class BoundRate(BoundConstraint):
         """C (..., K, rows) of decisions u (..., R, m)."""
         first = u[..., :1, :] if self.before is None else np.broadcast_to(self.before, (*u.shape[:-2], 1, u.shape[-1]))
         rate = np.diff(u, axis=-2, prepend=first)[..., self.places, :] / self.period
-        own, most = rate[..., self.limited], self.limit[self.limited]
-        found: Floats = np.concatenate([own - most, -own - most], axis=-1)
+        rates, most = rate[..., self.limited], self.limit[self.limited]
+        found: Floats = np.concatenate([rates - most, -rates - most], axis=-1)
         return found
 
 
@@ -217,14 +217,14 @@ class WithinControlRate(PlanConstraint):
         if self.before is not None:
             given = self.before
             if isinstance(given, Mapping):
-                own = control_array(f"{name} before", given, joints)
+                command = control_array(f"{name} before", given, joints)
             elif np.ndim(given) == 0:
-                own = np.full(m, real(f"{name} before", given))
+                command = np.full(m, real(f"{name} before", given))
             else:
-                own = finite_array(f"{name} before", given, (m,))
-            if before is not None and not np.array_equal(before, own):
+                command = finite_array(f"{name} before", given, (m,))
+            if before is not None and not np.array_equal(before, command):
                 raise InputError(f"{name} and ControlRateCost must have the same control before")
-            before = own
+            before = command
         names = joints if joints is not None else tuple(f"control {i}" for i in range(m))
         limited = np.flatnonzero(np.isfinite(limit))
         period = float(horizon.t[horizon.hold] - horizon.t[0])

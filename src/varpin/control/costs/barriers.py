@@ -60,7 +60,7 @@ class _Barrier(TaskCost):
         if isinstance(weight, Mapping) and isinstance(robot, Robot):
             weight = joint_array(f"{name} weight", weight, robot.joint_names)
         super().__init__(robot, weight)
-        self.limits = checked_limits(f"{name} limits", self._own(robot) if limits is None else limits, self.size)
+        self.limits = checked_limits(f"{name} limits", self._limits_of(robot) if limits is None else limits, self.size)
         if not np.isfinite(self.limits).any():
             raise InputError(f"{name}: robot {robot.name!r} has no such limits; give limits=(lower, upper)")
         self.margin = joint_array(f"{name} margin", margin, robot.joint_names, uniform=True)
@@ -70,7 +70,7 @@ class _Barrier(TaskCost):
 
     @staticmethod
     @abstractmethod
-    def _own(robot: Robot) -> tuple[Floats, Floats]:
+    def _limits_of(robot: Robot) -> tuple[Floats, Floats]:
         """The robot's limits."""
 
     def _bound(self, points: Points, weight: Floats) -> BoundCost:
@@ -88,7 +88,7 @@ class JointLimitBarrier(_Barrier):
     in_velocity = False
 
     @staticmethod
-    def _own(robot: Robot) -> tuple[Floats, Floats]:
+    def _limits_of(robot: Robot) -> tuple[Floats, Floats]:
         return robot.position_limits
 
 
@@ -98,7 +98,7 @@ class VelocityLimitBarrier(_Barrier):
     in_velocity = True
 
     @staticmethod
-    def _own(robot: Robot) -> tuple[Floats, Floats]:
+    def _limits_of(robot: Robot) -> tuple[Floats, Floats]:
         return -robot.velocity_limit, robot.velocity_limit
 
 

@@ -1,4 +1,4 @@
-"""Keys of scene files for pydantic: numbers with units and ranges, words, values by joint, and mistakes in words."""
+"""Pydantic rules for the keys of scene files (numbers with units and ranges, words, values by joint), and messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from varpin.io.scenefile.table import SceneFileError, shown, suggestion
 
 
 class Keys(BaseModel):
-    """A table of a scene file: its keys are the fields, and there are no others."""
+    """A table of a scene file. Its keys are the fields; other keys are errors."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -49,12 +49,12 @@ K = TypeVar("K", bound=Keys)
 
 @dataclass(frozen=True)
 class Rule:
-    """What a key takes, as the annotation of its field.
+    """The allowed values of a key, as the annotation of its field.
 
     Attributes:
-        kind: As pydantic knows it.
-        what: The same in words, for whatever is wrong with a value.
-        parts: Whether the value has parts that have rules of their own.
+        kind: The type for pydantic.
+        what: The allowed values in words, for messages.
+        parts: Whether parts of the value have rules and messages of their own.
     """
 
     kind: Any
@@ -91,7 +91,7 @@ TEXT = Rule(Annotated[str, Field(strict=True, pattern=r"^[^\x00]*[^\x00\s][^\x00
 
 
 def word(*options: str) -> Rule:
-    """One of some words."""
+    """One of the strings ``options``."""
 
     def known(value: Any) -> str:
         if not isinstance(value, str):
@@ -104,20 +104,20 @@ def word(*options: str) -> Rule:
 
 
 def numbers(length: int | None = None, unit: str = "") -> Rule:
-    """A list of finite numbers, of a given length."""
+    """A list of finite numbers, of a given length if any."""
     kind = Annotated[tuple[Annotated[float, number(unit)], ...], Field(min_length=length, max_length=length)]
     return Rule(kind, f"a list of {'' if length is None else f'{length} '}numbers{_unit(unit)}", parts=True)
 
 
 def values(unit: str = "", *, least: float | None = None, **others: Any) -> Rule:
-    """One number for all, a list of one for each, or a table by name; or what ``others`` allow."""
+    """One number for all, a list with one for each, or a table by name; or one of the kinds ``others``."""
     scalar = Annotated[float, number(unit, least=least)]
     what = f"a number for all, a list, or a table by name{_unit(unit)}"
     return either(what, **{"number": scalar, "list": tuple[scalar, ...], "table": dict[str, scalar], **others})
 
 
 def either(what: str, shape: Callable[[Any], str] | None = None, **kinds: Any) -> Rule:
-    """One of several kinds, by the ``shape`` of a value: by its type in TOML, if left out."""
+    """One of several kinds, selected by the ``shape`` of a value, which is its TOML type if left out."""
     readers = {name: TypeAdapter(kind) for name, kind in kinds.items()}
 
     def chosen(value: Any, info: ValidationInfo) -> Any:
@@ -130,7 +130,7 @@ def either(what: str, shape: Callable[[Any], str] | None = None, **kinds: Any) -
 
 
 def typed(kinds: Mapping[str, type[Keys]], default: str | None = None) -> Rule:
-    """A table of one of several kinds, by its key ``type``."""
+    """A table of one of several kinds, selected by its key ``type``."""
     options = f"one of {', '.join(kinds)}"
 
     def chosen(table: Any, info: ValidationInfo) -> Keys:
@@ -149,7 +149,7 @@ def typed(kinds: Mapping[str, type[Keys]], default: str | None = None) -> Rule:
 
 
 def toml_type(value: Any) -> str:
-    """The name of a value's type; of types that no key takes ``"other"``."""
+    """The name of a value's type; ``"other"`` for types that no key takes."""
     names = {bool: "flag", str: "text", list: "list", dict: "table", int: "number", float: "number"}
     return names.get(type(value), "other")
 
@@ -159,16 +159,16 @@ def _unit(unit: str) -> str:
 
 
 def mistake(key: str | int, problem: str) -> ValidationError:
-    """What is wrong under a key of a table, for validators to raise."""
+    """An error at a key of a table, for validators to raise."""
     error = PydanticCustomError("mistake", "{problem}", {"problem": problem})
     return ValidationError.from_exception_data("scene", [InitErrorDetails(type=error, loc=(key,), input=None)])
 
 
 def read_keys(kind: type[K], data: Any, path: Path) -> K:
-    """The tables of the file ``path``, of a ``kind``.
+    """Validate the tables of the file ``path``.
 
     Raises:
-        SceneFileError: The first thing that is wrong with them.
+        SceneFileError: The first mistake in them.
     """
     try:
         return kind.model_validate(data, context={"folder": path.resolve().parent})

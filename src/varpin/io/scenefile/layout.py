@@ -1,10 +1,10 @@
-"""A scene file held against its robot: every list and table as one number for each joint or control."""
+"""A scene file applied to its robot: lists and tables become one number for each joint or control."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +19,20 @@ from varpin.mechanics.constraints import Constraint, KinematicInput
 from varpin.mechanics.forces import Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.mechanics.scene import Scene, closest_controls, damping_of
-from varpin.model import Robot, load_robot
+from varpin.model import Robot, combine, load_robot
+
+if TYPE_CHECKING:
+    from varpin.io.scenefile.tables import RobotKeys
 
 _OnFrames = TypeVar("_OnFrames", bound=Force | Constraint)
 
-# Times at which controls and references are compared with what stays, at most.
+# Largest number of times at which controls and references are sampled for checks.
 _SAMPLES = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class Noises:
-    """Intensities of a noise model, by joint (n,) or, of control noise, by control (m,)."""
+    """Intensities of a noise model, by joint (n,), or by control (m,) for control noise."""
 
     kind: str
     intensity: Floats
@@ -38,19 +41,19 @@ class Noises:
 
 @dataclass(frozen=True, eq=False)
 class JointForces:
-    """A force on joints, its attributes by joint (n,)."""
+    """A force on joints with its attributes (n,)."""
 
     kind: type[Force]
     values: Mapping[str, Floats]
 
     def force(self) -> Force:
-        """As a scene takes it."""
+        """The force as an object."""
         return self.kind(**self.values)
 
 
 @dataclass(frozen=True, eq=False)
 class CostTerm:
-    """A term of the cost on the whole robot: weights (c,) and target of its components."""
+    """A term of the cost with the weights (c,) and the target of its components."""
 
     spec: CostSpec
     weight: Floats
@@ -60,22 +63,26 @@ class CostTerm:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A scene on a robot, whole or without some of its joints.
+    """A scene on a robot, complete or without some of its joints.
 
     Attributes:
         spec: The file.
         robot: The robot.
-        damping: (n,), like stiffness, rest, q0 and v0.
-        forces: Others on joints.
-        frame_forces: Others on frames.
-        constraints: What the motion keeps; where there are some, no joint is left out.
+        damping: Viscous damping (n,) [N m s/rad or N s/m].
+        stiffness: Stiffness of the joint springs (n,) [N m/rad or N/m].
+        rest: Rest positions of the joint springs (n,) [rad or m].
+        forces: Other forces on joints.
+        frame_forces: Forces on frames.
+        constraints: Constraints of the motion; with any, no joint is left out.
+        q0: Initial configuration (n,) [rad or m].
+        v0: Initial velocity (n,) [rad/s or m/s].
         actuated: Indices of the driven joints (m,).
         gear: Generalized force per control (m,).
-        torque_limit: (m,) [N m or N], infinite where there is none.
-        noise: Models.
-        costs: Terms.
-        controls: Of a simulation, over time; None for none, ``"hold"`` for holding ones.
-        held: Joints that are left out, and where [rad or m].
+        torque_limit: Bounds (m,) [N m or N], infinite where there is none.
+        noise: Noise models.
+        costs: Terms of the cost.
+        controls: Controls of a simulation over time; None for none, ``"hold"`` for those that hold the robot at q0.
+        held: Joints that are left out, and their positions [rad or m].
     """
 
     spec: SceneSpec
@@ -97,15 +104,15 @@ class Layout:
     held: Mapping[str, float]
 
     def without(self, joints: Sequence[str]) -> Layout:
-        """The same scene with ``joints`` locked where they start, and only what is about the others.
+        """The same scene with ``joints`` locked at their initial positions, and without what acts on them alone.
 
-        What is about a frame or the whole robot stays, as long as it can move.
+        Terms and forces on a frame stay if the frame still moves; those on the whole robot stay.
         """
         if not joints:
             return self
         names = self.robot.joint_names
         held = {**self.held, **{name: float(self.q0[names.index(name)]) for name in joints}}
-        robot = _load(self.spec, held)
+        robot = _load(self.spec, held, self.robot)
         keep = np.array([names.index(name) for name in robot.joint_names], dtype=np.int64)
         driven = np.flatnonzero(np.isin(self.actuated, keep))
         position = {int(joint): index for index, joint in enumerate(keep)}
@@ -146,24 +153,27 @@ class Layout:
 
     @property
     def served(self) -> NDArray[np.bool_]:
-        """Which joints (n,) have a servo: their control is a position."""
+        """Whether each joint (n,) has a servo, so that its control is a position."""
         servos = [force.values["stiffness"] > 0.0 for force in self.forces if force.kind is PositionServo]
         return np.asarray(np.any([np.zeros(self.robot.dof, dtype=np.bool_), *servos], axis=0))
 
     @property
     def moved(self) -> NDArray[np.bool_]:
-        """Joints (n,) whose control is a position that they are moved to by hand."""
+        """Whether each joint (n,) is a kinematic input, so that its control is its position."""
         names = [each.joint for each in self.constraints if isinstance(each, KinematicInput)]
         return np.isin(self.robot.joint_names, names)
 
     @property
     def control_limit(self) -> Floats:
-        """Of controls (m,), infinite where there is none: of positions none, a torque limit is their servo's."""
+        """Bounds of the controls (m,), infinite where there is none.
+
+        Controls that are positions have none: a torque limit then bounds the effort of the servo.
+        """
         positions = (self.served | self.moved)[self.actuated]
         return np.where(positions, np.inf, self.torque_limit / np.abs(self.gear))
 
     def _force(self, force: JointForces) -> Force:
-        """As a scene takes it. A torque limit bounds the effort of a servo."""
+        """A force as an object. A torque limit bounds the effort of a servo."""
         if force.kind is not PositionServo:
             return force.force()
         limit = np.full(self.robot.dof, np.inf)
@@ -198,7 +208,7 @@ class Layout:
         )
 
     def _noise(self, model: Noises) -> Noise | None:
-        """Only the processes that do something."""
+        """A noise model as an object, with its nonzero processes alone; None if there are none."""
         act = np.flatnonzero(model.intensity)
         if not len(act):
             return None
@@ -242,7 +252,7 @@ def holding_controls(scene: Scene, q: Floats) -> Floats:
 
 
 def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:
-    """Which coordinates (n,) move a frame; all False if there is no such frame."""
+    """Whether each coordinate (n,) moves a frame; all False if there is no such frame."""
     model, moving = robot.free_model, np.zeros(robot.dof, dtype=np.bool_)
     if model.existFrame(frame):
         for joint in model.supports[model.frames[model.getFrameId(frame)].parentJoint]:
@@ -251,8 +261,23 @@ def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:
     return moving
 
 
-def _load(spec: SceneSpec, held: Mapping[str, float]) -> Robot:
-    given, table = spec.robot, spec.root.table("robot")
+def _load(spec: SceneSpec, held: Mapping[str, float], whole: Robot | None = None) -> Robot:
+    """The robot of a file, with the joints of ``whole`` that are ``held`` locked as well."""
+    if spec.prefixes is None:
+        return _one(spec.robots[0], spec.root.table("robot"), held)
+    own: list[dict[str, float]] = [{} for _ in spec.robots]
+    for part, locks in zip(() if whole is None else whole.parts, own, strict=whole is not None):
+        names = {part.prefix + name: name for name in (*part.robot.joint_names, *part.robot.locked)}
+        locks.update({names[name]: at for name, at in held.items() if name in names})
+    tables = [spec.root.table(f"robot[{k}]") for k in range(len(own))]
+    robots = [_one(given, table, locks) for given, table, locks in zip(spec.robots, tables, own, strict=True)]
+    try:
+        return combine(*robots, prefixes=spec.prefixes)
+    except InputError as error:
+        raise tables[-1].error("prefix", str(error)) from None
+
+
+def _one(given: RobotKeys, table: Table, held: Mapping[str, float]) -> Robot:
     for joint, value in given.lock.items():
         if degrees_for_radians(value):
             raise table.error(f"lock.{joint}", f"{value:g} looks like degrees: positions are in rad or m")
@@ -286,10 +311,10 @@ def _load(spec: SceneSpec, held: Mapping[str, float]) -> Robot:
 
 
 def lay_out(spec: SceneSpec) -> Layout:
-    """Load the robot and hold the scene against it.
+    """Load the robot and apply the scene to it.
 
     Raises:
-        SceneFileError: Names, lengths or values that do not fit it.
+        SceneFileError: Names, lengths or values do not fit the robot.
     """
     robot = _load(spec, {})
     try:
@@ -362,7 +387,7 @@ def _require_own_controls(
     actuated: NDArray[np.int64],
     gear: Floats,
 ) -> None:
-    """Refuse servos on joints that no control is the position of."""
+    """Refuse servos on joints without a control of their own with gear 1, and two servos on one joint."""
     seen: set[int] = set()
     for force, laid in zip(spec.forces, forces, strict=True):
         if laid.kind is not PositionServo:
@@ -381,14 +406,14 @@ def _require_own_controls(
 
 
 def _require_controls(layout: Layout) -> None:
-    """Refuse controls of a simulation beyond their limits, degrees for positions, and noise in proportion to those."""
+    """Refuse control noise on servo positions, positions in degrees, and controls of a simulation beyond limits."""
     spec, served, moved = layout.spec, layout.served[layout.actuated], layout.moved[layout.actuated]
     for index, model in enumerate(layout.noise):
         if model.kind == "control" and (served & (model.intensity != 0.0)).any():
             joint = layout.driven[int(np.argmax(served & (model.intensity != 0.0)))]
             raise spec.root.error(
                 f"noise[{index}].intensity",
-                f"is in proportion to forces, and the control of {joint!r} is the position of its servo",
+                f"is proportional to forces, but the control of {joint!r} is the position of its servo",
             )
     if not isinstance(layout.controls, Timeline):
         return
@@ -410,7 +435,7 @@ def _require_controls(layout: Layout) -> None:
 
 
 def times_of(spec: SceneSpec) -> Floats:
-    """Times over the horizon [s] at which references are evaluated before there is a motion."""
+    """Times over the horizon [s] at which controls and references are sampled for checks."""
     return np.linspace(0.0, spec.duration, min(spec.steps, _SAMPLES) + 1)
 
 
@@ -454,7 +479,7 @@ def _force(spec: ForceSpec, robot: Robot) -> JointForces:
 
 
 def _on_frames(part: _OnFrames, table: Table, robot: Robot) -> _OnFrames:
-    """What acts on frames itself, if it fits the robot."""
+    """``part`` itself, after a check that it fits the robot."""
     try:
         part.bind(robot)
     except UnknownFrame as error:
@@ -467,7 +492,7 @@ def _on_frames(part: _OnFrames, table: Table, robot: Robot) -> _OnFrames:
 
 
 def _has_moving_end(force: Force, robot: Robot) -> bool:
-    """Whether a joint that is left moves what a force acts on."""
+    """Whether a remaining joint moves a frame on which a force acts."""
     points = [getattr(force, name) for name in ("frame", "a", "b") if hasattr(force, name)]
     frames = [point if isinstance(point, str) else point[0] for point in points if isinstance(point, str | tuple)]
     return any(joints_of_frame(robot, frame).any() for frame in frames)

@@ -1,4 +1,4 @@
-"""The hard constraints of a plan that a scene file can name, a line or two each."""
+"""The hard constraints of a plan in scene files."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Kind:
     """A kind of constraint.
 
     Attributes:
-        make: Builds it for a robot.
-        rules: Its keys, each with its rule and what it is if left out, ``...`` where it must be given.
+        make: Function that builds it for a robot.
+        rules: Its keys, each with its rule and its default, ``...`` for a required key.
     """
 
     make: Callable[[Robot, Given], PlanConstraint]
@@ -42,7 +42,7 @@ class Kind:
 
 
 def _limits(given: Given) -> Any:
-    """(lower, upper), infinite where nothing is said; None where neither is given."""
+    """(lower, upper), infinite where one is left out; None where both are."""
     lower, upper = (given[side] for side in ("lower", "upper"))
     if lower is None and upper is None:
         return None

@@ -1,4 +1,4 @@
-"""References in time as scene files write them: constants, sines, waypoints and files of numbers."""
+"""References over time in scene files: constants, sines, waypoints and files of numbers."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Timeline:
     """Values over time, one column for each component.
 
     Attributes:
-        at: Takes times (N,) [s]; returns (N, c).
-        constant: Whether they are the same at all times.
+        at: Function from times (N,) [s] to values (N, c).
+        constant: Whether the values are the same at all times.
     """
 
     at: Callable[[Floats], Floats]
@@ -46,7 +46,7 @@ def constant(values: Floats) -> Timeline:
     return Timeline(_Constant(values), True)
 
 
-# Functions of time are classes, because functions within functions cannot be pickled.
+# Functions of time are classes, because closures cannot be pickled.
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,16 +110,16 @@ class Sine:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A reference as it stands in a file, not yet held against a robot.
+    """A reference in a file, before it is applied to a robot.
 
     Attributes:
-        table: Where it stands.
-        name: Under which key.
-        offset: Constant part, of constants and sines.
-        sines: What is added to it.
-        times: Of waypoints [s].
+        table: The table that contains it.
+        name: Its key.
+        offset: Constant part of constants and sines.
+        sines: Sines added to the offset.
+        times: Times of waypoints [s].
         values: Waypoints, one row each.
-        smooth: Between waypoints: a monotone cubic instead of straight lines.
+        smooth: Whether a monotone cubic, instead of straight lines, connects the waypoints.
         file: CSV or npz file.
     """
 
@@ -133,10 +133,10 @@ class Reference:
     file: Path | None = None
 
     def timeline(self, names: Sequence[str], duration: float, what: str) -> Timeline:
-        """Its values for the components ``names``.
+        """Its values over time for the components ``names``.
 
         Raises:
-            SceneFileError: It is for other components, of another length, or does not last for ``duration`` [s].
+            SceneFileError: It has other components or another length, or does not last for ``duration`` [s].
         """
         if self.file is not None:
             return self._of_file(self.file, names, duration, what)
@@ -178,14 +178,14 @@ class Reference:
         t = columns["t"]
         rows = np.column_stack([columns[name] for name in names])
         if len(t) < 2 or not (np.diff(t) > 0.0).all():
-            raise wrong("its times must be two or more, and increase")
+            raise wrong("it must have two or more increasing times")
         if t[0] > 1e-9 * duration or t[-1] < duration * (1.0 - 1e-9):
-            raise wrong(f"its times go from {t[0]:g} to {t[-1]:g} s, and the scene from 0 to {duration:g} s")
+            raise wrong(f"its times go from {t[0]:g} to {t[-1]:g} s, but the scene lasts from 0 to {duration:g} s")
         return _between(t, rows, smooth=False)
 
 
 def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
-    """Rows over time, the first and the last held before and after."""
+    """Rows over time; before the first time and after the last, the first and the last row."""
     if smooth:
         return Timeline(_Smooth(scipy.interpolate.PchipInterpolator(times, rows), times[0], times[-1]), constant=False)
     return Timeline(_Linear(times, rows), constant=False)
@@ -201,16 +201,16 @@ def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
                     head = [name.strip() for name in row]
                     twice = [name for name, times in Counter(head).items() if times > 1]
                     if twice:
-                        raise wrong(f"its column {shown(twice[0])} is there twice")
+                        raise wrong(f"it has two columns {shown(twice[0])}")
                     continue
                 if len(row) != len(head):
-                    raise wrong(f"row {number} has {len(row)} entries, and there are {len(head)} columns")
+                    raise wrong(f"row {number} has {len(row)} entries, but there are {len(head)} columns")
                 for column, word in zip(head, row, strict=True):
                     try:
                         value = float(word)
                     except ValueError:
                         raise wrong(
-                            f"row {number}, column {shown(column)}: {shown(word.strip())} is no number"
+                            f"row {number}, column {shown(column)}: {shown(word.strip())} is not a number"
                         ) from None
                     if not math.isfinite(value):
                         raise wrong(f"row {number}, column {shown(column)} is not finite")
@@ -235,7 +235,7 @@ def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
     length = arrays["t"].shape if "t" in arrays else ()
     for name, values in arrays.items():
         if values.dtype.kind not in "fi" or values.ndim != 1 or values.shape != length:
-            raise wrong(f"its array {shown(name)} must be as many numbers as t, got shape {values.shape}")
+            raise wrong(f"its array {shown(name)} must have the shape of t, {length}, got {values.shape}")
         if not np.isfinite(values).all():
             raise wrong(f"its array {shown(name)} is not finite")
     return {name: np.asarray(values, dtype=np.float64) for name, values in arrays.items()}

@@ -1,4 +1,4 @@
-"""What of a scene has to be computed, and what does not."""
+"""The joints of a scene that have to be computed, and those that can be left out."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from varpin.mechanics.scene import Scene
 from varpin.support.markup import facts, listed
 
 Mask = NDArray[np.bool_]
-# What a scene has if it asks for it.
+# Forces that act only if the scene has them, by their names in the report.
 _ABSENT: Mapping[str, type[Force]] = {"stops at joint limits": JointStop, "dry friction": CoulombFriction}
 
 
 @dataclass(frozen=True)
 class Required:
-    """What a scene has to have computed, and what was left out of it.
+    """Report on the parts of a scene that are computed and those that are left out.
 
     Attributes:
-        joints: What is computed.
-        locked: Joints that the scene locks, and where [rad or m]: their links are part of others.
-        idle: Joints that nothing touches, and where they stay.
-        parts: The joints that are computed, in groups that share nothing; solve plans each by itself.
-        coupled: What keeps groups together although they share no inertia; empty if nothing does.
-        terms: What may act, and in what words it does or does not.
+        joints: The computed joints.
+        locked: Joints that the scene locks, and their positions [rad or m]: their links are part of others.
+        idle: Joints that stay at rest and are left out, and their positions.
+        parts: The computed joints in independent groups; ``solve`` plans each group separately.
+        coupled: Why groups are planned together although they share no inertia; empty if they are not.
+        terms: Description of each possible effect, by its name.
     """
 
     joints: tuple[str, ...]
@@ -45,12 +45,12 @@ class Required:
 
     @property
     def described(self) -> int:
-        """Moving joints of the robot as it is described."""
+        """Number of moving joints in the robot's description."""
         return len(self.joints) + len(self.locked) + len(self.idle)
 
     @property
     def saved(self) -> float:
-        """The part of the linear algebra of a plan that is saved, by counting: it grows with the cube of joints."""
+        """Saved share of the linear algebra of a plan, whose work grows with the cube of the number of joints."""
         return 1.0 - sum(len(part) ** 3 for part in self.parts) / self.described**3
 
     def _repr_html_(self) -> str:
@@ -81,10 +81,10 @@ class Required:
 
 
 def idle_joints(layout: Layout, scene: Scene) -> Mask:
-    """Which joints (n,) stay where they are whatever is computed: no force and no cost touches their group.
+    """Whether each joint (n,) stays at rest, as no force and no cost acts on its group.
 
-    A joint at rest that no force acts on in any configuration, and that costs nothing where it is, stays; so do its
-    group and what is left out with it. Noise in proportion to controls does nothing to controls that are zero.
+    A joint is idle if it starts at rest, no force acts on it in any configuration, and no cost does at its position.
+    A group is idle if all its joints are. Control noise does not act on zero controls.
     """
     if scene.constraints or layout.spec.plan_constraints:
         return np.zeros(scene.robot.dof, dtype=np.bool_)
@@ -104,35 +104,39 @@ def idle_joints(layout: Layout, scene: Scene) -> Mask:
         touched |= _costs(term, layout, scene, t)
     group = scene.group
     busy = np.isin(group, group[touched])
-    # Where nothing happens at all, all of it is the scene.
+    for part in layout.robot.parts:
+        # Of several robots each keeps its joints, or those that are touched.
+        own = np.isin(layout.robot.joint_names, [part.prefix + name for name in part.robot.joint_names])
+        busy |= own & ~busy[own].any()
+    # If every joint is idle, none is left out.
     return ~busy if busy.any() else np.zeros_like(busy)
 
 
 def _resting(layout: Layout) -> Floats:
-    """Controls (m,) that do nothing where the joints start: no force, or the place where a servo's joint stands."""
+    """Controls (m,) that leave the joints at rest: zero force, or the initial position for a servo."""
     return np.where(layout.served, layout.q0, 0.0)[layout.actuated]
 
 
 def _pushed(layout: Layout, scene: Scene) -> Mask:
-    """Which joints springs, stops and what acts on frames push at where they start."""
+    """Joints (n,) on which springs, stops and forces on frames act in the initial configuration."""
     floating = Scene(layout.robot, gravity=False, forces=scene.forces, actuation=layout.actuation)
     return np.asarray(floating.holding_torque(layout.q0) != 0.0)
 
 
 def _weighed(layout: Layout) -> Mask:
-    """Which joints gravity pulls at, in some configuration."""
+    """Joints (n,) on which gravity acts in some configuration."""
     robot = layout.robot
     if layout.spec.gravity is False:
         return np.zeros(robot.dof, dtype=np.bool_)
     bare = Scene(robot, gravity=layout.spec.gravity, damping=0.0)
     rng = np.random.default_rng(0)
-    places = [layout.q0, *rng.uniform(-2.0, 2.0, (3, robot.dof))]
-    pull = np.abs([lagrangian_jet(bare, q, np.zeros(robot.dof), backend="pinocchio").Lq for q in places]).max(axis=0)
-    return np.asarray(pull > 1e-12 * pull.max(initial=0.0))
+    samples = [layout.q0, *rng.uniform(-2.0, 2.0, (3, robot.dof))]
+    torque = np.abs([lagrangian_jet(bare, q, np.zeros(robot.dof), backend="pinocchio").Lq for q in samples]).max(axis=0)
+    return np.asarray(torque > 1e-12 * torque.max(initial=0.0))
 
 
 def _costs(term: CostTerm, layout: Layout, scene: Scene, t: Floats) -> Mask:
-    """Which joints a term of the cost would move, or charges where they are."""
+    """Joints (n,) that a term of the cost would move, or that it charges in the initial configuration."""
     touched = np.zeros(layout.robot.dof, dtype=np.bool_)
     space = term.spec.term.space
     if space == "frame":
@@ -154,7 +158,7 @@ def _costs(term: CostTerm, layout: Layout, scene: Scene, t: Floats) -> Mask:
 
 
 def requirements(layout: Layout, whole: Layout, idle: Sequence[str], scene: Scene) -> Required:
-    """The report on what ``layout``, the ``scene``, has left of ``whole``."""
+    """The report on ``layout``, whose scene is ``scene``, as a part of ``whole``."""
     names, group = layout.robot.joint_names, scene.group
     parts = [tuple(name for name, g in zip(names, group, strict=True) if g == label) for label in np.unique(group)]
     together = ", ".join(sorted({term.spec.kind for term in layout.costs if term.spec.term.space == "robot"}))
@@ -193,10 +197,14 @@ def _terms(layout: Layout) -> dict[str, str]:
     costs = [term.spec.kind + (" at the end" if term.spec.terminal else "") for term in layout.costs]
     kinds: set[type[Force]] = {force.kind for force in layout.forces} | {type(part) for part in layout.frame_forces}
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds] + ["contact"]
-    kinds_kept = [own.kind for own in spec.plan_constraints]
+    kinds_kept = [constraint.kind for constraint in spec.plan_constraints]
     kept = [name.replace("_", " ") for name, kind in PLAN_CONSTRAINTS.items() if kind in kinds_kept]
     shapes = "replays and clearance" if "clearance" in kept else "a replay"
-    payloads = [f"{payload.mass:g} kg at {payload.frame}" for payload in spec.robot.payload]
+    payloads = [
+        f"{payload.mass:g} kg at {word}{payload.frame}"
+        for word, robot in zip(spec.prefixes or ("",), spec.robots, strict=True)
+        for payload in robot.payload
+    ]
     terms = {
         "gravity": f"{', '.join(f'{g:g}' for g in gravity)} m/s^2" if any(gravity) else "none",
         "damping": of(layout.damping, joints),

@@ -1,4 +1,4 @@
-"""A scene file ready for work: the robot, the scene, the problem, and what it leaves out."""
+"""A loaded scene file: its robot, scene and optimal control problem, and the joints that it leaves out."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from varpin.simulation.run import simulate
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 
-# Setting a part up takes as long as this much linear algebra, in cubes of joints times steps, measured.
+# Measured time to set up a part, in units of linear algebra: the cube of the number of joints, times steps.
 _SETUP = 200_000
 
 
 @dataclass(frozen=True, eq=False)
 class SceneFile:
-    """A scene file on its robot, without the joints that nothing touches.
+    """A scene file on its robot, without idle joints.
 
     Attributes:
-        spec: What the file says.
-        required: What is computed, what is not, and why.
+        spec: The content of the file.
+        required: Report on what is computed, what is not, and why.
         scene: Robot and surroundings.
         q0: Initial configuration (n,) [rad or m].
         v0: Initial velocity (n,) [rad/s or m/s].
@@ -67,15 +67,15 @@ class SceneFile:
 
     @property
     def robot(self) -> Robot:
-        """The robot that is computed."""
+        """The robot, without the joints that are left out."""
         return self.scene.robot
 
     @cached_property
     def integrator(self) -> Integrator:
         """The integrator of the file.
 
-        Where it names none, that of :class:`varpin.OptimalControlProblem`, or of :func:`varpin.simulate` where nothing
-        is to be planned: then the one that its start asks for, and what ``simulate`` took is on the trajectory.
+        If it names none: the default of :class:`varpin.OptimalControlProblem`, or that of :func:`varpin.simulate` if
+        the file has no cost. The trajectory names what ``simulate`` took.
         """
         if self.spec.integrator is not None:
             return self.spec.integrator
@@ -88,21 +88,21 @@ class SceneFile:
         """The optimal control problem of the file.
 
         Raises:
-            SceneFileError: The file has no cost, or one that does not fit.
+            SceneFileError: The file has no cost, or a cost does not fit the robot.
         """
         return self._problem(self._layout, self.scene)
 
     def _problem(self, layout: Layout, scene: Scene) -> OptimalControlProblem:
         spec = self.spec
         if not spec.costs:
-            raise spec.root.error("cost", "is missing; a scene to solve has a [[cost]] at least")
+            raise spec.root.error("cost", "is missing; a scene to solve needs at least one [[cost]]")
         most = layout.control_limit
         constraints = []
-        for own in spec.plan_constraints:
+        for constraint in spec.plan_constraints:
             try:
-                constraints.append(own.kind.make(scene.robot, own.given))
+                constraints.append(constraint.kind.make(scene.robot, constraint.given))
             except VarpinError as error:
-                raise own.table.error("", str(error)) from None
+                raise constraint.table.error("", str(error)) from None
         try:
             return OptimalControlProblem(
                 scene,
@@ -119,9 +119,9 @@ class SceneFile:
                 constraints=constraints,
             )
         except (InputError, CostError) as error:
-            for own, made in zip(spec.plan_constraints, constraints, strict=True):
+            for keys, made in zip(spec.plan_constraints, constraints, strict=True):
                 if str(error).startswith(made.label):
-                    raise own.table.error("", str(error)) from None
+                    raise keys.table.error("", str(error)) from None
             where = "horizon.controls" if "linear controls" in str(error) else "cost"
             raise spec.root.error(where, str(error)) from None
 
@@ -133,7 +133,7 @@ class SceneFile:
         if isinstance(given, Timeline):
             k = np.arange(self.spec.steps, dtype=np.float64)
             found = given.at((k + 0.5) * self.spec.dt)
-            # A position of a joint moved by hand is where it is at the end of the step.
+            # The control of a kinematic input is its position at the end of the step.
             moved = [int(np.argmax(self.scene.actuation[c])) for c in self.scene.inputs.values()]
             found[:, moved] = given.at((k + 1.0) * self.spec.dt)[:, moved]
             cubic = [place for place, rate in zip(moved, self.scene.rates, strict=True) if rate >= 0]
@@ -141,7 +141,7 @@ class SceneFile:
         return holding_controls(self.scene, self.q0)
 
     def _rates(self, given: Timeline) -> Floats:
-        """Derivatives of values over time at the ends of steps, by differences backward, within the horizon."""
+        """Time derivatives of controls at the ends of steps, by backward differences of fourth order."""
         t, h = np.arange(1.0, self.spec.steps + 1.0) * self.spec.dt, 0.01 * self.spec.dt
         before = [weight * given.at(t - k * h) for k, weight in enumerate((25.0, -48.0, 36.0, -16.0, 3.0))]
         rates: Floats = sum(before[1:], before[0]) / (12.0 * h)
@@ -176,13 +176,14 @@ class SceneFile:
     ) -> Solution:
         """The optimal motion, by :func:`varpin.solve` with the options of ``[solve]``.
 
-        Groups of joints that share nothing are planned each by itself, and then held against the whole once.
+        Independent groups of joints are planned separately; their plans then start one solve of the whole problem.
 
         Args:
-            controls: To start from, as for :func:`varpin.solve`.
-            resume: A solution to go on from.
-            apart: Whether to plan groups apart; where it pays if left out. With ``controls`` or ``resume`` never.
-            **options: Of :func:`varpin.solve`, instead of the file's.
+            controls: Initial controls, as for :func:`varpin.solve`.
+            resume: A solution to continue from.
+            apart: Whether to plan groups separately; if left out, where that saves time. Not used with ``controls`` or
+                ``resume``.
+            **options: Options of :func:`varpin.solve` that replace those of the file.
         """
         given = {**self.spec.options, **options}
         if controls is None and resume is None and (self._pays_apart() if apart is None else apart):
@@ -190,7 +191,7 @@ class SceneFile:
         return solve(self.problem, controls, resume=resume, **given)
 
     def _pays_apart(self) -> bool:
-        """Whether what planning apart saves in linear algebra is more than what it takes to set the parts up."""
+        """Whether planning groups separately saves more linear algebra than setting up the parts costs."""
         if self.spec.plan_constraints:
             return False
         parts = self.required.parts
@@ -198,13 +199,13 @@ class SceneFile:
         return len(parts) > 1 and self.spec.steps * saved > _SETUP * len(parts)
 
     def marks(self, duration: float | None = None) -> dict[str, Any]:
-        """What :func:`varpin.replay` can mark of the task, as its options: ``replay(robot, motion, **scene.marks())``.
+        """Options of :func:`varpin.replay` that mark the task: ``replay(robot, motion, **scene.marks())``.
 
-        Targets and paths of the frames that the cost is about, with their traces; of a reference of joints, the robot
-        that follows it as a ghost; and constraints.
+        They are targets, reference paths and traces of the frames in the cost, a ghost of the robot that follows a
+        reference of joints, and constraints.
 
         Args:
-            duration: Of the motion that is shown [s]; the horizon if left out.
+            duration: Duration of the motion [s]; the horizon if left out.
         """
         marks = marks_of(self._layout, self.spec.duration if duration is None else duration)
         if self.spec.plan_constraints:
@@ -219,7 +220,12 @@ class SceneFile:
 
     @cached_property
     def _parts(self) -> tuple[tuple[Layout, OptimalControlProblem], ...]:
-        """Each group of joints by itself; none where a group has nothing that drives it, or costs nothing."""
+        """The groups of joints as problems of their own; empty if a group has no control or no cost.
+
+        Empty, too, for several robots, for a part does not have all of them.
+        """
+        if self.spec.prefixes is not None:
+            return ()
         names, parts = self.robot.joint_names, []
         for part in self.required.parts:
             layout = self._layout.without([name for name in names if name not in part])
@@ -229,7 +235,7 @@ class SceneFile:
         return tuple(parts)
 
     def _planned_apart(self, options: dict[str, Any]) -> LinearPolicy | None:
-        """The policies of all groups of joints side by side; None where they cannot be planned apart."""
+        """The policies of all groups of joints in one; None where they cannot be planned separately."""
         if not self._parts or self.spec.shape == "linear":
             return None
         problem, driven = self.problem, self._layout.driven
@@ -245,7 +251,7 @@ class SceneFile:
         return LinearPolicy(u, gains, reference, hold=plan.hold, on=plan.on, period=plan.period)
 
     def saving(self, *, steps: int = 200, repeats: int = 5) -> float:
-        """How many times as long a step takes with all joints that the file does not lock, measured.
+        """Measured time of a step with all joints that the file does not lock, divided by that of this scene.
 
         Raises:
             StepFailure: As :func:`varpin.simulate`.
@@ -272,11 +278,11 @@ def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
         source: Path of a TOML file, or the name of a scene that comes with varpin (``"finger_tracking"``).
 
     Other Args:
-        required_only: Leave out joints that nothing touches. The answer for the others is the same.
+        required_only: Leave out idle joints, on which no force and no cost acts. Results for the others are the same.
 
     Raises:
         FileError: There is no such file, or it cannot be read.
-        SceneFileError: A mistake in it: the key, what was given and what is allowed.
+        SceneFileError: There is a mistake in the file: the message names the key, the given value and allowed ones.
     """
     path = find_scene(source)
     spec = read_scene(path)
@@ -297,6 +303,6 @@ def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
         _layout=layout,
     )
     if spec.costs:
-        # A mistake in the cost is raised now, not at the first use of the problem.
+        # Raise a mistake in the cost now, not at the first use of the problem.
         file.problem  # noqa: B018
     return file

@@ -1,4 +1,4 @@
-"""What a replay can mark of a scene's task: where its frames are to go, and which motion its joints are to follow."""
+"""Marks of a scene's task in a replay: targets and paths of frames, and a ghost that follows joint references."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _POINTS = 400
 
 
 def marks_of(layout: Layout, duration: float) -> dict[str, Any]:
-    """Options of :func:`varpin.replay`: traces, targets, references and a ghost, of what the cost is about.
+    """Options of :func:`varpin.replay` from the cost: traces, targets, references and a ghost.
 
     Args:
         layout: The scene.
-        duration: Of the motion that is shown [s].
+        duration: Duration of the motion [s].
     """
     wanted = [term for term in layout.costs if term.target is not None and term.weight.all()]
     positions = [term for term in wanted if term.spec.kind == "frame_position"]
@@ -47,13 +47,13 @@ def marks_of(layout: Layout, duration: float) -> dict[str, Any]:
 
 
 def _of_one_frame(position: CostTerm, orientation: CostTerm) -> bool:
-    """Whether two terms are of one frame, both over time or both at the end."""
+    """Whether two terms have the same frame, both over time or both at the end."""
     one, other = position.spec, orientation.spec
     return one.frame == other.frame and one.terminal == other.terminal
 
 
 def _values(term: CostTerm, duration: float) -> Floats:
-    """A target over time (K, c), or a constant one (1, c); of a term at the end, its value there."""
+    """A target over time (K, c), or (1, c) if it is constant or the target of a terminal term."""
     assert term.target is not None
     if term.spec.terminal:
         return term.target.at(np.array([duration]))
@@ -62,7 +62,7 @@ def _values(term: CostTerm, duration: float) -> Floats:
 
 
 def _target(position: CostTerm, orientation: CostTerm | None, duration: float) -> Floats:
-    """Positions (K, 3) of a frame, or its poses (K, 4, 4)."""
+    """Target positions (K, 3) of a frame, or poses (K, 4, 4) with a target of its orientation."""
     points = _values(position, duration)
     if orientation is None:
         return points
@@ -76,7 +76,7 @@ def _target(position: CostTerm, orientation: CostTerm | None, duration: float) -
 
 
 def _ghost(layout: Layout, duration: float) -> Floats | None:
-    """Configurations (K, n) that the joints are to follow, or to end at; None if none are."""
+    """Configurations (K, n) that the joints should follow or reach; None if there is no such cost."""
     terms = [term for term in layout.costs if term.spec.kind == "tracking" and term.weight.any()]
     if not terms:
         return None

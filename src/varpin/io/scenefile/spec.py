@@ -1,4 +1,4 @@
-"""What a scene file says, read and checked as far as that goes without the robot."""
+"""The content of a scene file, checked as far as possible without the robot."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ if TYPE_CHECKING:
 
 
 def word_of(name: str) -> str:
-    """The name of a class as scene files have it: PointOnLine is point_on_line, RungeKutta4 runge_kutta_4."""
+    """The name of a class in scene files: point_on_line for PointOnLine, runge_kutta_4 for RungeKutta4."""
     return re.sub(r"(?<!^)([A-Z0-9])", r"_\1", name).lower()
 
 
-# A motion of seven joints over so many steps takes gigabytes.
+# Largest number of steps: a motion of seven joints over as many takes gigabytes.
 MOST_STEPS = 10**7
-# Steps times terms of a cost: references are evaluated for each.
+# Largest product of steps and terms of the cost: each term evaluates its reference at each step.
 MOST_EVALUATIONS = 10**6
-# Of a [[force]], by the word for it; its keys are the fields of the force, by joint.
+# Forces on joints by the type of a [[force]], whose keys are the fields of the force, by joint.
 FORCES: Mapping[str, type[Force]] = {
     "armature": Armature,
     "damper": JointDamper,
@@ -56,13 +56,13 @@ FORCES: Mapping[str, type[Force]] = {
     "spring": JointSpring,
     "stop": JointStop,
 }
-# The same of forces on frames; what their fields take is in ``tables``.
+# Forces on frames by the type of a [[force]]; the rules of their fields are in ``tables``.
 FRAME_FORCES: Mapping[str, type[Force]] = {
     "frame_damper": FrameDamper,
     "frame_spring": FrameSpring,
     "frame_wrench": FrameWrench,
 }
-# Of a [[constraint]]: all that need no function, PointOnLine as point_on_line.
+# Constraints by the type of a [[constraint]]: all those without a function.
 CONSTRAINTS: Mapping[str, type[Constraint]] = {
     word_of(name): kind
     for name, kind in sorted(vars(constraints).items())
@@ -76,9 +76,9 @@ class ForceSpec:
     """A force on joints.
 
     Attributes:
-        kind: Which one.
+        kind: Class of the force.
         values: Its attributes by joint, those that the file gives.
-        table: Where it stands, for messages.
+        table: Its table, for messages.
     """
 
     kind: type[Force]
@@ -91,8 +91,8 @@ class FrameForceSpec:
     """A force on frames.
 
     Attributes:
-        force: What the file says.
-        table: Where it stands, for messages.
+        force: The force.
+        table: Its table, for messages.
     """
 
     force: Force
@@ -104,8 +104,8 @@ class ConstraintSpec:
     """A constraint.
 
     Attributes:
-        constraint: What the file says.
-        table: Where it stands, for messages.
+        constraint: The constraint.
+        table: Its table, for messages.
     """
 
     constraint: Constraint
@@ -117,9 +117,9 @@ class PlanConstraintSpec:
     """A hard constraint of the plan.
 
     Attributes:
-        kind: What its type in the file means.
-        given: Its keys.
-        table: Where it stands, for messages.
+        kind: Kind of constraint.
+        given: Values of its keys.
+        table: Its table, for messages.
     """
 
     kind: Kind
@@ -132,16 +132,16 @@ class CostSpec:
     """A term of the cost.
 
     Attributes:
-        table: Where it stands.
+        table: Its table, for messages.
         kind: Its type in the file.
-        term: What the type means.
-        weight: By component.
-        terminal: At the end, instead of its integral.
+        term: The kind of term.
+        weight: Weights by component.
+        terminal: Whether it is a terminal cost instead of an integral over time.
         reference: Its target over time, if it has one.
         holding_q: A configuration whose holding torques are the reference, by joint; ``()`` for the initial one.
-        frame: Name of a frame, for terms that have one.
-        numbers: What else it takes.
-        words: What else it takes.
+        frame: Name of its frame; empty for terms without one.
+        numbers: Its other keys with numbers.
+        words: Its other keys with words.
     """
 
     table: Table
@@ -161,35 +161,37 @@ class SceneSpec:
     """A scene file.
 
     Attributes:
-        name: Of the file, or of the bundled scene.
-        title: For people.
-        path: Of the file.
+        name: Name of the file without its suffix.
+        title: Title for reports.
+        path: Path of the file.
         root: Its tables, for messages.
-        robot: Which robot, and how it is taken.
-        gravity: [m/s^2], or whether there is any.
-        damping: By joint [N m s/rad or N s/m], or "robot" for the description's own; None where nothing is said.
-        stiffness: Of joint springs, by joint [N m/rad or N/m].
-        rest: Where springs are slack, by joint [rad or m].
-        forces: Others on joints.
-        frame_forces: Others on frames.
-        constraints: What the motion keeps.
-        plan_constraints: What the plan keeps; where there are some, no joint is left out.
-        actuated: Joints that are driven; None for all.
+        robots: The tables [robot] or [[robot]]; several robots are one tree.
+        prefixes: Prefix of the names of each robot; None for a file with one ``[robot]``.
+        gravity: Gravity [m/s^2], or whether there is any.
+        damping: Viscous damping by joint [N m s/rad or N s/m], or "robot" for that of the description; None where it is
+            left out.
+        stiffness: Stiffness of joint springs, by joint [N m/rad or N/m].
+        rest: Rest positions of joint springs, by joint [rad or m].
+        forces: Other forces on joints.
+        frame_forces: Forces on frames.
+        constraints: Constraints of the motion.
+        plan_constraints: Hard constraints of the plan; with any, no joint is left out.
+        actuated: Driven joints; None for all.
         gear: Generalized force per control, by driven joint.
-        torque_limit: By driven joint [N m or N]; ``"robot"`` for the robot description's; None for none.
-        noise: Models.
+        torque_limit: Bounds by driven joint [N m or N]; ``"robot"`` for those of the description; None for none.
+        noise: Noise models.
         q0: Initial configuration by joint [rad or m].
-        v0: Initial velocity by joint.
-        dt: [s].
+        v0: Initial velocity by joint [rad/s or m/s].
+        dt: Time step [s].
         steps: N.
         hold: Steps that share a control.
-        sampling: Of running costs.
-        shape: Of a plan's controls in time: ``"held"``, or ``"linear"`` between nodes.
+        sampling: Sampling of running costs.
+        shape: Controls of a plan between nodes: ``"held"`` or ``"linear"``.
         integrator: The integrator; None where the file names none.
-        costs: Terms.
-        controls: Of a simulation: None for none, ``"hold"`` for holding ones, or values over time.
-        seed: Of the noise of a simulation; without it there is none.
-        options: Of solve.
+        costs: Terms of the cost.
+        controls: Controls of a simulation: None for none, ``"hold"`` to hold the robot, or values over time.
+        seed: Seed of the noise in a simulation; None for no noise.
+        options: Options of ``solve``.
         outputs: Files to write.
     """
 
@@ -197,7 +199,8 @@ class SceneSpec:
     title: str
     path: Path
     root: Table
-    robot: RobotKeys
+    robots: tuple[RobotKeys, ...]
+    prefixes: tuple[str, ...] | None
     gravity: bool | tuple[float, ...]
     damping: ByName | Literal["robot"] | None
     stiffness: ByName
@@ -231,16 +234,16 @@ class SceneSpec:
 
 
 def scenes() -> dict[str, Path]:
-    """The scenes that come with varpin, by name."""
+    """Files of the scenes bundled with varpin, by name."""
     return {path.stem: path for path in sorted((models_dir() / "scenes").glob("*.toml"))}
 
 
 def find_scene(source: str | Path) -> Path:
-    """The scene file at a path, or of a bundled name.
+    """The scene file at a path, or the bundled one of that name.
 
     Raises:
-        FileError: There is none; names that come close are listed.
-        InputError: Not a path.
+        FileError: There is no such file; similar names are listed.
+        InputError: ``source`` is not a path.
     """
     if not isinstance(source, str | Path) or "\0" in str(source):
         raise InputError(f"a scene must be the path of a TOML file or a name, got {type(source).__name__}")
@@ -259,10 +262,10 @@ def read_scene(path: Path, name: str | None = None) -> SceneSpec:
     """Read a scene file.
 
     Raises:
-        FileError: It cannot be read.
-        SceneFileError: A mistake in it.
+        FileError: The file cannot be read.
+        SceneFileError: There is a mistake in it.
     """
-    # It takes pydantic, which only whoever reads a scene has to wait for.
+    # Imported here because pydantic loads slowly, and only scene files need it.
     from varpin.io.scenefile.tables import spec_of  # noqa: PLC0415
 
     try:
@@ -273,11 +276,11 @@ def read_scene(path: Path, name: str | None = None) -> SceneSpec:
         raise SceneFileError(path.name, "", "it is not a text in UTF-8") from None
     except RecursionError:
         raise SceneFileError(path.name, "", "it is nested too deeply") from None
-    except ValueError as error:  # tomllib lets those of Python's own numbers through
+    except ValueError as error:  # TOMLDecodeError, or an error of Python's number parsing
         raise SceneFileError(path.name, "", f"it is not TOML: {error}") from None
     return spec_of(data, path, path.stem if name is None else name)
 
 
 def degrees_for_radians(value: float) -> bool:
-    """Whether an angle is beyond two turns either way, as degrees written for radians are."""
+    """Whether an angle [rad] is larger than two turns, and therefore probably in degrees."""
     return abs(value) > 4.0 * math.pi

@@ -22,9 +22,9 @@ class SceneFileError(VarpinError, ValueError):
     """A mistake in a scene file.
 
     Attributes:
-        source: The file.
-        key: Where in it, as in ``cost[1].weight``; empty for the file as a whole.
-        problem: What was given, and what is allowed.
+        source: Name of the file.
+        key: Key of the mistake, as in ``cost[1].weight``; empty for the file as a whole.
+        problem: The given value and the allowed ones, in words.
     """
 
     def __init__(self, source: str, key: str, problem: str) -> None:
@@ -39,19 +39,19 @@ class Table:
     """The key of a table of a scene file, for messages.
 
     Attributes:
-        source: The file.
-        key: Of the table; empty for the file's own.
+        source: Name of the file.
+        key: Key of the table; empty for the top level.
     """
 
     source: str
     key: str
 
     def path(self, name: str) -> str:
-        """The whole key of ``name``."""
+        """The full key of ``name``."""
         return f"{self.key}.{name}" if self.key and name else self.key or name
 
     def error(self, name: str, problem: str) -> SceneFileError:
-        """A mistake under ``name``, or in the table itself if it is empty."""
+        """An error at the key ``name``, or in the table itself if it is empty."""
         return SceneFileError(self.source, self.path(name), problem)
 
     def table(self, name: str) -> Table:
@@ -79,7 +79,7 @@ class Table:
 
 
 def shown(value: object) -> str:
-    """A value from a file, in short."""
+    """A short text for a value from a file."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, Mapping):
@@ -90,7 +90,7 @@ def shown(value: object) -> str:
 
 
 def suggestion(word: str, names: Iterable[str], what: str) -> str:
-    """Which names come close, and all of them."""
+    """A hint with similar names, and the list of all names."""
     names = tuple(names)
     matches = difflib.get_close_matches(word, names, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
@@ -98,10 +98,10 @@ def suggestion(word: str, names: Iterable[str], what: str) -> str:
 
 
 def inside(text: str, folder: Path, what: str) -> Path:
-    """A path that a file names: below ``folder`` if it is relative, links followed, and anywhere if it is absolute.
+    """A path in a file. A relative path must stay below ``folder``, links resolved; an absolute one may be anywhere.
 
     Raises:
-        ValueError: It is no path, or leads out of the folder.
+        ValueError: It is not a path, or leads out of the folder.
     """
     path = Path(text)
     if path.is_absolute():
@@ -109,7 +109,7 @@ def inside(text: str, folder: Path, what: str) -> Path:
     try:
         found, root = (folder / path).resolve(), folder.resolve()
     except (OSError, RuntimeError) as error:
-        raise ValueError(f"{text!r} is no path: {error}") from None
+        raise ValueError(f"{text!r} is not a path: {error}") from None
     if not found.is_relative_to(root):
         raise ValueError(f"{text!r} leads out of {what} {root}; name files below it, or give an absolute path")
     return found

@@ -1,4 +1,4 @@
-"""The tables of a scene file: their keys, and what these take."""
+"""The tables of a scene file: their keys and the rules of their values."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _THREE = tuple[float, float, float]
 
 
 def _checked(kind: Any, check: Callable[..., Any]) -> Rule:
-    """What ``check`` makes of a value of a kind; it raises a ValueError."""
+    """A value of a kind, converted by ``check``, which raises a ValueError for wrong ones."""
     plain, what = (Annotated[Any, kind], kind.what) if isinstance(kind, Rule) else (kind, "")
     return Rule(Annotated[plain, AfterValidator(check)], what, parts=True)
 
@@ -69,14 +69,14 @@ def _distinct(rule: Rule) -> Rule:
     def once(entries: tuple[str, ...]) -> tuple[str, ...]:
         for index, entry in enumerate(entries):
             if entry in entries[:index]:
-                raise mistake(index, f"{entry!r} is there twice")
+                raise mistake(index, f"{entry!r} is a duplicate")
         return entries
 
     return _checked(tuple[Annotated[str, rule], ...], once)
 
 
 def _beside(text: str, info: ValidationInfo) -> Path:
-    """A path that a scene names; relative ones are below its folder."""
+    """A path in a scene file; a relative one must be below the folder of the file."""
     context: Any = info.context
     return inside(text, context["folder"], "the scene's folder")
 
@@ -92,7 +92,7 @@ def _existing(path: Path) -> Path:
 
 
 def _robot_source(text: str, info: ValidationInfo) -> str | Path:
-    """A name, or the path of a file."""
+    """The name of a robot, or the path of an existing file."""
     named = not Path(text).suffix and "/" not in text and "\\" not in text
     return text if named else _existing(_beside(text, info))
 
@@ -106,7 +106,7 @@ class PayloadKeys(Keys):
     inertia: Annotated[tuple[float, ...], numbers(unit="kg m^2")] = (0.0, 0.0, 0.0)
 
     def payload(self) -> Payload:
-        """As a robot takes it."""
+        """The payload as an object."""
         inertia: Any = self.inertia
         if len(inertia) == 6:
             xx, xy, xz, yy, yz, zz = inertia
@@ -121,13 +121,13 @@ class PayloadKeys(Keys):
 
 
 class BaseKeys(Keys):
-    """Where the base of a robot stands."""
+    """Placement of the base of a robot."""
 
     xyz: Annotated[_THREE, numbers(3, "m")] = (0.0, 0.0, 0.0)
     rpy: Annotated[_THREE, numbers(3, "rad")] = (0.0, 0.0, 0.0)
 
     def transform(self) -> Any:
-        """As (4, 4)."""
+        """The placement as a matrix (4, 4)."""
         transform = np.eye(4)
         transform[:3, :3] = Rotation.from_euler("xyz", self.rpy).as_matrix()
         transform[:3, 3] = self.xyz
@@ -155,6 +155,20 @@ class RobotKeys(Keys):
     density: Annotated[float, number("kg/m^3", above=0.0)] = 1000.0
 
 
+class MemberKeys(RobotKeys):
+    """[[robot]]."""
+
+    prefix: Annotated[str, TEXT] = ""
+
+
+def _several(robots: RobotKeys | tuple[MemberKeys, ...]) -> tuple[RobotKeys, ...]:
+    if isinstance(robots, RobotKeys):
+        return (robots,)
+    if len(robots) < 2:
+        raise ValueError(f"[[robot]] is for two robots or more, got {len(robots)}; one is written [robot]")
+    return robots
+
+
 class SpringKeys(Keys):
     """[springs]."""
 
@@ -174,7 +188,7 @@ class ActuationKeys(Keys):
     @model_validator(mode="after")
     def _require_joints(self) -> ActuationKeys:
         if self.joints == ():
-            raise mistake("joints", "must name a joint at least; leave it out to drive all of them")
+            raise mistake("joints", "must name at least one joint; leave it out to drive all of them")
         return self
 
 
@@ -188,7 +202,7 @@ class NoiseKeys(Keys):
     @model_validator(mode="after")
     def _require_no_center(self) -> NoiseKeys:
         if self.type != "state" and self.center is not None:
-            raise mistake("center", f"is of state noise alone, and this is {self.type} noise")
+            raise mistake("center", f"belongs to state noise alone, and this is {self.type} noise")
         return self
 
 
@@ -211,7 +225,7 @@ class HorizonKeys(Keys):
 
     @property
     def count(self) -> int:
-        """Steps."""
+        """Number of steps."""
         return self.steps or round(min((self.duration or 0.0) / self.dt, 2.0 * MOST_STEPS))
 
     @model_validator(mode="after")
@@ -225,10 +239,10 @@ class HorizonKeys(Keys):
                 wrong = f"{duration:g} s is more than {MOST_STEPS} steps of dt = {self.dt:g} s, the most there may be"
             else:
                 fits = duration / max(steps, 1)
-                wrong = f"{duration:g} s is no whole number of steps of dt = {self.dt:g} s; dt = {fits!r} would be"
+                wrong = f"{duration:g} s is not a whole number of steps of dt = {self.dt:g} s; dt = {fits!r} fits"
             raise mistake("duration", wrong)
         if steps % self.hold:
-            raise mistake("hold", f"{steps} steps are no multiple of {self.hold}")
+            raise mistake("hold", f"{steps} steps are not a multiple of {self.hold}")
         return self
 
 
@@ -282,8 +296,8 @@ REFERENCE_KEYS: Mapping[str, type[Keys]] = {"file": FileKeys, "waypoints": Waypo
 
 def _reference_shape(value: Any) -> str:
     keys = set(value) if isinstance(value, dict) else set()
-    if any(isinstance(own, list | dict) for own in (value[key] for key in keys & {"constant", "value"})):
-        raise ValueError("numbers that do not change are given themselves, as in target = [0.4, 0.2, 0.3], in no table")
+    if any(isinstance(value[key], list | dict) for key in keys & {"constant", "value"}):
+        raise ValueError("constant values are given without a table, as in target = [0.4, 0.2, 0.3]")
     return next((name for name, kind in REFERENCE_KEYS.items() if keys & set(kind.model_fields)), toml_type(value))
 
 
@@ -333,12 +347,12 @@ class OutputKeys(Keys):
 
 
 class TypedKeys(Keys):
-    """A table of the kind that its ``type`` says."""
+    """A table whose kind is its ``type``."""
 
     type: str = ""
 
 
-# [integrator]: by their names in scene files, RungeKutta4 as runge_kutta_4, with the options that can be given there.
+# [integrator]: options of the integrators in scene files.
 _OPTIONS = {
     "alpha": Annotated[float, number(least=0.0, most=1.0)],
     "stages": Annotated[int, whole(1)],
@@ -381,7 +395,7 @@ def _along(unit: str) -> Rule:
 
 _ON_FRAME: dict[str, Any] = {"text": Annotated[str, TEXT], "table": PointKeys}
 _POINT = either("a frame's name, { frame, place } or a place in the world [m]", **_ON_FRAME, list=_THREE_NUMBERS)
-# What the fields of forces on frames take.
+# Rules of the fields of forces on frames.
 _OF_FRAMES = {
     "a": _POINT,
     "b": _POINT,
@@ -397,7 +411,7 @@ _OF_FRAMES = {
 }
 
 
-# What the fields of constraints take beyond what their annotations say.
+# Rules of the fields of constraints that do not follow from their annotations.
 _OF_CONSTRAINTS = {
     "a": _POINT,
     "b": _POINT,
@@ -409,7 +423,7 @@ _OF_CONSTRAINTS = {
 }
 
 
-# What a field takes by its annotation, where it has no rule of its own.
+# Rules by annotation, for fields without a rule of their own.
 _BY_ANNOTATION = {"Point": _POINT, "str": TEXT, "float": number(), "int": whole(0), "ArrayLike": numbers()}
 
 
@@ -442,8 +456,8 @@ def _cost_keys(name: str, term: Term) -> type[Keys]:
 
 # [[plan_constraint]]
 def _plan_constraint_keys(name: str, kind: Kind) -> type[Keys]:
-    own: dict[str, Any] = {key: (Annotated[Any, rule], default) for key, (rule, default) in kind.rules.items()}
-    return create_model(name, __base__=TypedKeys, **own)
+    rules: dict[str, Any] = {key: (Annotated[Any, rule], default) for key, (rule, default) in kind.rules.items()}
+    return create_model(name, __base__=TypedKeys, **rules)
 
 
 FORCE_KEYS = {name: _force_keys(kind) for name, kind in FORCES.items()} | {
@@ -467,7 +481,12 @@ class SceneKeys(Keys):
         either("true, false or three numbers [m/s^2]", flag=bool, list=Annotated[Any, numbers(3, "m/s^2")]),
     ] = True
     damping: Annotated[Any, values("N m s/rad or N s/m", least=0.0, text=Annotated[str, word("robot")])] = None
-    robot: RobotKeys
+    robot: Annotated[
+        tuple[RobotKeys, ...],
+        _checked(
+            either("a table [robot], or several of [[robot]]", table=RobotKeys, list=tuple[MemberKeys, ...]), _several
+        ),
+    ]
     springs: SpringKeys = SpringKeys()
     force: tuple[Annotated[Any, typed(FORCE_KEYS)], ...] = ()
     constraint: tuple[Annotated[Any, typed(CONSTRAINT_KEYS)], ...] = ()
@@ -484,27 +503,29 @@ class SceneKeys(Keys):
 
 
 def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
-    """The tables of the file ``path``, checked as far as that goes without the robot.
+    """The content of the file ``path``, checked as far as possible without the robot.
 
     Raises:
-        SceneFileError: A mistake in them.
+        SceneFileError: There is a mistake in the tables.
     """
     root = Table(path.name, "")
     keys = read_keys(SceneKeys, data, path)
     horizon = keys.horizon
     if horizon.count * len(keys.cost) > MOST_EVALUATIONS:
         costs = f"{horizon.count} steps times {len(keys.cost)} costs"
-        raise root.error("horizon", f"{costs} are too many; {MOST_EVALUATIONS} are the most")
+        raise root.error("horizon", f"{costs} are too many; the product may be at most {MOST_EVALUATIONS}")
     forces = [_force(root.table(f"force[{index}]"), entry) for index, entry in enumerate(keys.force)]
     controls = keys.simulate.controls
     if controls is not None and controls != "hold":
         controls = _reference_of(root.table("simulate"), "controls", controls, horizon.dt)
+    members = [robot for robot in keys.robot if isinstance(robot, MemberKeys)]
     return SceneSpec(
         name=name,
         title=name if keys.title is None else keys.title,
         path=path,
         root=root,
-        robot=keys.robot,
+        robots=keys.robot,
+        prefixes=tuple(robot.prefix for robot in members) if members else None,
         gravity=keys.gravity,
         damping=keys.damping,
         stiffness=keys.springs.stiffness,
@@ -539,12 +560,12 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
 
 
 def _given(keys: Keys) -> dict[str, Any]:
-    """The keys that a table has, its type apart."""
+    """The given keys of a table, without its type."""
     return {name: getattr(keys, name) for name in keys.model_fields_set if name != "type"}
 
 
 def _all(keys: Keys) -> dict[str, Any]:
-    """All keys of a table, its type apart, with what they are where they are left out."""
+    """All keys of a table, without its type, with defaults for those left out."""
     return {name: getattr(keys, name) for name in type(keys).model_fields if name != "type"}
 
 
@@ -568,7 +589,7 @@ def _constraint(table: Table, keys: TypedKeys) -> ConstraintSpec:
 
 
 def _point(value: Any) -> Any:
-    """A point as forces and constraints take it."""
+    """A point in the form that forces and constraints take."""
     if isinstance(value, PointKeys):
         return value.frame, list(value.place)
     return list(value) if isinstance(value, tuple) else value
@@ -576,7 +597,7 @@ def _point(value: Any) -> Any:
 
 def _integrator(table: Table, keys: TypedKeys) -> Integrator | None:
     if type(keys) is TypedKeys:
-        # The file has no such table.
+        # The file has no table [integrator].
         return None
     kind = keys.type or "gauss"
     given = {"stages": default_integrator().stages} if kind == "gauss" else {}

@@ -1,4 +1,4 @@
-"""The terms of a cost that a scene file can name: a line or two each."""
+"""The terms of a cost in scene files."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ Space = Literal["q", "v", "u", "frame", "robot"]
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What a term is made of.
+    """The values from which a term is built.
 
     Attributes:
-        robot: Of the scene, without the joints that are left out.
-        weight: One for each axis.
+        robot: The robot, without the joints that are left out.
+        weight: One weight for each axis.
         target: Its reference, if it has one.
         frame: Name of its frame, if it has one.
-        numbers: What else it takes.
-        words: What else it takes.
+        numbers: Its other keys with numbers.
+        words: Its other keys with words.
     """
 
     robot: Robot
@@ -59,7 +59,7 @@ class Given:
 
     @property
     def rotation(self) -> Any:
-        """The same for roll, pitch and yaw, as rotation matrices."""
+        """The target roll, pitch and yaw as a rotation matrix (3, 3), or as a function of time."""
         assert self.target is not None
         angles = self.target
         return _matrix(angles(0.0)) if angles.constant else _Turning(angles)
@@ -67,7 +67,7 @@ class Given:
 
 @dataclass(frozen=True, eq=False)
 class _Turning:
-    """Rotation matrices over time, in a form that can be pickled."""
+    """Rotation matrices over time; a class, so that it can be pickled."""
 
     angles: Timeline
 
@@ -85,18 +85,19 @@ class Term:
     """A kind of cost term.
 
     Attributes:
-        make: Builds it.
-        space: What it is about: a block of (q, v, u), whose components are joints; a frame; or the whole robot.
+        make: Function that builds it.
+        space: Its argument: q, v or u, whose components are joints; a frame; or the whole robot.
         reference: Key of its target, or None if it has none.
-        components: Names of the target's components, where they are not joints.
-        axes: Names of what may be weighed apart, where that is not joints; of one, the weight is a number.
-        optional: Whether the target may be left out, and is 0 then.
-        holding: Whether ``hold`` may stand for the reference: the torques that keep the robot at a configuration.
-        initial: Whether the target is of the beginning alone: numbers, or none if it is left out.
+        components: Names of the target's components, if they are not joints.
+        axes: Names of the components with weights of their own, if they are not joints; with one, the weight is a
+            number.
+        optional: Whether the target may be left out; it is then 0.
+        holding: Whether ``hold`` may replace the reference by the torques that hold the robot at a configuration.
+        initial: Whether the target is constant and concerns the first step alone; None if it is left out.
         can_end: Whether it can be a terminal term.
-        numbers: Other keys it takes, numbers >= 0, and their defaults, None where there is none.
-        words: Other keys it takes, and the words allowed, the default first.
-        limits: Of a barrier, the robot's limits it is about, (n,) and (n,).
+        numbers: Other keys with numbers >= 0, and their defaults, None for a required key.
+        words: Other keys with words, and the allowed words, the default first.
+        limits: Function that returns the robot's limits (n,), (n,) for a barrier; None for other terms.
     """
 
     make: Callable[[Given], Cost]

@@ -1,4 +1,4 @@
-"""Motions shown in meshcat: as one HTML file that plays by itself, as a film, or in a live window."""
+"""Motions in meshcat: as one self-contained HTML file, as a film, or in a live window."""
 
 from varpin.show.replay.annotations import frame_names as frame_names
 from varpin.show.replay.motion import replay as replay

@@ -1,4 +1,4 @@
-"""What a replay marks beside the robots themselves, checked and put on its clock: traces, targets, frames, torques."""
+"""Annotations of a replay, validated and sampled at its keyframes: traces, targets, frames, torques."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# Points of a trace: a coarse motion's path is curved between its nodes, a long one's needs no more than so many.
+# Smallest and largest number of points of a trace. Coarse motions are refined, as paths are curved between nodes.
 _FEWEST, _MOST = 200, 1000
 
-# Beads on the way that a plan means to take.
+# Beads on the planned path of a frame.
 _BEADS = 12
 
 
 def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequence[str]) -> list[tuple[str, ...]]:
-    """The frames each robot is asked for.
+    """The requested frames of each robot.
 
     Args:
-        option: What the names were given as.
-        robots: The arms.
-        names: One or several, of which each robot takes those it has; or whether its end effector.
+        option: Name of the option, for messages.
+        robots: The robots.
+        names: One or several names, of which each robot takes those it has; True for its end effector.
 
     Raises:
-        InputError: No robot has a frame of such a name.
+        InputError: No robot has a frame of that name.
     """
     if isinstance(names, bool | np.bool_):
         return [(robot.end_effector,) if names else () for robot in robots]
@@ -65,16 +65,16 @@ def traces(
     end: float,
     growing: Floats | None = None,
 ) -> list[Trace]:
-    """The paths of frames along a motion up to a time; none of a frame that does not move.
+    """The paths of frames along a motion up to a time, without those of frames that do not move.
 
     Args:
-        kind: Of what moves.
-        robot: The arm.
-        names: Of its frames.
+        kind: Whether it is the motion of the robot or of its ghost.
+        robot: The robot.
+        names: Names of its frames.
         t: Times (N + 1,) [s].
         q: Configurations (N + 1, n) [rad or m], linear in between as on the page.
-        end: Of the motion that is shown [s].
-        growing: Times of the keyframes (K,) [s], to draw them as far as the motion has come.
+        end: End of the replay [s].
+        growing: Times of the keyframes (K,) [s], to let paths grow with the motion; None for whole paths.
     """
     times = np.append(t[t < end], min(end, t[-1]))
     if len(times) - 1 > _MOST:
@@ -95,14 +95,14 @@ def traces(
 
 
 def outlooks(robot: Robot, names: Sequence[str], run: MpcRun, ahead: float, times: Floats) -> list[Outlook]:
-    """Where a controller's plans mean to take frames.
+    """The planned paths of frames at each keyframe.
 
     Args:
-        robot: The arm.
-        names: Of its frames.
-        run: What the controller did.
-        ahead: How far to look [s].
-        times: Of the keyframes (K,) [s].
+        robot: The robot.
+        names: Names of its frames.
+        run: The run of the controller.
+        ahead: Time from now to the end of the path [s].
+        times: Times of the keyframes (K,) [s].
     """
     ticks = run.period * np.arange(len(run.plans) + 1, dtype=np.float64)
     found = []
@@ -116,7 +116,7 @@ def outlooks(robot: Robot, names: Sequence[str], run: MpcRun, ahead: float, time
 
 
 def rows_at(times: Floats, t: Floats, rows: Floats) -> Floats:
-    """Rows (N, n) at times (N,), read off at others."""
+    """Rows (N, n) at times ``t`` (N,), interpolated linearly at ``times`` (K,)."""
     return np.column_stack([np.interp(times, t, column) for column in rows.T])
 
 
@@ -124,7 +124,7 @@ def references(given: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Trace
     """Paths in the world, by name.
 
     Raises:
-        InputError: One of them is no path (K, 3), not finite, or stays in one place.
+        InputError: A path is not (K, 3), is not finite, or stays in one place.
     """
     if given is None:
         return ()
@@ -137,13 +137,13 @@ def references(given: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Trace
             raise InputError(f"{what} must have shape (K, 3), points on a path in the world [m], got {points.shape}")
         points = points[_moves(require_finite(what, points))]
         if len(points) < 2:
-            raise InputError(f"{what} stays in one place; give a place as a target")
+            raise InputError(f"{what} stays in one place; give a single point as a target")
         found.append(Trace("reference", str(name), points))
     return tuple(found)
 
 
 def _moves(points: Floats) -> NDArray[np.bool_]:
-    """Which points (P,) of a path (P, 3) are apart from the last one before that is."""
+    """Mask (P,) of the points of a path (P, 3) that differ from the last point kept before."""
     kept = np.zeros(len(points), dtype=np.bool_)
     if not len(points):
         return kept
@@ -156,14 +156,14 @@ def _moves(points: Floats) -> NDArray[np.bool_]:
 
 
 def target_tracks(given: Mapping[str, object] | None, end: float) -> dict[str, tuple[Floats, Floats, Floats | None]]:
-    """Times (K,) [s], places (K, 3) [m] and, of poses, turns (K, 4) of each target; one row of one that stays.
+    """Times (K,) [s], positions (K, 3) [m] and, for poses, quaternions (K, 4) of each target; one row if it is fixed.
 
     Args:
         given: Points (3,), poses (4, 4), pin.SE3, or rows of either, spread evenly over the motion's time.
-        end: Of the motion [s].
+        end: End of the motion [s].
 
     Raises:
-        InputError: One of them is neither, not finite, or no rotation; or it moves and the motion does not.
+        InputError: A target is none of these, is not finite, or has no rotation; or it moves and the motion does not.
     """
     if given is not None and not isinstance(given, Mapping):
         raise InputError(f"targets must map names to places or poses, as in {{'cup': [0.5, 0, 0.3]}}, got {given!r}")
@@ -180,7 +180,7 @@ def target_tracks(given: Mapping[str, object] | None, end: float) -> dict[str, t
                 f"shape {array.shape}"
             )
         if len(array) > 1 and end == 0.0:
-            raise InputError(f"the motion is a single pose, so {what} must stay, too, got {len(array)} rows")
+            raise InputError(f"the motion is a single pose, so {what} must be one row, too, got {len(array)}")
         times = np.linspace(0.0, end, len(array))
         if not poses:
             found[str(name)] = times, array, None
@@ -188,7 +188,7 @@ def target_tracks(given: Mapping[str, object] | None, end: float) -> dict[str, t
         R = array[:, :3, :3]
         rigid = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max() < 1e-6 and (np.linalg.det(R) > 0.0).all()
         if not rigid or np.abs(array[:, 3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-9:
-            raise InputError(f"{what} is no pose: a rotation and a place above the row 0 0 0 1")
+            raise InputError(f"{what} must be a pose: a rotation and a position above the row 0 0 0 1")
         found[str(name)] = times, array[:, :3, 3], scipy.spatial.transform.Rotation.from_matrix(R).as_quat()
     return found
 
@@ -216,21 +216,22 @@ def target(name: str, track: tuple[Floats, Floats, Floats | None], times: Floats
 def torque_shares(
     robot: Robot, motion: Trajectory | ArrayLike, torques: bool | ArrayLike, limit: JointValues | None
 ) -> Floats | None:
-    """How much of its limit each joint's torque takes in each step (N, n), in [0, 1]; None if it is not to be shown.
+    """Torque of each joint in each step as a share of its limit (N, n), in [0, 1]; None if torques are not shown.
 
     Args:
-        robot: The arm.
-        motion: Of which the controls are taken.
-        torques: Whether to; or the torques (N, n) themselves [N m or N].
-        limit: One or (n,) [N m or N]; the robot's own if left out, and where it has none the largest torque there is.
+        robot: The robot.
+        motion: The motion whose controls are the torques, if ``torques`` is True.
+        torques: Whether to show torques; or the torques (N, n) themselves [N m or N].
+        limit: One number, (n,) or by name [N m or N]; if left out, the robot's limits, and where it has none the
+            joint's largest torque.
 
     Raises:
-        InputError: The motion has no torques of all joints, or they are not (N, n), or a limit is not positive.
+        InputError: The motion does not have torques of all joints, they are not (N, n), or a limit is not positive.
     """
     if isinstance(torques, bool | np.bool_):
         if not torques:
             if limit is not None:
-                raise InputError("torque_limit colours nothing without torques")
+                raise InputError("torque_limit needs torques")
             return None
         if not isinstance(motion, Trajectory):
             raise InputError("torques=True takes the controls of a trajectory; for an array, give the torques (N, n)")
@@ -242,13 +243,13 @@ def torque_shares(
             )
         if motion.scene_values.get("PositionServo", np.zeros(0)).size:
             raise InputError(
-                "torques=True takes controls for torques, and controls of this trajectory are positions that servos go "
-                f"to; give the torques (N, {robot.dof}) themselves"
+                "torques=True takes controls for torques, but controls of this trajectory are positions of servos; "
+                f"give the torques (N, {robot.dof}) themselves"
             )
         if len(moved_by_hand(motion)):
             raise InputError(
-                "torques=True takes controls for torques, and controls of this trajectory are positions of joints that "
-                f"are moved by hand; give the torques (N, {robot.dof}) themselves"
+                "torques=True takes controls for torques, but controls of this trajectory are positions of kinematic "
+                f"inputs; give the torques (N, {robot.dof}) themselves"
             )
     else:
         values = as_floats("torques", torques)
@@ -257,11 +258,11 @@ def torque_shares(
         values = require_finite("torques", values)
     size = np.abs(values)
     largest = size.max(axis=0, initial=0.0)
-    own = robot.effort_limit
-    bound = np.where(np.isfinite(own), own, largest)
+    effort = robot.effort_limit
+    bound = np.where(np.isfinite(effort), effort, largest)
     if limit is not None:
         given = joint_array("torque_limit", limit, robot.joint_names, uniform=True)
-        # Of joints that are not named the limit stays their own.
+        # Joints that are not named keep the limit of the robot.
         named = [not isinstance(limit, Mapping) or name in limit for name in robot.joint_names]
         bound = np.where(named, given, bound)
         if not (bound > 0.0).all():

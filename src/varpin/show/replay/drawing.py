@@ -1,4 +1,4 @@
-"""A script put into meshcat: robots, what is marked, the view, and everything's motion."""
+"""Drawing of a script in meshcat: robots, annotations, the view, and their animation."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from varpin.show.replay.view import across, set_view, side_by_side, view_directi
 
 Floats = NDArray[np.float64]
 
-# Viewers compute in single precision, and with squares [m].
+# Largest coordinate [m]: viewers compute squares in single precision.
 _FARTHEST = 1e18
 
-# Of marks, in sizes of a robot's motion.
+# Sizes of marks relative to the size of a robot's motion.
 _TUBE, _BEAD, _BALL, _TRIAD, _LABEL, _TIE, _ROD, _EDGE = 0.003, 0.006, 0.02, 0.1, 0.045, 0.02, 0.006, 0.1
 
 logger = logging.getLogger(__name__)
@@ -42,15 +42,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """What the view was set for.
+    """The contents for which the view was set.
 
     Attributes:
-        size: Of the largest robot's motion [m].
-        places: Where each robot is (3,) [m].
-        points: All that is to be seen (P, 3) [m].
+        size: Size of the largest robot's motion [m].
+        places: Position of each robot's world (3,) [m].
+        points: Points around everything that is shown (P, 3) [m].
         toward: Unit vector (3,) to the camera.
         floor: Height of the grid [m].
-        pictures: What each robot looks like.
+        pictures: Picture of each robot.
     """
 
     size: float
@@ -62,12 +62,12 @@ class Stage:
 
 
 def draw(viewer: meshcat.Visualizer, script: Script) -> Stage:
-    """Send everything a script shows."""
+    """Send a script to a viewer."""
     return _Drawing(viewer, script).draw()
 
 
 class _Drawing:
-    """One script on its way to one viewer."""
+    """The drawing of one script in one viewer."""
 
     def __init__(self, viewer: meshcat.Visualizer, script: Script) -> None:
         self.viewer = viewer
@@ -83,7 +83,7 @@ class _Drawing:
         for k, (actor, place) in enumerate(zip(self.script.actors, places, strict=True)):
             number = f" {k + 1}" if k else ""
             self._actor(actor, number, place, size)
-            # Robots in one place share what is marked there.
+            # Robots in the same place share traces and targets.
             if not any((place == other).all() for other in places[:k]):
                 targets = [*self.script.targets, *actor.goals]
                 self._notes([*self.script.traces, *actor.traces], targets, f"notes{number}", place, size)
@@ -114,14 +114,14 @@ class _Drawing:
             lines += [tie.a[1][None] for tie in actor.ties if tie.a[0] < 0]
             lines += [goal.places for goal in actor.goals]
             seen = np.concatenate([points, *lines, *marked])
-            # What is much larger than the motion is seen in part.
+            # Regions much larger than the motion are shown in part.
             low, high, room = seen.min(axis=0), seen.max(axis=0), 0.3 * size
             around = [np.clip(region.corners, low - room, high + room) for region in actor.regions]
             extents.append(np.concatenate([seen, *around]))
             poses.append(picture.body_poses(positions))
         if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
             raise InputError(f"what is to be shown has sizes or places beyond {_FARTHEST:g} m, which no viewer draws")
-        # A point, or what is too small to tell from one, is seen from a metre away.
+        # The camera is one metre away from a point or anything of negligible size.
         size = size if size > 1.0 / _FARTHEST else 1.0
         toward = view_direction(np.concatenate([R[..., 2].reshape(-1, 3) for R, _ in poses]))
         for k, actor in enumerate(self.script.actors):
@@ -136,7 +136,7 @@ class _Drawing:
         return Stage(size, places, points, toward, float(floor), pictures)
 
     def _around_marks(self, actor: Actor, R: Floats, p: Floats, toward: Floats, size: float) -> list[Floats]:
-        """Points (P, 3) around labels and triads, of bodies whose poses are (S, b, 3, 3) and (S, b, 3)."""
+        """Points (P, 3) around labels and triads, for body poses R (S, b, 3, 3) and p (S, b, 3)."""
         found = []
         right = across(toward)
         up = np.cross(toward, right)
@@ -186,13 +186,13 @@ class _Drawing:
         self._animate(node, "material.color", "color", colors)
 
     def _notes(self, traces: Sequence[Trace], targets: Sequence[Target], root: str, place: Floats, size: float) -> None:
-        """What is marked in the world of one robot."""
+        """Draw traces and targets in the world of one robot."""
         self.viewer[root].set_transform(_translation(place))
         for k, trace in enumerate(traces):
             node = f"{root}/traces/{k} {trace.kind} {label(trace.name)}"
             self.viewer[node].set_object(marks.tube(trace.points, _TUBE * size, TRACE_COLORS[trace.kind]))
             if trace.reached is not None:
-                # three.js draws so many of its corners; a piece that is reached in part is drawn in part.
+                # drawRange is the number of corners that three.js draws, so that a piece can be drawn in part.
                 corners = marks.TUBE_PIECE * trace.reached
                 self._animate(f"{node}/<object>", "geometry[drawRange].count", "number", corners)
         for target, step in zip(targets, labels(target.name for target in targets), strict=True):
@@ -211,7 +211,7 @@ class _Drawing:
             self.viewer[f"{node}/label"].set_object(marks.Label(target.name, _LABEL * size, 1.2 * _BALL * size))
 
     def _outlooks(self, outlooks: Sequence[Outlook], root: str, size: float) -> None:
-        """Beads where plans mean to take frames."""
+        """Draw the planned paths of frames as beads."""
         for k, outlook in enumerate(outlooks):
             for b, places in enumerate(outlook.places.transpose(1, 0, 2)):
                 node = f"{root}/plans/{k} {label(outlook.name)}/{b}"
@@ -220,7 +220,7 @@ class _Drawing:
                 self._animate(node, "position", "vector3", places)
 
     def _ties(self, actor: Actor, number: str, size: float) -> None:
-        """Points, rods, lines and planes of the mechanism's constraints."""
+        """Draw the constraints of the mechanism as points, rods, lines and planes."""
         if not actor.ties:
             return
         picture, rows = self.pictures[id(actor.robot)], actor.positions["robot"]
@@ -245,10 +245,10 @@ class _Drawing:
             if tie.axis is None:
                 self._rod(f"notes{number}/ties/{k}", a, b, size)
                 continue
-            way = a - (p[:, body] if body >= 0 else 0.0)
-            seen = np.einsum("kji,kj->ki", R[:, body], way) if body >= 0 else way
+            offset = a - (p[:, body] if body >= 0 else 0.0)
+            seen = np.einsum("kji,kj->ki", R[:, body], offset) if body >= 0 else offset
             if tie.plane:
-                # Points in one plane share its square.
+                # Points in the same plane share one square.
                 key = (float(body), *tie.axis.round(9).tolist(), round(float(tie.axis @ place), 9))
                 planes.setdefault(key, []).append(seen)
             else:
@@ -268,19 +268,19 @@ class _Drawing:
             self.viewer[node].set_transform(pose)
 
     def _rod(self, node: str, a: Floats, b: Floats, size: float) -> None:
-        """A rod between two places (K, 3) in the world, as long as they are apart; none if they coincide."""
-        ways = b - a
-        lengths = np.linalg.norm(ways, axis=1)
+        """Draw a rod between two moving points (K, 3) of the world; none if they always coincide."""
+        spans = b - a
+        lengths = np.linalg.norm(spans, axis=1)
         if lengths.max() < _TUBE * size:
             return
-        # Turned from keyframe to keyframe on the shortest way; in between the page does the same.
+        # The smallest rotation from keyframe to keyframe, as the page interpolates in between.
         before, turn = np.array([0.0, 0.0, 1.0]), pin.Quaternion.Identity()
         turns = []
-        for way, length in zip(ways, lengths, strict=True):
+        for span, length in zip(spans, lengths, strict=True):
             if length > 1e-9 * size:
-                turn = pin.Quaternion.FromTwoVectors(before, way / length) * turn
+                turn = pin.Quaternion.FromTwoVectors(before, span / length) * turn
                 turn.normalize()
-                before = way / length
+                before = span / length
             turns.append(turn.coeffs().copy())
         pose = _translation(0.5 * (a[0] + b[0]))
         pose[:3, :3] = pin.Quaternion(turns[0]).toRotationMatrix() @ np.diag([1.0, 1.0, lengths[0]])
@@ -292,21 +292,21 @@ class _Drawing:
         self._animate(node, "scale", "vector3", scales)
 
     def _regions(self, actor: Actor, root: str, size: float) -> None:
-        """Obstacles, and where frames have to be."""
+        """Draw obstacles, and the regions that frames have to stay in or out of."""
         if not actor.regions:
             return
         picture = self.pictures[id(actor.robot)]
         points = picture.swept(np.concatenate([_samples(rows) for rows in actor.positions.values()]))
         for k, region in enumerate(actor.regions):
             if not np.abs(region.corners).max() < _FARTHEST:
-                logger.warning("%s %r is larger than what viewers draw; it is left out", region.kind, region.name)
+                logger.warning("%s %r is too large for viewers and is left out", region.kind, region.name)
                 continue
             color, node = REGION_COLORS[region.kind], f"{root}/regions/{k} {label(region.name)}"
             pose = np.eye(4)
             if region.box is None:
-                way = region.end - region.begin
-                length = float(np.linalg.norm(way))
-                pose[:3, :3] = z_to(way / length) if length > 0.0 else np.eye(3)
+                axis = region.end - region.begin
+                length = float(np.linalg.norm(axis))
+                pose[:3, :3] = z_to(axis / length) if length > 0.0 else np.eye(3)
                 pose[:3, 3] = 0.5 * (region.begin + region.end)
                 self.viewer[node].set_object(marks.capsule(region.radius, length, color))
             else:
@@ -322,24 +322,24 @@ class _Drawing:
                 self._animate(node, "position", "vector3", pose[:3, 3] + region.way)
 
     def _animate(self, node: str, name: str, kind: str, values: Floats) -> None:
-        """Give a property of a node its values (K, ...) at the keyframes."""
+        """Animate a property of a node with values (K, ...) at the keyframes."""
         path = self.viewer[node].path
-        # One frame a second, so that keyframe times are seconds.
+        # With fps = 1, keyframe times are seconds.
         clip = self.clips.setdefault(path, AnimationClip({}, fps=1))
         clip.tracks[name] = AnimationTrack(name, kind, self.script.times.tolist(), values.tolist())
 
 
 def _translation(place: Floats) -> Floats:
-    """Transform (4, 4)."""
+    """Transform (4, 4) of a translation."""
     pose = np.eye(4)
     pose[:3, 3] = place
     return pose
 
 
 def joint_track(prismatic: bool) -> str:
-    """What moves in a joint's node.
+    """The animated property of a joint's node.
 
-    It is one number: the page then interpolates in q itself, and links stay whole at any frame rate.
+    It is one number, so that the page interpolates in q and links stay rigid at any frame rate.
     """
     return "position[z]" if prismatic else "rotation[z]"
 
@@ -356,5 +356,5 @@ def joint_motion(prismatic: bool, position: float) -> Floats:
 
 
 def _samples(rows: Floats) -> Floats:
-    """Some of many rows, the first and the last among them."""
+    """Up to 50 of the rows, the first and the last among them."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, 50).astype(int))]

@@ -1,4 +1,4 @@
-"""The key to a replay's colours."""
+"""The legend of a replay's colours."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from numpy.typing import NDArray
 
 from varpin.show.replay.script import Script
 
-# Colours that neither robots nor the background have.
+# Colours that robots and the background do not have.
 GHOST_COLOR, TARGET_COLOR = 0x1450D2, 0xC0187A
 TIE_COLOR = 0x007C8A
 REGION_COLORS = {"obstacle": 0x9A5B13, "out": 0x9A5B13, "in": 0x6B3FA8}
 TRACE_COLORS = {"motion": 0xD1480F, "ghost": GHOST_COLOR, "reference": 0x157A3C}
 
-# From no torque to all there is; linear in between.
+# Colours of no torque, half of the limit and the whole limit; linear in between.
 EFFORT_COLORS = np.array([[0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]])
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A line of the key.
+    """A line of the legend.
 
     Attributes:
-        text: What has the colour.
-        colors: One, or several that go over into each other from left to right, as CSS has them.
+        text: Text of the line.
+        colors: One CSS colour, or those of a gradient from left to right.
     """
 
     text: str
@@ -33,7 +33,7 @@ class Entry:
 
 
 def legend(script: Script) -> list[Entry]:
-    """A line for each kind of thing that a script shows in a colour of its own."""
+    """The lines of the legend, one for each kind of mark in a script."""
     entries = []
     if any(actor.effort is not None for actor in script.actors):
         scale = tuple(_css(color) for color in np.rint(255.0 * EFFORT_COLORS).astype(int))

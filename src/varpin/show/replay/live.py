@@ -1,4 +1,4 @@
-"""Motions and plans shown in meshcat while they are computed."""
+"""Live view of motions and plans in meshcat while they are computed."""
 
 from __future__ import annotations
 
@@ -45,45 +45,47 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-# How long the server may take to answer, and a browser to come [s].
-_ANSWER, _COME = 20.0, 20.0
-# Of a motion that is computed too slowly, so much is made up for by going faster afterwards [s].
+# Time limits for an answer of the server, and for a browser to connect [s].
+_ANSWER_LIMIT, _BROWSER_LIMIT = 20.0, 20.0
+# Largest delay that is caught up by faster playback [s].
 _SLACK = 0.1
-# Between two changes of the words beside the robot [s]; people read no faster.
-_WORDS = 0.1
-# Their height, in sizes of the robot.
+# Shortest time between two changes of the text beside the robot [s].
+_TEXT_INTERVAL = 0.1
+# Height of the text, relative to the size of the robot.
 _LABEL = 0.045
-# A path is drawn in pieces, as what changes is sent whole: points of a piece, pieces that are kept, and points between
-# two pictures at most; and how far apart points are at least, and how thick it is, in sizes of the robot.
+# A path is sent in pieces, as meshcat sends a changed object whole: points of a piece, largest number of pieces, and
+# largest number of points between two pictures.
 _PIECE, _PIECES, _BETWEEN = 60, 100, 50
+# Shortest distance of points of a path, and its thickness, relative to the size of the robot.
 _APART, _TUBE = 0.004, 0.003
-# Iterates of a plan whose paths stay in view, points of such a path, and keyframes of all joints together.
-_ITERATES, _WAY, _KEYS = 8, 200, 3000
-# Postures from which the view takes how far a robot reaches, and what they may turn by.
+# Number of iterates of a plan whose paths stay in view, points of such a path, and keyframes of all joints together.
+_ITERATES, _PATH, _KEYS = 8, 200, 3000
+# Random postures that give the reach of a robot for the view, and their largest angle from the start [rad].
 _POSTURES, _TURN = 40, np.pi
+# Opacity of the paths of earlier iterates.
 _PALE = 0.25
 
 
 class LiveView:
-    """A window in which motions and plans are seen while they are computed.
+    """A window that shows motions and plans while they are computed.
 
         with vp.LiveView(scene, trace=True) as view:
             motion = vp.simulate(scene, q0, v0, dt=1e-3, steps=5000, progress=view.progress)
             plan = vp.solve(problem, callback=view.callback)
 
-    ``progress`` shows a motion of :func:`varpin.simulate` or :meth:`varpin.Mpc.run` as far as it has come, no faster
-    than it would happen: where computing is faster, it waits. ``callback`` shows the motion of each iterate of
-    :func:`varpin.solve` again and again, and the paths of the iterates before, pale. Nothing waits while no browser is
-    connected. The robot stands where the motion starts, and the camera has room for what it can reach; it moves back if
-    that is not enough.
+    ``progress`` shows the motion of :func:`varpin.simulate` or :meth:`varpin.Mpc.run` up to the present, at most at
+    true speed: where computing is faster, it waits. ``callback`` plays the motion of each iterate of
+    :func:`varpin.solve` in a loop, with the paths of earlier iterates in a pale colour. Nothing waits while no browser
+    is connected. At first the robot is in its initial configuration and the camera shows all that it can reach; the
+    camera moves back if that is not enough.
 
-    The server belongs to this process. It ends with :meth:`close`, with the ``with`` block or with the process, and the
-    browser keeps its last picture. It listens on every network interface of the machine, as meshcat's always does. If
-    the server dies, a warning says so, and the computation goes on. In a notebook, the view as the value of a cell is
-    the window.
+    The server belongs to this process. It ends with :meth:`close`, with the ``with`` block or with the process; the
+    browser keeps its last picture. The server listens on every network interface of the machine, as meshcat's always
+    does. If it dies, a warning is logged and the computation continues. In a notebook, the view as the value of a cell
+    is the window.
 
     Attributes:
-        url: Its address, for any browser of this machine.
+        url: Address of the window, for any browser on this machine.
     """
 
     def __init__(
@@ -103,26 +105,26 @@ class LiveView:
         """Open the window, and wait for the browser up to 20 s.
 
         Main args:
-            source: What is to be seen: a robot, its scene, or a problem.
-            trace: Frames whose paths are drawn; ``True`` for the end effector. Of a long motion the last minutes stay.
-            speed: Of the motion, at most; 1 is true speed, None as fast as it is computed.
+            source: A robot, its scene, or a problem.
+            trace: Frames whose paths are drawn; ``True`` for the end effector. A long motion keeps the last part.
+            speed: Largest playback speed; 1 is true speed, None as fast as the motion is computed.
 
         Other Args:
             reference: A path (K, 3) in the world [m] to draw, or several by name.
-            targets: What to reach, by name: a point (3,) [m], a pose (4, 4) or ``pin.SE3``.
+            targets: Targets by name: a point (3,) [m], a pose (4, 4) or ``pin.SE3``.
             frames: Frames to draw as triads; ``True`` for the end effector.
             constraints: Draw the constraints of the scene or the problem.
-            fps: Pictures a second, at most.
-            hold: How long each iterate of a plan is shown, at least [s].
-            open: Start a web browser. Without it, open :attr:`url` in one.
+            fps: Largest number of pictures a second.
+            hold: Shortest time for which each iterate of a plan is shown [s].
+            open: Start a web browser. Otherwise open :attr:`url` in one.
 
         Raises:
-            InputError: ``source`` is none of these; a frame that is not there; a reference or a target that is none.
+            InputError: ``source`` is none of these, a frame does not exist, or a reference or a target is invalid.
         """
         robot = source if isinstance(source, Robot) else getattr(getattr(source, "scene", source), "robot", None)
         if not isinstance(robot, Robot):
             raise InputError(
-                f"a LiveView is of a Robot, a Scene or an OptimalControlProblem, got {type(source).__name__}"
+                f"a LiveView takes a Robot, a Scene or an OptimalControlProblem, got {type(source).__name__}"
             )
         self.robot = robot
         self._speed = None if speed is None else positive("speed", speed, "1")
@@ -151,7 +153,7 @@ class LiveView:
         script = Script(np.zeros(1), (actor,), references(reference), marked)
         self._q = start
         self._begin_run()
-        self._told, self._last_words = "", -math.inf
+        self._text, self._text_time = "", -math.inf
         self._iterates: list[tuple[str, ...]] = []
         self._plans = 0
         self._animated = self._closed = False
@@ -162,7 +164,7 @@ class LiveView:
         self._stage = draw(self._viewer, script)
         self._picture = self._stage.pictures[0]
         self._nodes = self._picture.moving_nodes("robot")
-        self._room = self._stage.points
+        self._in_view = self._stage.points
         if open and open_browser(self.url):
             self.wait()
 
@@ -174,19 +176,19 @@ class LiveView:
     ) -> None:
         self.close()
 
-    def wait(self, seconds: float = _COME) -> bool:
-        """Wait until a browser shows the robot, or for some seconds; says whether one does, and warns if not."""
+    def wait(self, seconds: float = _BROWSER_LIMIT) -> bool:
+        """Wait until a browser shows the robot, at most ``seconds``; returns whether one does, and warns if not."""
         end = time.monotonic() + positive("seconds", seconds, "s")
-        if not self._silent and self._window.came.wait(seconds):
-            # Robots with large meshes take a browser some seconds.
+        if not self._silent and self._window.connected.wait(seconds):
+            # A browser needs some seconds to draw large meshes.
             with self._sending():
                 if self._window.has_drawn(max(0.1, end - time.monotonic())):
                     return True
-        logger.warning("no browser shows %s within %g s; the view goes on without one", self.url, seconds)
+        logger.warning("no browser shows %s within %g s; the view continues without one", self.url, seconds)
         return False
 
     def close(self) -> None:
-        """End the server. The browser keeps its last picture; a plan goes on moving."""
+        """End the server. The browser keeps its last picture, and continues to play a plan."""
         self._closed = True
         self._window.close()
 
@@ -201,12 +203,12 @@ class LiveView:
         """Show nodes of a motion, for ``simulate(..., progress=view.progress)``.
 
         Args:
-            done: Steps so far.
-            steps: In all.
-            nodes: Those that are new.
+            done: Number of steps so far.
+            steps: Number of steps in all.
+            nodes: The new nodes.
 
         Raises:
-            InputError: Of another robot.
+            InputError: They are of another robot.
         """
         if not isinstance(nodes, Nodes):
             raise InputError("view.progress is for the progress of simulate and Mpc.run; of solve, give view.callback")
@@ -231,11 +233,11 @@ class LiveView:
         """Show an iterate of a plan, for ``solve(..., callback=view.callback)``.
 
         Args:
-            iteration: What the search did.
-            motion: With which it ended.
+            iteration: Record of the iteration.
+            motion: Its motion.
 
         Raises:
-            InputError: Of another robot.
+            InputError: The motion is of another robot.
         """
         if not isinstance(motion, Trajectory) or not hasattr(iteration, "cost"):
             raise InputError("view.callback is for the callback of solve; of simulate and Mpc.run, give view.progress")
@@ -252,14 +254,14 @@ class LiveView:
                 self._clear_plans()
             if iteration.step > 0.0 or not self._plans:
                 self._show_plan(motion.t - motion.t[0], motion.q)
-            self._say(f"iteration {iteration.index}, cost {iteration.cost:.5g}", last=True)
+            self._show_text(f"iteration {iteration.index}, cost {iteration.cost:.5g}", last=True)
             self._planned = time.monotonic()
 
     def show(self, motion: Trajectory | Solution | MpcRun) -> None:
-        """Play a motion, a plan or a run again and again, from its beginning.
+        """Play a motion, a plan or a run in a loop, from its beginning.
 
         Raises:
-            InputError: It is none, or of another robot.
+            InputError: It is none of these, or of another robot.
         """
         moved = getattr(motion, "trajectory", getattr(motion, "motion", motion))
         if not isinstance(moved, Trajectory):
@@ -272,7 +274,7 @@ class LiveView:
             self._clear_plans()
             self._loop_began = -math.inf
             self._show_plan(moved.t - moved.t[0], moved.q)
-            self._say(f"{moved.duration:.4g} s", last=True)
+            self._show_text(f"{moved.duration:.4g} s", last=True)
 
     @property
     def _silent(self) -> bool:
@@ -280,12 +282,12 @@ class LiveView:
 
     @contextlib.contextmanager
     def _sending(self) -> Iterator[None]:
-        """A server that is gone costs the picture, not the motion."""
+        """A block in which an error of the server is logged and ends the view, but not the computation."""
         try:
             yield
         except zmq.ZMQError as error:
             self._window.lost = True
-            logger.warning("the server of the live view is gone (%s); the computation goes on without a picture", error)
+            logger.warning("the server of the live view has ended (%s); the computation continues without it", error)
 
     def _require(self, q: Floats) -> None:
         if q.shape[1] != self.robot.dof:
@@ -295,9 +297,9 @@ class LiveView:
             )
 
     def _begin_run(self) -> None:
-        """Stand at the start of a motion."""
+        """Reset the view to the start of a motion."""
         self._shown = -math.inf  # time of the last picture [s of motion]
-        self._anchor = time.monotonic()  # when the motion began, as the pictures have it
+        self._anchor = time.monotonic()  # wall time at which playback of the motion began [s]
         for piece in getattr(self, "_pieces", []):
             self._viewer[piece].delete()
         self._pieces: list[str] = []
@@ -305,7 +307,7 @@ class LiveView:
         self._path: dict[str, list[Floats]] = {name: [] for name in self._traced}
 
     def _play(self, t: Floats, q: Floats, speed: float, of: str) -> None:
-        """Show the motion over new nodes, each picture when it is due; of what is late the last alone."""
+        """Show the motion over new nodes, each picture at its time; late pictures are skipped, except for the last."""
         begin, end = max(self._shown, float(t[0])), float(t[-1])
         count = max(1, math.ceil((end - begin) / (speed * self._interval) - 1e-9))
         for time_ in np.linspace(begin, end, count + 1)[1:].tolist() if end > begin else [begin]:
@@ -321,7 +323,7 @@ class LiveView:
         self._anchor = max(self._anchor, time.monotonic() - end / speed - _SLACK)
 
     def _move(self, t: Floats, q: Floats, now: float, of: str, *, last: bool = False) -> None:
-        """Put the robot where it is at a time [s] of the motion over new nodes."""
+        """Show the robot at a time ``now`` [s] of the motion over new nodes."""
         if now == self._shown and not last:
             return
         rows = rows_at(np.array([now]), t, q)
@@ -331,11 +333,11 @@ class LiveView:
         if now > self._shown:
             self._draw_path(np.concatenate([rows_at(between, t, q), rows]))
         self._pose(rows[0])
-        self._say(f"t = {now:.2f}{of or ' s'}", last=last)
+        self._show_text(f"t = {now:.2f}{of or ' s'}", last=last)
         self._shown, self._drawn = now, time.monotonic()
 
     def _pose(self, q: Floats) -> None:
-        """Move the joints that have moved, and what hangs between bodies; and the camera, if it must."""
+        """Update the joints that have moved, the rods between bodies and, if necessary, the camera."""
         self._stop_loop()
         tree = self.robot.tree
         before, positions = _positions(self.robot, self._q[None])[0], _positions(self.robot, q[None])[0]
@@ -348,21 +350,21 @@ class LiveView:
             if tie.axis is None:
                 a, b = (end[1] if end[0] < 0 else R[0, end[0]] @ end[1] + p[0, end[0]] for end in (tie.a, tie.b))
                 self._viewer[f"notes/ties/{k}"].set_transform(_rod(a, b))
-        self._make_room(p[0])
+        self._keep_in_view(p[0])
 
-    def _make_room(self, points: Floats) -> None:
-        """Move the camera back where points (P, 3) are out of what it was set for."""
-        low, high = self._room.min(axis=0), self._room.max(axis=0)
+    def _keep_in_view(self, points: Floats) -> None:
+        """Move the camera back if points (P, 3) are outside its view."""
+        low, high = self._in_view.min(axis=0), self._in_view.max(axis=0)
         edge = 0.1 * self._stage.size
         if (points >= low - edge).all() and (points <= high + edge).all():
             return
-        # As far again, so that a motion that goes on does not take the camera along in every picture.
+        # Twice as far as necessary, so that the camera does not move with every picture.
         out = points + np.where(points > high, points - high, 0.0) - np.where(points < low, low - points, 0.0)
-        self._room = np.concatenate([self._room, points, out])
-        set_view(self._viewer, self._room, self._stage.toward, self._stage.floor, self._stage.size)
+        self._in_view = np.concatenate([self._in_view, points, out])
+        set_view(self._viewer, self._in_view, self._stage.toward, self._stage.floor, self._stage.size)
 
     def _draw_path(self, q: Floats) -> None:
-        """Draw the paths of the traced frames on, over configurations (k, n)."""
+        """Extend the paths of the traced frames over configurations (k, n)."""
         for name in self._traced:
             path = self._path[name]
             path += list(self.robot.frame_positions(q, name))
@@ -383,12 +385,12 @@ class LiveView:
             self._viewer[self._pieces.pop(0)].delete()
 
     def _show_plan(self, t: Floats, q: Floats) -> None:
-        """Play a motion again and again, from where the one before is, and draw its paths."""
+        """Play a motion in a loop, from the phase of the previous one, and draw its paths."""
         if self._iterates:
             for node in self._iterates[-1]:
                 pale = [*(channel / 255.0 for channel in TRACE_COLORS["motion"].to_bytes(3, "big")), _PALE]
                 self._viewer[f"{node}/<object>"].set_property("color", pale)
-        rows = q[np.linspace(0, len(q) - 1, min(len(q), _WAY)).astype(int)]
+        rows = q[np.linspace(0, len(q) - 1, min(len(q), _PATH)).astype(int)]
         nodes = []
         for name in self._traced:
             points = _apart(self.robot.frame_positions(rows, name), _APART * self._stage.size)
@@ -403,14 +405,14 @@ class LiveView:
             for node in self._iterates.pop(0):
                 self._viewer[node].delete()
         positions = _positions(self.robot, rows)
-        self._make_room(self._picture.body_poses(positions)[1].reshape(-1, 3))
+        self._keep_in_view(self._picture.body_poses(positions)[1].reshape(-1, 3))
         if t[-1] > 0.0:
             self._loop(t, q)
         else:
             self._pose(q[-1])
 
     def _loop(self, t: Floats, q: Floats) -> None:
-        """Let the page play a motion from the phase at which the last one is."""
+        """Let the page play a motion in a loop, from the phase of the previous one."""
         now, speed, tree = time.monotonic(), self._speed or 1.0, self.robot.tree
         end = float(t[-1]) / speed
         if self._loop_began == -math.inf:
@@ -418,7 +420,7 @@ class LiveView:
         phase = (now - self._loop_began) % end
         keys = int(np.clip(_KEYS // len(tree.parent), 10, max(10.0, min(300.0, 30.0 * end))))
         times = np.linspace(0.0, end, keys + 1)
-        # From the phase to the end, and from the start to the phase; in between it jumps.
+        # From the phase to the end, then from the start to the phase, with a jump in between.
         first, second = np.append(phase, times[times > phase]), np.append(times[times < phase], phase)
         clock = np.concatenate([first - phase, second + (end - phase) + 1e-6])
         rows = _positions(self.robot, rows_at(speed * np.concatenate([first, second]), t, q))
@@ -431,7 +433,7 @@ class LiveView:
         self._animated, self._q = True, q[0]
 
     def _stop_loop(self) -> None:
-        """Take the robot from the page's animation, which would go on moving it."""
+        """End the page's animation, which would continue to move the robot."""
         if not self._animated:
             return
         path = self._viewer[self._nodes[0]].path
@@ -445,54 +447,54 @@ class LiveView:
             self._viewer[node].delete()
         self._iterates, self._planned = [], -math.inf
 
-    def _say(self, words: str, *, last: bool = False) -> None:
-        """Write words above the robot, not more often than they can be read."""
+    def _show_text(self, words: str, *, last: bool = False) -> None:
+        """Show a text above the robot, not more often than every ``_TEXT_INTERVAL`` unless it is the last."""
         now = time.monotonic()
-        if words == self._told or (now - self._last_words < _WORDS and not last):
+        if words == self._text or (now - self._text_time < _TEXT_INTERVAL and not last):
             return
         size = self._stage.size
-        low, high = self._room.min(axis=0), self._room.max(axis=0)
+        low, high = self._in_view.min(axis=0), self._in_view.max(axis=0)
         pose = np.eye(4)
         pose[:3, 3] = [*(0.5 * (low + high))[:2], low[2]]
         self._viewer["notes/words"].set_transform(pose)
         self._viewer["notes/words"].set_object(marks.Label(words, _LABEL * size, 0.0))
-        self._told, self._last_words = words, now
+        self._text, self._text_time = words, now
 
 
 class _Window(ViewerWindow):
-    """A server of meshcat's, of which it is known whether a browser is there and that it answers.
+    """A meshcat server that reports whether browsers are connected, and whose answers have a time limit.
 
     Attributes:
-        came: Set once a browser has come.
-        watched: Whether one is there now.
-        lost: Whether the server is gone.
+        connected: Set once a browser has connected.
+        watched: Whether a browser is connected now.
+        lost: Whether the server has ended.
     """
 
     def __init__(self) -> None:
-        self.came = threading.Event()
+        self.connected = threading.Event()
         self.lost = False
         self._browsers = 0
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(zmq_url=None, start_server=True, server_args=[])
-        # The server writes a line for each browser that comes or goes.
+        # The server writes a line for each browser that connects or disconnects.
         threading.Thread(target=self._listen, daemon=True).start()
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is there."""
+        """Whether a browser is connected."""
         return self._browsers > 0
 
     def connect_zmq(self) -> None:
-        """Connect, so that an answer that Ctrl-C kept from being read, or that never comes, holds nothing up."""
+        """Connect to the server; an answer that is missing, or unread because of Ctrl-C, does not block."""
         self.zmq_socket = self.context.socket(zmq.REQ)
         for option in (zmq.REQ_RELAXED, zmq.REQ_CORRELATE):
             self.zmq_socket.setsockopt(option, 1)
-        self.zmq_socket.setsockopt(zmq.RCVTIMEO, int(1000 * _ANSWER))
+        self.zmq_socket.setsockopt(zmq.RCVTIMEO, int(1000 * _ANSWER_LIMIT))
         self.zmq_socket.setsockopt(zmq.LINGER, 0)
         self.zmq_socket.connect(self.zmq_url)
 
     def send(self, command: Any) -> None:
-        """Send a command, and wait until the server has taken it."""
+        """Send a command, and wait until the server has accepted it."""
         words = lowered(command)
         self.zmq_socket.send_multipart([words["type"].encode(), words["path"].encode(), umsgpack.packb(words)])
         self.zmq_socket.recv()
@@ -501,12 +503,12 @@ class _Window(ViewerWindow):
         for line in self.server_proc.stderr:
             if line.startswith(b"opened:"):
                 self._browsers += 1
-                self.came.set()
+                self.connected.set()
             elif line.startswith(b"closed:"):
                 self._browsers -= 1
 
     def has_drawn(self, seconds: float) -> bool:
-        """Whether the browser has obeyed all commands within some seconds: it answers to them in their order."""
+        """Whether the browser has executed all commands within ``seconds``, as it executes them in order."""
         if not self.watched:
             return False
         self.zmq_socket.send_multipart([b"capture_image", b"", umsgpack.packb({"type": "capture_image"})])
@@ -524,11 +526,11 @@ class _Window(ViewerWindow):
 
 
 def _postures(robot: Robot, start: Floats) -> Floats:
-    """Configurations (S, n) [rad or m] around one that a robot may take, its limits kept."""
+    """Random configurations (S, n) [rad or m] around ``start``, within the limits."""
     lower, upper = robot.position_limits
-    room = np.where(robot.slides, 0.0, _TURN)
-    low = np.where(robot.slides & np.isfinite(lower), lower, np.maximum(lower, start - room))
-    high = np.where(robot.slides & np.isfinite(upper), upper, np.minimum(upper, start + room))
+    turn = np.where(robot.slides, 0.0, _TURN)
+    low = np.where(robot.slides & np.isfinite(lower), lower, np.maximum(lower, start - turn))
+    high = np.where(robot.slides & np.isfinite(upper), upper, np.minimum(upper, start + turn))
     shares = np.random.default_rng(0).random((_POSTURES, robot.dof))
     return np.asarray(low + shares * (high - low))
 
@@ -540,7 +542,7 @@ def _positions(robot: Robot, q: Floats) -> Floats:
 
 
 def _apart(points: Floats, least: float) -> Floats:
-    """Points (P, 3) that are apart from the one before by so much [m] at least, the first and the last among them."""
+    """Points of a path (P, 3) at least ``least`` [m] from the previous one kept, the first and the last among them."""
     kept = [0]
     for k in range(1, len(points)):
         if np.linalg.norm(points[k] - points[kept[-1]]) > least:
@@ -551,9 +553,9 @@ def _apart(points: Floats, least: float) -> Floats:
 
 
 def _rod(a: Floats, b: Floats) -> Floats:
-    """Where a rod of length 1 along z is between two places (4, 4)."""
-    way, pose = b - a, np.eye(4)
-    length = float(np.linalg.norm(way))
-    pose[:3, :3] = (z_to(way / length) if length > 0.0 else np.eye(3)) @ np.diag([1.0, 1.0, length])
+    """Transform (4, 4), scaling included, that puts a rod of length 1 along z between two points."""
+    span, pose = b - a, np.eye(4)
+    length = float(np.linalg.norm(span))
+    pose[:3, :3] = (z_to(span / length) if length > 0.0 else np.eye(3)) @ np.diag([1.0, 1.0, length])
     pose[:3, 3] = 0.5 * (a + b)
     return pose

@@ -149,9 +149,9 @@ def replay(
         )
     runs = [run if _is_run(run) else None for _, run in shown]
     pairs = [(arm, _moved(moved)) for arm, moved in shown]
-    own = [moved.dt for _, moved in pairs if isinstance(moved, Trajectory)]
-    if dt is not None and len(own) == len(pairs):
-        raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {own[0]:g} s")
+    steps = [moved.dt for _, moved in pairs if isinstance(moved, Trajectory)]
+    if dt is not None and len(steps) == len(pairs):
+        raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {steps[0]:g} s")
     motions = [
         _motion(arm, moved, dt, f"motion {k + 1}" if several else "motion") for k, (arm, moved) in enumerate(pairs)
     ]
@@ -254,9 +254,9 @@ def _shares(
     pairs: Sequence[tuple[Robot, Trajectory | ArrayLike]], torques: Sequence[Any], limit: JointValues | None
 ) -> list[Floats | None]:
     """:func:`torque_shares` of each robot; the limit is of those that are coloured."""
-    hidden = [isinstance(own, bool | np.bool_) and not own for own in torques]
+    hidden = [isinstance(torque, bool | np.bool_) and not torque for torque in torques]
     limits = [None if out and not all(hidden) else limit for out in hidden]
-    return [torque_shares(*pair, own, bound) for pair, own, bound in zip(pairs, torques, limits, strict=True)]
+    return [torque_shares(*pair, torque, bound) for pair, torque, bound in zip(pairs, torques, limits, strict=True)]
 
 
 def _pairs(robot: Robot | Sequence[tuple[Robot, Motion]], motion: Motion | None) -> list[tuple[Robot, Motion]]:
@@ -302,8 +302,8 @@ def _nodes(robot: Robot, title: str, name: str, motion: Trajectory) -> tuple[Flo
             f"{robot.name!r} has joints {', '.join(robot.joint_names)}"
         )
     for what in ("rotation", "translation"):
-        made, own = motion.scene_values.get(what), getattr(robot.tree, what)
-        if made is not None and not (made.shape == own.shape and np.allclose(made, own, rtol=1e-6, atol=1e-9)):
+        made, given = motion.scene_values.get(what), getattr(robot.tree, what)
+        if made is not None and not (made.shape == given.shape and np.allclose(made, given, rtol=1e-6, atol=1e-9)):
             raise InputError(
                 f"the {title} is of robot {motion.robot!r}, whose joints lie otherwise than those of {robot.name!r}, "
                 "which have the same names"

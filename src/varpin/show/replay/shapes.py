@@ -79,7 +79,7 @@ class ShapeLoader(MeshcatVisualizer):
         """Send a Wavefront file, each of its materials as a mesh of its own."""
         parts = wavefront.parts(Path(shape.meshPath))
         for k, part in enumerate(parts):
-            own = node if len(parts) == 1 else f"{node}/{k}"
+            path = node if len(parts) == 1 else f"{node}/{k}"
             color = _hex(shape.meshColor if shape.overrideMaterial or part.color is None else part.color)
             opacity = float(shape.meshColor[3]) if shape.overrideMaterial else part.opacity
             texture = shape.meshTexturePath or ("" if shape.overrideMaterial else part.texture)
@@ -88,7 +88,7 @@ class ShapeLoader(MeshcatVisualizer):
             )
             if texture and part.mapped:
                 material.map, material.color = _picture(texture), _WHITE
-            self.viewer[own].set_object(meshcat.geometry.MeshGeometry(part.text, "obj"), material)
+            self.viewer[path].set_object(meshcat.geometry.MeshGeometry(part.text, "obj"), material)
         self.viewer[node].set_transform(placement.homogeneous @ np.diag([*shape.meshScale, 1.0]))
 
     def _load_textured(self, shape: pin.GeometryObject, placement: pin.SE3, node: str) -> bool:

@@ -44,9 +44,9 @@ def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None,
         raise InputError(
             f"constraints must be True or False, a Scene or an OptimalControlProblem, got {type(given).__name__}"
         )
-    own = scene.robot
-    if own.joint_names != robot.joint_names or not own.built_like(robot):
-        raise InputError(f"constraints are of robot {own.name!r}, another one than {robot.name!r}, which is shown")
+    planned = scene.robot
+    if planned.joint_names != robot.joint_names or not planned.built_like(robot):
+        raise InputError(f"constraints are of robot {planned.name!r}, another one than {robot.name!r}, which is shown")
     if source is scene:
         return scene, (), 0.0
     return scene, tuple(source.constraints), float(source.t0)  # type: ignore[attr-defined]
@@ -77,9 +77,9 @@ def regions(constraints: Sequence[PlanConstraint], times: Floats) -> tuple[Regio
     from varpin.control import constraints as kinds  # noqa: PLC0415 - few replays need controllers imported
 
     found: dict[Any, Region] = {}
-    for own in constraints:
-        if isinstance(own, kinds.KeepClear):
-            for body in own.obstacles:
+    for constraint in constraints:
+        if isinstance(constraint, kinds.KeepClear):
+            for body in constraint.obstacles:
                 half = None if body.sides is None else 0.5 * body.sides
                 box = None if half is None else np.array([-half, half])
                 ends, way = (body.begin, body.end), None
@@ -89,17 +89,17 @@ def regions(constraints: Sequence[PlanConstraint], times: Floats) -> tuple[Regio
                 region = Region("obstacle", body.name, *ends, body.radius, box, body.rotation, way)
                 # One obstacle may be that of several constraints.
                 found[repr(body)] = region
-        elif isinstance(own, kinds.KeepInSphere | kinds.KeepOutOfSphere):
-            kind = "out" if own.outside else "in"
-            centers = own.shifts(times)
-            way = centers - centers[0] if callable(own.center) else None
-            found[own] = Region(kind, own.frame, centers[0], centers[0], own.radius, way=way)  # type: ignore[arg-type]
-        elif isinstance(own, kinds.KeepInBox):
-            found[own] = Region("in", own.frame, np.zeros(3), np.zeros(3), 0.0, own.limits)
-        elif isinstance(own, kinds.KeepInHalfSpace):
+        elif isinstance(constraint, kinds.KeepInSphere | kinds.KeepOutOfSphere):
+            kind = "out" if constraint.outside else "in"
+            centers = constraint.shifts(times)
+            way = centers - centers[0] if callable(constraint.center) else None
+            found[constraint] = Region(kind, constraint.frame, centers[0], centers[0], constraint.radius, way=way)  # type: ignore[arg-type]
+        elif isinstance(constraint, kinds.KeepInBox):
+            found[constraint] = Region("in", constraint.frame, np.zeros(3), np.zeros(3), 0.0, constraint.limits)
+        elif isinstance(constraint, kinds.KeepInHalfSpace):
             plane = np.array([[-np.inf, -np.inf, 0.0], [np.inf, np.inf, 0.0]])
-            place = own.offset * own.normal
-            found[own] = Region("in", own.frame, place, place, 0.0, plane, z_to(own.normal))
+            place = constraint.offset * constraint.normal
+            found[constraint] = Region("in", constraint.frame, place, place, 0.0, plane, z_to(constraint.normal))
     return tuple(found.values())
 
 
@@ -110,9 +110,9 @@ def goals(constraints: Sequence[PlanConstraint], taken: Sequence[Target]) -> tup
     from varpin.control.constraints import ReachFrame  # noqa: PLC0415 - as above
 
     found = []
-    for own in constraints:
-        if isinstance(own, ReachFrame) and own.position is not None:
-            place = own.position
+    for constraint in constraints:
+        if isinstance(constraint, ReachFrame) and constraint.position is not None:
+            place = constraint.position
             if not any(np.allclose(target.places[-1], place, atol=1e-9) for target in taken):
-                found.append(Target(f"goal of {own.frame}", place[None]))
+                found.append(Target(f"goal of {constraint.frame}", place[None]))
     return tuple(found)

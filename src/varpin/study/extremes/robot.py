@@ -158,9 +158,9 @@ def check_robot(
         RobotError: There is no such robot, or its file cannot be read.
         InputError: ``patience`` is not positive.
     """
-    own = robot if isinstance(robot, Robot) else load_robot(robot)
+    arm = robot if isinstance(robot, Robot) else load_robot(robot)
     limit = positive("patience", patience, "s")
-    jobs = [(m, i) for m in motions_of(own) for i in (INTEGRATORS if integrators is None else integrators)]
+    jobs = [(m, i) for m in motions_of(arm) for i in (INTEGRATORS if integrators is None else integrators)]
     cells: list[Cell] = []
     try:
         for motion, integrator in jobs:
@@ -169,7 +169,7 @@ def check_robot(
             cells.append(_cell(motion, integrator, limit))
     except KeyboardInterrupt:
         pass
-    return Record(tuple(cells), own.name, deep=False, missing=len(jobs) - len(cells))
+    return Record(tuple(cells), arm.name, deep=False, missing=len(jobs) - len(cells))
 
 
 def _cell(motion: Motion, integrator: Integrator, patience: float) -> Cell:

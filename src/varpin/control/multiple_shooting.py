@@ -1,0 +1,480 @@
+"""A search that starts on given states: forces of their own hold the motion there, and are taken away on the way.
+
+Equations (O14) and (O15) of docs/mathematics.md. A motion on given states, which no controls need be able to make, is
+one of the robot with a force of its own on every joint. What the forces of a step do to the state at its end is the gap
+of multiple shooting there. Each iteration first tries the step that closes all gaps, as FDDP does (Mastalli et al.,
+"Crocoddyl", 2020): the backward pass knows that the forces go. Where the motion does not follow the model so far, the
+forces are controls that cost something, more and more. When they are gone the motion is one of the controls alone, and
+single shooting goes on.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.control.backward import Along, Plan, backward, states
+from varpin.control.costs import CostError, Expansion
+from varpin.control.history import Iteration
+from varpin.control.penalties import PenalizedProblem
+from varpin.control.problem import OptimalControlProblem
+from varpin.core.arrays import Commands
+from varpin.errors import InputError, LinearizationError
+from varpin.linearization import linearize_steps, velocity_at_nodes
+from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.policy import LinearPolicy
+from varpin.mechanics.scene import Scene, assisted, quiet
+from varpin.simulation.run import Motions, StepFailure, named
+from varpin.support.checks import as_floats, finite_array
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+# How far the first of the states may be from the problem's [rad or m].
+_SAME = 1e-6
+# The natural frequency of what holds the first motion on the path, times a decision's period.
+_HOLDS = 0.25
+# Of the forces on the joints: less than this part of the largest one is none.
+_NONE = 1e-9
+# What a step must keep of the decrease that the model promises, how many times the rise it may be that the model
+# foresees, and the lengths that are tried.
+_KEEPS, _WORSE = 0.1, 2.0
+_LENGTHS = 0.5 ** np.arange(10)
+# What forces cost grows by this factor where the model promises no more than this part of what is paid.
+_DEARER, _SETTLED = 4.0, 0.1
+# The regularization after steps that are shorter than this, and where iterations end.
+_LONG, _LEAST, _GROWTH, _MOST = 0.25, 1e-6, 10.0, 1e6
+# What a trial may end with.
+_LOST = (StepFailure, CostError, CustomForceError)
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """States to start from, on a problem's nodes: q (N + 1, n) and v (N + 1, n)."""
+
+    q: Floats
+    v: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """A motion with forces on the joints.
+
+    Attributes:
+        trajectory: As of the problem, of which it is none.
+        full: As of the scene with forces on the joints.
+        cost: Of it; nothing is paid for these forces.
+    """
+
+    trajectory: Trajectory
+    full: Trajectory
+    cost: float
+
+
+def path_of(problem: OptimalControlProblem, given: object) -> Path:
+    """The states that a search is to start on, checked.
+
+    Raises:
+        InputError: They do not fit the problem, or do not begin where it does.
+    """
+    if problem.linear:
+        raise InputError("states are for held controls; the problem's are linear between nodes")
+    if problem.scene.inputs:
+        raise InputError(
+            "states do not go with a KinematicInput, whose control is where its joint is: give controls instead"
+        )
+    n, nodes, names = problem.scene.robot.dof, problem.steps + 1, problem.scene.robot.joint_names
+    q: object = given
+    v: object = None
+    if isinstance(given, Trajectory):
+        if given.joint_names != names:
+            raise InputError(
+                f"states: the motion is of joints {', '.join(given.joint_names)}, and the problem of {', '.join(names)}"
+            )
+        q, v = given.q, given.v
+    elif isinstance(given, tuple):
+        if len(given) != 2:
+            raise InputError(f"states must be q, or a pair (q, v), got {len(given)} arrays")
+        q, v = given
+    positions = _rows("states", q, (nodes, n))
+    off = np.abs(positions[0] - problem.q0)
+    joint = int(np.argmax(off))
+    if off[joint] > _SAME:
+        raise InputError(
+            f"states must begin at the problem's q0: joint {names[joint]!r} is at {positions[0, joint]:.6g} in their "
+            f"first row, and at {problem.q0[joint]:.6g} in q0"
+        )
+    lower, upper = problem.scene.robot.position_limits
+    beyond = np.maximum(positions - upper, lower - positions)
+    if beyond.max() > _SAME:
+        node, joint = divmod(int(np.argmax(beyond)), beyond.shape[1])
+        logger.warning(
+            "states: joint %r is %.4g rad or m beyond its limit at node %d", names[joint], beyond[node, joint], node
+        )
+    speeds = np.gradient(positions, problem.dt, axis=0) if v is None else _rows("states: v", v, (nodes, n))
+    speeds[0] = problem.v0
+    return Path(positions, speeds)
+
+
+def _rows(name: str, given: object, shape: tuple[int, int]) -> Floats:
+    array = as_floats(name, given)
+    if array.ndim == 2 and array.shape[1] == shape[1] and array.shape[0] != shape[0]:
+        raise InputError(
+            f"{name} must have a row for each of {shape[0]} nodes, the first and the last included, got "
+            f"{array.shape[0]}: numpy.interp makes as many of others"
+        )
+    return finite_array(name, array, shape).copy()
+
+
+class GapClosing:
+    """Iterations on a motion that starts on given states, until the controls alone make it.
+
+    Attributes:
+        history: Of the iterations so far.
+        motion: The motion so far.
+        left: Of the forces that the first motion has, the part that is left.
+    """
+
+    def __init__(self, problem: OptimalControlProblem, path: Path, controls: Floats | None) -> None:
+        """Make the first motion.
+
+        Args:
+            problem: What to minimize. What its noise adds is left to the search that follows.
+            path: The states.
+            controls: Those that go with them (R, m); the inverse dynamics' within their limits if left out.
+
+        Raises:
+            StepFailure: The motion cannot be integrated.
+            CostError: Its cost is not finite.
+        """
+        scene, own = assisted(problem.scene), quiet(problem.scene)
+        self.scene, self.problem = scene, problem.changed(scene=own)
+        if isinstance(problem, PenalizedProblem):
+            # The rows of penalties are those of the motion so far, and not of what passes expect of it.
+            self.problem = self.problem.changed(passes=0)
+        self.history: list[Iteration] = []
+        self.left = 1.0
+        n, m = own.robot.dof, own.controls
+        M = lagrangian_jet(own, problem.q0, np.zeros(n)).Lvv
+        omega = _HOLDS / problem.period
+        hold = -np.hstack([omega**2 * M, 2.0 * omega * (np.eye(n) if problem.integrator.variational else M)])
+        self._weight = np.linalg.inv(M)
+        self._motions = Motions(scene, problem.integrator, problem.q0, problem.v0, problem.dt)
+        self._gains = np.tile(np.linalg.pinv(own.actuation) @ hold, (problem.decisions, 1, 1))
+        u, force = _inverse_dynamics(problem, path, controls)
+        gains = np.zeros((problem.decisions, m + n, 2 * n))
+        gains[:, m:] = hold
+        at = path.q, path.v
+        if problem.integrator.variational:
+            at = path.q, np.array([lagrangian_jet(own, q, v).Lv for q, v in zip(*at, strict=True)])
+        self.motion = self._rolled(np.hstack([u, force]), gains, np.hstack(at)[: -1 : problem.hold])
+        if controls is None:
+            # What held the motion on the path is the controls' as far as they can.
+            force = self.motion.full.u @ scene.actuation.T
+            u = np.clip(force @ np.linalg.pinv(own.actuation).T, *problem.control_limits)
+            self.motion = self._of(replace(self.motion.full, u=np.hstack([u, force - u @ own.actuation.T])))
+        if not np.isfinite(self.motion.cost):
+            culprits = " + ".join(map(repr, problem.not_finite(self.motion.trajectory) or problem.cost.terms))
+            raise CostError(culprits, f"the cost of the motion along the states is {self.motion.cost}")
+        self._dearest = self._holding_cost()
+        self._first = float(np.linalg.norm(self.motion.full.u[:, m:]))
+        if self._first <= _NONE * np.linalg.norm(self.motion.full.u @ scene.actuation.T):
+            self.left = 0.0
+        # To begin with the forces cost what the motion does.
+        self._price = 1.0
+        self._price = self.motion.cost / (self._bill(self.motion) or 1.0)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the controls alone make the motion."""
+        return self.left == 0.0
+
+    def policy(self) -> LinearPolicy:
+        """The controls of the motion, with feedback that keeps next to it."""
+        problem, motion = self.problem, self.motion.trajectory
+        limits = problem.control_limits
+        return LinearPolicy(
+            problem.decided(motion),
+            self._gains,
+            states(problem, motion)[: -1 : problem.hold],
+            problem.hold,
+            "momentum" if problem.integrator.variational else "velocity",
+            (limits[0], limits[1]),
+            period=problem.period,
+        )
+
+    def run(self, iterations: int, deadline: float, report: Callable[[Iteration, Trajectory], None]) -> None:
+        """Take the forces away, in so many iterations at most; it may end with some left."""
+        regularization = 0.0
+        while not self.closed and len(self.history) < iterations and time.perf_counter() <= deadline:
+            started = time.perf_counter()
+            try:
+                item = self._iterate(regularization)
+            except (CostError, CustomForceError, LinearizationError) as error:
+                logger.info("states: %s", error)
+                break
+            item = replace(item, index=len(self.history), seconds=time.perf_counter() - started)
+            self.history.append(item)
+            logger.info("states, forces of %.3g of their first size: %s", self.left, item)
+            report(item, self.motion.trajectory)
+            if item.step >= _LONG:
+                regularization = regularization / _GROWTH if regularization > _LEAST else 0.0
+                if item.expected_decrease <= _SETTLED * (item.cost + self._bill(self.motion)):
+                    self._price *= _DEARER
+            else:
+                regularization = max(_LEAST, _GROWTH * item.regularization)
+                if regularization > _MOST:
+                    break
+        if not self.closed:
+            logger.info("states: forces of %.3g of their first size are left; the search goes on without", self.left)
+
+    def _rolled(self, u: Floats, gains: Floats, reference: Floats) -> _Motion:
+        """The motion under controls and forces (R, m + n) with feedback."""
+        problem = self.problem
+        free = np.outer([-np.inf, np.inf], np.ones(problem.scene.robot.dof))
+        commands = Commands(
+            u=u,
+            gains=gains,
+            reference=reference,
+            hold=problem.hold,
+            limits=np.hstack([problem.control_limits, free]),
+            before=np.zeros((0, u.shape[1])),
+        )
+        full, failure = self._motions.under(commands)
+        if failure is not None:
+            raise StepFailure(full.steps, full.t[-1], named(problem.scene, failure), self._own(full))
+        return self._of(full)
+
+    def _own(self, full: Trajectory) -> Trajectory:
+        """A motion of the scene with forces on the joints as one of the problem's, which it is none of."""
+        m = self.problem.scene.controls
+        return replace(
+            full, u=full.u[:, :m].copy(), u_stages=full.u_stages[:, :, :m], scene_values=self.problem.scene.values
+        )
+
+    def _of(self, full: Trajectory) -> _Motion:
+        own = self._own(full)
+        return _Motion(own, full, float(self.problem.shares(own).sum()))
+
+    def _holding_cost(self) -> float:
+        """The cost of the motion that a search starts with that is given nothing."""
+        problem, own = self.problem, self.problem.integrator
+        n, m = problem.scene.robot.dof, problem.scene.controls
+        commands = problem.holding_policy().commands(problem.steps, m, n, own.variational, problem.dt, own.stage_times)
+        try:
+            motion, failure = Motions(problem.scene, own, problem.q0, problem.v0, problem.dt).under(commands)
+            return np.inf if failure is not None else float(problem.shares(motion).sum())
+        except _LOST:
+            return np.inf
+
+    def _iterate(self, regularization: float) -> Iteration:
+        """Take all forces away at once, if that leads where the model says; else make them smaller."""
+        motion, trials, passes = self.motion, 0, 0
+        length = 0.0
+        closed = self._closed(regularization)
+        if closed is not None:
+            (rise, gradient), passes, trials, length = closed, 2, 1, float(self.closed)
+        if not self.closed:
+            length, rise, gradient, more = self._smaller(regularization)
+            passes, trials = passes + 1, trials + more
+        return Iteration(
+            index=0,
+            cost=self.motion.cost,
+            noise_cost=0.0,
+            expected_decrease=-rise,
+            decrease=motion.cost - self.motion.cost,
+            step=length,
+            regularization=regularization,
+            gradient=gradient,
+            backward_passes=passes,
+            rollouts=trials,
+            seconds=0.0,
+        )
+
+    def _closed(self, regularization: float) -> tuple[float, float] | None:
+        """Try the step of multiple shooting that takes all forces away.
+
+        The rise of the cost that the model expects of it, and the gradient's largest entry.
+        """
+        problem, motion, m = self.problem, self.motion, self.problem.scene.controls
+        around = _Around(problem, self.scene, motion)
+        plan = backward(problem, motion.trajectory, regularization, along=around)
+        if plan is None:
+            return None
+        # Where the states go when the forces do, under the plan's feedback; and from there as in any pass.
+        x, u = around.responded(plan, np.zeros_like(plan.feedforward), forces=True)
+        shifted = around.moved(x, u)
+        found = backward(problem, motion.trajectory, regularization, along=shifted)
+        if found is None:
+            return None
+        more_x, more_u = shifted.responded(found, found.feedforward, forces=False)
+        x, u = x + more_x, u + more_u
+        rise = around.change(x, u)
+        at, old = states(problem, motion.trajectory)[: -1 : problem.hold], motion.full.u[:: problem.hold]
+        gains, commands = np.zeros((*old.shape, at.shape[1])), np.zeros_like(old)
+        gains[:, :m], commands[:, :m] = found.feedback, old[:, :m] + u
+        gradient = float(np.abs(found.free_gradient(problem, motion.trajectory)).max())
+        try:
+            trial = self._rolled(commands, gains, at + x[: -1 : problem.hold])
+        except _LOST as error:
+            logger.info("states: without forces: %s", error)
+            return rise, gradient
+        promised = _WORSE * rise if rise > 0.0 else _KEEPS * rise
+        if trial.cost - motion.cost <= promised and trial.cost <= max(self._dearest, 2.0 * motion.cost):
+            self.motion, self._gains, self.left = trial, found.feedback, 0.0
+        return rise, gradient
+
+    def _smaller(self, regularization: float) -> tuple[float, float, float, int]:
+        """A step of the search in which the forces are controls that cost something.
+
+        The length of the step, the rise that the model expects of it, the gradient's largest entry and the trials.
+        """
+        problem, motion, n, m = self.problem, self.motion, self.problem.scene.robot.dof, self.problem.scene.controls
+        assisted = problem.changed(
+            scene=self.scene,
+            control_limits=np.hstack([problem.control_limits, np.outer([-np.inf, np.inf], np.ones(n))]),
+        )
+        plan = backward(assisted, motion.full, regularization, along=self._priced(assisted))
+        if plan is None:
+            return 0.0, np.nan, np.nan, 0
+        at, old = states(problem, motion.trajectory)[: -1 : problem.hold], motion.full.u[:: problem.hold]
+        here = motion.cost + self._bill(motion)
+        length, trials = 0.0, 0
+        for step in _LENGTHS:
+            trials += 1
+            try:
+                trial = self._rolled(old + step * plan.feedforward, plan.feedback, at)
+            except _LOST as error:
+                logger.info("states: trial of length %g: %s", step, error)
+                continue
+            if trial.cost + self._bill(trial) - here <= _KEEPS * step * plan.slope:
+                self.motion, self._gains = trial, plan.feedback[:, :m]
+                length, self.left = float(step), float(np.linalg.norm(trial.full.u[:, m:])) / self._first
+                break
+        gradient = float(np.abs(plan.free_gradient(assisted, motion.full)).max())
+        return length, -plan.expected_decrease, gradient, trials
+
+    def _bill(self, motion: _Motion) -> float:
+        """What the forces cost."""
+        force = motion.full.u[:, self.problem.scene.controls :]
+        return 0.5 * self._price * self.problem.dt * float(np.einsum("Na,ab,Nb->", force, self._weight, force))
+
+    def _priced(self, assisted: OptimalControlProblem) -> Along:
+        """What passes along the motion are made from in which the forces are controls."""
+        problem, motion = self.problem, self.motion
+        m, samples, x = problem.scene.controls, len(problem.model_rule), 2 * problem.scene.robot.dof
+        own = Along(problem, motion.trajectory)
+        along = Along(assisted.changed(rate=None), motion.full)
+        along.problem = assisted
+        size = x + self.scene.controls
+        price = self._price * self._weight
+        running = own.running
+        gradient, hessian = np.zeros((len(running.gradient), size)), np.zeros((len(running.gradient), size, size))
+        gradient[:, : x + m], hessian[:, : x + m, : x + m] = running.gradient, running.hessian
+        # Samples of a step weigh the same, and share what forces cost in it.
+        share = 1.0 / (samples * float(problem.rule[0, 0]))
+        gradient[:, x + m :] = share * np.repeat(motion.full.u[:, m:] @ price, samples, axis=0)
+        hessian[:, x + m :, x + m :] = share * price
+        along.running, along.terminal = Expansion(gradient, hessian), own.terminal
+        if problem.rate is not None:
+            R, k = problem.decisions, self.scene.controls
+            along.pull, along.rate = np.zeros((R, k)), np.zeros((R, k, k))
+            along.pull[:, :m], along.rate[:, :m, :m] = own.pull, own.rate
+        return along
+
+
+class _Around(Along):
+    """What passes along a motion with forces on the joints are made from."""
+
+    def __init__(self, problem: OptimalControlProblem, scene: Scene, motion: _Motion) -> None:
+        super().__init__(problem, motion.trajectory)
+        m, n, q, v = problem.scene.controls, problem.scene.robot.dof, motion.trajectory.q, motion.trajectory.v
+        lin = linearize_steps(scene, motion.full, problem.integrator, problem.q0)
+        # What taking the forces away does to the end of each step.
+        self.gap = -np.einsum("Nxf,Nf->Nx", lin.B[:, :, m:], motion.full.u[:, m:])
+        self.rates = velocity_at_nodes(problem.scene, q, v) if problem.integrator.variational else None
+        own = replace(lin, B=np.ascontiguousarray(lin.B[:, :, :m]), Gu=lin.Gu[:, :, :, :m])
+        self.blocks = [(0, problem.steps)]
+        self.kept = own, np.zeros((0, n, 2 * n)) if self.rates is None else self.rates
+
+    def responded(self, plan: Plan, ahead: Floats, *, forces: bool) -> tuple[Floats, Floats]:
+        """Where the linearized motion goes: states (N + 1, 2n) and controls (R, m), less the nominal ones.
+
+        ``ahead`` (R, m) is what controls do beside the plan's feedback; with ``forces`` these go away.
+        """
+        problem, (lin, _) = self.problem, self.linearized(0, self.problem.steps)
+        x, u = np.zeros((problem.steps + 1, lin.A.shape[1])), np.zeros_like(ahead)
+        for j in range(problem.steps):
+            k = j // problem.hold
+            if j % problem.hold == 0:
+                u[k] = ahead[k] + plan.feedback[k] @ x[j]
+                if plan.previous is not None and k > 0:
+                    u[k] += plan.previous[k] @ u[k - 1]
+                if self.slack.size:
+                    u[k] = np.clip(u[k], *self.slack[k])
+            x[j + 1] = lin.A[j] @ x[j] + lin.B[j] @ u[k]
+            if forces:
+                x[j + 1] += self.gap[j]
+        return x, u
+
+    def _at_samples(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
+        """Changes of (q, v, u) at the samples of the cost and of (q, v) at the end, of those of states and controls."""
+        problem, n = self.problem, self.problem.scene.robot.dof
+        q, v = x[:, :n], x[:, n:] if self.rates is None else np.einsum("Nvx,Nx->Nv", self.rates, x)
+        samples = np.concatenate(problem.model_samples(q, v, np.repeat(u, problem.hold, axis=0)), axis=1)
+        return samples, np.concatenate([q[-1], v[-1]])
+
+    def moved(self, x: Floats, u: Floats) -> _Around:
+        """The same as it is after changes of states (N + 1, 2n) and controls (R, m), by the quadratic model."""
+        there, (samples, end) = copy(self), self._at_samples(x, u)
+        there.added = _products(self.running.hessian, samples)
+        final, D = self.terminal, self.terminal.slopes
+        pull = final.cost.gradient + end @ final.cost.hessian[0]
+        there.terminal = final._replace(cost=replace(final.cost, gradient=pull), gradient=(pull @ D)[0])
+        there.slack = self.slack - u[:, None] if self.slack.size else self.slack
+        change = np.diff(u, axis=0, prepend=np.zeros_like(u[:1]))
+        there.pull = self.pull + np.einsum("kab,kb->ka", self.rate, change) if self.pull.size else self.pull
+        return there
+
+    def change(self, x: Floats, u: Floats) -> float:
+        """By how much changes of states (N + 1, 2n) and controls (R, m) make the motion dearer, by the model."""
+        weight, (samples, end) = self.problem.dt * float(self.problem.rule[0, 0]), self._at_samples(x, u)
+        final = self.terminal.cost
+        slope = weight * float((self.running.gradient * samples).sum()) + float(final.gradient[0] @ end)
+        curvature = weight * float((_products(self.running.hessian, samples) * samples).sum())
+        curvature += float(end @ final.hessian[0] @ end)
+        if self.pull.size:
+            change = np.diff(u, axis=0, prepend=np.zeros_like(u[:1]))
+            slope += float((self.pull * change).sum())
+            curvature += float(np.einsum("ka,kab,kb->", change, self.rate, change))
+        return slope + 0.5 * curvature
+
+
+def _products(hessian: Floats, z: Floats) -> Floats:
+    """H z at each point (K, size)."""
+    found: Floats = z @ hessian[0] if len(hessian) == 1 else (hessian @ z[:, :, None])[:, :, 0]
+    return found
+
+
+def _inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Floats | None) -> tuple[Floats, Floats]:
+    """The controls (R, m) that come closest to making a motion on the path, and the forces (R, n) that are missing."""
+    scene, hold = problem.scene, problem.hold
+    q, v = 0.5 * (path.q[:-hold:hold] + path.q[hold::hold]), np.diff(path.q[::hold], axis=0) / problem.period
+    a = np.diff(path.v[::hold], axis=0) / problem.period
+    jets = [lagrangian_jet(scene, *at) for at in zip(q, v, strict=True)]
+    needed = np.array([jet.Lvv @ a[k] + jet.Lvq @ v[k] - jet.Lq for k, jet in enumerate(jets)])
+    # Servos that stay where they are pull at nothing.
+    still = np.array([scene.command_at(at) for at in q]) @ scene.actuation.T
+    needed += still - scene.core.forces(q, v, still)[0]
+    if controls is None:
+        controls = np.clip(needed @ np.linalg.pinv(scene.actuation).T, *problem.control_limits)
+    return controls, needed - controls @ scene.actuation.T

@@ -1,0 +1,180 @@
+"""Searches that start on states: where they end, in how many iterations, and what they refuse."""
+
+import logging
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import varpin as vp
+from varpin.control import Status
+
+STEPS = 50
+
+
+def sliders():
+    """Two sliders one on the other: a linear robot."""
+    model, at = pin.Model(), 0
+    for name, mass in (("a", 2.0), ("b", 1.0)):
+        at = model.addJoint(at, pin.JointModelPX(), pin.SE3.Identity(), name)
+        model.appendBodyToJoint(at, pin.Inertia(mass, np.zeros(3), 0.01 * np.eye(3)), pin.SE3.Identity())
+    return vp.load_robot(model)
+
+
+def linear(**options):
+    """A linear problem with one control for two joints."""
+    scene = vp.Scene(sliders(), gravity=False, stiffness={"b": 3.0}, damping=0.1, actuation=["a"])
+    cost = vp.ControlCost(0.1) + vp.VelocityCost(0.1)
+    cost += vp.Terminal(vp.TrackingCost([1.0, 0.0], 100.0) + vp.VelocityCost(10.0))
+    return vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.04, steps=STEPS, **options)
+
+
+def reach(*extra, scene=None, **options):
+    """Two links to a posture."""
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1) if scene is None else scene
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
+    for term in extra:
+        cost = cost + term
+    return vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=1.2 / STEPS, steps=STEPS, **options)
+
+
+def line(end, steps=STEPS):
+    s = np.linspace(0.0, 1.0, steps + 1)[:, None]
+    return s * s * (3.0 - 2.0 * s) * np.asarray(end, dtype=float)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"integrator": vp.RungeKutta4()}, {"hold": 5}, {"sampling": "midpoint"}, {"integrator": vp.Radau(2)}],
+)
+def test_a_linear_problem_takes_one_step(options):
+    problem = linear(**options)
+    own, found = vp.solve(problem), vp.solve(problem, states=line([1.0, 0.3]))
+    assert found.status.converged
+    assert [row.step for row in found.history] == [1.0, 0.0]
+    assert found.cost == pytest.approx(own.cost, rel=1e-12)
+    np.testing.assert_allclose(found.trajectory.q, own.trajectory.q, atol=1e-10)
+
+
+def test_underactuated_under_noise():
+    """Single shooting stalls far above, as the arm never gets near the goal."""
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1, actuation=["joint1"], noise=vp.ControlNoise(0.1))
+    problem = reach(scene=scene)
+    own = vp.solve(problem, max_iterations=25, check=False)
+    found = vp.solve(problem, states=line([1.0, 0.5]), check=False)
+    assert found.status.converged
+    assert found.iterations <= 25
+    assert found.cost < 0.01 * own.cost
+    assert found.noise_cost > 0.0
+    again = problem.simulate(found.policy)
+    assert problem.cost_of(again) == pytest.approx(found.cost, rel=1e-9)
+
+
+def test_the_first_motion_follows_the_path():
+    """All joints are driven, and nothing is missing."""
+    problem, path = reach(), line([1.0, 0.5])
+    found = vp.solve(problem, states=path, max_iterations=0, check=False)
+    np.testing.assert_allclose(found.trajectory.q, path, atol=2e-3)
+    for states in (found.trajectory, (found.trajectory.q, found.trajectory.v)):
+        again = vp.solve(problem, states=states, max_iterations=0, check=False)
+        np.testing.assert_allclose(again.trajectory.q, path, atol=4e-3)
+    given = vp.solve(problem, found.controls, states=path, max_iterations=0, check=False)
+    np.testing.assert_allclose(given.trajectory.q, path, atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["limits", "rate", "true cost"])
+def test_what_goes_with_it(kind):
+    problem = reach(*([vp.ControlRateCost(1e-3)] if kind == "rate" else []))
+    if kind == "limits":
+        problem = reach(control_limits=(-30.0, 30.0))
+    options = {"true_cost": 0.01} if kind == "true cost" else {}
+    found = vp.solve(problem, states=line([1.0, 0.5]), check=False, **options)
+    assert found.status.converged
+    # As cheap as what a search of its own makes of it.
+    assert vp.solve(found.problem, found, check=False).cost == pytest.approx(found.cost, rel=1e-5)
+    if kind == "limits":
+        assert np.abs(found.controls).max() <= 30.0
+
+
+def test_around_an_obstacle():
+    """A path above the ball leads to a plan above it, where the search's own start swings below."""
+    arm = {name: ([0, 0, 0], [1, 0, 0], 0.05) for name in ("joint1", "joint2")}
+    ball = vp.Obstacle.sphere([1.4, 0.0, -1.35], 0.15)
+    problem = reach(constraints=[vp.KeepClear(vp.planar_chain(2), [ball], 0.02, capsules=arm)])
+    own = vp.solve(problem, check=False)
+    found = vp.solve(problem, states=line([1.0, 0.5]), check=False)
+    assert found.status.converged
+    assert found.violation <= 1e-9
+    assert found.cost < 0.2 * own.cost
+    with pytest.raises(vp.InputError, match="either states or resume"):
+        vp.solve(problem, resume=found, states=line([1.0, 0.5]))
+
+
+def test_resume_and_files(tmp_path):
+    problem = reach(scene=vp.Scene(vp.planar_chain(2), damping=0.1, actuation=["joint1"]))
+    path = line([1.0, 0.5])
+    whole = vp.solve(problem, states=path, check=False)
+    part = vp.solve(problem, states=path, check=False, max_iterations=whole.iterations - 3)
+    back = vp.Solution.load(part.save(tmp_path / "part.npz"), problem)
+    rest = vp.solve(problem, resume=back, check=False)
+    assert rest.iterations == whole.iterations
+    assert rest.trajectory.u.tobytes() == whole.trajectory.u.tobytes()
+    assert rest.gains.tobytes() == whole.gains.tobytes()
+
+
+def test_interrupted_while_gaps_are_closed():
+    problem = reach(scene=vp.Scene(vp.planar_chain(2), damping=0.1, actuation=["joint1"]))
+
+    def stop(row):
+        assert row.index == 0
+        raise KeyboardInterrupt
+
+    found = vp.solve(problem, states=line([1.0, 0.5]), callback=stop, check=False)
+    assert found.status is Status.INTERRUPTED
+    assert len(found.history) == 1
+    assert problem.cost_of(problem.simulate(found.controls)) < np.inf
+    assert vp.solve(problem, resume=found, check=False).status.converged
+
+
+def test_paths_beyond_limits_are_told_of(caplog):
+    robot = vp.load_robot("ur5")
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(np.zeros(6), 10.0))
+    problem = vp.OptimalControlProblem(vp.Scene(robot), cost, np.zeros(6), np.zeros(6), dt=0.02, steps=10)
+    path = np.zeros((11, 6))
+    path[5, 2] = 9.0
+    with caplog.at_level(logging.WARNING):
+        vp.solve(problem, states=path, max_iterations=0, check=False)
+    assert "joint 'elbow_joint' is" in caplog.text
+    assert "beyond its limit at node 5" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("states", "message"),
+    [
+        (line([1.0, 0.5], 20), r"a row for each of 51 nodes.*got 21"),
+        (np.zeros((51, 3)), r"states must have shape \(51, 2\)"),
+        (np.full((51, 2), np.nan), "states"),
+        (line([1.0, 0.5]) + np.array([0.0, 0.1]), r"begin at the problem's q0: joint 'joint2' is at 0.1"),
+        ((np.zeros((51, 2)),), r"a pair \(q, v\), got 1"),
+        ((np.zeros((51, 2)), np.zeros((50, 2))), "states: v must have a row for each of 51 nodes"),
+        ("path", "states"),
+    ],
+)
+def test_refused_states(states, message):
+    with pytest.raises(vp.InputError, match=message):
+        vp.solve(reach(), states=states)
+
+
+def test_refused_beside_states():
+    problem = reach()
+    plan = vp.solve(problem, max_iterations=0, check=False)
+    with pytest.raises(vp.InputError, match="without feedback"):
+        vp.solve(problem, plan, states=line([1.0, 0.5]))
+    with pytest.raises(vp.InputError, match="either states or resume"):
+        vp.solve(problem, resume=plan, states=line([1.0, 0.5]))
+    with pytest.raises(vp.InputError, match="held controls"):
+        vp.solve(reach(controls="linear"), states=line([1.0, 0.5]))
+    other = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.0], [0.0], dt=0.01, steps=3)
+    with pytest.raises(vp.InputError, match="of joints"):
+        vp.solve(problem, states=other)
