@@ -77,7 +77,7 @@ bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> beg
     for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {nodes, n});
     for (const auto& [array, name] : {std::pair{&again_q, "again_q"}, {&again_v, "again_v"}})
         require(*array, name, {windows, looks, n});
-    if (looks == 0 || length % looks != 0) throw std::invalid_argument("a window is not of so many like parts");
+    if (looks == 0 || length % looks != 0) throw std::invalid_argument("looks must divide the length of a window");
     for (std::size_t w = 0; w < windows; ++w) {
         if (begins(w) < 0 || static_cast<std::size_t>(begins(w)) + length >= nodes)
             throw std::invalid_argument("a window is beyond the motion");
