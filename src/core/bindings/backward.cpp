@@ -187,8 +187,7 @@ std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regulariz
     return pass.run(h, hold, regularization, steps, samples, changes, gains);
 }
 
-// The linearized motion under gains from `state`, which becomes the state at the end: expected (R, 2n + m), moves (R,
-// m).
+// The linearized motion under gains from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
 void foresee(int hold, const HeldSteps& given, const HeldGains& held, InOut<1> state, InOut<2> expected,
              InOut<2> moves) {
     const Gains gains = held.fitting(given, hold);

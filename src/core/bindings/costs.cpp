@@ -90,8 +90,7 @@ Out values(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
     return out;
 }
 
-// Gradient (N, 2n + m) and Hessian (N, 2n + m, 2n + m) of all terms; the Hessian is (1, 2n + m, 2n + m) if it is the
-// same for all rows.
+// Gradient (N, 2n + m) and Hessian (N, 2n + m, 2n + m) of all terms; one Hessian if it is the same for all rows.
 std::tuple<Out, Out> expand(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
     const std::size_t rows = rows_of(costs, q, v, u), size = static_cast<std::size_t>(costs.size());
     const std::size_t matrices = costs.linear() ? 1 : rows;

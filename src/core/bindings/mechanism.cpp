@@ -59,8 +59,7 @@ Element element_of(const std::string& kind, int coordinate, const std::vector<do
     throw std::invalid_argument("there is no element of kind " + kind);
 }
 
-// Couplings: name of the kind, bodies of both points (-1 for the world), numbers, with the positions of both points
-// first.
+// Couplings: name of the kind, bodies of both points (-1 for the world), numbers, from the positions of both points on.
 using NamedCouplings = std::vector<std::tuple<std::string, int, int, std::vector<double>>>;
 
 CoupledElement coupling_of(const std::string& kind, int a, int b, const std::vector<double>& values) {

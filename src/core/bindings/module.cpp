@@ -3,8 +3,7 @@
 
 NB_MODULE(_core, m) {
     m.doc() = "The compiled core.";
-    // A user's function may refer to the scene that owns it; such cycles at the exit of Python are no leaks of the
-    // core.
+    // A user's function may refer to the scene that owns it; such cycles at the exit of Python are no leaks.
     nanobind::set_leak_warnings(false);
     varpin::border::register_mechanism(m);
     varpin::border::register_kinematics(m);

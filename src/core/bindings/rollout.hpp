@@ -1,5 +1,4 @@
-// Common bindings of rollouts of the variational integrators and of the derivatives of their steps, with and without
-// constraints.
+// Common bindings of rollouts and derivatives of steps for the variational integrators, with and without constraints.
 #pragma once
 
 #include <nanobind/stl/tuple.h>

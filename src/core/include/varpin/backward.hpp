@@ -10,8 +10,9 @@
 //
 // and likewise in u; v0 grows by (1/2) sum_i g_i' S g_i. A cost (1/2) (u - w)' R (u - w) of the change from the
 // previous control w adds R to Q_uu and to Q_ww and -R to Q_uw at a decision: gains on w follow from the formula for x
-// with -R in place of Q_ux, and the value before the decision depends on (x, w). Equations (O2), (O4) and (O6) of
-// docs/mathematics.md.
+// with -R in place of Q_ux, and the value before the decision depends on (x, w).
+//
+// Equations (O2), (O4) and (O6) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>

@@ -557,8 +557,7 @@ class Collocation {
         return total;
     }
 
-    // (A_i' + F_v,i) x_i + (L_qq,i + F_q,i) h sum_j a_ij x_j into `change`, for the x in `delta`, the last solution of
-    // elimination.
+    // (A_i' + F_v,i) x_i + (L_qq,i + F_q,i) h sum_j a_ij x_j into `change`, for x in `delta`, the last solution.
     void change_of_slope(double h, std::vector<double>& change) {
         if (elimination) {
             elimination->change_of_slope(delta.data(), change.data());

@@ -1,8 +1,7 @@
 // Compensated sums, and angles without whole turns.
 //
 // The angle of a joint after a million turns has only nine decimals in floating point. The Lagrangian is periodic in
-// such an angle, so sweeps take it within one turn. Whole turns are counted separately, and the reported angle is
-// continuous.
+// such an angle, so sweeps take it within one turn. Whole turns are counted separately; the reported angle has them.
 #pragma once
 
 #include <cmath>

@@ -247,8 +247,7 @@ class Couplings {
         turning(arms, potential.slope, [&](int i, int j, const T& term) { Lqq[i * n + j] -= term; });
     }
 
-    // Adds the forces without potential to `out` (n), and writes their derivatives in q and v (n, n), which may be
-    // null.
+    // Adds the forces without potential to `out` (n); writes their derivatives by_q and by_v (n, n), which may be null.
     template <class T>
     void add_forces(int n, const T* q, const T* v, CouplingWorkspace<T>& workspace, JointForce<T>* out, T* by_q,
                     T* by_v) const {

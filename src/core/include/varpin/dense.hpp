@@ -65,8 +65,8 @@ inline void solve_lu(const double* lu, int n, Block block, const double* b, doub
     }
 }
 
-// LU with row pivoting; `order` (n) receives the permutation of rows. Returns the sign of the determinant, 0 if it is
-// not finite.
+// LU with row pivoting; `order` (n) receives the permutation of rows. Returns the sign of the determinant, 0 at a pivot
+// that is zero or not finite.
 inline int factor_lu_pivoting(double* a, int n, int* order) {
     int sign = 1;
     for (int i = 0; i < n; ++i) order[i] = i;

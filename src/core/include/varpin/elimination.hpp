@@ -91,8 +91,7 @@ void write_padded(const Six& a, const Vec3<double>& b, double* x) {
 }
 inline Motion<double> motion_at(const double* x) { return {{x[0], x[1], x[2]}, {x[3], x[4], x[5]}}; }
 
-// Functions of vectors (size) and row-major matrices (size, size) of even size. Sums of products have two parts, of
-// even and odd terms.
+// Functions of vectors (size) and row-major matrices (size, size) of even size. Sums add even and odd terms apart.
 template <int size>
 double product(const double* a, const double* b) {
     Pair sum = pair_at(a) * pair_at(b);

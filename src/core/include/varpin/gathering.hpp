@@ -1,5 +1,4 @@
-// Storage for the elimination of bodies one by one, from the last to the first, and for coordinates that several bodies
-// share.
+// Storage for the elimination of bodies, from the last to the first, and for coordinates that several bodies share.
 #pragma once
 
 #include <algorithm>

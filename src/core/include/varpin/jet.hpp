@@ -280,8 +280,7 @@ void project_mass(const Tree& tree, int j, Jet<T, Size>& w) {
     }
 }
 
-// Add the subtree of body j to its parent. Joints above an origin are prismatic: they need masses and linear momenta
-// only.
+// Add the subtree of body j to its parent. Joints above an origin are prismatic: only masses and linear momenta count.
 template <class T>
 [[gnu::always_inline]] inline void pass_inertia(const Body& link, const Inertia<T>& carried, Inertia<T>& up,
                                                 bool second) {

@@ -218,8 +218,7 @@ class VariationalLinearization {
         return both;
     }
 
-    // Add start' (z . d2(q1, p1)) start at the root in the stepper, after part_derivatives; `start` (2n, 3n) may be
-    // null.
+    // Add start' (z . d2(q1, p1)) start at the stepper's root, after part_derivatives; `start` (2n, 3n) may be null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
         const Tableau& tableau = equation.tableau;
@@ -289,8 +288,7 @@ class VariationalLinearization {
         }
     }
 
-    // Add the second derivatives of gamma . F of elements at stage i, which are diagonal, to `inner`, and those in f to
-    // H.
+    // Add the diagonal second derivatives of gamma . F of elements at stage i to `inner`, and those in f to H.
     void add_elements(double h, int i, const double* z, double* H) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
         const int w = 3 * n;

@@ -122,8 +122,7 @@ inline double fastest_damping(Inertias& inertias, const States& states, double l
     return fastest;
 }
 
-// Whether springs, servos or gravity advance the phase of a mode by more than a radian over h [s] in one of some
-// states.
+// Whether springs, servos or gravity advance a mode by more than a radian over h [s] in one of some states.
 inline bool pulls_fast(Inertias& inertias, const States& states, double h) {
     for (std::size_t r = 0; r < states.rows; ++r) {
         const std::size_t row = r * inertias.dof();

@@ -256,8 +256,7 @@ class StageElimination {
         }
     }
 
-    // Eliminate coordinate c with its u, l and D, to which its diagonal is added; multiplies sign_ by the sign of det
-    // D.
+    // Eliminate coordinate c with its u, l and D, to which its diagonal is added; updates sign_ by that of det D.
     void take_out(int c, const Factors& factors_here, double* X) {
         for (int k = 0; k < stages_ * stages_; ++k) lu_[k] += diagonal_[k * tree_->dof() + c];
         const int sign = factor_lu_pivoting(lu_.data(), stages_, rows_.data());

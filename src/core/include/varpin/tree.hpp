@@ -1,5 +1,4 @@
-// The robot as a tree of bodies, each on one joint about or along the z axis of its own frame, and the forces of a
-// scene.
+// The robot as a tree of bodies, each on one joint about or along the z axis of its own frame, in a scene.
 #pragma once
 
 #include <algorithm>

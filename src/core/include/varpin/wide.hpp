@@ -1,6 +1,5 @@
 // Whether the processor has vectors of four numbers. Functions that profit are compiled twice from one inlined
-// function, without fused multiply-add: the results are identical to those with vectors of two, with half the
-// instructions.
+// function, without fused multiply-add: identical results with half the instructions of vectors of two.
 #pragma once
 
 #if defined(__x86_64__) && defined(__GNUC__)
