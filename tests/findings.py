@@ -17,7 +17,7 @@ MARKS = {
     "unstable loop": "control loop",
     "period too long": "too fast for its period",
     "replay": "cannot be played again",
-    "between nodes": "between them",
+    "between nodes": "between nodes",
     "noise left out": "least cost without noise",
 }
 

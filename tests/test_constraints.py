@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import random_rotation
-from refusals import refused
+from refusals import refused, unnamed
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
@@ -400,8 +400,7 @@ def test_a_start_next_to_the_constraints_is_moved_onto_them(caplog):
     motion = vp.simulate(scene, off, [1.0, 1.0, 1.0, 1.0], dt=1e-2, steps=2)
     assert max(violations(scene, motion)) < 1e-12
     (said,) = motion.warnings
-    assert "q0 was moved by up to" in said
-    assert "v0 was changed by up to" in said
+    assert not unnamed(said, "q0", "v0")
     assert said in caplog.text
     assert vp.simulate(scene, q, v, dt=1e-2, steps=2).warnings == ()
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import pickle
-import re
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from refusals import refused
+from refusals import refused, unnamed
 
 import varpin as vp
 from varpin.model import geometry, readable_geometry
@@ -162,23 +161,22 @@ def test_shapes_and_locked_joints(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "facts"),
     [
-        (one(joint=HINGE.format('stiffness="2"')), r"joint springs \(1\)"),
-        (one(joint=HINGE.format('damping="2 0.5"')), r"nonlinear joint dampers \(1\)"),
-        (one(joint=HINGE.format('springdamper="0.1 1"')), r"springs and dampers by their time constant \(1\)"),
-        (one(MASS + TIP, '<option density="1.2" viscosity="0.01"/>'), r"forces of a fluid \(1\)"),
-        (one(compiler='boundmass="0.1"'), r"least masses and inertias \(1\)"),
-        (one(place='gravcomp="1"'), r"gravity compensation \(1\)"),
-        (one(MASS + TIP, '<equality><joint joint1="ja" joint2="jtip"/></equality>'), r"equality constraints \(1\)"),
-        (one(MASS + TIP, '<tendon><fixed name="f"><joint joint="ja" coef="1"/></fixed></tendon>'), r"tendons \(1\)"),
+        (one(joint=HINGE.format('stiffness="2"')), "joint springs"),
+        (one(joint=HINGE.format('damping="2 0.5"')), "nonlinear"),
+        (one(joint=HINGE.format('springdamper="0.1 1"')), "time constant"),
+        (one(MASS + TIP, '<option density="1.2" viscosity="0.01"/>'), "fluid"),
+        (one(compiler='boundmass="0.1"'), "least masses"),
+        (one(place='gravcomp="1"'), "gravity compensation"),
+        (one(MASS + TIP, '<equality><joint joint1="ja" joint2="jtip"/></equality>'), "equality constraints"),
+        (one(MASS + TIP, '<tendon><fixed name="f"><joint joint="ja" coef="1"/></fixed></tendon>'), "tendons"),
     ],
 )
-def test_what_is_left_out_is_told(tmp_path, caplog, text, words):
+def test_what_is_left_out_is_told(tmp_path, caplog, text, facts):
     vp.load_robot(written(tmp_path, text))
     (record,) = caplog.records
-    assert "which the model leaves out" in record.getMessage()
-    assert re.search(words, record.getMessage())
+    assert not unnamed(record.getMessage(), "leaves out", facts)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from chromium import animation, commands, picture, seek, shape_poses, visit
-from refusals import refused
+from refusals import naming, refused
 from scipy.spatial.transform import Rotation
 
 import varpin as vp
@@ -446,8 +446,7 @@ def test_a_missing_mesh_costs_its_own_link_only(browser, tmp_path, caplog):
     urdf.write_text(ARM)
     with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
         page = replay(vp.load_robot(urdf), [[0.0, 0.5]], dt=1.0, html=tmp_path / "arm.html")
-    assert "no_such_mesh.stl" in caplog.text
-    assert "drawing the skeleton of 'lower' instead" in caplog.text
+    assert naming(caplog.messages, "no_such_mesh.stl", "skeleton", "'lower'")
     drawn = [command for command in commands(page) if command["type"] == "set_object" and "shapes" in command["path"]]
     upper = [command for command in drawn if "/elbow/" not in command["path"]]
     assert [command["object"]["geometries"][0]["type"] for command in upper] == ["BoxGeometry"]

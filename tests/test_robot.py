@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import arm, joint, link, mimic, random_inertia, random_tree, write_urdf
-from refusals import refused
+from refusals import naming, refused
 
 import varpin as vp
 from varpin.model import bundled_robots, example_robot_data, geometry
@@ -200,7 +200,7 @@ class TestSources:
         with caplog.at_level(logging.WARNING):
             robot = vp.load_robot(pin.RobotWrapper(model, shapes, shapes))
         assert robot.joint_names == ("left", "left_tip", "right", "right_tip")
-        assert "reordered to left, left_tip, right, right_tip" in caplog.text
+        assert naming(caplog.messages, "left, left_tip, right, right_tip")
         assert [robot.model.names[shape.parentJoint] for shape in geometry(robot).geometryObjects] == list(parents)
         q, v = rng.normal(size=(2, 4))
         scene = vp.Scene(robot)
@@ -469,7 +469,7 @@ class TestMimic:
     def test_of_a_leader_that_is_not_there_stays_free(self, tmp_path, caplog):
         path = arm(tmp_path, inside=mimic("thumb"))
         assert vp.load_robot(path).joint_names == ("j1",)
-        assert "'j1' mimics 'thumb', which is not a moving joint" in caplog.text
+        assert naming(caplog.messages, "'j1'", "'thumb'")
 
     def test_free_makes_followers_coordinates(self, load):
         robot = vp.load_robot("panda", mimic="free")

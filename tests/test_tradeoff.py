@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from refusals import refused
+from refusals import naming, refused
 
 import varpin as vp
 from varpin.show.plots import plot_optimal_control_tradeoff, plot_work_precision
@@ -242,7 +242,7 @@ def test_interrupted_measurement_goes_on_where_it_stopped(tmp_path, monkeypatch,
 
     with caplog.at_level(logging.WARNING, "varpin"):
         part = vp.work_precision(spring(), [0.7], [0.3], integrators=four, progress=interrupt, **options)
-    assert "interrupted after 3 of 8 runs" in caplog.text
+    assert naming(caplog.messages, "3 of 8")
     assert (len(part.runs), part.missing) == (3, 5)
     assert vp.WorkPrecision.load(path).runs == part.runs
     whole = vp.work_precision(spring(), [0.7], [0.3], integrators=four, **options)

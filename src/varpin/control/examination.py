@@ -137,20 +137,13 @@ def _alternating(solution: Solution) -> list[Finding]:
     found = alternation(motion.v)
     if found is None:
         return []
-    name = problem.scene.robot.joint_names[found.joint]
     if problem.sampling == "midpoint":
         why = "costs sampled at the midpoints of steps do not see it; sampling='gauss' does"
     elif problem.integrator.order < 4:
         why = f"{problem.integrator} is coarse at this dt; {_usual(problem)}, the default, is less so"
     else:
         why = "the optimum moves faster than the steps; a smaller dt, or a ControlRateCost, smooths it"
-    return [
-        Finding(
-            _ALTERNATION,
-            f"the velocity of {name} alternates from step to step, {found.changes} times in a row from "
-            f"t = {motion.t[found.first]:.4g} s on: {why}",
-        )
-    ]
+    return [Finding(_ALTERNATION, f"{found.sentence(motion.joint_names, motion.t)}: {why}")]
 
 
 def _unfinished(solution: Solution) -> list[Finding]:
@@ -264,9 +257,9 @@ def _between(solution: Solution) -> list[Finding]:
             found.append(
                 Finding(
                     "constraints between nodes",
-                    f"{record.label} holds at the nodes, and between them {bound.rows[row]} is violated by "
-                    f"{c[place, row]:.2g} {bound.unit} at t = {bound.times[place]:.4g} s: a bound that is as much "
-                    "narrower, or a smaller dt, keeps it there, too",
+                    f"{record.label} holds at the nodes, but between nodes {bound.rows[row]} is violated by "
+                    f"{c[place, row]:.2g} {bound.unit} at t = {bound.times[place]:.4g} s: make the bound narrower by "
+                    "that much, or dt smaller",
                 )
             )
     return found

@@ -94,7 +94,7 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
                 yield Finding(
                     "goal outside constraints",
                     f"{name} is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.4g} m at t = "
-                    f"{bound.times[-1]:.4g} s: move the one or the other",
+                    f"{bound.times[-1]:.4g} s: move the goal, or the bound",
                 )
 
 
@@ -130,7 +130,7 @@ def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
         if abs(end[joint]) * turning[joint] > _TURNS:
             yield Finding(
                 "goal in degrees",
-                f"the terminal TrackingCost wants {robot.joint_names[joint]} at {end[joint]:.4g} rad, "
+                f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} at {end[joint]:.4g} rad, "
                 f"{abs(end[joint]) / (2.0 * np.pi):.0f} turns: angles are in radians, np.deg2rad makes them of degrees",
             )
             continue
@@ -142,8 +142,8 @@ def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
             if beyond[joint] > _SAME:
                 yield Finding(
                     "goal outside constraints",
-                    f"the terminal TrackingCost wants {robot.joint_names[joint]} {beyond[joint]:.4g} rad or m outside "
-                    f"{limits.label}, where the plan will not end",
+                    f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} {beyond[joint]:.4g} rad or "
+                    f"m outside {limits.label}, where the plan will not end",
                 )
 
 

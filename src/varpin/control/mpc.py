@@ -452,10 +452,10 @@ def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
     found = None if motion.dw.any() else alternation(motion.v[::substeps])
     if found is None:
         return ()
+    seen = found.sentence(motion.joint_names, motion.t[::substeps], "tick")
     sentence = (
-        f"under the controller the velocity of {motion.joint_names[found.joint]} alternates from tick to tick, "
-        f"{found.changes} times in a row from t = {motion.t[substeps * found.first]:.4g} s on: the feedback is too "
-        "fast for the period; a smaller dt, or a greater weight on the controls or on their changes, calms it"
+        f"under the controller {seen}: the feedback is too fast for the period; a smaller dt, or a greater weight on "
+        "the controls or on their changes, calms it"
     )
     return (Finding("alternating ticks", sentence),)
 

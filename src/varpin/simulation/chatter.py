@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,19 @@ class Alternation:
     joint: int
     changes: int
     first: int
+
+    def sentence(self, joints: Sequence[str], t: Floats, interval: str = "step") -> str:
+        """What is seen, for a warning to say why: which velocity alternates, how often, and from when on.
+
+        Args:
+            joints: Names of the coordinates.
+            t: Times of the nodes (N + 1,) [s].
+            interval: What lies between two nodes.
+        """
+        return (
+            f"the velocity of {joints[self.joint]} alternates from {interval} to {interval}, {self.changes} times in a "
+            f"row from t = {t[self.first]:.4g} s on"
+        )
 
 
 def alternation(v: Floats, u: Floats | None = None) -> Alternation | None:

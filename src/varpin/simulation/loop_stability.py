@@ -178,12 +178,8 @@ def _flipping(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding,
     if found is not None:
         size = np.abs(np.diff(v[found.first : found.first + found.changes + 3, found.joint], n=2))
         if size[-1] >= _CALMS * size[0]:
-            sentence = (
-                f"under the control law the velocity of {scene.robot.joint_names[found.joint]} alternates from period "
-                f"to period, {found.changes} times in a row from t = {trajectory.t[hold * found.first]:.4g} s on: "
-                f"{advice}"
-            )
-            return (Finding(_FLIPS, sentence, found.joint),)
+            seen = found.sentence(scene.robot.joint_names, trajectory.t[::hold], "period")
+            return (Finding(_FLIPS, f"under the control law {seen}: {advice}", found.joint),)
     late = u[len(u) // 2 :]
     high, low = late == u.max(axis=0, initial=-np.inf), late == u.min(axis=0, initial=np.inf)
     flips = ((high[1:] & low[:-1]) | (low[1:] & high[:-1])).sum(axis=0)

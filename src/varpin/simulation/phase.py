@@ -26,7 +26,7 @@ Complexes = NDArray[np.complex128]
 # Nodes at which modes are looked at, and the most joints of a robot that they are looked for of.
 _NODES, _JOINTS = 9, 60
 # What is spoken of, in units of the way of the joint that goes furthest.
-_SHOWS = 0.02
+SHOWS = 0.02
 # By how much an oscillation has to turn over the motion [rad]; what turns by less loses nothing that shows. A joint
 # that nothing holds has the eigenvalue zero twice, which rounding splits into slow modes of any height.
 _TURNS = 1.0
@@ -75,7 +75,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     bounds = np.sqrt(np.abs(aq).sum(axis=2).max(axis=1)) + np.abs(av).sum(axis=2).max(axis=1)
     fastest = float(bounds.max())
     drift = _drift(integrator, np.array([1j * fastest]), h)
-    if drift is None or (h * fastest < 1.0 and abs(drift[0]) * trajectory.t[-1] < _SHOWS):
+    if drift is None or (h * fastest < 1.0 and abs(drift[0]) * trajectory.t[-1] < SHOWS):
         return None
     way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
     # A robot held in equilibrium has accelerations of rounding, and swings as little.
@@ -89,7 +89,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     A[:n, n:] = np.eye(n)
     for k in dict.fromkeys([*ends, *range(len(at))]):
         # Modes that are damped as those at the ends, and hardly faster, turn by nearly as little.
-        if k not in ends and alike and most * growth < _NOTHING * _SHOWS:
+        if k not in ends and alike and most * growth < _NOTHING * SHOWS:
             break
         node, A[n:, :n], A[n:, n:] = at[k], aq[k], av[k]
         try:
@@ -119,7 +119,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
             shares = np.where(off > rounding, off / way[:, None], 0.0)
         joint, mode = np.unravel_index(int(shares.argmax()), shares.shape)
         share = float(shares[joint, mode])
-        if share >= _SHOWS and (worst is None or share > worst.share):
+        if share >= SHOWS and (worst is None or share > worst.share):
             worst = Loss(int(joint), float(off[joint, mode]), share, float(rates[mode].imag), float(turned[mode]))
     return worst
 

@@ -44,6 +44,7 @@ from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.damping import Fast, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.limits import left as limits_left
+from varpin.simulation.phase import SHOWS as PHASE_SHOWS
 from varpin.simulation.phase import phase_lost
 from varpin.simulation.retaking import Again, Finer, finer, stopping, taken_again
 from varpin.simulation.saturation import bent
@@ -69,7 +70,9 @@ WORK, LEAST_WORK = 50, 256
 # times the error of a window counts, for over a period it grows.
 _WINDOWS, _MARGIN = 16, 8.0
 # The least steps of a window that another method takes; and how many times errors of velocities count after jumps.
-_SHORT, _PASSING = 16, 1.25
+_SHORT, _PASSING = 8, 1.25
+# How many times the error of a window counts for each window that the whole motion is long.
+_ADDS = 8.0
 # Stages of what they are taken again with where dampers are faster than the step.
 _STOPPING = 3
 # Steps from where a joint comes to rest that are taken again with it, and in how many parts each; in more if it fails.
@@ -122,11 +125,8 @@ def alternating(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     found = None if trajectory.dw.any() else alternation(trajectory.v, trajectory.u)
     if found is None or _does_so_in_smaller_steps(scene, integrator, trajectory, found):
         return ()
-    sentence = (
-        f"the velocity of {scene.robot.joint_names[found.joint]} alternates from step to step, {found.changes} times "
-        f"in a row from t = {trajectory.t[found.first]:.4g} s on: dt = {trajectory.dt:g} s is too long for what is "
-        "stiff, damped or fed back here"
-    )
+    seen = found.sentence(scene.robot.joint_names, trajectory.t)
+    sentence = f"{seen}: dt = {trajectory.dt:g} s is too long for what is stiff, damped or fed back here"
     return (Finding("alternating velocities", sentence, found.joint),)
 
 
@@ -223,8 +223,10 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     # Whatever moves a joint by hand gives and takes energy.
     found = [] if scene.inputs else [*_energy(scene, integrator, trajectory)]
     unsettled = _unsettled(scene, integrator, trajectory)
-    if resolved(scene, integrator, trajectory):
-        return (*found, *(() if found else _adding_up(scene, integrator, trajectory)), *unsettled)
+    seen = looked_again(scene, integrator, trajectory)
+    if seen.resolved:
+        more = () if found else _adding_up(scene, integrator, trajectory, stays=seen.stays)
+        return (*found, *more, *unsettled)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and spoken_of(error):
         dt, start = trajectory.dt, trajectory.t[error.step]
@@ -251,7 +253,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     if scene.constraints and not found:
         found.extend(_not_told(scene, integrator, trajectory))
     if not found:
-        found.extend(_adding_up(scene, integrator, trajectory))
+        found.extend(_adding_up(scene, integrator, trajectory, stays=False))
     return (*found, *(finding for finding in unsettled if finding.kind not in {other.kind for other in found}))
 
 
@@ -263,9 +265,10 @@ def _not_told(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> t
     return (_ringing(scene, fast, trajectory.dt),) if trajectory.dt * fast.rate > resolves else ()
 
 
-def _adding_up(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says what adds up over a motion that steps resolve from period to period."""
-    return (*_out_of_phase(scene, integrator, trajectory), *_at_limits_of_drives(scene, integrator, trajectory))
+def _adding_up(scene: Scene, integrator: Integrator, trajectory: Trajectory, *, stays: bool) -> tuple[Finding, ...]:
+    """Says what adds up over a motion that steps resolve from period to period; oscillations whose phase ``stays``."""
+    phase = () if stays else _out_of_phase(scene, integrator, trajectory)
+    return (*phase, *_at_limits_of_drives(scene, integrator, trajectory))
 
 
 def _at_limits_of_drives(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -471,8 +474,21 @@ def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats
     return change, impulse * (v + 0.5 * change)
 
 
-def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
-    """Whether even steps of twice the length make the same motion, so that there is nothing more to look for.
+class Seen(NamedTuple):
+    """What windows of a motion tell that were taken again.
+
+    Attributes:
+        resolved: Whether even steps of twice the length, or those of a better method, make the same motion, so that
+            there is nothing more to look for over a period.
+        stays: Whether errors are so small that over the whole motion, too, they do not add up to a word.
+    """
+
+    resolved: bool
+    stays: bool = False
+
+
+def looked_again(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Seen:
+    """Whether even steps of twice the length, or a better method, make the same of a motion.
 
     Windows all over the motion, or some of them, are taken again from their first nodes, all at once, under the kicks
     that noise gave it. That takes half as long as the motion, or less; a motion of whole steps can pass whose noise
@@ -480,19 +496,19 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     """
     steps, q, v, u = trajectory.steps, trajectory.q, trajectory.v, trajectory.u
     if isinstance(integrator, Reference) or not steps or scene.noise.diffusion is None:
-        return False
+        return Seen(False)
     noisy = bool(trajectory.dw.any())
     fastest, split, steady, pulled = glance(scene.core, q, v, u, trajectory.statistics.substeps, trajectory.dt)
     if not fastest > _STILL:
-        return True
+        return Seen(True)
     if split:
-        return False
+        return Seen(False)
     damped = bool(_fast_damping(scene, trajectory).rate)
     # Under constraints nothing stops what dampers do in one step; and what a hand does in two is another motion.
     if scene.inputs or (scene.constraints and damped):
-        return False
+        return Seen(False)
     if steps == 1:
-        return not (damped or noisy or pulled) and _halves_agree(scene, integrator, trajectory)
+        return Seen(not (damped or noisy or pulled) and _halves_agree(scene, integrator, trajectory))
     # Springs and dampers far faster than the step do as little in two, and controls that jump at nodes are others
     # there, which methods for such dampers follow. A better method is held against that in steps as long as theirs.
     jumps = not (steady or trajectory.u_stages.shape[1])
@@ -502,7 +518,7 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     elif pulled or (damped and jumps):
         better = finer(integrator, trajectory, damped=damped, pulled=pulled)
         if better.parts != 1:
-            return False
+            return Seen(False)
         other, times = better.method, 1
     begins, length = _windows(trajectory, every=times == 2)
     commands, drift = open_loop(u[:length:times]), np.zeros((0, 0, scene.robot.dof))
@@ -518,11 +534,20 @@ def resolved(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bo
     if times == 1 and not (jumps or pulled) and again is not None:
         # What a start off the slow motion leaves of itself after a single step is not to be held against it.
         again = np.ascontiguousarray(again[0][:, 1::2]), np.ascontiguousarray(again[1][:, 1::2])
+    if again is None:
+        return Seen(False)
+
+    def agree(gain: float, gain_of_velocity: float) -> bool:
+        return _agree(scene, (q, v), begins, length, trajectory.dt, again, gain, gain_of_velocity)
+
     # How much less the error is in steps of half the length; of another method nothing is known. What jumps do to
     # velocities that are damped is over soon, and does not grow; what lasts moves joints.
-    gain = (1.0 if damped or times == 1 else 2.0**integrator.order - 1.0) / _MARGIN
-    gain_of_velocity = 1.0 / _PASSING if damped and jumps and not pulled else gain
-    return again is not None and _agree(scene, (q, v), begins, length, trajectory.dt, again, gain, gain_of_velocity)
+    less = 1.0 if damped or times == 1 else 2.0**integrator.order - 1.0
+    of_velocity = 1.0 / _PASSING if damped and jumps and not pulled else less / _MARGIN
+    if not agree(less / _MARGIN, of_velocity):
+        return Seen(False)
+    # A whole motion is so many windows long, and errors of oscillations may add up from each to the next.
+    return Seen(True, agree(less * PHASE_SHOWS / WRONG_MOTION * length / (_ADDS * steps), of_velocity))
 
 
 def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
@@ -536,12 +561,17 @@ def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
         pieces = min(-(-steps // WINDOW), _WINDOWS)
         length = min(WINDOW, 2 * -(-steps // (2 * pieces)), steps - steps % 2)
     else:
-        pieces = min(max(2, steps // (4 * WINDOW)), _WINDOWS)
+        pieces = min(max(1, steps // (4 * WINDOW)), _WINDOWS)
         length = min(WINDOW, max(_SHORT, 2 * (steps // 12)), steps - steps % 2)
-    apart = max(pieces, 1 + steps % 2) - 1
+    apart = max(pieces, 1 + steps % 2 if every else 1) - 1
     begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
-    if pieces == _WINDOWS or not every:
-        begins = np.union1d(begins, blows(v, length)[: None if pieces == _WINDOWS else 1])
+    if pieces == _WINDOWS:
+        begins = np.union1d(begins, blows(v, length))
+    elif not every:
+        seen = np.zeros(steps, dtype=np.bool_)
+        for begin in begins.tolist():
+            seen[begin : begin + length] = True
+        begins = np.union1d(begins, blows(v, length, seen)[:1])
     return begins, length
 
 
@@ -603,7 +633,7 @@ def _agree(
 
 
 def _halves_agree(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
-    """:func:`resolved` of a single step: two of half its length make the same motion."""
+    """:func:`looked_again` of a single step: two of half its length make the same motion."""
     q, v, u, half = trajectory.q, trajectory.v, trajectory.u, 0.5 * trajectory.dt
     commands = open_loop(np.concatenate([u, u]))
     if trajectory.u_stages.shape[1]:

@@ -109,6 +109,10 @@ class _Runs:
         while steps % (2 * stride) == 0 and steps // stride > _NODES:
             stride *= 2
         n, dt, nothing = len(given.q0), given.duration / steps, np.zeros((0, 0, 0))
+        if steps > self.most:
+            # Runs that end in their first steps cost nothing and are halved without end, until this one is too long.
+            self.evaluations += steps
+            return Sample(steps, np.full((steps // stride, n), np.nan), math.inf, pure=False)
         commands = given.commands(integrator, steps)
         state, (last,) = integrator.start(given.scene, given.q0[None], given.v0[None])
         q, done, evaluations, pure = np.full((steps // stride, n), np.nan), 0, 0, True

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from varpin.control.costs import Cost, CostSum, Terminal
 from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
 from varpin.io.scenefile.references import Timeline, constant
-from varpin.io.scenefile.spec import CostSpec, ForceSpec, SceneSpec, degrees_for_radians
+from varpin.io.scenefile.spec import CostSpec, ForceSpec, degrees_for_radians
 from varpin.io.scenefile.table import Floats, SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Given
 from varpin.mechanics.constraints import Constraint, KinematicInput
@@ -23,6 +23,9 @@ from varpin.model import Robot, combine, load_robot
 
 if TYPE_CHECKING:
     from varpin.io.scenefile.tables import RobotKeys
+
+if TYPE_CHECKING:
+    from varpin.io.scenefile.tables import SceneSpec
 
 _OnFrames = TypeVar("_OnFrames", bound=Force | Constraint)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,10 +17,10 @@ from varpin.control.problem import integrator_for
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator
 from varpin.io.scenefile.layout import Layout, holding_controls, lay_out
+from varpin.io.scenefile.reading import find_scene, read_scene
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.required import Required, idle_joints, requirements
 from varpin.io.scenefile.shown import marks_of
-from varpin.io.scenefile.spec import SceneSpec, find_scene, read_scene
 from varpin.io.scenefile.table import Floats
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene
@@ -29,6 +29,9 @@ from varpin.simulation.choice import usual_integrator
 from varpin.simulation.run import simulate
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from varpin.io.scenefile.tables import SceneSpec
 
 # Measured time to set up a part, in units of linear algebra: the cube of the number of joints, times steps.
 _SETUP = 200_000

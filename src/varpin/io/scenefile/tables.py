@@ -1,10 +1,10 @@
-"""The tables of a scene file: their keys and the rules of their values."""
+"""The tables of a scene file: their keys, the rules of their values, and their content as a :class:`SceneSpec`."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,7 +45,6 @@ from varpin.io.scenefile.spec import (
     ForceSpec,
     FrameForceSpec,
     PlanConstraintSpec,
-    SceneSpec,
     word_of,
 )
 from varpin.io.scenefile.table import ByName, Table, inside
@@ -500,6 +499,83 @@ class SceneKeys(Keys):
     simulate: SimulateKeys = SimulateKeys()
     solve: SolveKeys = SolveKeys()
     outputs: OutputKeys = OutputKeys()
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSpec:
+    """A scene file.
+
+    Attributes:
+        name: Name of the file without its suffix.
+        title: Title for reports.
+        path: Path of the file.
+        root: Its tables, for messages.
+        robots: The tables [robot] or [[robot]]; several robots are one tree.
+        prefixes: Prefix of the names of each robot; None for a file with one ``[robot]``.
+        gravity: Gravity [m/s^2], or whether there is any.
+        damping: Viscous damping by joint [N m s/rad or N s/m], or "robot" for that of the description; None where it is
+            left out.
+        stiffness: Stiffness of joint springs, by joint [N m/rad or N/m].
+        rest: Rest positions of joint springs, by joint [rad or m].
+        forces: Other forces on joints.
+        frame_forces: Forces on frames.
+        constraints: Constraints of the motion.
+        plan_constraints: Hard constraints of the plan; with any, no joint is left out.
+        actuated: Driven joints; None for all.
+        gear: Generalized force per control, by driven joint.
+        torque_limit: Bounds by driven joint [N m or N]; ``"robot"`` for those of the description; None for none.
+        noise: Noise models.
+        q0: Initial configuration by joint [rad or m].
+        v0: Initial velocity by joint [rad/s or m/s].
+        dt: Time step [s].
+        steps: N.
+        hold: Steps that share a control.
+        sampling: Sampling of running costs.
+        shape: Controls of a plan between nodes: ``"held"`` or ``"linear"``.
+        integrator: The integrator; None where the file names none.
+        costs: Terms of the cost.
+        controls: Controls of a simulation: None for none, ``"hold"`` to hold the robot, or values over time.
+        seed: Seed of the noise in a simulation; None for no noise.
+        options: Options of ``solve``.
+        outputs: Files to write.
+    """
+
+    name: str
+    title: str
+    path: Path
+    root: Table
+    robots: tuple[RobotKeys, ...]
+    prefixes: tuple[str, ...] | None
+    gravity: bool | tuple[float, ...]
+    damping: ByName | Literal["robot"] | None
+    stiffness: ByName
+    rest: ByName
+    forces: tuple[ForceSpec, ...]
+    frame_forces: tuple[FrameForceSpec, ...]
+    constraints: tuple[ConstraintSpec, ...]
+    plan_constraints: tuple[PlanConstraintSpec, ...]
+    actuated: tuple[str, ...] | None
+    gear: ByName
+    torque_limit: ByName | str | None
+    noise: tuple[NoiseKeys, ...]
+    q0: ByName
+    v0: ByName
+    dt: float
+    steps: int
+    hold: int
+    sampling: str
+    shape: str
+    integrator: Integrator | None
+    costs: tuple[CostSpec, ...]
+    controls: Reference | str | None
+    seed: int | None
+    options: Mapping[str, Any]
+    outputs: OutputKeys
+
+    @property
+    def duration(self) -> float:
+        """The horizon [s]."""
+        return self.dt * self.steps
 
 
 def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
