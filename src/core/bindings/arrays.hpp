@@ -1,4 +1,4 @@
-// Arrays at the border to Python: their kinds, and the one place where their shapes are checked.
+// Arrays at the border to Python: their types, and the check of their shapes.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -40,7 +40,7 @@ void require(const Array& array, const char* name, std::initializer_list<std::si
     }
 }
 
-// Of an array that may be left out: empty along its first axis, or of this shape.
+// Check of an array that may be left out: empty along its first axis, or of this shape.
 template <class Array>
 bool given(const Array& array, const char* name, std::initializer_list<std::size_t> shape) {
     if (array.shape(0) == 0 && *shape.begin() != 0) return false;

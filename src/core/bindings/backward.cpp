@@ -30,7 +30,7 @@ std::vector<Sample> rule_of(In<2> rule) {
     return samples;
 }
 
-// Steps that keep the arrays they look at; what may be left out is empty then.
+// Steps with references to their arrays; optional arrays may be empty.
 struct HeldSteps {
     HeldSteps(In<3> A_, In<3> B_, In<3> G_, In<4> Gx_, In<4> Gu_, In<2> rule, In<2> gradient_, In<3> hessian_,
               In<3> velocity_, In<3> curvature_, In<3> slack_, In<2> expected_, In<3> rate_, In<2> pull_)
@@ -90,7 +90,7 @@ struct HeldSteps {
     ExpandedSteps steps;
 };
 
-// Arrays of gains to be filled in; what is not asked for is empty.
+// Arrays of gains to be filled in; unwanted ones are empty.
 struct HeldGains {
     HeldGains(InOut<2> feedforward_, InOut<3> feedback_, InOut<3> previous_, InOut<2> control_gradient_,
               InOut<2> costate_, InOut<3> spread_)
@@ -101,7 +101,7 @@ struct HeldGains {
           costate(costate_),
           spread(spread_) {}
 
-    // Views, once it is known that they fit these steps, each control held over `hold` of them.
+    // Views, after a check that the arrays fit these steps, with each control held over `hold` of them.
     Gains fitting(const HeldSteps& held, int hold) const {
         const ExpandedSteps& steps = held.steps;
         if (hold < 1 || steps.steps % hold != 0) throw std::invalid_argument("hold does not divide the steps");
@@ -135,7 +135,7 @@ void make_pass(BackwardPass* self, int controls, In<1> gradient, In<2> hessian) 
     new (self) BackwardPass(static_cast<int>(x / 2), controls, gradient.data(), hessian.data());
 }
 
-// Squares that keep the arrays they look at.
+// Squares with references to their arrays.
 struct HeldSquares {
     HeldSquares(In<3> root_, In<2> shift_, In<2> linear_) : root(root_), shift(shift_), linear(linear_) {
         const std::size_t N = shift.shape(0), z = shift.shape(1);
@@ -143,7 +143,7 @@ struct HeldSquares {
         require(linear, "linear", {N, z});
     }
 
-    // Views, once it is known that there are `count` functions of `size` variables.
+    // Views, after a check that there are `count` functions of `size` variables.
     Squares fitting(const char* name, std::size_t count, std::size_t size) const {
         require(shift, name, {count, size});
         return {.root = root.data(), .one_root = root.shape(0) == 1, .shift = shift.data(), .linear = linear.data()};
@@ -187,7 +187,7 @@ std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regulariz
     return pass.run(h, hold, regularization, steps, samples, changes, gains);
 }
 
-// Where the linearized motion goes under gains from `state`: expected (R, 2n + m), moves (R, m), and the state then.
+// The linearized motion under gains from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
 void foresee(int hold, const HeldSteps& given, const HeldGains& held, InOut<1> state, InOut<2> expected,
              InOut<2> moves) {
     const Gains gains = held.fitting(given, hold);
@@ -208,7 +208,7 @@ void define_results(nb::class_<Pass>& type) {
         .def_prop_ro("loss", [](const Pass& pass) { return pass.found.loss; });
 }
 
-// The minimum, the factors of its free part, and which entries the box holds.
+// The minimum, the factors of the Hessian's free part, and the entries at a limit.
 std::optional<std::tuple<Out, Out, nb::ndarray<nb::numpy, bool>>> box_minimum(In<2> H, In<1> g, In<2> limits,
                                                                               In<1> guess) {
     const std::size_t m = g.shape(0);

@@ -1,4 +1,4 @@
-// Bodies with their joints from Python's arrays, and rotations as NumPy has them: row by row.
+// Bodies with their joints from Python arrays, and rotations as row-major NumPy arrays.
 #pragma once
 
 #include <stdexcept>
@@ -27,7 +27,7 @@ inline void write(const Mat3<double>& R, double* rows) {
     write(t.z, rows + 6);
 }
 
-// Of every body what stands between it and its parent; n coordinates move them.
+// Bodies with the data of their joints, but without inertia; n coordinates.
 inline std::vector<Body> jointed_bodies(const Integers<1>& parent, const Integers<1>& prismatic, const In<3>& rotation,
                                         const In<2>& translation, const Integers<1>& coordinate, const In<1>& ratio,
                                         const In<1>& offset, std::size_t n) {
@@ -40,7 +40,7 @@ inline std::vector<Body> jointed_bodies(const Integers<1>& parent, const Integer
     std::vector<Body> out(bodies);
     for (std::size_t j = 0; j < bodies; ++j) {
         if (parent(j) < -1 || parent(j) >= static_cast<std::int64_t>(j))
-            throw std::invalid_argument("parents come before their children");
+            throw std::invalid_argument("parents must come before their children");
         if (coordinate(j) < 0 || coordinate(j) >= static_cast<std::int64_t>(n))
             throw std::invalid_argument("a body's coordinate is out of range");
         Body& link = out[j];

@@ -18,15 +18,17 @@ namespace {
 using namespace nanobind::literals;
 
 CostTerms terms_for(int dof, int controls) {
-    if (dof < 0 || controls < 0) throw std::invalid_argument("numbers of coordinates and controls are not negative");
+    if (dof < 0 || controls < 0)
+        throw std::invalid_argument("numbers of coordinates and controls must not be negative");
     return {dof, controls, {}, {}};
 }
 
 std::size_t add_frame(CostTerms& costs, const Links& links, In<2> turned, In<1> shifted) {
     require(turned, "turned", {3, 3});
     require(shifted, "shifted", {3});
-    if (links.bodies.empty()) throw std::invalid_argument("a frame stands on a body");
-    if (links.dof != costs.dof) throw std::invalid_argument("the frame is of another number of coordinates");
+    if (links.bodies.empty()) throw std::invalid_argument("a frame needs at least one body");
+    if (links.dof != costs.dof)
+        throw std::invalid_argument("the frame has another number of coordinates than the costs");
     costs.frames.push_back({links, {rotation_at(turned.data()), {shifted(0), shifted(1), shifted(2)}}});
     return costs.frames.size() - 1;
 }
@@ -34,8 +36,9 @@ std::size_t add_frame(CostTerms& costs, const Links& links, In<2> turned, In<1> 
 std::size_t add_center(CostTerms& costs, const Links& links) {
     double mass = 0.0;
     for (const Body& link : links.bodies) mass += link.mass;
-    if (!(mass > 0.0)) throw std::invalid_argument("a centre of mass is of bodies with a mass");
-    if (links.dof != costs.dof) throw std::invalid_argument("the bodies are of another number of coordinates");
+    if (!(mass > 0.0)) throw std::invalid_argument("the total mass must be > 0 for a centre of mass");
+    if (links.dof != costs.dof)
+        throw std::invalid_argument("the bodies have another number of coordinates than the costs");
     costs.frames.push_back({links, {}, true});
     return costs.frames.size() - 1;
 }
@@ -44,22 +47,22 @@ void add_term(CostTerms& costs, Subject subject, int index, In<2> weight, In<2> 
     const std::size_t size = weight.shape(0);
     const bool entries = subject == Subject::entries || subject == Subject::excess;
     const int last = entries ? costs.size() - static_cast<int>(size) : static_cast<int>(costs.frames.size()) - 1;
-    if (index < 0 || index > last) throw std::invalid_argument("the term is of what is not there");
+    if (index < 0 || index > last) throw std::invalid_argument("the term's frame or entries do not exist");
     const bool measures = subject == Subject::manipulability;
     if (!entries) {
         if (costs.frames[index].center && subject != Subject::position)
-            throw std::invalid_argument("a centre of mass has a position and no more");
+            throw std::invalid_argument("a centre of mass has only a position");
         if (size != (subject == Subject::twist ? 6u : measures ? 1u : 3u))
-            throw std::invalid_argument("a weight of a wrong size");
+            throw std::invalid_argument("a weight has a wrong size");
     }
     require(weight, "weight", {size, size});
     require(target, "target", {target.shape(0), target_width(subject, size)});
     if (target.shape(0) == 0) throw std::invalid_argument("there is no target");
     const std::vector<int> rows(directions.data(), directions.data() + directions.size());
     if (rows.empty() == measures || rows.size() > static_cast<std::size_t>(costs.dof))
-        throw std::invalid_argument("directions are those of a manipulability, no more than there are coordinates");
+        throw std::invalid_argument("only a manipulability has directions, at most one for each coordinate");
     for (int row : rows)
-        if (row < 0 || row > 5) throw std::invalid_argument("directions are rows of a Jacobian");
+        if (row < 0 || row > 5) throw std::invalid_argument("directions must be rows of a Jacobian");
     costs.terms.push_back({subject,
                            static_cast<int>(size),
                            index,
@@ -87,8 +90,7 @@ Out values(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
     return out;
 }
 
-// Gradient (N, 2n + m) and Hessian (N, 2n + m, 2n + m) of all terms, the latter (1, 2n + m, 2n + m) where it is the
-// same at all rows.
+// Gradient (N, 2n + m) and Hessian (N, 2n + m, 2n + m) of all terms; one Hessian if it is the same for all rows.
 std::tuple<Out, Out> expand(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
     const std::size_t rows = rows_of(costs, q, v, u), size = static_cast<std::size_t>(costs.size());
     const std::size_t matrices = costs.linear() ? 1 : rows;
@@ -106,7 +108,7 @@ std::tuple<Out, Out> expand(const CostTerms& costs, In<2> q, In<2> v, In<2> u) {
     return {gradient, hessian};
 }
 
-// The same at the samples of the steps of a motion: nodes q and v (N + 1, n), controls u (N, m).
+// `expand` at the samples of the steps of a motion with nodes q and v (N + 1, n) and controls u (N, m).
 std::tuple<Out, Out> expand_steps(const CostTerms& costs, In<2> rule, In<2> q, In<2> v, In<2> u) {
     const std::size_t N = u.shape(0), n = static_cast<std::size_t>(costs.dof), samples = rule.shape(0);
     const std::size_t rows = N * samples, size = static_cast<std::size_t>(costs.size());
@@ -172,7 +174,7 @@ std::tuple<Out, Out> samples(In<2> rule, In<3> q, In<3> v) {
     const std::size_t motions = q.shape(0), nodes = q.shape(1), n = q.shape(2), count = rule.shape(0);
     require(rule, "rule", {count, 9});
     require(v, "v", {motions, nodes, n});
-    if (nodes == 0) throw std::invalid_argument("a motion has a node");
+    if (nodes == 0) throw std::invalid_argument("a motion needs at least one node");
     double *at_q = nullptr, *at_v = nullptr;
     const std::size_t rows = (nodes - 1) * count;
     const Out sampled_q = array_for(at_q, {motions, rows, n}), sampled_v = array_for(at_v, {motions, rows, n});

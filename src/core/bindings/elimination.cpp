@@ -1,4 +1,4 @@
-// Elimination from the leaves to the roots, to be looked at by itself.
+// Elimination from the leaves to the roots, for tests and examination.
 #include "varpin/elimination.hpp"
 
 #include <nanobind/stl/tuple.h>
@@ -16,7 +16,7 @@ namespace {
 
 using namespace nanobind::literals;
 
-// Everything at one (q, v).
+// Elimination at one (q, v).
 class BoundElimination {
   public:
     BoundElimination(const Mechanism& mechanism, In<1> q, In<1> v)
@@ -78,7 +78,7 @@ class BoundElimination {
     ArticulatedBodies articulated_;
     Tableau tableau_{.stages = 1, .a = {0.0}, .gradient = {0.0}, .force = {1.0}, .b = {1.0}, .c = {0.5}, .ahead = {}};
     std::optional<Elimination> free_;
-    std::optional<StageElimination> tied_;  // where coordinates move several bodies
+    std::optional<StageElimination> tied_;  // for coordinates that move several bodies
     bool regular_ = false;
 };
 

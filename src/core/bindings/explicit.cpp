@@ -135,7 +135,7 @@ BoundRollout rollout(SharedMechanism mechanism, ExplicitMethod method, In<2> q, 
 bool first_nodes(BoundRollout& rollout, nb::handle nodes) {
     const NodeArrays arrays(*rollout.mechanism, nodes);
     arrays.require_paths(static_cast<std::size_t>(rollout.core.paths()));
-    if (arrays.steps() < 1) throw std::invalid_argument("there is no room for the first nodes");
+    if (arrays.steps() < 1) throw std::invalid_argument("the nodes have no rows for the first nodes");
     return rollout.core.first_nodes(arrays.view());
 }
 

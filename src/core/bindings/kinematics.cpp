@@ -18,7 +18,7 @@ using namespace nanobind::literals;
 
 Links links_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> translation, Integers<1> coordinate,
                In<1> ratio, In<1> offset, In<1> mass, In<2> center, int dof) {
-    if (dof < 0) throw std::invalid_argument("a number of coordinates is not negative");
+    if (dof < 0) throw std::invalid_argument("the number of coordinates must not be negative");
     Links out{jointed_bodies(parent, prismatic, rotation, translation, coordinate, ratio, offset,
                              static_cast<std::size_t>(dof)),
               dof};
@@ -31,14 +31,14 @@ Links links_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> 
     return out;
 }
 
-// Rotations (N, 3, 3), positions (N, 3) and, where wanted, Jacobians (N, 6, n), else (0, 6, n), of a frame that stands
-// at (turned, shifted) in the last body.
+// Rotations (N, 3, 3), positions (N, 3) and Jacobians (N, 6, n), (0, 6, n) if not wanted, of a frame with rotation
+// `turned` and position `shifted` in the last body.
 std::tuple<Out, Out, Out> place_frame(const Links& links, In<2> turned, In<1> shifted, In<2> q, bool jacobian) {
     const std::size_t n = static_cast<std::size_t>(links.dof), rows = q.shape(0), count = links.bodies.size();
     require(turned, "turned", {3, 3});
     require(shifted, "shifted", {3});
     require(q, "q", {rows, n});
-    if (count == 0) throw std::invalid_argument("a frame stands on a body");
+    if (count == 0) throw std::invalid_argument("a frame needs at least one body");
     double *R = nullptr, *p = nullptr, *J = nullptr;
     const Out rotation = array_for(R, {rows, 3, 3}), position = array_for(p, {rows, 3}),
               jacobians = array_for(J, {jacobian ? rows : 0, 6, n});

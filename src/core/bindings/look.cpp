@@ -1,4 +1,4 @@
-// The look at a finished motion.
+// Checks of a finished motion.
 #include "varpin/look.hpp"
 
 #include <nanobind/stl/optional.h>
@@ -17,7 +17,7 @@ namespace {
 
 using namespace nanobind::literals;
 
-// Look at rows of q, v and f (K, n).
+// Call `look` with the rows of q, v and f (K, n).
 template <class Look>
 auto at_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const In<2>& f, const Look& look) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
@@ -28,7 +28,7 @@ auto at_rows(const Mechanism& mechanism, const In<2>& q, const In<2>& v, const I
 }
 
 double fastest_damping_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f, double least) {
-    if (!(least > 0.0)) throw std::invalid_argument("least is a positive rate");
+    if (!(least > 0.0)) throw std::invalid_argument("least must be a positive rate");
     return at_rows(mechanism, q, v, f,
                    [&](Inertias& inertias, const States& states) { return fastest_damping(inertias, states, least); });
 }
@@ -44,8 +44,8 @@ std::tuple<double, double, Out, Out> energy_turnover(const Mechanism& mechanism,
     const std::size_t steps = u.shape(0);
     for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&p, "p"}}) require(*array, name, {steps + 1, n});
     require(u, "u", {steps, m});
-    if (!(dt > 0.0)) throw std::invalid_argument("dt is positive");
-    if (looks < 2) throw std::invalid_argument("inertias are looked at at both ends at least");
+    if (!(dt > 0.0)) throw std::invalid_argument("dt must be positive");
+    if (looks < 2) throw std::invalid_argument("looks must be at least 2");
     Turnover found;
     {
         nb::gil_scoped_release release;
@@ -59,7 +59,7 @@ std::tuple<double, bool, bool, bool> glance_at(const Mechanism& mechanism, In<2>
                                                Integers<1> substeps, double dt) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
     const std::size_t steps = u.shape(0);
-    if (steps == 0) throw std::invalid_argument("a motion has a step");
+    if (steps == 0) throw std::invalid_argument("a motion needs at least one step");
     for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {steps + 1, n});
     require(u, "u", {steps, m});
     require(substeps, "substeps", {steps});
@@ -77,7 +77,7 @@ bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> beg
     for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {nodes, n});
     for (const auto& [array, name] : {std::pair{&again_q, "again_q"}, {&again_v, "again_v"}})
         require(*array, name, {windows, looks, n});
-    if (looks == 0 || length % looks != 0) throw std::invalid_argument("a window is not of so many like parts");
+    if (looks == 0 || length % looks != 0) throw std::invalid_argument("looks must divide the length of a window");
     for (std::size_t w = 0; w < windows; ++w) {
         if (begins(w) < 0 || static_cast<std::size_t>(begins(w)) + length >= nodes)
             throw std::invalid_argument("a window is beyond the motion");
@@ -89,8 +89,8 @@ bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> beg
 
 std::tuple<std::int64_t, std::int64_t, std::int64_t> alternation(In<2> v, std::optional<In<2>> u, double counts,
                                                                  double idle, double even) {
-    if (v.shape(0) == 0) throw std::invalid_argument("a motion has a node");
-    if (u && u->shape(0) != v.shape(0) - 1) throw std::invalid_argument("there is not one control for each step");
+    if (v.shape(0) == 0) throw std::invalid_argument("a motion needs at least one node");
+    if (u && u->shape(0) != v.shape(0) - 1) throw std::invalid_argument("each step needs one control");
     const Alternation found =
         longest_alternation(v.data(), static_cast<std::int64_t>(v.shape(0)) - 1, static_cast<int>(v.shape(1)),
                             u ? u->data() : nullptr, u ? static_cast<int>(u->shape(1)) : 0, {counts, idle, even});

@@ -28,7 +28,7 @@ std::vector<double> copied(const Array& array) {
     return {array.data(), array.data() + array.size()};
 }
 
-// Elements by the name of their kind, with their coordinate and their numbers in order.
+// Elements: name of the kind, coordinate, numbers.
 using Named = std::vector<std::tuple<std::string, int, std::vector<double>>>;
 
 template <class Kind, class... Numbers>
@@ -59,8 +59,7 @@ Element element_of(const std::string& kind, int coordinate, const std::vector<do
     throw std::invalid_argument("there is no element of kind " + kind);
 }
 
-// Couplings by the name of their kind, with the bodies of their points, -1 for the world, and their numbers in order,
-// the places of both points first.
+// Couplings: name of the kind, bodies of both points (-1 for the world), numbers, from the positions of both points on.
 using NamedCouplings = std::vector<std::tuple<std::string, int, int, std::vector<double>>>;
 
 CoupledElement coupling_of(const std::string& kind, int a, int b, const std::vector<double>& values) {
@@ -84,15 +83,15 @@ CoupledElement coupling_of(const std::string& kind, int a, int b, const std::vec
     throw std::invalid_argument("there is no coupling of kind " + kind);
 }
 
-// Vectors that bodies carry (body, whether it is a direction, place), rows that are products (x, y, factor, constant)
-// and ties (follower, leader, coefficients, the control that is a rate or -1), and functions (rows, of q: (g, C), of q
-// and weights: curvature).
+// Constraints: vectors fixed to bodies (body, whether it is a direction, coordinates), rows that are products (x, y,
+// factor, constant), ties (follower, leader, coefficients, control of the rate or -1), and functions (number of rows,
+// function of q for (g, C), function of q and weights for the curvature).
 using NamedVector = std::vector<std::tuple<int, bool, std::array<double, 3>>>;
 using NamedConstraints = std::tuple<std::vector<NamedVector>, std::vector<std::tuple<int, int, double, double>>,
                                     std::vector<std::tuple<int, int, std::vector<double>, int>>,
                                     std::vector<std::tuple<int, nb::object, nb::object>>>;
 
-// A Python function that is called without the interpreter's lock held.
+// A Python function whose references are released under the interpreter's lock.
 std::shared_ptr<nb::object> held(const nb::object& function) {
     return {new nb::object(function), [](nb::object* owned) {
                 nb::gil_scoped_acquire acquire;
@@ -126,7 +125,7 @@ Constraints constraints_of(const NamedConstraints& named, const std::vector<Body
     const auto& [vectors, products, ties, customs] = named;
     const auto require_below = [](int index, std::size_t count) {
         if (index < 0 || index >= static_cast<int>(count))
-            throw std::invalid_argument("a constraint points to nothing");
+            throw std::invalid_argument("a constraint's vectors or coordinates are out of range");
     };
     std::vector<VectorSum> sums;
     for (const NamedVector& parts : vectors) {
@@ -154,8 +153,8 @@ Constraints constraints_of(const NamedConstraints& named, const std::vector<Body
     return Constraints(sums, rows, tied, functions, bodies, static_cast<int>(n));
 }
 
-// A force that Python evaluates: of (q, v, whether derivatives are wanted) it returns (F, dF/dq, dF/dv), and what it
-// raises ends the call that asked.
+// A force in Python: a function of (q, v, whether derivatives are wanted) that returns (F, dF/dq, dF/dv). Its
+// exceptions propagate to the caller.
 OuterForce outer_force_of(nb::object function, std::size_t n) {
     return [function = std::move(function), n](const double* q, const double* v, double* F, double* by_q,
                                                double* by_v) {
@@ -196,7 +195,7 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     Mechanism out;
     out.tree.bodies = jointed_bodies(parent, prismatic, rotation, translation, coordinate, ratio, offset, n);
     for (std::size_t j = 0; j < bodies; ++j) {
-        if (origin(j) == 0 && parent(j) < 0) throw std::invalid_argument("a root is an origin");
+        if (origin(j) == 0 && parent(j) < 0) throw std::invalid_argument("a root must be an origin");
         Body& link = out.tree.bodies[j];
         link.mass = mass(j);
         link.center = {center(j, 0), center(j, 1), center(j, 2)};
@@ -212,14 +211,14 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     int begin = 0;
     for (std::size_t b = 0; b < ends.shape(0); ++b) {
         if (ends(b) <= begin || ends(b) > static_cast<std::int64_t>(n))
-            throw std::invalid_argument("the ends of blocks rise up to the number of coordinates");
+            throw std::invalid_argument("the ends of blocks must increase up to the number of coordinates");
         out.tree.blocks.push_back({begin, static_cast<int>(ends(b))});
         begin = static_cast<int>(ends(b));
     }
-    if (begin != static_cast<int>(n)) throw std::invalid_argument("the last block ends with the last coordinate");
+    if (begin != static_cast<int>(n)) throw std::invalid_argument("the last block must end with the last coordinate");
     for (std::size_t r = 0; r < loads.shape(0); ++r) {
         if (loads(r) < 0 || loads(r) >= static_cast<std::int64_t>(bodies) || parent(loads(r)) < 0)
-            throw std::invalid_argument("a light part begins with a body that another carries");
+            throw std::invalid_argument("the first body of a light part must have a parent");
         LightPart part;
         part.body = static_cast<int>(loads(r));
         for (std::size_t c = 0; c < n; ++c) part.carried.push_back(carried(r, c) != 0);
@@ -286,7 +285,7 @@ std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
 }
 
 // The derivative of v in (q, p) (N, n, 2n) at each row of q and v (N, n): at fixed q dv = M^-1 dp, at fixed p
-// dv = -M^-1 L_vq dq. Not a number where M is not positive definite.
+// dv = -M^-1 L_vq dq. NaN where M is not positive definite.
 Out velocity_slopes(const Mechanism& mechanism, In<2> q, In<2> v) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
     require(q, "q", {rows, n});
@@ -316,8 +315,8 @@ Out velocity_slopes(const Mechanism& mechanism, In<2> q, In<2> v) {
     return out;
 }
 
-// At each row of q, v and the constant force f (N, n) the forces that elements and couplings have beside L_q, the
-// elements' dF/dq and dF/dv, and the power turned into heat.
+// At each row of q, v and the constant force f (N, n): the forces of elements and couplings besides L_q, dF/dq and
+// dF/dv of the elements, and the dissipated power.
 std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
     require(q, "q", {rows, n});
@@ -340,7 +339,7 @@ std::tuple<Out, Out, Out, Out> forces(const Mechanism& mechanism, In<2> q, In<2>
     return {value, by_q, by_v, lost};
 }
 
-// At each row of q and v (N, n) the forces that couplings have beside L_q, dF/dq and dF/dv (N, n, n).
+// At each row of q and v (N, n): the forces of couplings besides L_q, and dF/dq and dF/dv (N, n, n).
 std::tuple<Out, Out, Out> coupled_forces(const Mechanism& mechanism, In<2> q, In<2> v) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
     require(q, "q", {rows, n});

@@ -1,9 +1,9 @@
-// What Python sees of the core: one registration for each idea.
+// The Python module of the core.
 #include "registrations.hpp"
 
 NB_MODULE(_core, m) {
     m.doc() = "The compiled core.";
-    // A function of the user's own may hold the scene that holds it: what is left then when Python ends is no mistake.
+    // A user's function may refer to the scene that owns it; such cycles at the exit of Python are no leaks.
     nanobind::set_leak_warnings(false);
     varpin::border::register_mechanism(m);
     varpin::border::register_kinematics(m);

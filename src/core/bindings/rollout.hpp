@@ -1,5 +1,4 @@
-// What rollouts of the variational integrators and the derivatives of their steps share at the border, with constraints
-// and without.
+// Common bindings of rollouts and derivatives of steps for the variational integrators, with and without constraints.
 #pragma once
 
 #include <nanobind/stl/tuple.h>
@@ -18,8 +17,8 @@
 
 namespace varpin::border {
 
-// P paths with the work arrays of a step, `stepping`; forks share them, so only one of them moves at a time. A State is
-// a PathState, or has one as its `path`.
+// P paths with the work arrays of a step, `stepping`. Forks share these arrays, so only one of them advances at a time.
+// A State is a PathState, or has one as its `path`.
 template <class Stepping, class State>
 class Rollout {
   public:
@@ -31,7 +30,7 @@ class Rollout {
           stages_(tableau.stages),
           states_(paths, State(mechanism, tableau.stages)) {}
 
-    // Put each path at its row of q and v (P, n); false where an M(q) is not positive definite.
+    // Start each path at its row of q and v (P, n); false if an M(q) is not positive definite.
     bool begin(In<2> q, In<2> v) {
         const std::size_t n = size();
         require(q, "q", {states_.size(), n});
@@ -65,7 +64,7 @@ class Rollout {
         return {Q, MV, V, E};
     }
 
-    // Of each part of every step of a path in its last roll that was not taken whole.
+    // The halvings of each part of every divided step in the last roll of a path.
     BytesOut halvings(std::size_t path) const { return array_of(path_of(state(path)).halvings); }
 
   protected:
@@ -97,8 +96,8 @@ class Rollout {
     }
 };
 
-// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step, f constant over it or a ramp up to f; how
-// it ended and how many were done. first(step, guess, Jx, Jf) writes those of one step.
+// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step, for f constant over it or a ramp up to f;
+// the outcome, and the number of steps done. first(step, guess, Jx, Jf) writes the derivatives of one step.
 template <class First>
 std::tuple<Out, Out, std::int64_t, std::size_t> derivatives_of(const StepsAt& at, const Tableau& tableau,
                                                                const In<3>& guess, const First& first) {

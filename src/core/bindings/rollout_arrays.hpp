@@ -1,5 +1,5 @@
-// What a rollout reads and writes at the border: Python's named tuples Commands and Nodes, checked in this one place
-// and seen as those of policy.hpp and nodes.hpp.
+// Input and output of a rollout at the border: the Python named tuples Commands and Nodes, checked and converted to
+// those of policy.hpp and nodes.hpp.
 #pragma once
 
 #include <cstdint>
@@ -17,7 +17,7 @@
 
 namespace varpin::border {
 
-// An array of a named tuple. It is never converted: what is written to it is for its owner.
+// An array of a named tuple. It is never converted, so that its owner sees what is written to it.
 template <class Array>
 Array field(nb::handle record, const char* name) {
     Array array;
@@ -53,7 +53,7 @@ class NodeArrays {
     std::size_t paths() const { return q.shape(0); }
     std::size_t steps() const { return q.shape(1); }
     void require_paths(std::size_t wanted) const {
-        if (paths() != wanted) throw std::invalid_argument("the nodes are not those of as many paths");
+        if (paths() != wanted) throw std::invalid_argument("the nodes have another number of paths");
     }
     Nodes view() const {
         return {static_cast<std::int64_t>(paths()),
@@ -78,7 +78,7 @@ class NodeArrays {
     IntegersInOut<1> ended, done;
 };
 
-// Commands for P paths over N steps, with controls at `stages` stages of each where they change within it.
+// Commands for P paths over N steps; controls that change within steps are given at `stages` stages.
 class CommandArrays {
   public:
     CommandArrays(const Mechanism& mechanism, nb::handle commands, std::size_t paths, std::size_t steps, int stages)
@@ -93,12 +93,12 @@ class CommandArrays {
         const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
         const std::size_t decisions = u.shape(0), width = gains.shape(2);
         if (hold < 1 || decisions * static_cast<std::size_t>(hold) != steps)
-            throw std::invalid_argument("the commands are not for as many steps as there are nodes");
+            throw std::invalid_argument("commands and nodes have different numbers of steps");
         require(u, "u", {decisions, m});
         feedback = given(gains, "gains", {decisions, m, width}) && decisions > 0;
         if (feedback) {
             if (width != 2 * n && width != 2 * n + m)
-                throw std::invalid_argument("gains have a column for each of (q, p) or (q, p, control before)");
+                throw std::invalid_argument("gains must have a column for each of (q, p) or (q, p, previous control)");
             require(reference, "reference", {decisions, width});
         }
         require(limits, "limits", {2, m});
@@ -106,13 +106,14 @@ class CommandArrays {
         linear = places.shape(0) > 0;
         if (linear) {
             require(places, "places", {static_cast<std::size_t>(stages)});
-            if (!earlier && steps > 0) throw std::invalid_argument("controls on a line begin at the control before");
-            if (within.shape(0) > 0) throw std::invalid_argument("controls are on a line or given at stages");
+            if (!earlier && steps > 0)
+                throw std::invalid_argument("linear controls need the control before the first step");
+            if (within.shape(0) > 0) throw std::invalid_argument("controls are either linear or given at stages");
         }
         if (within.shape(0) == 0) return;
         require(within, "within", {steps, static_cast<std::size_t>(stages), m});
         if (feedback || hold != 1)
-            throw std::invalid_argument("controls that change within a step go with neither feedback nor a hold");
+            throw std::invalid_argument("controls that change within a step allow neither feedback nor a hold");
         changing = true;
     }
 
@@ -139,9 +140,9 @@ class CommandArrays {
     In<1> places;
     int hold;
     bool feedback = false;  // whether there are gains
-    bool earlier = false;   // whether the controls before the first are known
+    bool earlier = false;   // whether the controls before the first step are known
     bool changing = false;  // whether controls change within steps
-    bool linear = false;    // whether they are linear over each decision's steps
+    bool linear = false;    // whether controls are linear over the steps of each decision
 };
 
 // Increments of Wiener processes (P, N, k), or null where there are none: (0, 0, k), or k = 0.
@@ -150,7 +151,7 @@ inline const double* increments_of(const Mechanism& mechanism, const In<3>& incr
     return given(increments, "increments", {nodes.paths(), nodes.steps(), k}) && k > 0 ? increments.data() : nullptr;
 }
 
-// A force on top of the controls' (P, N, n), or null for (0, 0, n).
+// A force in addition to the controls (P, N, n), or null for (0, 0, n).
 inline const double* drift_of(const Mechanism& mechanism, const In<3>& drift, const NodeArrays& nodes) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
     return given(drift, "drift", {nodes.paths(), nodes.steps(), n}) ? drift.data() : nullptr;
@@ -164,8 +165,8 @@ inline const double* impulses_of(const Mechanism& mechanism, const std::optional
     return impulses->data();
 }
 
-// Roll `paths` paths by the commands into the nodes: move(commands, increments, drift, nodes) without the interpreter's
-// lock, once everything is checked. `stages` are those at which controls may change within a step.
+// Roll `paths` paths: calls move(commands, increments, drift, nodes) without the interpreter's lock, after all checks.
+// `stages` is the number of stages at which controls may change within a step.
 template <class Move>
 void roll_paths(const Mechanism& mechanism, std::size_t paths, int stages, nb::handle commands, const In<3>& increments,
                 const In<3>& drift, nb::handle nodes, const Move& move) {
@@ -178,7 +179,7 @@ void roll_paths(const Mechanism& mechanism, std::size_t paths, int stages, nb::h
     move(by.view(), dw, more, to.view());
 }
 
-// The arrays that N steps are taken again from.
+// The arrays from which N steps are repeated.
 class StepsAt {
   public:
     StepsAt(const Mechanism& mechanism, const Tableau& tableau, In<2> q, In<2> p, In<3> force, Integers<1> substeps,
@@ -197,12 +198,13 @@ class StepsAt {
         for (std::size_t s = 0; s < N; ++s) {
             const std::int64_t parts = substeps(s);
             if (parts < 1 || parts > (std::int64_t{1} << 30))
-                throw std::invalid_argument("a step has one part or more, and at most 2^30");
+                throw std::invalid_argument("a step must have from 1 to 2^30 parts");
             place_[s + 1] = place_[s] + (parts > 1 ? static_cast<std::size_t>(parts) : 0);
         }
         require(halvings, "halvings", {place_[N]});
         for (std::size_t k = 0; k < halvings.size(); ++k) {
-            if (halvings(k) < 1 || halvings(k) > 62) throw std::invalid_argument("parts are halved 1 to 62 times");
+            if (halvings(k) < 1 || halvings(k) > 62)
+                throw std::invalid_argument("parts must have from 1 to 62 halvings");
         }
     }
 
@@ -211,11 +213,11 @@ class StepsAt {
     const double* q(std::size_t s) const { return q_.data() + s * n; }
     const double* p(std::size_t s) const { return p_.data() + s * n; }
     const double* force(std::size_t s) const { return force_.data() + s * force_.shape(1) * n; }
-    // Of the parts of a step; none if it was taken whole.
+    // The halvings of the parts of a step; empty for an undivided step.
     std::span<const std::uint8_t> halvings(std::size_t s) const {
         return {halvings_.data() + place_[s], place_[s + 1] - place_[s]};
     }
-    // How many steps right before a step were taken whole, as far as they bear on its guess.
+    // The number of consecutive undivided steps before a step, up to the number that its guess uses.
     int past(std::size_t s) const {
         int found = 0;
         while (found < 8 && s > static_cast<std::size_t>(found) && place_[s - found - 1] == place_[s]) ++found;
@@ -226,10 +228,10 @@ class StepsAt {
     In<2> q_, p_;
     In<3> force_;  // (N, 1, n) constant over a step, or (N, s, n)
     Bytes halvings_;
-    std::vector<std::size_t> place_;  // (N + 1) where the parts of a step begin
+    std::vector<std::size_t> place_;  // (N + 1) index of the first part of each step
 };
 
-// How the first step that was not solved ended, and how many were done before it.
+// The outcome of the first step that was not solved, and the number of steps before it.
 template <class Step>
 std::pair<Outcome, std::size_t> each_step(std::size_t N, const Step& step) {
     nb::gil_scoped_release release;

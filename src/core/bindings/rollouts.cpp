@@ -23,7 +23,7 @@ using namespace nanobind::literals;
 Tableau tableau_of(In<2> a, In<2> gradient, In<2> force, In<1> b, In<1> c, In<2> ahead, double reach, double skew,
                    bool stiffly_accurate) {
     const std::size_t s = b.shape(0);
-    if (s == 0) throw std::invalid_argument("a tableau has at least one stage");
+    if (s == 0) throw std::invalid_argument("a tableau must have at least one stage");
     for (const auto& [array, name] : {std::pair{&a, "a"}, {&gradient, "gradient"}, {&force, "force"}})
         require(*array, name, {s, s});
     require(c, "c", {s});
@@ -38,11 +38,11 @@ Tableau tableau_of(In<2> a, In<2> gradient, In<2> force, In<1> b, In<1> c, In<2>
 }
 
 Guards guards_of(bool active, double branch_margin, double energy_balance, double energy_budget, int most_halvings) {
-    if (most_halvings < 0 || most_halvings > 62) throw std::invalid_argument("halvings are from 0 to 62");
+    if (most_halvings < 0 || most_halvings > 62) throw std::invalid_argument("halvings must be from 0 to 62");
     return {active, branch_margin, energy_balance, energy_budget, most_halvings};
 }
 
-// The step with the sizes that the compiler knows, if it knows those of the mechanism.
+// The step with sizes known at compile time, if there is one for the mechanism.
 std::shared_ptr<Stepping> stepping_of(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
                                       const Guards& guards, double left, Solver solver) {
     if (auto small = small_stepping(mechanism, tableau, tolerance, guards, left, solver)) return small;

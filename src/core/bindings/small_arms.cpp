@@ -1,11 +1,11 @@
-// Steps of arms of few joints, whose number the compiler knows: for up to seven joints it is worth the room.
+// Steps of arms with up to seven joints, whose number is known at compile time.
 #include "stepping.hpp"
 
 namespace varpin::border {
 
 namespace {
 
-// What `make(Size)` makes for the number of joints of a mechanism, if its steps are solved with one matrix.
+// The result of `make(Size)` for the number of joints of a mechanism, if its steps are solved with one matrix.
 template <class Made, class Make>
 std::unique_ptr<Made> of_size(const Mechanism& mechanism, const Tableau& tableau, Solver solver, const Make& make) {
     const Tree& tree = mechanism.tree;

@@ -1,4 +1,4 @@
-// Steps of the variational integrators and their derivatives, whatever the compiler knows of their sizes.
+// Steps of the variational integrators and their derivatives, for sizes known at compile time or at run time.
 #pragma once
 
 #include <cstdint>
@@ -63,7 +63,7 @@ struct DifferentiationOf final : Differentiation {
     }
 };
 
-// Of sizes that the compiler knows, those of arms under a method of one stage; null where there is none.
+// Stepping with a size known at compile time, for arms and methods with one stage; null if there is none.
 std::unique_ptr<Stepping> small_stepping(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
                                          const Guards& guards, double left, Solver solver);
 std::unique_ptr<Differentiation> small_differentiation(const Mechanism& mechanism, const Tableau& tableau,

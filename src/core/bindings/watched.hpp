@@ -1,4 +1,4 @@
-// A watch that keeps the arrays it looks at.
+// A watch with references to its arrays.
 #pragma once
 
 #include <cstdint>
@@ -27,10 +27,10 @@ class HeldWatch {
         require(values, "values", {N * rule.shape(0), costs.terms.size()});
     }
 
-    // For a rollout of one path over as many steps.
+    // The watch of a rollout of one path, after a check of the number of steps.
     Watch* of(const Nodes& nodes) {
         if (nodes.paths != 1 || nodes.steps != static_cast<std::int64_t>(u_.shape(0)))
-            throw std::invalid_argument("a watch is for one path of as many steps");
+            throw std::invalid_argument("a watch needs one path and the same number of steps");
         return &core;
     }
 

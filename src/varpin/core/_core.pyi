@@ -13,7 +13,10 @@ Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 class Mechanism:
-    """A tree of bodies in its surroundings; see src/core/include/varpin/tree.hpp for the fields."""
+    """A tree of bodies with the forces, constraints, actuation and noise of a scene.
+
+    The fields are described in src/core/include/varpin/tree.hpp.
+    """
 
     @staticmethod
     def make(
@@ -65,19 +68,19 @@ class Mechanism:
         """The derivative of v in (q, p) (N, n, 2n) at each row of q and v; NaN where M is not positive definite."""
 
     def forces(self, q: Floats, v: Floats, f: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Forces F beside L_q, what elements have of dF/dq and dF/dv, and the power turned into heat (N, n).
+        """Forces F besides L_q, dF/dq and dF/dv of elements, and the dissipated power, each (N, n).
 
-        They are at rows of q, v and f (N, n), f being the constant force of the controls, to which F adds.
+        They are taken at rows of q, v and the constant force f of the controls (N, n), to which F adds.
         """
 
     def coupled_forces(self, q: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
-        """The couplings' forces beside L_q (N, n), and dF/dq and dF/dv (N, n, n), at rows of q and v (N, n)."""
+        """Forces F of couplings besides L_q (N, n), and dF/dq and dF/dv (N, n, n), at rows of q and v (N, n)."""
 
     def jets_along(self, q: Floats, v: Floats, alpha: Floats, beta: Floats) -> tuple[Floats, Floats, Floats]:
-        """Derivatives of M, L_vq and L_qq (N, n, n) at each row of q and v along that of alpha and beta (N, n)."""
+        """Derivatives of M, L_vq and L_qq (N, n, n) at rows of q and v along rows of alpha and beta (N, n)."""
 
 class Solver(Enum):
-    """How a variational step solves; see src/core/include/varpin/elimination.hpp."""
+    """Linear solver of a variational step; see src/core/include/varpin/elimination.hpp."""
 
     automatic = ...
     dense = ...
@@ -86,25 +89,25 @@ class Solver(Enum):
 class Elimination:
     """Solves at one (q, v) by elimination from the leaves to the roots; see src/core/include/varpin/elimination.hpp.
 
-    Raises ValueError where couplings act.
+    Raises ValueError for a mechanism with couplings.
     """
 
     def __init__(self, mechanism: Mechanism, q: Floats, v: Floats) -> None: ...
     def step(self, ahead: float, behind: float, diagonal: Floats, b: Floats) -> tuple[Floats, Floats, float, bool]:
         """X with N x = b, (A' + ahead L_qq) x, x' M x, and whether all pivots of N are positive.
 
-        N = M + ahead A - behind A' - ahead behind L_qq + diag(diagonal - armature + ahead behind stiffness), springs
-        being part of L_qq.
+        N = M + ahead A - behind A' - ahead behind L_qq + diag(diagonal - armature + ahead behind stiffness), with
+        springs in L_qq.
         """
 
     def least_pivot_ratio(self, coupling: float, curvature: float, diagonal: Floats) -> float:
-        """The smallest ratio of a pivot of M + coupling (A + A') - curvature L_qq to the same one of M; 0 if none is.
+        """The smallest ratio of a pivot of M + coupling (A + A') - curvature L_qq to the same pivot of M.
 
-        Of the diagonal as in :meth:`step`.
+        It is 0 if a pivot is not positive. ``diagonal`` as in :meth:`step`.
         """
 
     def mass(self, b: Floats) -> tuple[Floats, Floats, bool]:
-        """M^-1 b, the coordinates' shares of b . x / 2, and whether M is positive definite."""
+        """X = M^-1 b, the shares of coordinates in b . x / 2, and whether M is positive definite."""
 
 class Tableau:
     """Collocation over a step of unit length; see src/core/include/varpin/tableau.hpp."""
@@ -125,7 +128,7 @@ class Tableau:
         """Raises ValueError for arrays that do not fit each other."""
 
 class Guards:
-    """When a step is accepted; see src/core/include/varpin/guards.hpp."""
+    """Conditions on accepted steps; see src/core/include/varpin/guards.hpp."""
 
     @staticmethod
     def make(
@@ -133,7 +136,7 @@ class Guards:
     ) -> Guards: ...
 
 class Watch:
-    """The running cost of one path while it is rolled out, and whether the motion is worth going on with."""
+    """The running cost of one path during its rollout, and whether to stop it early."""
 
     class Verdict(Enum):
         going = 0
@@ -141,40 +144,40 @@ class Watch:
         dear = 2
 
     def __init__(self, costs: CostTerms, rule: Floats, q: Floats, v: Floats, u: Floats, values: Floats) -> None:
-        """Over nodes q and v (N + 1, n) and controls u (N, m) that are being written, the first node there already.
+        """Watch nodes q and v (N + 1, n) and controls u (N, m), written during the rollout except the first node.
 
-        The values of the terms at the samples of the rule (s, 9) go into ``values`` (N s, terms).
+        Writes the values of the terms at the samples of the rule (s, 9) into ``values`` (N s, terms).
         """
 
     def ask(self, weight: float, most: float, after: int, parts: float) -> None:
-        """End the motion where ``weight`` times its values exceed ``most``, or its first steps take too many parts.
+        """Stop the motion when ``weight`` times the sum of its values exceeds ``most``.
 
-        It is looked at from ``after`` steps on, which may take ``parts`` together.
+        The check begins after ``after`` steps. The motion also stops there if these steps have over ``parts`` parts.
         """
 
     def after(self, step: int, parts: int) -> bool:
-        """Look at a step, which was taken in so many parts; False where the motion is to end there."""
+        """Account for a step with this number of parts; False to stop the motion."""
 
     @property
     def verdict(self) -> Verdict: ...
 
 class _Rollout:
-    """What the rollouts of variational integrators have in common; of this file alone.
+    """Common interface of the rollouts of variational integrators; it exists in this file only.
 
-    Paths and the work arrays of a step, which forks share: one of them moves at a time.
+    A rollout has paths and the work arrays of a step. Forks share the work arrays: only one of them advances at a time.
     """
 
     def begin(self, q: Floats, v: Floats) -> bool:
-        """Put each path at its row of q and v (P, n); False where an M(q) is not positive definite."""
+        """Start each path at its row of q and v (P, n); False if an M(q) is not positive definite."""
 
     def kick(self, impulse: Floats) -> None:
-        """Add an impulse (P, n) to the momenta; constraints absorb what is normal to them."""
+        """Add an impulse (P, n) to the momenta; constraints absorb its normal component."""
 
     def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
         """Configurations, momenta and velocities (P, n), and energies (P,)."""
 
     def halvings(self, path: int) -> Bytes:
-        """Of each part of every step of a path in its last roll that was not taken whole, step after step."""
+        """The halvings of each part of every divided step in the last roll of a path, in order."""
 
 class VariationalRollout(_Rollout):
     """Paths without constraints."""
@@ -190,7 +193,7 @@ class VariationalRollout(_Rollout):
         solver: Solver = Solver.automatic,
     ) -> None: ...
     def fork(self, guards: Guards) -> VariationalRollout:
-        """The paths as they stand, to move on by themselves."""
+        """An independent copy of the paths."""
 
     def roll(
         self,
@@ -202,10 +205,10 @@ class VariationalRollout(_Rollout):
         watch: Watch | None = None,
         impulses: Floats | None = None,
     ) -> None:
-        """Take the steps that the commands are for, and write them into the nodes; named tuples of arrays.
+        """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays.
 
-        One path alone may be under a watch, which may end it. ``impulses`` on top of the noise's jump the momenta
-        before and after each step (P, N, 2, n).
+        A watch may stop a single path. ``impulses`` (P, N, 2, n), in addition to noise, are added to the momenta before
+        and after each step.
         """
 
 class ConstrainedRollout(_Rollout):
@@ -215,16 +218,16 @@ class ConstrainedRollout(_Rollout):
         self, mechanism: Mechanism, tableau: Tableau, places: Floats, tolerance: float, guards: Guards, paths: int
     ) -> None: ...
     def fork(self, guards: Guards) -> ConstrainedRollout:
-        """The paths as they stand, to move on by themselves."""
+        """An independent copy of the paths."""
 
     def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: Nodes) -> None:
-        """Take the steps that the commands are for, and write them into the nodes; named tuples of arrays."""
+        """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays."""
 
     def impulses(self, path: int) -> Floats:
-        """What the constraints gave in each step of a path in its last roll (steps, c): dg/dq' times it."""
+        """Constraint impulses (steps, c) in each step of the last roll of a path; joints feel dg/dq' times them."""
 
     def weakest(self, path: int) -> int:
-        """The row of the constraints that depended most on the others where a path was last."""
+        """The constraint row that was closest to dependence on the others at the end of a path."""
 
 def constrained_derivatives(
     mechanism: Mechanism,
@@ -243,7 +246,7 @@ def constrained_derivatives(
     guess: Floats,
     ramp: bool = False,
 ) -> tuple[Floats, Floats, Floats, int, int]:
-    """As variational_derivatives; and in the rates (N, i) of joints moved by hand, (N, 2n, i)."""
+    """As variational_derivatives, and derivatives (N, 2n, i) in the rates (N, i) of driven joints."""
 
 def variational_derivatives(
     mechanism: Mechanism,
@@ -261,13 +264,13 @@ def variational_derivatives(
     ramp: bool = False,
     solver: Solver = Solver.automatic,
 ) -> tuple[Floats, Floats, int, int]:
-    """d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n); how it ended, and how many steps were done.
+    """d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n), the outcome, and the number of steps done.
 
-    ``force`` (N, 1, n) is constant over each step, or (N, s, n) that at each stage. f is constant over the step, or
-    with ``ramp`` grows from 0 at its start to f at its end.
+    ``force`` is (N, 1, n), constant over each step, or (N, s, n) at its stages. f is constant over the step, or with
+    ``ramp`` grows linearly from 0 at its start to f at its end.
 
-    ``halvings`` are those of the parts of all steps with more ``substeps`` than one. The same parts are taken again;
-    one that ``guards`` refuse, where they are active, in halves.
+    ``halvings`` are those of the parts of all steps with more than one of ``substeps``. The same parts are repeated;
+    parts that active ``guards`` refuse are halved.
     """
 
 def variational_curvatures(
@@ -286,7 +289,7 @@ def variational_curvatures(
     z: Floats,
     solver: Solver = Solver.automatic,
 ) -> tuple[Floats, int, int]:
-    """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n); how it ended, and how many steps were done."""
+    """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n), the outcome, and the number of steps done."""
 
 def variational_ends(
     mechanism: Mechanism,
@@ -302,12 +305,12 @@ def variational_ends(
     *,
     solver: Solver = Solver.automatic,
 ) -> tuple[Floats, Floats, int, int]:
-    """Configurations and velocities (N, n) at the end of each step; how it ended, and how many steps were done."""
+    """Configurations and velocities (N, n) at the end of each step, the outcome, and the number of steps done."""
 
 class ExpandedSteps:
-    """The linearized dynamics and the expanded costs of N steps; what may be left out is empty then.
+    """The linearized dynamics and the expanded costs of N steps; optional arrays may be empty.
 
-    See src/core/include/varpin/steps.hpp for the fields.
+    The fields are described in src/core/include/varpin/steps.hpp.
     """
 
     def __init__(
@@ -331,11 +334,11 @@ class ExpandedSteps:
         """Raises ValueError for arrays that do not fit each other."""
 
 class Gains:
-    """Arrays of R decisions and N steps that a backward pass fills in: u + k + K (x - x_nominal).
+    """Arrays of R decisions and N steps that a backward pass fills in, for u + k + K (x - x_nominal).
 
-    ``feedforward`` (R, m), ``feedback`` (R, m, 2n), ``previous`` (R, m, m) on the control before where its change costs
-    something, ``control_gradient`` (R, m) of the cost, ``costate`` (N, 2n) its gradient in the state after each step,
-    empty if not asked for, and ``spread`` (N, 2n, 2n) S where there is noise.
+    ``feedforward`` (R, m), ``feedback`` (R, m, 2n), ``previous`` (R, m, m) on the previous control if its change has a
+    cost, ``control_gradient`` (R, m) of the cost, ``costate`` (N, 2n), its gradient in the state after each step, empty
+    if not wanted, and ``spread`` (N, 2n, 2n), S, with noise only.
     """
 
     def __init__(
@@ -363,23 +366,23 @@ class _Found:
         """Sum of k . Quu k."""
     @property
     def noise(self) -> float:
-        """What noise adds to the cost."""
+        """The cost of noise."""
     @property
     def loss(self) -> float:
-        """The largest part of a pivot of Quu, or of its root, that rounding may have changed."""
+        """The largest relative rounding error of a pivot of Quu, or of its root."""
 
 class BackwardPass(_Found):
     """The recursion from the terminal cost's gradient (2n,) and Hessian (2n, 2n) in x."""
 
     def __init__(self, controls: int, gradient: Floats, hessian: Floats) -> None: ...
     def run(self, h: float, hold: int, regularization: float, steps: ExpandedSteps, gains: Gains) -> int:
-        """Over a block of steps, the last block first; -1, or the decision that has no minimum.
+        """Pass over a block of steps, the last block first; returns -1, or the decision without a minimum.
 
         Each control is held over ``hold`` steps.
         """
 
 class RootPass(_Found):
-    """The same on square roots, from the terminal cost in x as one function of squares, and its gradient (2n,)."""
+    """:class:`BackwardPass` on square roots, from the terminal cost in x as squares, and its gradient (2n,)."""
 
     def __init__(self, controls: int, terminal: Squares, gradient: Floats) -> None: ...
     def run(
@@ -392,20 +395,21 @@ class RootPass(_Found):
         running: Squares,
         change: Squares | None = None,
     ) -> int:
-        """As that of :class:`BackwardPass`; ``running`` are the samples' costs, ``change`` those of R changes."""
+        """See :class:`BackwardPass`; ``running`` has the costs of the samples, ``change`` those of R changes."""
 
 def foresee(hold: int, steps: ExpandedSteps, gains: Gains, state: Floats, expected: Floats, moves: Floats) -> None:
-    """Where the linearized motion goes under gains, each control clipped to its limits.
+    """The linearized motion under gains, each control clipped to its limits.
 
-    ``state`` (2n + m,), the deviations before the first step of the state and of the control before it, becomes those
-    after the last; ``expected`` (R, 2n + m) are those before each decision, ``moves`` (R, m) the controls' changes.
+    ``state`` (2n + m,) has the deviations of the state and of the previous control at the start, and is overwritten by
+    those at the end. ``expected`` (R, 2n + m) receives those before each decision, ``moves`` (R, m) the changes of the
+    controls.
     """
 
 def box_minimum(H: Floats, g: Floats, limits: Floats, guess: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]] | None:
     """The x (m,) within ``limits`` (2, m) that minimizes g . x + (1/2) x'Hx; None where H is not positive definite.
 
-    With it, L D L' of H with held rows and columns replaced by those of the identity (unit L below the diagonal, D on
-    it), and which entries the box holds.
+    Also returns L D L' of H with rows and columns of entries at a limit replaced by those of the identity (unit L below
+    the diagonal, D on it), and which entries are at a limit.
     """
 
 class Links:
@@ -428,14 +432,14 @@ class Links:
         """Raises ValueError for arrays that do not fit each other or describe no tree."""
 
     def place_frame(self, turned: Floats, shifted: Floats, q: Floats, jacobian: bool) -> tuple[Floats, Floats, Floats]:
-        """World rotations (N, 3, 3) and positions (N, 3) of a frame on the last body, its Jacobians (N, 6, n) if asked.
+        """World rotations (N, 3, 3), positions (N, 3) and Jacobians (N, 6, n) of a frame on the last body.
 
-        The frame stands at (turned (3, 3), shifted (3,)) in the body; Jacobians are linear over angular velocity in
-        world axes, and (0, 6, n) where nobody asks for them.
+        The frame has rotation ``turned`` (3, 3) and position ``shifted`` (3,) in the body. Jacobians are linear, then
+        angular velocity in world axes; without ``jacobian`` they are (0, 6, n).
         """
 
 class Outcome(IntEnum):
-    """Why a rollout of a path ended; see src/core/include/varpin/nodes.hpp."""
+    """The reason for the end of a path's rollout; see src/core/include/varpin/nodes.hpp."""
 
     solved = ...
     diverged = ...
@@ -447,7 +451,7 @@ class Outcome(IntEnum):
     assembly = ...
 
 class ForwardDynamics:
-    """Forward dynamics at one state after another."""
+    """Forward dynamics at single states."""
 
     def __init__(self, mechanism: Mechanism, solver: Solver = Solver.automatic) -> None: ...
     def rate(self, x: Floats, force: Floats) -> tuple[Floats, bool]:
@@ -461,7 +465,7 @@ def accelerations(
 ) -> tuple[Floats, Floats, Floats, Floats, int]:
     """Accelerations (N, n) at each row of q, v and force (N, n), and their derivatives (N, n, n) in each.
 
-    With them, how many rows there are before the first whose mass matrix is not positive definite.
+    Also returns the number of rows before the first whose mass matrix is not positive definite.
     """
 
 class ExplicitMethod(Enum):
@@ -472,7 +476,7 @@ class ExplicitMethod(Enum):
     runge_kutta = ...
 
 class ExplicitRollout:
-    """P paths of an explicit method on their way."""
+    """P paths of an explicit method."""
 
     @staticmethod
     def start(mechanism: Mechanism, method: ExplicitMethod, q: Floats, v: Floats) -> ExplicitRollout:
@@ -480,15 +484,15 @@ class ExplicitRollout:
 
     @property
     def q(self) -> Floats:
-        """Where the paths stand (P, n) [rad or m]; what is written to it moves them."""
+        """Current configurations of the paths (P, n) [rad or m], writable."""
 
     @property
     def v(self) -> Floats:
-        """Their velocities (P, n), in the same way."""
+        """Current velocities of the paths (P, n) [rad/s or m/s], writable."""
 
     def copy(self) -> ExplicitRollout: ...
     def first_nodes(self, nodes: Nodes) -> bool:
-        """Enter where each path stands as its node 0; False where a mass matrix is not positive definite."""
+        """Write the state of each path as its node 0; False if a mass matrix is not positive definite."""
 
     def roll(
         self,
@@ -502,8 +506,8 @@ class ExplicitRollout:
     ) -> None:
         """All N steps of length dt [s] of all paths.
 
-        With increments of the Wiener processes (P, N, k), or (0, 0, k) for none, and a force (P, N, n) on top of that
-        of the controls, or (0, 0, n) for none.
+        ``increments`` of the Wiener processes are (P, N, k), or (0, 0, k) for none; ``drift`` is a force in addition to
+        the controls (P, N, n), or (0, 0, n) for none.
         """
 
 def linearize_explicit(
@@ -511,33 +515,34 @@ def linearize_explicit(
 ) -> tuple[Floats, Floats, int]:
     """Derivatives of (q, v) after one step from each row of q and v, under a force (N, 1, n), or (N, s, n) by times.
 
-    In (q, v) (N, 2n, 2n), and in a constant force (N, 2n, n), or with ``ramp`` in one that grows to it from 0.
+    They are taken in (q, v) (N, 2n, 2n), and in a constant force (N, 2n, n), or with ``ramp`` in one that grows
+    linearly to it from 0.
 
-    With them, how many rows there are before the first with a mass matrix that is not positive definite.
+    Also returns the number of rows before the first whose mass matrix is not positive definite.
     """
 
 def fastest_damping(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, least: float) -> float:
-    """The fastest rate of what damps [1/s] over rows of q, v and the controls' forces f (K, n); 0 below ``least``."""
+    """The fastest damping rate [1/s] at rows of q, v and the controls' forces f (K, n); 0 below ``least``."""
 
 def pulls_fast(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, dt: float) -> bool:
-    """Whether springs, servos or gravity turn a mode by more than a radian over dt [s], at a row of q, v, f (K, n)."""
+    """Whether springs, servos or gravity advance a mode by more than a radian in dt [s], at a row of q, v, f (K, n)."""
 
 def glance(
     mechanism: Mechanism, q: Floats, v: Floats, u: Floats, substeps: Integers, dt: float
 ) -> tuple[float, bool, bool, bool]:
-    """The largest velocity; whether steps were taken in parts, all have the same controls, and a pull is fast.
+    """The largest velocity; whether steps were divided, all have the same controls, and :func:`pulls_fast` over a step.
 
-    Of nodes (N + 1, n), ``dt`` [s] apart, and controls (N, m). The last is :func:`pulls_fast` over a step, at the ends.
+    The nodes are (N + 1, n), ``dt`` [s] apart, the controls (N, m). The last value is taken at both ends of the motion.
     """
 
 def energy_turnover(
     mechanism: Mechanism, q: Floats, v: Floats, p: Floats, u: Floats, dt: float, *, even: float, looks: int
 ) -> tuple[float, float, Floats, Floats]:
-    """The energy that a motion turns over [J]; of its nodes (N + 1, n), ``dt`` [s] apart, and controls (N, m).
+    """The energy that a motion turns over [J], from its nodes (N + 1, n), ``dt`` [s] apart, and controls (N, m).
 
-    The largest kinetic energy; the largest work so far of all controls, of servos that of their drives. For each
-    coordinate (n,): the kinetic energy of the largest change of its velocity, at least by the part ``even`` of its
-    largest; the largest work so far.
+    Returns the largest kinetic energy; the largest accumulated work of all controls, for servos that of their drives;
+    and for each coordinate (n,) the kinetic energy of the largest change of its velocity, at least the share ``even``
+    of its largest velocity, and the largest accumulated work.
     """
 
 def windows_agree(
@@ -556,24 +561,26 @@ def windows_agree(
     light: float,
     even: float,
 ) -> bool:
-    """Whether windows of a motion (N + 1, n) are what steps of twice the length make of them (K, length / 2, n).
+    """Whether windows of a motion (N + 1, n) agree with the results (K, looks, n) of other steps.
 
-    Up to ``way`` of each coordinate's way over the window, and ``velocity`` of its largest velocity.
+    Errors may reach the share ``way`` of the travel of each coordinate in the window, and ``velocity`` of its largest
+    velocity. The results are at ``looks`` evenly spaced nodes of each window.
     """
 
 def longest_alternation(
     v: Floats, u: Floats | None, *, counts: float, idle: float, even: float
 ) -> tuple[int, int, int]:
-    """The coordinate, the number and the first node of the longest stretch of turns of v (N + 1, n), one after another.
+    """Coordinate, length and first node of the longest alternation of v (N + 1, n).
 
-    Turns are those of its second differences. Nodes at which one of the controls u (N, m) turns do not count.
+    An alternation is a sequence of sign changes in consecutive second differences. Nodes at which a control of u (N, m)
+    reverses interrupt it.
     """
 
 class Subject(Enum):
-    """What the residual of a cost is of.
+    """The quantity of a cost's residual.
 
-    Entries of z = (q, v, u), or what they are beyond limits; a frame's position, orientation or twist, or what its
-    manipulability lacks.
+    Entries of z = (q, v, u), or their excess beyond limits; the position, orientation or twist of a frame, or the
+    deficit of its manipulability.
     """
 
     entries = 0
@@ -589,36 +596,36 @@ class CostTerms:
     @staticmethod
     def make(dof: int, controls: int) -> CostTerms: ...
     def add_frame(self, links: Links, turned: Floats, shifted: Floats) -> int:
-        """A frame that stands at (turned, shifted) in the last of some bodies; its index."""
+        """Add a frame with rotation ``turned`` and position ``shifted`` in the last of some bodies; its index."""
 
     def add_center(self, links: Links) -> int:
-        """The bodies' centre of mass, in the place of a frame; its index."""
+        """Add the centre of mass of the bodies in place of a frame; its index."""
 
     def add_term(self, subject: Subject, place: int, weight: Floats, target: Floats, directions: Integers) -> None:
-        """A term with weight (r, r) and targets (T, r) that repeat after T samples.
+        """Add a term with weight (r, r) and targets (T, r) that repeat after T samples.
 
-        Targets of an orientation are (T, 9); of an excess (T, 2 r), the least values and then the greatest. ``place``
-        is the first of the entries of z, or the index of the frame; ``directions`` (d,) are the rows of the Jacobian
-        that a manipulability is of, none for other subjects.
+        Targets of an orientation are (T, 9); of an excess (T, 2 r), lower limits and then upper limits. ``place`` is
+        the index of the first entry of z, or of the frame; ``directions`` (d,) are the rows of the Jacobian in a
+        manipulability, none for other subjects.
         """
 
     def values(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The value of each term (N, terms) at rows of q (N, n), v (N, n) and u (N, m)."""
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
-        """Gradient (N, 2n + m) and Hessian (N or 1, 2n + m, 2n + m) of all terms, of Gauss and Newton."""
+        """Gradient (N, 2n + m) and Gauss-Newton Hessian (N or 1, 2n + m, 2n + m) of all terms."""
 
     def expand_steps(self, rule: Floats, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
-        """The same at the samples of the rule (s, 9) in the steps of q and v (N + 1, n) under u (N, m)."""
+        """:meth:`expand` at the samples of the rule (s, 9) in the steps of q and v (N + 1, n) under u (N, m)."""
 
 def change_values(weight: Floats, before: Floats, u: Floats) -> Floats:
-    """What the changes of controls (P, N, m) cost, weight (m, m) . (u_k - u_(k-1))^2, one by one (P, N).
+    """The cost (P, N) of each change of controls (P, N, m), weight (m, m) . (u_k - u_(k-1))^2.
 
-    ``before`` is the control before the first one (1, m), or (0, m) where the first one is free.
+    ``before`` is the control before the first one (1, m), or (0, m) if the first change has no cost.
     """
 
 def expand_changes(weight: Floats, before: Floats, u: Floats) -> tuple[Floats, Floats]:
-    """Gradients (N, m) and Hessians (N, m, m) in u_k of the same at controls (N, m), with u_(k-1) as it is."""
+    """Gradients (N, m) and Hessians (N, m, m) in u_k of the cost of :func:`change_values`, at fixed u_(k-1)."""
 
 def sample_steps(rule: Floats, q: Floats, v: Floats) -> tuple[Floats, Floats]:
     """Samples (P, N s, n) of q and v from their nodes (P, N + 1, n), by a rule (s, 9)."""

@@ -56,9 +56,9 @@ def integrator_of(text: str) -> Integrator:
     known = options_of(kind)
     odd = [option for option in named if option not in known[len(values) :]]
     if len(values) > len(known) or odd:
-        which = f"option {odd[0]!r}" if odd and odd[0] not in known else "room for all of these options"
+        which = f"no option {odd[0]!r}" if odd and odd[0] not in known else "fewer options than given"
         has = f"its options are {', '.join(known)}" if known else "it has none"
-        raise InputError(f"{name} has no {which}; {has}: {text!r}")
+        raise InputError(f"{name} has {which}; {has}: {text!r}")
     return kind(*values, **named)
 
 

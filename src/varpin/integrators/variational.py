@@ -51,9 +51,9 @@ Floats = NDArray[np.float64]
 # Tolerance of an energy balance that is not checked.
 _UNCHECKED = 1e300
 
-# Second derivatives under constraints are differences of the first of fourth order: places and weights, in units of a
-# shift [rad or m, or of speed].
+# Points and weights of fourth-order differences of first derivatives, for second derivatives under constraints.
 _DIFFERENCES = ((1.0, 2.0 / 3.0), (-1.0, -2.0 / 3.0), (2.0, -1.0 / 12.0), (-2.0, 1.0 / 12.0))
+# Unit of the points [rad or m, and for momenta and forces the speeds rad/s or m/s].
 _SHIFT = 2.5e-4
 
 REASONS: dict[int, str] = {
@@ -338,9 +338,10 @@ class Variational(Integrator):
         return Jx, Jf
 
     def _contract_by_differences(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
-        """:meth:`contract` under constraints: differences of the gradients z' J, whose derivatives J are exact.
+        """:meth:`contract` under constraints, by differences of the gradients z' J with exact derivatives J.
 
-        In directions of like speeds: a momentum that suits the base moves a light wrist by rad/s.
+        Momenta and forces are scaled by the mass matrix to equal speeds, since heavy and light joints differ by orders
+        of magnitude.
         """
         n, N, cubic = scene.robot.dof, trajectory.steps, [k for k, rate in enumerate(scene.rates) if rate >= 0]
         wide = 3 * n + len(cubic)
@@ -353,7 +354,7 @@ class Variational(Integrator):
         S[:, n : 2 * n, n : 2 * n] = M
         S[:, 2 * n : 3 * n, 2 * n : 3 * n] = M / trajectory.dt
         for c in scene.inputs.values():
-            # A position in place of a force.
+            # The control of a kinematic input is a position, not a force.
             S[:, 2 * n + c, 2 * n : 3 * n] = S[:, 2 * n : 3 * n, 2 * n + c] = 0.0
             S[:, 2 * n + c, 2 * n + c] = 1.0
         copies = len(_DIFFERENCES)

@@ -574,7 +574,7 @@ def quiet(scene: Scene) -> Scene:
 
 
 def assisted(scene: Scene) -> Scene:
-    """The scene without its noise and with n controls more, a force on each joint."""
+    """The scene without noise, with n additional controls, a force on each joint."""
     return _driven(scene, np.hstack([scene.actuation, np.eye(scene.robot.dof)]))
 
 
@@ -583,9 +583,9 @@ def _driven(scene: Scene, actuation: Floats) -> Scene:
     actuation = actuation.copy()
     actuation.setflags(write=False)
     made = object.__new__(Scene)
-    # Past the dataclass, which refuses assignments, and without properties that are made on use.
-    own = {item.name: getattr(scene, item.name) for item in fields(Scene)}
-    vars(made).update(own | {"actuation": actuation, "noise": bind(None, actuation)})
+    # The frozen dataclass refuses assignments; cached properties are not copied.
+    values = {item.name: getattr(scene, item.name) for item in fields(Scene)}
+    vars(made).update(values | {"actuation": actuation, "noise": bind(None, actuation)})
     return made
 
 
@@ -890,8 +890,8 @@ def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Flo
         alone = _sole_control(actuation, c)
         if alone is None:
             raise InputError(
-                f"the position servo of joint {name!r} needs a control of its own: in this actuation no control drives "
-                "this joint alone, with factor 1"
+                f"the position servo of joint {name!r} needs a control of its own: no control of this actuation drives "
+                "the joint alone, with factor 1"
             )
         scaled[c, alone] = servo.values[0]
     return scaled

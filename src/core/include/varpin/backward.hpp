@@ -2,15 +2,16 @@
 // docs/mathematics.md, "The backward pass", "Digits", "Limits" and "Smooth controls".
 //
 // The value after a step is v0 + Wx . x' + Wu . u + (1/2) (x', u) W (x', u), in deviations from the nominal trajectory;
-// u is in it only while a control is held over several steps. With x' = A x + B u + sum_i (g_i + Gx_i x + Gu_i u) dw_i,
-// the cost of the step expanded at its samples z = D (x, u), and S = h (Wxx + h dz/dx'' l_zz dz/dx'),
+// it depends on u only while a control is held over several steps. With x' = A x + B u + sum_i (g_i + Gx_i x + Gu_i u)
+// dw_i, the cost of the step expanded at its samples z = D (x, u), and S = h (Wxx + h dz/dx'' l_zz dz/dx'),
 //
 //     Q_x  = h D'l_z + A'Wx + sum_i Gx_i' S g_i,        Q_xx = h D'l_zz D + A'Wxx A + sum_i Gx_i' S Gx_i,
 //     k    = -Q_uu^-1 Q_u,    K = -Q_uu^-1 Q_ux,        V_xx = Q_xx + K'(Q_uu K + Q_ux) + Q_ux'K,
 //
-// and so on in u; v0 grows by (1/2) sum_i g_i' S g_i. Where the change of the control costs (1/2) (u - w)' R (u - w),
-// w the control before, the decision adds R to Q_uu and to Q_ww and -R to Q_uw: gains on w are those on x with -R in
-// place of Q_ux, and the value before it is one of (x, w).
+// and likewise in u; v0 grows by (1/2) sum_i g_i' S g_i. A cost (1/2) (u - w)' R (u - w) of the change from the
+// previous control w adds R to Q_uu and to Q_ww and -R to Q_uw at a decision: gains on w follow from the formula for x
+// with -R in place of Q_ux, and the value before the decision depends on (x, w).
+//
 // Equations (O2), (O4) and (O6) of docs/mathematics.md.
 #pragma once
 
@@ -29,7 +30,7 @@ namespace varpin {
 
 class BackwardPass {
   public:
-    // From the gradient (2n) and the Hessian (2n, 2n) of the terminal cost in x.
+    // Starts from the gradient (2n) and the Hessian (2n, 2n) of the terminal cost in x.
     BackwardPass(int dof, int controls, const double* terminal_gradient, const double* terminal_hessian)
         : n(dof),
           m(controls),
@@ -62,8 +63,8 @@ class BackwardPass {
         }
     }
 
-    // Over a block of steps, which follow each other from the last to the first, each control held over `hold` of them;
-    // -1, or the decision that has no minimum.
+    // A pass over a block of steps, with each control held over `hold` of them; blocks follow each other from the last
+    // to the first. Returns -1, or the decision without a minimum.
     std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Gains& gains) {
         for (std::ptrdiff_t s = steps.steps - 1; s >= 0; --s) {
             if (gains.costate) std::copy_n(costate.data(), x, gains.costate + s * x);
@@ -86,8 +87,8 @@ class BackwardPass {
     Found found;
 
   private:
-    // Q and its gradients from the value after step s. The control is that of the next step, or what its change is
-    // counted from, where the value has rows of its own for it: `held`.
+    // Q and its gradients from the value after step s. With `held`, the value has rows for the control: that of the
+    // next step, or the previous control of a change with a cost.
     void carry(const ExpandedSteps& steps, std::ptrdiff_t s, bool held) {
         step.load(steps, s);
         std::fill_n(terms.begin(), size, 0.0);
@@ -117,7 +118,7 @@ class BackwardPass {
         }
     }
 
-    // T = factor H D for the leading rows of the running cost's Hessian that are not zero; how many there are.
+    // T = factor H D for the leading nonzero rows of the running cost's Hessian; returns their number.
     int weigh(double factor, const double* H, const TiledMatrix& of) {
         int rows = x;
         while (rows > 0 &&
@@ -136,7 +137,7 @@ class BackwardPass {
         return rows;
     }
 
-    // The samples h w l(z) of step s, with z = D (x, u).
+    // Add the samples h w l(z) of step s, with z = D (x, u).
     void add_running_cost(double h, const ExpandedSteps& steps, std::ptrdiff_t s) {
         const auto samples = static_cast<std::ptrdiff_t>(steps.rule.size());
         for (std::ptrdiff_t sample = 0; sample < samples; ++sample) {
@@ -164,7 +165,7 @@ class BackwardPass {
         }
     }
 
-    // The terms of the noise, and S into `spread`. Where the running cost is sampled after the kick, it counts too.
+    // Add the terms of the noise, including running costs sampled after the kick; writes S into `spread`.
     void add_noise(double h, const ExpandedSteps& steps, std::ptrdiff_t s, double* spread) {
         const auto samples = static_cast<std::ptrdiff_t>(steps.rule.size());
         for (int i = 0; i < x; ++i) {
@@ -205,8 +206,8 @@ class BackwardPass {
 
     // Gains of decision r, and the value under them; false where Quu is not positive definite.
     //
-    // Within limits the decision minimizes the model where the state is expected, and controls at a limit have no
-    // feedback (Tassa, Mansard and Todorov 2014, who expect the nominal state).
+    // With limits, the decision minimizes the model at the expected state, and controls at a limit have no feedback
+    // (Tassa, Mansard and Todorov 2014, at the nominal state).
     bool decide(double regularization, const ExpandedSteps& steps, std::ptrdiff_t r, const Gains& gains) {
         const double* rate = steps.rate ? steps.rate + r * m * m : nullptr;
         const double* pull = steps.rate ? steps.pull + r * m : nullptr;
@@ -234,8 +235,8 @@ class BackwardPass {
         return true;
     }
 
-    // k within limits where the state, and the control before, are `ahead` of the nominal ones (2n + m), or at those if
-    // null; its free part holds for deviations from the nominal ones again.
+    // k within limits at deviations `ahead` (2n + m) of the state and the previous control from the nominal ones, null
+    // for zero; the result applies at zero deviation again.
     bool keep_within(const double* slack, const double* ahead, const double* rate, double* k) {
         const double* Qu = Qz.data() + x;
         std::copy_n(Qu, m, pulled.data());
@@ -268,7 +269,7 @@ class BackwardPass {
         return true;
     }
 
-    // What the change of a control costs, its part in that control.
+    // Add the cost of the change of a control, in that control.
     void add_rate(const double* rate, const double* pull) {
         for (int i = 0; i < m; ++i) {
             Qz[x + i] += pull[i];
@@ -277,8 +278,8 @@ class BackwardPass {
         }
     }
 
-    // Quu with each control regularized by its own diagonal entry, whatever the others' units; one that nothing depends
-    // on stays as it is, if there are others. False where the diagonal is not positive.
+    // Quu with each control regularized in proportion to its own diagonal entry, independent of units. A control
+    // without any effect is not regularized, if there are others. False if the diagonal is not positive.
     bool regularize(double regularization) {
         double largest = 0.0;
         for (int i = 0; i < m; ++i) largest = std::max(largest, std::abs(Q[x + i][x + i]));
@@ -292,12 +293,12 @@ class BackwardPass {
         return true;
     }
 
-    // Whether nothing depends on control i.
+    // Whether control i has no effect.
     bool is_idle(int i) const {
         return Qz[x + i] == 0.0 && std::all_of(Q[x + i], Q[x + i] + size, [](double entry) { return entry == 0.0; });
     }
 
-    // K, with no feedback for controls that the box holds.
+    // K, with zero feedback for controls at a limit.
     void find_feedback() {
         for (int i = 0; i < m; ++i) {
             for (int c = 0; c < x; ++c) {
@@ -308,7 +309,7 @@ class BackwardPass {
         solve_ldl_rows(factors.data(), m, K[0], K.stride());
     }
 
-    // The value in x before a decision: V_xx = Q_xx + K'(Quu K + Qux) + Qux'K, whatever the regularization.
+    // The value in x before a decision: V_xx = Q_xx + K'(Quu K + Qux) + Qux'K, valid for regularized gains too.
     void minimized_value(const double* k) {
         for (int i = 0; i < m; ++i) {
             double moved = 0.0;
@@ -339,7 +340,7 @@ class BackwardPass {
         mirror(W, x);
     }
 
-    // Gains G on the control before a decision, and the value's rows and columns in it.
+    // Gains G on the previous control of a decision, and the rows and columns of the value in it.
     void value_of_previous(const double* R, const double* pull, const double* k, double* G) {
         for (int i = 0; i < m; ++i) {
             for (int c = 0; c < m; ++c) G[i * m + c] = box.held[i] ? 0.0 : R[i * m + c];
@@ -382,8 +383,8 @@ class BackwardPass {
     // The value: its Hessian, its gradient, and
     TiledMatrix W;
     std::vector<double> gradient;
-    std::vector<double> costate;  // the gradient without feedback and feed-forward: of the cost itself
-    std::vector<double> scale;    // rounding has left entry (i, j) of W off by about eps scale_i scale_j
+    std::vector<double> costate;  // the gradient of the cost, without feedback and feed-forward
+    std::vector<double> scale;    // the rounding error of entry (i, j) of W is about eps scale_i scale_j
 
     // Work arrays of a step.
     LinearStep step;
@@ -398,7 +399,7 @@ class BackwardPass {
     std::vector<double> Quu, factors;  // (m, m) regularized; L D L' of its free part
     TiledMatrix K, Qux, rest;          // (m, x); the last is Quu K + Qux
     std::vector<double> residual;      // (m) Quu k + Qu
-    std::vector<double> pulled;        // (m) the gradient where the state is expected
+    std::vector<double> pulled;        // (m) the gradient at the expected state
     BoxMinimum box;
 };
 

@@ -1,15 +1,15 @@
-// A body of a tree and the joint that it is on.
+// A body of a tree, with its joint.
 #pragma once
 
 #include "varpin/spatial.hpp"
 
 namespace varpin {
 
-// Body and joint. The joint stands at ratio * q[coordinate] + offset; mimic joints have ratios other than 1.
+// Body and joint. The joint position is ratio * q[coordinate] + offset; mimic joints have ratios other than 1.
 struct Body {
-    int parent = -1;  // -1 at a root; parents come first
+    int parent = -1;  // -1 for a root; parents come first
     bool prismatic = false;
-    Mat3<double> rotation{};     // of the joint's frame in its parent's, at joint position 0
+    Mat3<double> rotation{};     // of the joint's frame in the parent body, at joint position 0
     Vec3<double> translation{};  // [m]
     double mass = 0.0;           // [kg]
     Vec3<double> center{};       // in the body's frame [m]
@@ -17,7 +17,7 @@ struct Body {
     int coordinate = 0;
     double ratio = 1.0;
     double offset = 0.0;  // [rad or m]
-    bool origin = false;  // no joint above turns: moments of what it carries are taken about its own joint
+    bool origin = false;  // no ancestor is revolute: moments of this branch are taken about this joint
 };
 
 }  // namespace varpin

@@ -1,7 +1,7 @@
 // A quadratic function's minimum in a box, by a primal active set (Nocedal and Wright, Numerical Optimization, 16.5);
 // docs/mathematics.md, "Limits". Control-limited differential dynamic programming (Tassa, Mansard and Todorov 2014)
-// projects Newton steps onto the box instead. They may end where no projection of the next one descends; far from well
-// conditioned they do.
+// projects Newton steps onto the box instead. For ill-conditioned Hessians that may end at a point from which no
+// projected step descends.
 // Equation (O4) of docs/mathematics.md.
 #pragma once
 
@@ -18,7 +18,7 @@ class BoxMinimum {
     explicit BoxMinimum(int size) : factors(size * size), held(size), m(size), downhill(size), step(size) {}
 
     // The x (m) with least <= x <= greatest that minimizes g.x + (1/2) x'Hx, from a first guess in x; H (m, m) is
-    // positive definite. False where it is not, or where the iteration does not end.
+    // positive definite. False if it is not, or if the iteration does not end.
     bool solve(const double* H, const double* g, const double* least, const double* greatest, double* x) {
         for (int i = 0; i < m; ++i) x[i] = clipped(x[i], least[i], greatest[i]);
         for (int i = 0; i < m; ++i) {
@@ -39,7 +39,7 @@ class BoxMinimum {
     std::vector<char> held;       // (m) whether the box holds an entry
 
   private:
-    // Of the terms that cancel in an entry of the gradient, what counts for zero.
+    // An entry of the gradient below this part of its cancelling terms counts as zero.
     static constexpr double rounding = 1e-13;
 
     struct Entry {
@@ -59,7 +59,7 @@ class BoxMinimum {
     // NaN becomes the least.
     static double clipped(double x, double least, double greatest) { return std::min(std::max(least, x), greatest); }
 
-    // To the minimum over the free entries.
+    // The step to the minimum over the free entries.
     bool find_step(const double* H, const double* g, const double* x) {
         for (int i = 0; i < m; ++i) {
             downhill[i] = held[i] ? 0.0 : -gradient(H, g, x, i).value;
@@ -71,7 +71,7 @@ class BoxMinimum {
         return true;
     }
 
-    // Along the step, as far as the free entries go before the first of them meets a side; whether one did.
+    // Move along the step until the first free entry reaches a limit; returns whether one did.
     bool go(const double* least, const double* greatest, double* x) {
         double length = 1.0;
         int first = -1;
@@ -92,7 +92,7 @@ class BoxMinimum {
         return true;
     }
 
-    // The held entry that would gain most from being free, or -1 where none would gain.
+    // The held entry whose release would decrease the function most, or -1 if there is none.
     int most_to_gain(const double* H, const double* g, const double* least, const double* greatest,
                      const double* x) const {
         double most = 0.0;

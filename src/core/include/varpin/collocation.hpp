@@ -1,15 +1,15 @@
 // The forced discrete Euler-Lagrange equations of a collocation step: their residual r (`residuals_of`), Newton's
-// iteration on it and its derivatives. docs/mathematics.md, "Solving a step", "Higher order" and "Linearization". Under
-// constraints of the scene see constrained.hpp. The unknowns are the stage velocities V_i (tableau.hpp); with F = f +
-// the forces of the elements (forces.hpp), whose derivatives F_q, F_v and F_f - 1 are diagonal, and of couplings
+// iteration on it and its derivatives. docs/mathematics.md, "Solving a step", "Higher order" and "Linearization";
+// constrained.hpp has steps with constraints. The unknowns are the stage velocities V_i (tableau.hpp). With F = f + the
+// forces of elements (forces.hpp), whose derivatives F_q, F_v and F_f - 1 are diagonal, and of couplings
 // (couplings.hpp), whose F_q and F_v are full in their blocks,
 //
 //     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
 //     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' - f_im F_v,m)
 //                         - h^2 sum_j a_jm (abar_ij L_qq,j + f_ij F_q,j)
 //
-// N falls apart into one matrix for each block of the tree; elimination needs none of them. On the
-// branch of solutions that is connected to h -> 0 its determinant is positive.
+// N is block-diagonal, with one matrix for each block of the tree; elimination needs none of them. On the branch of
+// solutions that is connected to h -> 0 its determinant is positive.
 // Equations (D3), (D4), (S1), (C1), (C3), (L1) and (L2) of docs/mathematics.md; (1.8) and (1.9) of the paper.
 #pragma once
 
@@ -34,30 +34,30 @@ namespace varpin {
 
 inline constexpr double infinity = std::numeric_limits<double>::infinity();
 inline constexpr double rounding_unit = std::numeric_limits<double>::epsilon();
-// Below it squares and products with the rounding unit underflow: what dies out ends at rest.
+// Numbers below this count as zero, since their squares and products with the rounding unit underflow.
 inline constexpr double nothing = 1e-290;
 
-// What a step took.
+// Solver statistics of a step.
 struct Effort {
     std::int64_t newton_iterations = 0;
     std::int64_t jets = 0;
     std::int64_t sweeps = 0;  // of first order
     std::int64_t substeps = 0;
-    double residual = 0.0;  // the worst, in rounding units of the terms that cancel in it
+    double residual = 0.0;  // the largest, in rounding units of its cancelling terms
     double branch_margin = infinity;
 };
 
-// Where a step begins.
+// The start of a step.
 struct Start {
     const Coordinate* position = nullptr;  // (n)
     const Compensated* p = nullptr;        // (n)
-    const double* force = nullptr;  // (n) the controls' and the drift of the noise, or a row (s, n) for each stage
-    int stride = 0;                 // from one row to the next; 0 where it is constant over the step
+    const double* force = nullptr;         // (n) of controls and drift of noise, or (s, n) at the stages
+    int stride = 0;                        // distance of rows; 0 for a constant force
 
     const double* force_at(int stage) const { return force + stage * stride; }
 };
 
-// Of a number of joints and of stages that the compiler knows, or does not.
+// The step equation; numbers of joints and stages may be known at compile time.
 template <class Size = int, class Stages = int>
 class Collocation {
   public:
@@ -102,20 +102,20 @@ class Collocation {
     const Tableau& tableau;
     [[no_unique_address]] Size n;
     [[no_unique_address]] Stages stages;
-    std::vector<Jet<double, Size>> stage;    // without matrices where there is an elimination
-    std::optional<Elimination> elimination;  // at the iterate of the last factors; of one stage, without ties
+    std::vector<Jet<double, Size>> stage;    // without matrices if there is an elimination
+    std::optional<Elimination> elimination;  // at the iterate of the last factors; for one stage without ties
     std::optional<StageElimination> stage_elimination;
     std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
     std::vector<double> Q;                   // (s, n)
     std::vector<double> slope;               // (s, n) L_q + F
-    std::vector<JointForce<double>> acting;  // (s, n) of the elements and couplings; derivatives of elements alone
-    std::vector<double> coupled_q;           // (s, n, n) dF/dq of the couplings, if there are such forces
+    std::vector<JointForce<double>> acting;  // (s, n) of elements and couplings; derivatives of elements only
+    std::vector<double> coupled_q;           // (s, n, n) dF/dq of couplings, if there are such forces
     std::vector<double> coupled_v;           // (s, n, n) dF/dv
-    std::vector<double> weight;              // (s) of the force at each stage, in what derivatives in f are taken in
-    bool weighted = false;                   // whether any of them is not 1
+    std::vector<double> weight;              // (s) factor of the force f at each stage, for derivatives in f
+    bool weighted = false;                   // whether any factor is not 1
 
-    // Let derivatives in f be in a force that grows over the step from 0 to f, of which this solves a part; `begin` and
-    // `share` in units of the step.
+    // Take derivatives in f for a force that grows linearly from 0 to f over the whole step, of which this is the part
+    // at `begin` with length `share`, both in units of the step.
     void weigh_ramp(double begin, double share) {
         weighted = true;
         for (int i = 0; i < stages; ++i) weight[i] = begin + share * tableau.c[i];
@@ -123,13 +123,13 @@ class Collocation {
 
     // Solve the step equation from the guess in V.
     //
-    // The first factorization is kept at least until a second correction shows how fast it contracts, and for as long
-    // as three more would do. Gives up when a correction exceeds half of the one before (natural monotonicity,
-    // Deuflhard 2004), unless the residual is down at its rounding floor. A last correction is not looked at again if
-    // that contraction, or after a first one what the equation bends, takes the residual below a tenth of the
-    // tolerance: slopes are then corrected to first order. A guess within the tolerance is corrected too: what is
-    // extrapolated misses from step to step alike, and energy would drift. Where `jets_wanted`, it ends with the jets
-    // of the root.
+    // The first factorization is kept until a second correction shows its contraction, and for as long as three more
+    // corrections would suffice. The iteration fails when a correction exceeds half of the one before (natural
+    // monotonicity, Deuflhard 2004), unless the residual is at its rounding floor. The residual after the last
+    // correction is not evaluated if its estimate is below a tenth of the tolerance; `slope` is then corrected to first
+    // order. The estimate follows from the contraction, or after a first correction from the nonlinearity of the
+    // equation. A guess within the tolerance is corrected too: extrapolated guesses have a similar error in every step,
+    // and energy would drift. With `jets_wanted`, the iteration ends with the jets at the root.
     Outcome solve(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
         double before = infinity, worst = infinity;
         bool fresh = true;
@@ -148,7 +148,7 @@ class Collocation {
             const double size = kinetic_size(delta.data());
             if (iteration >= most_corrections) break;
             if (!(size <= 0.25 * before)) {
-                // The factors may be to blame, if they are of another iterate.
+                // The factors may be the cause, if they are from another iterate.
                 if (fresh) break;
                 fresh = true;
                 continue;
@@ -191,8 +191,8 @@ class Collocation {
         return elimination->factor(h * tableau.a[0], h * tableau.gradient[0], diagonal.data());
     }
 
-    // What the elements add to the pivot of coordinate c: -(by_rate F_v + by_place F_q) averaged over the step, and
-    // where no jet has the curvature of their potentials, that with F_q.
+    // The contribution of elements to the pivot of coordinate c: -(by_rate F_v + by_position F_q) averaged over the
+    // step. F_q includes the curvature of their potentials if the jets do not have it.
     double stiffening(int c, double by_rate, double by_position) const {
         if (!mechanism.forces.any()) return 0.0;
         double total = 0.0;
@@ -206,7 +206,7 @@ class Collocation {
 
     bool coupled() const { return !coupled_q.empty(); }
 
-    // The same of couplings at an entry of the symmetric part.
+    // The contribution of couplings to an entry of the symmetric part.
     [[gnu::noinline]] double coupled_stiffening(int r, int c, double by_rate, double by_position) const {
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
@@ -218,7 +218,7 @@ class Collocation {
         return total;
     }
 
-    // The same of the matrices in the stages' jets.
+    // `factor` for the matrices in the stages' jets.
     bool factor_blocks(double h) {
         double* matrix = lu.data();
         int* rows = order.data();
@@ -226,7 +226,7 @@ class Collocation {
             const int size = stages * (block.end - block.begin);
             assemble(h, block, matrix);
             if (stages == 1) {
-                // The symmetric part is positive definite on the branch sought.
+                // On the desired branch, the symmetric part is positive definite.
                 if (!factor_lu(matrix, size, {0, size})) return false;
             } else if (factor_lu_pivoting(matrix, size, rows) <= 0) {
                 return false;
@@ -238,7 +238,7 @@ class Collocation {
     }
 
     // Derivatives at the root, from the jets of its stages: dV (s, n, 3n), and of (q1, p1), all in (q0, p0, f); Jx is
-    // (2n, 2n), Jf (2n, n). Blocks alone are written into dV.
+    // (2n, 2n), Jf (2n, n). Only blocks of dV are written.
     void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
         if (eliminated_columns) return eliminate_derivatives(h, dV, Jx, Jf);
         const auto& blocks = blocks_of(mechanism.tree, n);
@@ -259,7 +259,7 @@ class Collocation {
         }
     }
 
-    // x with N x = right (s, n), from what `factor` left.
+    // x with N x = right (s, n), from the factors of `factor`.
     void solve_factored(const double* right, double* x) {
         if (eliminated()) return elimination ? elimination->solve(right, x) : stage_elimination->solve(right, x);
         solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
@@ -279,16 +279,16 @@ class Collocation {
         });
     }
 
-    // How many of q0, p0 and f have columns to be solved for: with one stage the force acts in proportion to the
-    // momentum, unless something else is in a force's place.
+    // How many of q0, p0 and f need a solve. With one stage, the columns of the force are proportional to those of the
+    // momentum, unless `every_kind` is set.
     int kinds() const { return stages == 1 && !every_kind ? 2 : 3; }
     bool every_kind = false;
 
-    // What a force on coordinate c does to the one stage, in units of what a momentum does.
+    // The effect of a force on coordinate c on a single stage, relative to that of a momentum.
     double by_momentum(double h, int c) const { return h * (weight[0] * tableau.force[0] + changed(0, c)); }
 
   private:
-    friend class ConstrainedStepper;  // which borders the matrix with constraints
+    friend class ConstrainedStepper;  // adds rows and columns of constraints to the matrix
 
     template <class Solve>
     void solve_blocks(const double* right, double* x, const Solve& solve_block) {
@@ -307,28 +307,29 @@ class Collocation {
     }
 
     static constexpr int most_corrections = 10;
-    // Columns of a block that are solved for at once with its matrix rather than one by one by elimination. Measured.
+    // Number of columns of a block up to which solving them together with the block's matrix is faster than elimination
+    // column by column. Measured.
     static constexpr int few_columns = 45;
-    // In rounding units: a residual below may stagnate; without rounding's own scatter it would be 1.
+    // Residuals below this may stagnate, in rounding units; without the scatter of rounding it would be 1.
     static constexpr double stagnation = 100.0;
-    // A residual that is expected this far below the tolerance need not be looked at.
+    // A residual whose estimate is below the tolerance by this factor is not evaluated.
     static constexpr double sure = 10.0;
-    // Largest part of its estimate that bending leaves of a residual, with room: below 1 in what has been measured.
+    // Safety factor of the estimate in left_by_bending; measured ratios of residual and estimate are below 1.
     static constexpr double bending = 10.0;
 
     std::vector<double> residual, delta;  // (s, n)
     std::vector<double> lu;               // the factors of each block, one after another
-    std::vector<int> order;               // of their rows
+    std::vector<int> order;               // permutation of their rows
     std::vector<double> change, local, columns, gain;
     bool eliminated_columns = false;  // of derivatives
-    std::vector<double> turning;      // (n) how much a coordinate turns bodies; infinite, or NaN where it is still,
-                                      // where it slides them on a body that turns
-    std::vector<double> element_curvature;  // (s, n) of the elements' potentials, where there is an elimination
-    std::vector<double> diagonal;           // (s, s, n) of N, besides what elimination takes from the bodies
+    std::vector<double> turning;      // (n) rotation of bodies per unit of a coordinate; infinite for a coordinate that
+                                      // translates a body on a rotating one, where its product is NaN without motion
+    std::vector<double> element_curvature;  // (s, n) of the elements' potentials, if there is an elimination
+    std::vector<double> diagonal;           // (s, s, n) of N, without the contributions of bodies in an elimination
 
-    // At most what the second derivatives of r leave of a residual after the correction in `delta` with fresh factors,
-    // in its rounding units. Kinetic and potential energy bend with the angles by which bodies turn: that much of a
-    // change of the momenta, and as much again of the momenta themselves. Infinite where forces bend too.
+    // Estimate of the residual, in rounding units, that second derivatives of r leave after the correction in `delta`
+    // with fresh factors. Kinetic and potential energy are nonlinear in the angles of bodies: the estimate is the angle
+    // times the change of momenta, plus the squared angle times the momenta. Infinite if forces are nonlinear too.
     double left_by_bending(double h, double before) const {
         if (!mechanism.forces.linear() || mechanism.couplings.any()) return infinity;
         double turn = 0.0;
@@ -349,7 +350,7 @@ class Collocation {
         }
     }
 
-    // For matrices and their factors.
+    // Allocate matrices and their factors.
     void allocate() {
         int size = 0, largest = 0;
         for (const Block& block : blocks_of(mechanism.tree, n)) {
@@ -364,7 +365,7 @@ class Collocation {
         local.resize(2 * largest);
     }
 
-    // Matrices too at an iterate that elimination had no need of them for.
+    // Compute the matrices of the jets at an iterate of elimination, which does not need them.
     void write_jets() {
         if (lu.empty()) allocate();
         for (int i = 0; i < stages; ++i) lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
@@ -418,7 +419,8 @@ class Collocation {
         }
     }
 
-    // What the elements add to N_im of coordinate c: by F, and where `potentials` are not in jets, by those too.
+    // The contribution of elements to N_im of coordinate c: of F and, with `potentials`, of their potentials, if the
+    // jets do not have these.
     double element_entry(double h, int i, int m, int c, bool potentials) const {
         double by_position = 0.0;
         for (int j = 0; j < stages; ++j) {
@@ -447,8 +449,8 @@ class Collocation {
         return stages == 1 ? residuals_of(1, h, start) : residuals_of(stages, h, start);
     }
 
-    // Here and elsewhere, loops over stages whose number the compiler knows to be one are none.
-    // The discrete Euler-Lagrange residual r_i(V) of each stage into `residual`; returns the worst in rounding units.
+    // The discrete Euler-Lagrange residual r_i(V) of each stage into `residual`; returns the largest in rounding units.
+    // Called with the constant 1 for one stage, so that the compiler removes the loops over stages.
     [[gnu::always_inline]] inline double residuals_of(const int stages, double h, const Start& start) {
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
@@ -477,12 +479,12 @@ class Collocation {
         return worst;
     }
 
-    // The block's part of N, (s width, s width).
+    // The block of N, (s width, s width).
     void assemble(double h, Block block, double* matrix) {
         if (stages == 1) return assemble_one(h, block, matrix);
         const int width = block.end - block.begin, size = stages * width;
         std::fill(matrix, matrix + size * size, 0.0);
-        // Row r of slope j's derivative in all of V, of which the rows of N take their share in one long loop.
+        // Row r of the derivative of slope j in all of V, added to the rows of N in one long loop.
         for (int r = 0; r < width; ++r) {
             const int row = block.begin + r;
             for (int j = 0; j < stages; ++j) {
@@ -514,7 +516,7 @@ class Collocation {
         }
     }
 
-    // The same of a single stage, which asks for no sums over stages.
+    // `assemble` for a single stage, without sums over stages.
     void assemble_one(double h, Block block, double* matrix) const {
         const double ahead = h * tableau.a[0], behind = h * tableau.gradient[0];
         const double *M = stage[0].M.data(), *A = stage[0].A.data(), *Lqq = stage[0].Lqq.data();
@@ -531,7 +533,7 @@ class Collocation {
         }
     }
 
-    // What the couplings' forces add to a row of N_im. Inlined it would slow down steps without any.
+    // The contribution of couplings to a row of N_im. Not inlined, since that would slow down steps without couplings.
     [[gnu::noinline]] void add_coupled_row(double h, int i, int m, int row, Block block, double* line) const {
         const int width = block.end - block.begin;
         const double by_rate = h * tableau.force[i * stages + m];
@@ -555,8 +557,7 @@ class Collocation {
         return total;
     }
 
-    // (A_i' + F_v,i) x_i + (L_qq,i + F_q,i) h sum_j a_ij x_j into `change`, of the x in `delta` that elimination has
-    // solved for.
+    // (A_i' + F_v,i) x_i + (L_qq,i + F_q,i) h sum_j a_ij x_j into `change`, for x in `delta`, the last solution.
     void change_of_slope(double h, std::vector<double>& change) {
         if (elimination) {
             elimination->change_of_slope(delta.data(), change.data());
@@ -580,7 +581,7 @@ class Collocation {
         columns.resize(stages * n);
         for (int k = 0; k < n; ++k) {
             for (int kind = 0; kind < 3; ++kind) {
-                // With one stage the force acts in proportion to the momentum, whose column has just been solved for.
+                // With one stage the column of the force is proportional to that of the momentum, just solved for.
                 const double scale =
                     stages == 1 && kind == 2 ? h * weight[0] * tableau.force[0] * (1.0 + acting[k].by_f) : 1.0;
                 if (stages > 1 || kind < 2) {
@@ -631,13 +632,13 @@ class Collocation {
         }
     }
 
-    // sum_j f_ij w_j (F_f,j - 1): what elements make of a constant force in r_i.
+    // sum_j f_ij w_j (F_f,j - 1): the change of a constant force in r_i by elements.
     double changed(int i, int c) const {
         double total = 0.0;
         for (int j = 0; j < stages; ++j) total += weight[j] * tableau.force[i * stages + j] * acting[j * n + c].by_f;
         return total;
     }
-    // sum_j b_j w_j F_f,j: what of it arrives at the end.
+    // sum_j b_j w_j F_f,j: the factor of a constant force in p1.
     double passed(int c) const {
         double total = weighted ? 0.0 : 1.0;
         for (int j = 0; j < stages && weighted; ++j) total += weight[j] * tableau.b[j];
@@ -645,7 +646,7 @@ class Collocation {
         return total;
     }
 
-    // Bring L_q + F to where the correction in `delta` has taken the stages, to first order in it.
+    // Correct L_q + F of the stages for the step `delta`, to first order.
     void correct_slopes(double h) {
         std::vector<double>& moved = residual;
         for (int i = 0; i < stages; ++i) {
@@ -716,7 +717,7 @@ class Collocation {
         } else {
             const int across = kinds() * width;
             columns.resize(entries(size, across));
-            // Row k of the block's own system, which stands at (stage, coordinate) in dV.
+            // Row k of the block's system, at (stage, coordinate) in dV.
             const auto line = [&](int k) { return &dV[((k / width) * n + block.begin + k % width) * 3 * n]; };
             for (int k = 0; k < size; ++k) {
                 const double* from = line(stages == 1 ? k : rows[k]);

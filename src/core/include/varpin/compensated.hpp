@@ -1,8 +1,7 @@
-// Sums that keep what rounding takes from them, and angles with whole turns taken off.
+// Compensated sums, and angles without whole turns.
 //
-// A joint that has turned a million times stands at an angle of which floating point keeps nine decimals, and a sweep
-// would see no more of it. The Lagrangian does not know how often an angle went round, so sweeps see it within one
-// turn; the turns are counted beside it, and the angle that is shown is continuous.
+// The angle of a joint after a million turns has only nine decimals in floating point. The Lagrangian is periodic in
+// such an angle, so sweeps take it within one turn. Whole turns are counted separately; the reported angle has them.
 #pragma once
 
 #include <cmath>
@@ -10,7 +9,7 @@
 
 namespace varpin {
 
-// high + low, low being what rounding took from high.
+// The sum high + low, where low is the rounding error of high.
 struct Compensated {
     double high = 0.0;
     double low = 0.0;
@@ -24,17 +23,17 @@ struct Compensated {
     }
 };
 
-// A coordinate: its value within one turn, and the whole turns beside it.
+// A coordinate: its value within one turn, and its whole turns.
 struct Coordinate {
     Compensated value;
     double turns = 0.0;
 
-    // A turn in two parts, the first so short that its multiples are exact (Cody and Waite 1980).
+    // A turn in two parts, the first with so few digits that its multiples are exact (Cody and Waite 1980).
     static constexpr double turn = 2.0 * std::numbers::pi;
     static constexpr double turn_high = 6.28125;
     static constexpr double turn_low = 0.0019353071795864769253;
 
-    // Take whole turns off.
+    // Remove whole turns.
     void unwind() {
         if (std::abs(value.high) <= turn) return;
         const double whole = std::floor(value.high / turn + 0.5);

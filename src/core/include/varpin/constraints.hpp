@@ -1,13 +1,13 @@
-// Holonomic constraints g(q) = 0, m rows, with all derivatives that steps ask for. docs/constraints.md.
+// Holonomic constraints g(q) = 0, m rows, with all derivatives that steps need. docs/constraints.md.
 //
-// Rows between frames are products g = factor X . Y - constant of vectors that bodies carry: a point of a body, the
-// vector between two points, or a direction. Each moves with the joints on the way to its body: with w_i the angular
-// velocity that joint i gives to it, d2X/dq_i dq_j = w_i x dX/dq_j for i above j or j itself, so that
+// Rows between frames are products g = factor X . Y - constant of vectors on bodies: a point of a body, the vector
+// between two points, or a direction. A vector depends on the joints from the root to its body: with w_i the angular
+// velocity per unit rate of joint i, d2X/dq_i dq_j = w_i x dX/dq_j for i an ancestor of j or j itself, so that
 //
 //     g_j  = X_j . Y + X . Y_j
 //     g_ij = X_ij . Y + X_i . Y_j + X_j . Y_i + X . Y_ij
 //
-// A row that ties a joint to another is a polynomial. Others are functions that whoever makes them gives.
+// A row that ties a joint to another is a polynomial. Other rows are functions from Python.
 #pragma once
 
 #include <algorithm>
@@ -23,19 +23,19 @@
 
 namespace varpin {
 
-// A point from its body's joint [m], or a direction, in the body's axes; in the world's where there is no body, -1.
+// A point relative to its body's joint [m], or a direction, in body axes; in the world for body -1.
 struct CarriedVector {
     int body = -1;
     Vec3<double> point{};
     bool direction = false;
 };
 
-// Sum of carried vectors, the second one taken negative.
+// A vector, or the difference of two.
 struct VectorSum {
     std::vector<CarriedVector> parts;  // one or two
 };
 
-// factor X . Y - constant; x and y are places in the list of vectors.
+// factor X . Y - constant; x and y are indices into the list of vectors.
 struct ProductRow {
     int x = 0;
     int y = 0;
@@ -43,19 +43,20 @@ struct ProductRow {
     double constant = 0.0;
 };
 
-// q_follower - sum_k coefficients_k q_leader^k. A joint that leads itself, without coefficients, is moved by hand.
+// q_follower - sum_k coefficients_k q_leader^k. A joint that leads itself, without coefficients, is driven: its motion
+// is prescribed by a control.
 struct TieRow {
     int follower = 0;
     int leader = 0;
     std::vector<double> coefficients;
-    int rate = -1;  // of a joint that is moved by hand: the control that is its rate at the goal, or -1 for a line
+    int rate = -1;  // of a driven joint: the control of its rate at the goal, or -1 for linear motion
 };
 
-// The row of a joint that is moved by hand: q - (where it is to be), of which the core knows the second.
+// The row of a driven joint, q - goal; the goal is in the force of the step.
 struct DrivenRow {
     int row = 0;
     int coordinate = 0;
-    int rate = -1;  // as TieRow's
+    int rate = -1;  // as in TieRow
 };
 
 // A function of q with several rows.
@@ -68,16 +69,16 @@ struct CustomRows {
 // Constraints at one q.
 struct ConstraintJet {
     std::vector<double> g;       // (m)
-    std::vector<double> scale;   // (m) of the terms that cancel in g
+    std::vector<double> scale;   // (m) magnitude of the terms that cancel in g
     std::vector<double> C;       // (m, n)
-    std::vector<double> size;    // (m, n) of the terms that cancel in C
+    std::vector<double> size;    // (m, n) magnitude of the terms that cancel in C
     std::vector<double> at_q;    // (n)
     std::vector<double> custom;  // (n, n)
-    // Work: of what derivatives are made.
+    // Work arrays of derivatives.
     struct Lever {
         int coordinate = 0;
         Vec3<double> turn{};   // w_i
-        Vec3<double> shift{};  // of the vector
+        Vec3<double> shift{};  // dX/dq_i of the vector
     };
     std::vector<Placement> at;
     std::vector<std::vector<Lever>> levers;  // of each part of each vector, from the root on
@@ -132,7 +133,7 @@ class Constraints {
     // m: products first, then ties, then functions.
     int rows() const { return rows_; }
 
-    // Rows of joints that are moved by hand.
+    // Rows of driven joints.
     const std::vector<DrivenRow>& driven() const { return driven_; }
 
     // g and C at q.
@@ -187,7 +188,7 @@ class Constraints {
         }
     }
 
-    // Adds factor sum_r weights_r g_r,qq to a matrix (n, n), where `at` has been.
+    // Adds factor sum_r weights_r g_r,qq to a matrix (n, n), at the q of the last `at`.
     void add_curvature(const double* weights, double factor, ConstraintJet& w, double* H) const {
         std::fill(w.weight.begin(), w.weight.end(), Vec3<double>{});
         int r = 0;
@@ -229,9 +230,9 @@ class Constraints {
         }
     }
 
-    // g_qq v (m, n), where `at` has been.
+    // g_qq v (m, n), at the q of the last `at`.
     void bend(const double* v, ConstraintJet& w, double* out) const {
-        // Of each vector: sum_i X_ij v_i by j, and sum_i X_i v_i.
+        // For each vector: sum_i X_ij v_i by j, and sum_i X_i v_i.
         std::fill(w.moved.begin(), w.moved.end(), Vec3<double>{});
         std::fill(w.weight.begin(), w.weight.end(), Vec3<double>{});
         std::size_t leg = 0;
@@ -261,7 +262,7 @@ class Constraints {
             ++r;
         }
         for (; r < rows_; ++r) {
-            // Of the others, one row at a time.
+            // For custom rows, one at a time.
             std::vector<double> unit(rows_), H(n_ * n_);
             unit[r] = 1.0;
             add_curvature(unit.data(), 1.0, w, H.data());
@@ -275,7 +276,7 @@ class Constraints {
   private:
     struct Joined {
         VectorSum sum;
-        std::vector<std::vector<int>> paths;  // of bodies, from the root to each part's
+        std::vector<std::vector<int>> paths;  // bodies from the root to that of each part
     };
 
     Links links_;
@@ -340,7 +341,7 @@ class Constraints {
                 slope[link.coordinate] += lever.shift;
                 const double moved = length(lever.shift);
                 size[link.coordinate] += moved;
-                // A place is known no better than the joints that lead to it.
+                // The rounding of joint positions limits the precision of a point.
                 w.reach[a] += moved * std::abs(q[link.coordinate]);
                 if (!carried.direction) w.reach[a] += length(link.translation);
                 levers.push_back(lever);

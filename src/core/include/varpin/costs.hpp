@@ -1,5 +1,5 @@
-// Costs weight . r^2 at samples (q, v, u), with their gradients and the Hessians of Gauss and Newton, 2 J' weight J,
-// in z = (q, v, u); and those of changes of controls. docs/mathematics.md, "Costs in the task", "Smooth controls".
+// Costs weight . r^2 at samples (q, v, u), with their gradients and Gauss-Newton Hessians 2 J' weight J in
+// z = (q, v, u); and costs of changes of controls. docs/mathematics.md, "Costs in the task", "Smooth controls".
 // Equations (O5), (O7) and (O8) of docs/mathematics.md.
 #pragma once
 
@@ -13,20 +13,19 @@
 
 namespace varpin {
 
-// A frame that stands at `offset` in the last of some bodies. Or, in the place of one, the centre of mass of all of
-// them: it has a position and no more.
+// A frame at `offset` on the last of some bodies; or the centre of mass of all of them, which has a position only.
 struct CostFrame {
     Links links;
     Placement offset;
     bool center = false;
 };
 
-// What a residual r is of: entries of z; what they are beyond limits; the position, the orientation or the twist of a
-// frame; or what its manipulability lacks.
+// The quantity of a residual r: entries of z; their excess beyond limits; the position, orientation or twist of a
+// frame; or the deficit of its manipulability.
 enum class Subject { entries, excess, position, orientation, twist, manipulability };
 
-// How many numbers a target has for a residual of some size: the least value of each entry and then the greatest, a
-// rotation matrix row by row, the least manipulability, or an entry of the target for each of r.
+// Number of entries of a target for a residual of some size: lower limits and then upper limits, a row-major rotation
+// matrix, the least manipulability, or one number for each entry of r.
 constexpr std::size_t target_width(Subject subject, std::size_t size) {
     return subject == Subject::excess ? 2 * size : subject == Subject::orientation ? 9 : size;
 }
@@ -37,7 +36,7 @@ struct CostTerm {
     int index = 0;                  // the first of its entries in z, or the index of its frame
     std::vector<double> weight;     // (r, r) symmetric
     std::vector<double> target;     // (T, target_width); sample s has row s % T
-    std::vector<int> directions{};  // which rows of the frame's Jacobian its manipulability is of
+    std::vector<int> directions{};  // rows of the frame's Jacobian in its manipulability
 };
 
 struct CostTerms {
@@ -47,13 +46,13 @@ struct CostTerms {
     std::vector<CostTerm> terms;
 
     int size() const { return 2 * dof + controls; }
-    // Whether every residual is linear, and so the Hessian the same at all samples.
+    // Whether all residuals are linear, so that the Hessian is the same at all samples.
     bool linear() const {
         return std::all_of(terms.begin(), terms.end(), [](const CostTerm& t) { return t.subject == Subject::entries; });
     }
 };
 
-// r' W r of r (size), with W r.
+// r' W r for r (size), and W r.
 inline double quadratic(const double* W, const double* r, int size, double* Wr) {
     double total = 0.0;
     for (int i = 0; i < size; ++i) {
@@ -65,7 +64,7 @@ inline double quadratic(const double* W, const double* r, int size, double* Wr) 
     return total;
 }
 
-// Work arrays for a sample at a time.
+// The evaluation of costs at single samples, with work arrays.
 class CostSample {
   public:
     explicit CostSample(const CostTerms& costs)
@@ -88,13 +87,13 @@ class CostSample {
         weighted_.resize(most);
     }
 
-    // The value of each term at (q, v, u), which has row `row` of the targets.
+    // The value of each term at (q, v, u), with row `row` of the targets.
     void values(const double* q, const double* v, const double* u, std::size_t row, double* found) {
         look(q, v, u, false);
         for (const CostTerm& term : costs_.terms) *found++ = weigh(term, row);
     }
 
-    // Add the gradient of all terms (2n + m), and the Hessians (2n + m, 2n + m) of those that are not linear.
+    // Add the gradient of all terms (2n + m), and the Hessians (2n + m, 2n + m) of terms that are not linear.
     void expand(const double* q, const double* v, const double* u, std::size_t row, double* gradient, double* hessian) {
         look(q, v, u, true);
         for (const CostTerm& term : costs_.terms) {
@@ -107,7 +106,7 @@ class CostSample {
                 add_excess(term, gradient, hessian);
                 continue;
             }
-            // Its slope is zero, too.
+            // Without a deficit the gradient is zero, too.
             if (term.subject == Subject::manipulability && error_[0] == 0.0) continue;
             const int columns = term.subject == Subject::twist ? 2 * costs_.dof : costs_.dof;
             differentiate(term, columns);
@@ -198,7 +197,7 @@ class CostSample {
         if (term.subject == Subject::excess) {
             for (int i = 0; i < term.size; ++i) {
                 const double y = z_[term.index + i], least = target[i], most = target[term.size + i];
-                // What is no number stays none.
+                // y - y keeps NaN.
                 error_[i] = y > most ? y - most : y < least ? y - least : y - y;
             }
             return;
@@ -220,7 +219,7 @@ class CostSample {
         }
         Vec3<double> r = frame.placement.position - Vec3<double>{target[0], target[1], target[2]};
         if (term.subject == Subject::orientation) {
-            // A matrix has its columns in a row, and so the transposed target's rows.
+            // Mat3 takes columns, so the rows of the target give its transpose.
             const Mat3<double> back{{target[0], target[1], target[2]},
                                     {target[3], target[4], target[5]},
                                     {target[6], target[7], target[8]}};
@@ -231,7 +230,7 @@ class CostSample {
         error_[2] = r.z;
     }
 
-    // Gradient and Hessian of what entries of z are beyond limits, whose slope there is one.
+    // Gradient and Hessian of the excess of entries of z, whose derivative beyond the limits is one.
     void add_excess(const CostTerm& term, double* gradient, double* hessian) const {
         for (int i = 0; i < term.size; ++i) {
             if (error_[i] == 0.0) continue;
@@ -267,9 +266,9 @@ class CostSample {
         }
     }
 
-    // A joint turns the axes of all after it: with w_i and l_i what joint i gives to the frame, d l_j / dq_i is
-    // w_i x l_j for i up to j and w_j x l_i beyond, and d w_j / dq_i is w_i x w_j for i before j, else zero. That times
-    // the joints' rates is the derivative of a twist in q, which goes into the first n of `columns` of J.
+    // The derivative of a twist in q, into the first n of `columns` of J. With w_i and l_i the angular and linear
+    // velocity of the frame per unit rate of joint i, d l_j / dq_i is w_i x l_j for i up to j and w_j x l_i beyond, and
+    // d w_j / dq_i is w_i x w_j for i before j, else zero; these are multiplied by the joints' rates.
     void twist_in_q(const Links& links, const FrameAt& frame, int columns) {
         const double* v = z_.data() + costs_.dof;
         Motion<double> ahead{};
@@ -292,7 +291,7 @@ class CostSample {
         }
     }
 
-    // The derivative of what a manipulability w lacks, -sum dw/dJ . dJ/dq, into the first row of J.
+    // The derivative of the deficit of a manipulability w, -sum dw/dJ . dJ/dq, into the first row of J.
     void lack_in_q(const CostTerm& term, const FrameAt& frame) {
         const Links& links = costs_.frames[term.index].links;
         const double* W = dexterity_.slope();
@@ -321,10 +320,10 @@ class CostSample {
     }
 };
 
-// What changes of controls cost, weight . (u_k - u_(k-1))^2, one by one.
+// The cost weight . (u_k - u_(k-1))^2 of each change of controls.
 class ChangeCost {
   public:
-    // `before` is the control before the first one, (m), or empty where the first one is free.
+    // `before` (m) is the control before the first one, or empty if the first change has no cost.
     ChangeCost(int controls, std::vector<double> weight, std::vector<double> before)
         : controls_(controls),
           weight_(std::move(weight)),
@@ -332,14 +331,14 @@ class ChangeCost {
           change_(controls_),
           weighted_(controls_) {}
 
-    // Of number k of the controls u (N, m).
+    // The cost of the change to control k of u (N, m).
     double value(const double* u, std::size_t k) {
         const double* from = k > 0 ? u + (k - 1) * controls_ : before_.empty() ? u : before_.data();
         for (int i = 0; i < controls_; ++i) change_[i] = u[k * controls_ + i] - from[i];
         return quadratic(weight_.data(), change_.data(), controls_, weighted_.data());
     }
 
-    // Gradient (m) and Hessian (m, m) in u_k, with u_(k-1) as it is.
+    // Gradient (m) and Hessian (m, m) in u_k at fixed u_(k-1).
     void expand(const double* u, std::size_t k, double* gradient, double* hessian) {
         value(u, k);
         for (int i = 0; i < controls_; ++i) gradient[i] = 2.0 * weighted_[i];
@@ -353,8 +352,8 @@ class ChangeCost {
     std::vector<double> before_, change_, weighted_;
 };
 
-// The samples of the steps of a motion, q and v: row s of the rule (s, 9) is (weight, q from q0, v0, q1, v1, v from q0,
-// v0, q1, v1). Nodes (N + 1, n); samples (N s, n).
+// The samples q and v (N s, n) of the steps of a motion, from its nodes (N + 1, n). A row of the rule (s, 9) holds a
+// weight, the coefficients of q0, v0, q1, v1 for q, and those for v.
 inline void sample_steps(const double* rule, std::size_t samples, std::size_t steps, std::size_t n, const double* q,
                          const double* v, double* at_q, double* at_v) {
     for (std::size_t k = 0; k < steps; ++k) {
@@ -365,7 +364,7 @@ inline void sample_steps(const double* rule, std::size_t samples, std::size_t st
                 double* __restrict found = to + (k * samples + s) * n;
                 std::fill(found, found + n, 0.0);
                 for (int part = 0; part < 4; ++part) {
-                    // What has no weight may be no number.
+                    // A node without weight may be NaN.
                     if (weights[part] == 0.0) continue;
                     for (std::size_t c = 0; c < n; ++c) found[c] += weights[part] * nodes[part][c];
                 }

@@ -1,16 +1,16 @@
-// Forces at points that bodies carry, and between them: what couples joints besides inertia. docs/core.md, "Couplings".
+// Couplings: forces at points of bodies, and between them. docs/core.md, "Couplings".
 //
-// A coupling acts between points a and b, d = x_a - x_b. With l_i and w_i the velocity and the angular velocity that
-// joint i gives to the one or the other point, l_i taken negative for b, and J the matrix of their sums over both
-// points, d(l_j)/dq_i = w_i x l_j for i above j or j itself, in which it is symmetric, and d(w_j)/dq_i = w_i x w_j for
-// i above j alone. A coupling is one of
+// A coupling acts between points a and b, d = x_a - x_b. Let l_i and w_i be the velocity and the angular velocity of a
+// point per unit rate of joint i, with l_i negative for b, and J the matrix of the sums of l_i over both points. Then
+// d(l_j)/dq_i = w_i x l_j for i an ancestor of j or j itself, symmetric in i and j, and d(w_j)/dq_i = w_i x w_j for i
+// an ancestor of j only. A coupling is one of
 //
 //     potential(d)   an energy V(d), part of the Lagrangian: V_q = J' V_d,  V_qq = J' V_dd J + V_d . d(J)/dq
-//     a damper       F = -J' D J v; or on angular velocities, J having the w_i in the place of the l_i
-//     a wrench       F_i = l_i . f + w_i . m, constant in the world's axes or in those of a's body
+//     a damper       F = -J' D J v; for angular velocities, J has w_i in place of l_i
+//     a wrench       F_i = l_i . f + w_i . m, constant in world axes or in the axes of a's body
 //
-// In the place of points there may be directions, unit vectors that bodies carry: d is their difference, and l_i = w_i
-// x the direction. |d|^2 / 2 = 1 - cos of the angle between them.
+// Points may be replaced by directions, unit vectors fixed to bodies: d is their difference, l_i = w_i x the direction,
+// and |d|^2 / 2 = 1 - cos of the angle between them.
 #pragma once
 
 #include <algorithm>
@@ -31,11 +31,10 @@
 
 namespace varpin {
 
-// A point in the axes of the body that carries it, from its joint; of the world where there is none, -1. Or a
-// direction.
+// A point, relative to the joint of its body in body axes, or in the world for body -1. Or a direction.
 struct Anchor {
     int body = -1;
-    Vec3<double> point{};  // [m]; of a direction 1
+    Vec3<double> point{};  // [m]; a unit vector for a direction
     bool direction = false;
 };
 
@@ -69,11 +68,11 @@ struct FrameLoad {
     VectorPotential<T> potential(const Vec3<T>& d) const {
         return {-dot(force, d), {T(-force.x), T(-force.y), T(-force.z)}, {}};
     }
-    // Of the terms that cancel in the force, points being as far from the origin as this.
+    // Magnitude of the terms that cancel in the force, for points at this distance from the origin.
     double scale(double) const { return detail::size_of(force); }
 };
 
-// Three springs along the world's axes, slack where d = rest.
+// Three springs along the world axes, without force at d = rest.
 struct FrameSpring {
     Anchor a, b;
     Vec3<double> stiffness{};  // [N/m]
@@ -88,7 +87,7 @@ struct FrameSpring {
     double scale(double far) const { return detail::size_of(stiffness) * (far + detail::size_of(rest)); }
 };
 
-// A spring along d, slack where |d| is its length, which is positive.
+// A spring along d, without force where |d| is its length, which is positive.
 struct FrameLengthSpring {
     Anchor a, b;
     double stiffness = 0.0;  // [N/m]
@@ -97,7 +96,7 @@ struct FrameLengthSpring {
     template <class T>
     VectorPotential<T> potential(const Vec3<T>& d) const {
         using std::sqrt;
-        // At d = 0 the direction of the force is none: there it is left out.
+        // At d = 0 the force has no direction and is set to zero.
         const T square = dot(d, d);
         if (!(value_of(square) > 0.0)) return {T(0.5 * stiffness * length * length), {}, {}};
         const T far = sqrt(square), stretch = far - T(length), inverse = reciprocal(far);
@@ -115,14 +114,14 @@ struct FrameLengthSpring {
     static Dual reciprocal(Dual x) { return {1.0 / x.value, -x.slope / (x.value * x.value)}; }
 };
 
-// Three dampers along the world's axes.
+// Three dampers along the world axes.
 struct FrameDamper {
     Anchor a, b;
     Vec3<double> damping{};  // [N s/m]
 };
 
-// A spring between a direction of a's body and one of b's, along which it is slack: V = stiffness (1 - cos) of the
-// angle. Three of them, for the axes of a frame, resist all turning. The stiffness may be negative, their sums are not.
+// A spring between a direction of a's body and one of b's: V = stiffness (1 - cos angle). Three of them, for the axes
+// of a frame, resist every rotation. Single stiffnesses may be negative, sums of two are not.
 struct FrameTurnSpring {
     Anchor a, b;
     double stiffness = 0.0;  // [N m]
@@ -135,7 +134,7 @@ struct FrameTurnSpring {
     double scale(double far) const { return std::abs(stiffness) * far; }
 };
 
-// A damper of the angular velocity of a's body against b's, along the world's axes.
+// A damper of the angular velocity of a's body relative to b's, along the world axes.
 struct FrameTurnDamper {
     Anchor a, b;
     Vec3<double> damping{};  // [N m s/rad]
@@ -146,17 +145,17 @@ struct FrameWrench {
     Anchor a, b;
     Vec3<double> force{};   // [N]
     Vec3<double> moment{};  // about a [N m]
-    bool carried = false;   // in the axes of a's body, and not in the world's
+    bool carried = false;   // in the axes of a's body instead of world axes
 };
 
 using CoupledElement =
     std::variant<FrameLoad, FrameSpring, FrameLengthSpring, FrameTurnSpring, FrameDamper, FrameTurnDamper, FrameWrench>;
 
-// A force F (n) on all coordinates that code outside of the core evaluates at q and v (n), and where they are not null
-// dF/dq and dF/dv (n, n).
+// A force F (n) on all coordinates at q and v (n), evaluated by code outside of the core, with dF/dq and dF/dv (n, n),
+// which may be null.
 using OuterForce = std::function<void(const double* q, const double* v, double* F, double* by_q, double* by_v)>;
 
-// What one joint does to one of the points.
+// Velocities of one of the points per unit rate of a joint.
 template <class T>
 struct Arm {
     int coordinate = 0;
@@ -165,20 +164,20 @@ struct Arm {
     Vec3<T> angular{};  // of the point's body
 };
 
-// Work arrays; Couplings::fit makes room in them, at their first use at the latest.
+// Work arrays; Couplings::fit allocates them, at their first use at the latest.
 template <class T>
 struct CouplingWorkspace {
     std::vector<PlacementOf<T>> at;
     std::vector<Arm<T>> arms;
-    std::vector<Vec3<T>> change;  // of the velocity of d with the coordinate of each arm
-    Vec3<T> point[2];             // of the points of the coupling that arms are of
+    std::vector<Vec3<T>> change;  // derivative of the velocity of d in the coordinate of each arm
+    Vec3<T> point[2];             // of the current coupling
     Mat3<T> rotation{};           // of a's body
 };
 
 class Couplings {
   public:
     Couplings() = default;
-    // Between points of some bodies, parents first.
+    // Couplings between points of bodies, given parents first.
     Couplings(const std::vector<CoupledElement>& couplings, const std::vector<Body>& bodies) {
         LinkCollector collector(bodies, links_);
         for (CoupledElement coupling : couplings) {
@@ -205,9 +204,9 @@ class Couplings {
     }
 
     bool any() const { return !joined_.empty() || outer_; }
-    // Whether code outside of the core has a force here, which may mind how often a joint went round.
+    // Whether there is a force of code outside of the core; it may depend on whole turns of joints.
     bool has_outer() const { return static_cast<bool>(outer_); }
-    // Whether there are forces beside those of potentials.
+    // Whether there are forces without potential.
     bool pushes() const { return pushes_; }
 
     template <class T>
@@ -217,8 +216,8 @@ class Couplings {
         workspace.change.reserve(most_arms_);
     }
 
-    // Calls visit(arms, VectorPotential, scale, magnitude) for each that has a potential, at q: `scale` of the terms
-    // that cancel in V_d, `magnitude` of those that make up the energy.
+    // Calls visit(arms, VectorPotential, scale, magnitude) for each coupling with a potential, at q: `scale` is the
+    // magnitude of the terms that cancel in V_d, `magnitude` that of the terms of the energy.
     template <class T, class Visit>
     void potentials(const T* q, CouplingWorkspace<T>& workspace, const Visit& visit) const {
         update_placements(q, workspace);
@@ -248,8 +247,7 @@ class Couplings {
         turning(arms, potential.slope, [&](int i, int j, const T& term) { Lqq[i * n + j] -= term; });
     }
 
-    // Adds the forces beside those of potentials to `out` (n), and writes their derivatives in q and v (n, n), which
-    // may be null.
+    // Adds the forces without potential to `out` (n); writes their derivatives by_q and by_v (n, n), which may be null.
     template <class T>
     void add_forces(int n, const T* q, const T* v, CouplingWorkspace<T>& workspace, JointForce<T>* out, T* by_q,
                     T* by_v) const {
@@ -285,7 +283,7 @@ class Couplings {
     std::size_t most_arms_ = 0;
     bool pushes_ = false;
 
-    // Heat is what both F . v and the slope in v take.
+    // Dissipated power is the smaller of -F . v and -v' dF/dv v, and not negative.
     template <class T>
     [[gnu::noinline]] void add_outer(int n, const T* q, const T* v, JointForce<T>* out, T* by_q, T* by_v) const {
         if constexpr (std::is_same_v<T, double>) {
@@ -305,7 +303,7 @@ class Couplings {
             }
             out[0].lost += std::max(0.0, std::min(power, damped));
         } else {
-            throw std::logic_error("a force from outside of the core has no second derivatives");
+            throw std::logic_error("a force in Python has no second derivatives");
         }
     }
 
@@ -337,7 +335,7 @@ class Couplings {
         }
     }
 
-    // add(i, j, g . dl_i/dq_j) for all pairs of coordinates whose arms move each other.
+    // Calls add(i, j, g . dl_i/dq_j) for all pairs of coordinates with a nonzero derivative.
     template <class T, class Add>
     static void turning(const std::vector<Arm<T>>& arms, const Vec3<T>& g, const Add& add) {
         for (std::size_t i = 0; i < arms.size(); ++i) {
@@ -395,7 +393,7 @@ class Couplings {
         }
     }
 
-    // With w_i taken negative for b, dw_j/dq_i = w_i x w_j for i above j alone, and so is what each turns of the rate.
+    // Derivatives with w in place of l, negative for b: dw_j/dq_i = w_i x w_j for i an ancestor of j only.
     template <class T>
     static void push(const FrameTurnDamper& damper, int n, const T* v, CouplingWorkspace<T>& workspace,
                      JointForce<T>* out, T* by_q, T* by_v) {

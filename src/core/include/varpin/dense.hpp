@@ -1,6 +1,6 @@
-// Small dense factorizations, written out: at the size of an arm a call of LAPACK costs more than its work.
-// Matrices are square with rows of length n; a function works on the rows and columns [begin, end) of one block.
-// Inner loops run along rows.
+// Small dense factorizations: at the size of an arm, the overhead of a LAPACK call exceeds its work. Matrices are
+// square with rows of length n; a function works on the rows and columns [begin, end) of one block. Inner loops run
+// along rows.
 #pragma once
 
 #include <algorithm>
@@ -18,9 +18,9 @@ inline double larger(double a, double b) { return a > b || a != a ? a : b; }
 
 namespace detail {
 
-// y -= s x over columns [first, last) of two rows, two at a time: on rows as short as an arm's, what compilers make of
-// the plain loop takes longer to set up than to run. Pairs begin at even columns, whatever `first` is: a processor
-// waits for a pair half of which it has just written.
+// y -= s x over columns [first, last) of two rows, two at a time: for short rows, the setup of the compiler's vector
+// loop takes longer than the loop. Pairs always begin at even columns: a load of a pair stalls if one of its halves has
+// just been stored alone.
 [[gnu::always_inline]] inline void subtract_scaled(double* y, double s, const double* x, int first, int last) {
     const Pair factor{s, s};
     int c = first;
@@ -65,8 +65,8 @@ inline void solve_lu(const double* lu, int n, Block block, const double* b, doub
     }
 }
 
-// LU with rows exchanged; `order` (n) receives which row stands where. Returns the sign of the determinant, 0 where it
-// is not finite.
+// LU with row pivoting; `order` (n) receives the permutation of rows. Returns the sign of the determinant, 0 at a pivot
+// that is zero or not finite.
 inline int factor_lu_pivoting(double* a, int n, int* order) {
     int sign = 1;
     for (int i = 0; i < n; ++i) order[i] = i;
@@ -95,7 +95,7 @@ inline int factor_lu_pivoting(double* a, int n, int* order) {
     return sign;
 }
 
-// The x with a x = b for the a that factor_lu_pivoting has factored.
+// The x with a x = b, from the factors of factor_lu_pivoting.
 inline void solve_lu_pivoting(const double* lu, int n, const int* order, const double* b, double* x) {
     for (int i = 0; i < n; ++i) {
         double total = b[order[i]];
@@ -109,7 +109,7 @@ inline void solve_lu_pivoting(const double* lu, int n, const int* order, const d
     }
 }
 
-// The x with a' x = b from the factors of a; `order` is null where rows were not exchanged. Overwrites b.
+// The x with a' x = b from the factors of a; `order` is null for factors without pivoting. Overwrites b.
 inline void solve_lu_transposed(const double* lu, int n, const int* order, double* b, double* x) {
     // a = P' L U, so U' y = b, L' z = y, x = P' z.
     for (int i = 0; i < n; ++i) {
@@ -122,14 +122,14 @@ inline void solve_lu_transposed(const double* lu, int n, const int* order, doubl
     for (int i = 0; i < n; ++i) x[order ? order[i] : i] = b[i];
 }
 
-// L D L' of a symmetric matrix in place: pivots on the diagonal, unit L below it, and nothing of use above. Reads the
-// lower triangle; false at a pivot that is not positive.
+// L D L' of a symmetric matrix in place: pivots on the diagonal, unit L below it; the upper triangle is not defined.
+// Reads the lower triangle; false at a pivot that is not positive.
 inline bool factor_ldl(double* a, int n, Block block) {
     for (int k = block.begin; k < block.end; ++k) {
         double* top = a + k * n;
         if (!(top[k] > 0.0)) return false;
         const double inverse = 1.0 / top[k];
-        // The column once more as a row, along which the loop runs.
+        // A copy of the column as a row, for the inner loop.
         for (int i = k + 1; i < block.end; ++i) {
             double* row = a + i * n;
             top[i] = row[k];
@@ -140,9 +140,9 @@ inline bool factor_ldl(double* a, int n, Block block) {
     return true;
 }
 
-// The smallest ratio of a pivot of the symmetric a to the same pivot of b, the last one first; 0 if one is not
-// positive. Reads and overwrites the lower triangles; both are factored at once, as neither fills a processor's
-// pipeline.
+// The smallest ratio of a pivot of the symmetric a to the same pivot of b, with elimination from the last to the first;
+// 0 if one is not positive. Reads and overwrites the lower triangles. Both are factored together, since neither fills
+// the processor's pipeline.
 inline double least_pivot_ratio(double* a, double* b, int n, Block block) {
     double least = std::numeric_limits<double>::infinity();
     for (int k = block.end - 1; k >= block.begin; --k) {
@@ -161,7 +161,7 @@ inline double least_pivot_ratio(double* a, double* b, int n, Block block) {
     return least;
 }
 
-// The x with L x = b, and the x with L' x = b in place of b.
+// The x with L x = b; solve_upper overwrites b, given in x, by the x with L' x = b.
 inline void solve_lower(const double* ldl, int n, Block block, const double* b, double* x) {
     for (int i = block.begin; i < block.end; ++i) {
         double total = b[i];
@@ -226,8 +226,7 @@ void subtract_rows(double* row, int columns, int begin, int end, const Factor& f
     row[c] = sum;
 }
 
-// The X with L U X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.
-// Row i of the block stands at x + (i - begin) * stride.
+// Overwrites B (size of the block, columns) by the X with L U X = B. Row i of the block is at x + (i - begin) * stride.
 inline void solve_lu_rows(const double* lu, int n, Block block, double* x, int columns, int stride) {
     const auto row = [&](int i) { return x + (i - block.begin) * stride; };
     const auto of_row = [&](int i) { return [=](int j) { return lu[i * n + j]; }; };
@@ -240,8 +239,8 @@ inline void solve_lu_rows(const double* lu, int n, Block block, double* x, int c
     }
 }
 
-// The X with L D L' X = B, B and X (size of the block, columns) row by row and in one place, all columns at once.
-// Row i of the block stands at x + (i - begin) * stride.
+// Overwrites B (size of the block, columns) by the X with L D L' X = B. Row i of the block is at
+// x + (i - begin) * stride.
 inline void solve_ldl_rows(const double* ldl, int n, Block block, double* x, int columns, int stride) {
     const auto row = [&](int i) { return x + (i - block.begin) * stride; };
     for (int i = block.begin; i < block.end; ++i) {

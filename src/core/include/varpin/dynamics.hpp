@@ -1,12 +1,12 @@
-// Forward dynamics and its derivatives, for the integrators that work on (q, v). docs/mathematics.md, "Explicit
-// methods". Inverse dynamics by the recursive Newton-Euler algorithm is tau = S . Phi, with Phi the force that moves
-// what a joint carries. Its derivatives follow from the rotate-along rule of the jet. For a body b below i, with V_p
-// and A_p velocity and acceleration (gravity taken off) of i's parent, (dq_i, dv_i) change velocity and acceleration by
+// Forward dynamics and its derivatives, for the integrators on (q, v). docs/mathematics.md, "Explicit methods". Inverse
+// dynamics by the recursive Newton-Euler algorithm is tau = S . Phi, with Phi the force on the subtree of a joint. Its
+// derivatives follow from the rotate-along rule of the jet. For a body b below i, with V_p and A_p the velocity and
+// acceleration (minus gravity) of i's parent, (dq_i, dv_i) change velocity and acceleration by
 //
 //     dV_b = W_i dq_i + S_i dv_i,    dA_b = Z_i dq_i + 2 W_i dv_i + dV_b x V_b,    Z_i = A_p x S_i + V_p x W_i,
 //
-// so that with U_i = (W_i, S_i), X_i = (Z_i, 2 W_i), columns for (dq_i, dv_i), C of `Coupling`, summed over what a
-// joint carries like its inertia Y, and i above j or j itself
+// so that with U_i = (W_i, S_i), X_i = (Z_i, 2 W_i), columns for (dq_i, dv_i), C of `Coupling` and inertia Y summed
+// over the subtree of a joint, and i an ancestor of j or j itself
 //
 //     dtau_j/d(q,v)_i = F_j . X_i + (C_j' S_j) . U_i
 //     dtau_i/d(q,v)_j = S_i . (Y_j X_j + C_j U_j + (S_j x* Phi_j, 0))
@@ -33,7 +33,7 @@ namespace varpin {
 //
 //     C (a, b) = (2 b x P, D b),    D b = w x T b + 2 (h . u) b - 2 (h . b) u,    T = 2 J - tr J;
 //
-// a drops out by Jacobi's identity. P and D add up over bodies.
+// a drops out by Jacobi's identity. P and D are additive over bodies.
 struct Coupling {
     Vec3<double> momentum{};  // P
     Mat3<double> turn{};      // D
@@ -65,14 +65,14 @@ constexpr Coupling& operator+=(Coupling& a, const Coupling& b) {
     a.turn.z += b.turn.z;
     return a;
 }
-// C x of the x with this angular part b.
+// C x for an x with angular part b.
 template <class T>
 constexpr Force<T> operator*(const Coupling& C, const Vec3<T>& b) {
     return {2.0 * cross(b, C.momentum), C.turn * b};
 }
 
-// Forward dynamics M a = force - bias at one state after another, with work arrays. Derivatives need a mass matrix;
-// what asks for none does without, if the tree is large.
+// Forward dynamics M a = force - bias at consecutive states, with work arrays. Derivatives need a mass matrix; without
+// them large trees use the articulated body algorithm.
 class ForwardDynamics {
   public:
     ForwardDynamics(const Mechanism& mechanism, bool derivatives, Solver solver = Solver::automatic)
@@ -104,7 +104,7 @@ class ForwardDynamics {
 
     int dof() const { return jet_.dof; }
 
-    // Mass matrix, its factors, bias and energies at (q, v), which what follows is about; false where the mass matrix
+    // Mass matrix, its factors, bias and energies at (q, v), the state of the calls below; false where the mass matrix
     // is not positive definite.
     bool at(const double* q, const double* v) {
         const Tree& tree = mechanism_->tree;
@@ -174,7 +174,7 @@ class ForwardDynamics {
         for (const Block& block : mechanism_->tree.blocks) solve_ldl(ldl_.data(), jet_.dof, block, b, x);
     }
 
-    // The accelerations a under a force, which the derivatives that follow are about too.
+    // The accelerations a under a force; derivatives are taken at this force.
     void acceleration(const double* force, double* a) {
         double* const by_q = coupled_q_.empty() ? nullptr : coupled_q_.data();
         double* const by_v = coupled_v_.empty() ? nullptr : coupled_v_.data();
@@ -183,8 +183,7 @@ class ForwardDynamics {
         solve_mass(room_.data(), a);
     }
 
-    // The derivatives of inverse dynamics where the joints accelerate by a, once after at(), for what follows; v as
-    // there.
+    // The derivatives of inverse dynamics at accelerations a, once after at() with the same v; for the calls below.
     void differentiate(const double* v, const double* a) {
         const Tree& tree = mechanism_->tree;
         const int n = jet_.dof;
@@ -212,8 +211,8 @@ class ForwardDynamics {
         }
     }
 
-    // The derivatives (n, n) of the accelerations in q, v and force, once after differentiate(), into arrays that are
-    // zero outside of blocks already.
+    // The derivatives (n, n) of the accelerations in q, v and force, once after differentiate(). Only blocks are
+    // written; the arrays must be zero elsewhere.
     void derivatives(double* in_q, double* in_v, double* in_force) const {
         const int n = jet_.dof;
         for (const Block& block : mechanism_->tree.blocks) {
@@ -231,8 +230,8 @@ class ForwardDynamics {
         }
     }
 
-    // A share in how accelerations change: x changes with other accelerations, of which these are the derivatives
-    // (b, columns), by in_q where it is q, by in_v where it is v.
+    // A contribution of an earlier stage to the derivatives: q and v change by in_q x and in_v x, where x (b, columns)
+    // are the derivatives of that stage's accelerations.
     struct Before {
         const double* x = nullptr;
         double in_q = 0.0, in_v = 0.0;
@@ -281,7 +280,7 @@ class ForwardDynamics {
         Coupling coupling{};
     };
 
-    // The elements' potential energy, whose force is part of the bias.
+    // Potential energy of elements and couplings; its force is part of the bias.
     void add_potentials(const double* q) {
         std::fill(bias_.begin(), bias_.end(), 0.0);
         std::fill(curvature_.begin(), curvature_.end(), 0.0);
@@ -319,7 +318,7 @@ class ForwardDynamics {
         return k < 0 ? Motion<double>{-1.0 * mechanism_->gravity, {}} : body_[k].acceleration;
     }
 
-    // A and Phi of body j alone; the joints accelerate by a (n), or not at all.
+    // A and Phi of body j alone, with joint accelerations a (n), null for zero.
     void accelerate(int j, const double* v, const double* a) {
         const Body& link = mechanism_->tree.bodies[j];
         const auto& here = jet_.body[j];
@@ -330,7 +329,7 @@ class ForwardDynamics {
         own.force = own.inertia * own.acceleration + cross(here.velocity, here.momentum);
     }
 
-    // The share of what body j carries in the derivatives of inverse dynamics.
+    // Contribution of the subtree of body j to the derivatives of inverse dynamics.
     void project_slopes(int j) {
         const Tree& tree = mechanism_->tree;
         const int n = jet_.dof;
@@ -357,15 +356,15 @@ class ForwardDynamics {
     }
 
     const Mechanism* mechanism_;
-    Jet<double> jet_;  // placements, velocities, inertias of what bodies carry, M, potential
+    Jet<double> jet_;  // placements, velocities, inertias of subtrees, M, potential
     std::vector<BodyState> body_;
     std::vector<double> q_, v_;                                      // (n)
-    std::vector<JointForce<double>> acting_;                         // (n) of the elements, under the last force
-    std::vector<double> curvature_;                                  // (n) of their potentials
+    std::vector<JointForce<double>> acting_;                         // (n) of elements, at the last force
+    std::vector<double> curvature_;                                  // (n) of the elements' potentials
     std::vector<double> coupled_q_, coupled_v_, coupled_curvature_;  // (n, n) of couplings, for derivatives
     std::vector<double> bias_, room_;
     std::optional<ArticulatedBodies> articulated_;  // in place of M
-    std::vector<double> momentum_;                  // (n) where bodies are articulated
+    std::vector<double> momentum_;                  // (n) with articulated bodies only
     std::vector<double> ldl_;                       // (n, n) factors of M
     std::vector<Slopes> slopes_;                    // (n, n) of inverse dynamics
     std::vector<double> weights_;                   // (others, b, b) of them, in other stages' accelerations

@@ -1,20 +1,20 @@
-// Solves with the matrix of a midpoint step by elimination from the leaves to the roots: work in proportion to the
-// number of bodies, and no matrix. docs/mathematics.md, "Linear in the number of joints". Between a joint j and one
-// above it, i,
+// Solves with the matrix of a midpoint step by elimination from the leaves to the roots, without forming the matrix;
+// the work is proportional to the number of bodies. docs/mathematics.md, "Linear in the number of joints". For a joint
+// j and an ancestor i,
 //
 //     N = M + ha A - hb A' - ha hb L_qq + diag(d)
 //     N_ij = row_i . (Y_j column_j) + row_i . u0_j,      u0 = ha (S x* H, g x (Y S)(linear))
 //     N_ji = (Y_j row_j) . column_i + l0_j . column_i,   l0 = -hb (S x* H, -g x (Y S)(linear))
 //
-// with nine entries each, row = (S - hb W, hb S(angular)) and column = (S + ha W, ha S(angular)), of which the inertia
-// Y of all that j carries takes the first six. Once all that j carries is eliminated, what is left of it answers a
-// motion w by X w + z, and so, x being the coordinate and w = w_parent + column x,
+// with nine entries each, row = (S - hb W, hb S(angular)) and column = (S + ha W, ha S(angular)); the inertia Y of the
+// subtree of j multiplies the first six. After elimination of the subtree below j, its force for a motion w is X w + z.
+// So, with x the coordinate and w = w_parent + column x,
 //
 //     u = X column + u0,  l = X' row + l0,  D = d + row . u:      x = (r - row . z) / D - l . w_parent / D
-//     handed on to the parent: X - u l' / D,  z + u (r - row . z) / D.
+//     passed to the parent: X - u l' / D,  z + u (r - row . z) / D.
 //
-// The symmetric part M + c (A + A') - k L_qq goes alike with rows and columns (S, W) of twelve entries, M alone with S:
-// that is the articulated body algorithm (Featherstone 2008).
+// The symmetric part M + c (A + A') - k L_qq is eliminated in the same way with rows and columns (S, W) of twelve
+// entries, and M alone with S: the articulated body algorithm (Featherstone 2008).
 // Equations (E1), (E2) and (E3) of docs/mathematics.md.
 #pragma once
 
@@ -33,12 +33,13 @@
 
 namespace varpin {
 
-// How to solve with M and with the matrix of a step; elimination cannot of the latter where couplings act.
+// Method for solves with M and with the matrix of a step. Elimination cannot take the latter with couplings.
 enum class Solver { automatic, dense, elimination };
 
-// Times of a dense step for each body, for each pair of a body and one above it, and for each cubed size of a block; in
-// units of what a body costs that is eliminated; and what it costs where steps have more stages, where they have one
-// and there are ties, and how much each slot of ties adds to that. Measured with benchmarks/joints.py.
+// Model of computing times, in units of the time to eliminate a body in a step with one stage. A dense step takes
+// body_cost for each body, pair_cost for each pair of a body and itself or an ancestor, and block_cost times the cubed
+// size of each block. Elimination of a body takes stages_cost with more stages, tied_cost with one stage and ties, and
+// a share of slot_cost more for each slot of ties. Measured with benchmarks/joints.py.
 inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3, tied_cost = 1.45,
                         slot_cost = 0.1;
 
@@ -60,29 +61,28 @@ inline bool eliminates(const Tree& tree, Solver solver, int stages = 1) {
     return cost * (1.0 + slot_cost * slots) * tree.size() < dense;
 }
 
-// Couplings fill more of a step's matrix than the bodies do.
+// Couplings fill entries of a step's matrix for which elimination has no form.
 inline bool eliminates(const Mechanism& mechanism, Solver solver, int stages = 1) {
     return !mechanism.couplings.any() && eliminates(mechanism.tree, solver, stages);
 }
 
 namespace detail {
 
-// Numbers are written in pairs where they are read in pairs next: a processor waits for single ones that it has just
-// written.
+// Numbers that are read in pairs are also written in pairs: a load of a pair stalls after stores of single numbers.
 template <class Six>
 void write(const Six& a, double* x) {
     put_pair(Pair{a.linear.x, a.linear.y}, x);
     put_pair(Pair{a.linear.z, a.angular.x}, x + 2);
     put_pair(Pair{a.angular.y, a.angular.z}, x + 4);
 }
-// Nine entries.
+// Writes nine entries.
 template <class Six>
 void write(const Six& a, const Vec3<double>& b, double* x) {
     write(a, x);
     put_pair(Pair{b.x, b.y}, x + 6);
     x[8] = b.z;
 }
-// The same and a zero.
+// Writes nine entries and a zero.
 template <class Six>
 void write_padded(const Six& a, const Vec3<double>& b, double* x) {
     write(a, x);
@@ -91,8 +91,7 @@ void write_padded(const Six& a, const Vec3<double>& b, double* x) {
 }
 inline Motion<double> motion_at(const double* x) { return {{x[0], x[1], x[2]}, {x[3], x[4], x[5]}}; }
 
-// Functions of vectors (size) and matrices (size, size), row by row, sizes being even. Sums of products have two parts,
-// of even and odd terms.
+// Functions of vectors (size) and row-major matrices (size, size) of even size. Sums add even and odd terms apart.
 template <int size>
 double product(const double* a, const double* b) {
     Pair sum = pair_at(a) * pair_at(b);
@@ -135,7 +134,7 @@ void add_transposed_product(const double* X, const double* x, double* y) {
     }
     for (int c = 0; c < size; c += 2) put_pair(sum.at[c / 2], y + c);
 }
-// y += X x with a symmetric X, of which a row holds pairs from that on in which the diagonal lies.
+// y += X x with a symmetric X, of which each row holds the pairs from the diagonal on.
 template <int size>
 void add_symmetric_product(const double* X, const double* x, double* y) {
     const Pairs<size> factor(x);
@@ -170,10 +169,10 @@ struct InertiaRows {
     Pair at[6][3];
 };
 
-// Whether a matrix holds all its pairs, or is symmetric and holds those from the diagonal on.
+// The pairs that a matrix holds: all, or those from the diagonal on if it is symmetric.
 enum class Kept { all, upper };
 
-// X - u l' in place of X, each pair (r, c) as `finished` leaves it. All in one go: what comes next waits for it.
+// Overwrites X by X - u l', with each pair (r, c) mapped by `finished`, in one pass, since the next body needs it.
 template <int size, Kept kept, int r = 0, class Finished>
 void replace(const double* u, const Pairs<size>& l, const Finished& finished, double* X) {
     if constexpr (r < size) {
@@ -184,7 +183,7 @@ void replace(const double* u, const Pairs<size>& l, const Finished& finished, do
     }
 }
 
-// s I added to a part of a matrix whose rows have length `stride`.
+// Adds s I to a part of a matrix with rows of length `stride`.
 inline void add_inertia(double s, const InertiaRows& I, int stride, double* x) {
     const Pair scale{s, s};
     for (int r = 0; r < 6; ++r, x += stride) {
@@ -192,8 +191,8 @@ inline void add_inertia(double s, const InertiaRows& I, int stride, double* x) {
     }
 }
 
-// Above an origin all slide: they see linear parts alone, which are the same about any point. `linear` says which
-// entries those are.
+// Joints above an origin are prismatic: they need only linear parts, which are independent of the reference point.
+// `linear` tells whether an entry is a linear part.
 template <int size>
 constexpr bool linear(int entry) {
     return entry < 9 ? entry % 6 < 3 && (size == 12 || entry < 6) : false;
@@ -217,7 +216,7 @@ void keep_linear_rows(double* X) {
 
 }  // namespace detail
 
-// M + diag(armature) as pivots and what goes with them, at one configuration after another.
+// The factors of M + diag(armature) at consecutive configurations.
 class ArticulatedBodies {
   public:
     explicit ArticulatedBodies(const Tree& tree) : ArticulatedBodies(tree, std::make_shared<Gathering>(tree)) {}
@@ -226,7 +225,7 @@ class ArticulatedBodies {
         if (order->ties.slots > 0) tied_.emplace(tree, order, 6);
     }
 
-    // Take M at q, with a jet that potential energies stay in; false at a pivot that is not positive.
+    // Factor M at q, with potential energies in `jet`; false at a pivot that is not positive.
     bool at(const Mechanism& mechanism, const double* q, Jet<double>& jet) {
         const auto visit = [&](int j) { set_body(j, tree_->bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia); };
         inertias(mechanism, q, jet, visit, [](int) {});
@@ -236,7 +235,7 @@ class ArticulatedBodies {
         return true;
     }
 
-    // What coordinate moves body j how, and the body's inertia by itself.
+    // Set the axis and the inertia of body j alone.
     void set_body(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
         detail::write(axis, body_[j].axis);
         body_[j].inertia = inertia;
@@ -244,8 +243,8 @@ class ArticulatedBodies {
         detail::write(axis, tied_->row(j));
     }
 
-    // One body after another, from the last to the first; false at a pivot that is not positive. Here and below, that
-    // nothing in the loop over bodies is a call takes a tenth off a step.
+    // Eliminate body j, from the last body to the first; false at a pivot that is not positive. Here and below, the
+    // attribute `flatten` inlines all calls in the loop over bodies, which saves a tenth of a step.
     [[gnu::flatten]] bool eliminate(int j) {
         const Body& link = tree_->bodies[j];
         State& state = body_[j];
@@ -272,11 +271,11 @@ class ArticulatedBodies {
         return true;
     }
 
-    // The inertia of coordinate c with all it carries free [kg m^2 or kg].
+    // The inertia of a body's coordinate with its subtree free [kg m^2 or kg].
     double pivot(int body) const { return body_[body].pivot; }
 
-    // x with (M + diag(armature)) x = b; x may be b. `share`, unless null, receives the terms of 1/2 b . x, none of
-    // which is negative: that of coordinate i is what is left of b_i when all it carries is free.
+    // x with (M + diag(armature)) x = b; x may be b. `share`, unless null, receives the terms of 1/2 b . x, which are
+    // not negative: left^2 / (2 pivot), with `left` the remainder of b_i when the subtree of coordinate i is free.
     void solve(const double* b, double* x, double* share) {
         if (tied_) return tied_->solve(b, x, share);
         for (int j = tree_->size() - 1; j >= 0; --j) {
@@ -295,7 +294,7 @@ class ArticulatedBodies {
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
             const State& state = body_[j];
-            const double* above = &motion_[6 * (link.parent + 1)];  // still, where there is none
+            const double* above = &motion_[6 * (link.parent + 1)];  // zero for a root
             x[link.coordinate] -= detail::product<6>(state.answer, above);
             detail::write_sum<6>(above, x[link.coordinate], state.axis, &motion_[6 * (j + 1)]);
         }
@@ -305,20 +304,20 @@ class ArticulatedBodies {
     struct State {
         double axis[6] = {};  // S
         Inertia<double> inertia{};
-        double u[6] = {}, answer[6] = {};  // X S, and that by the pivot
+        double u[6] = {}, answer[6] = {};  // X S, and X S / pivot
         double pivot = 0.0;
     };
 
     const Tree* tree_;
     std::vector<State> body_;
     detail::Gathered inertia_, force_;
-    std::vector<double> motion_;                // (b + 1, 6) of each body, after what stands still
-    std::optional<SymmetricElimination> tied_;  // where coordinates move several bodies
+    std::vector<double> motion_;                // (b + 1, 6) of each body, after a zero for the base
+    std::optional<SymmetricElimination> tied_;  // for coordinates that move several bodies
 };
 
-// What elimination takes over of a body from a sweep of first order.
+// The data of a body that elimination needs from a sweep of first order.
 struct EliminatedBody {
-    Inertia<double> inertia{};  // of the body by itself
+    Inertia<double> inertia{};  // of the body alone
     Motion<double> axis{};      // S
     Motion<double> rate{};      // W
     Force<double> turned{};     // S x* H
@@ -337,8 +336,8 @@ struct EliminatedBody {
         return made;
     }
 
-    // The body's entry of (A' + L_qq y) x where the coordinate's y x is `own`, bodies move by `moved` and `above`, nine
-    // entries each, and z is what those it carries have left; adds its own to that.
+    // The body's entry of (A' + ha L_qq) x. `rate_of_x` is ha x of its coordinate, `moved` and `above` are the motions
+    // of the body and its parent, nine entries each, and z is the sum of its children, to which the body is added.
     double change_of_slope(double rate_of_x, const double* moved, const double* above, double* z) const {
         double added[10];
         detail::write_padded(inertia * detail::motion_at(moved) + rate_of_x * turned, rate_of_x * lifted, added);
@@ -349,13 +348,13 @@ struct EliminatedBody {
     }
 };
 
-// The matrix of a midpoint step and its symmetric part, at one (q, v) after another.
+// The matrix of a midpoint step and its symmetric part, at consecutive (q, v).
 class Elimination {
   public:
     explicit Elimination(const Mechanism& mechanism)
         : Elimination(mechanism, std::make_shared<Gathering>(mechanism.tree)) {}
 
-    // Take over from a sweep of first order what follows is about.
+    // Set the state from a sweep of first order.
     void take(const Jet<double>& jet) {
         for (int j = 0; j < tree_->size(); ++j) body_[j] = EliminatedBody::of(*mechanism_, j, jet);
     }
@@ -415,7 +414,7 @@ class Elimination {
         }
     }
 
-    // y = (A' + ha L_qq) x of the x that `solve` left.
+    // y = (A' + ha L_qq) x for the x of the last `solve`.
     void change_of_slope(const double* x, double* y) {
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
@@ -442,8 +441,8 @@ class Elimination {
         return total;
     }
 
-    // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same one of M, armature included; 0 if
-    // one is not positive. What `factor` left remains.
+    // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same pivot of M, armature included; 0
+    // if one is not positive. The factors of `factor` are kept.
     [[gnu::flatten]] double least_pivot_ratio(double c, double k, const double* diagonal) {
         double least = std::numeric_limits<double>::infinity();
         for (int j = tree_->size() - 1; j >= 0; --j) {
@@ -493,7 +492,7 @@ class Elimination {
 
     struct Factors {
         double row[width] = {}, column[width] = {};
-        double u[width] = {}, l[width] = {};  // l by the pivot
+        double u[width] = {}, l[width] = {};  // l divided by the pivot
         double pivot = 0.0;
     };
 
@@ -502,10 +501,10 @@ class Elimination {
     const Mechanism* mechanism_;
     const Tree* tree_;
     std::vector<EliminatedBody> body_;
-    std::vector<Motion<double>> moved_;  // of each body, under some x
+    std::vector<Motion<double>> moved_;  // of each body, for some x
     std::vector<Factors> factors_;
     detail::Gathered matrix_, symmetric_, force_;
-    std::vector<double> motion_;  // (b + 1, 10) of each body under the x of `solve`, after what stands still
+    std::vector<double> motion_;  // (b + 1, 10) of each body for the x of `solve`, after a zero for the base
     double ahead_ = 0.0;
     ArticulatedBodies masses_;
 };

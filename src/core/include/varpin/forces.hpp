@@ -1,15 +1,14 @@
-// What acts on single joints besides inertia and gravity: elements, in one list. docs/core.md, "Forces". A new force is
-// a struct here, a name in bindings/mechanism.cpp and a class in mechanics/forces.py: docs/extending.md.
+// Elements: forces on single joints besides inertia and gravity. docs/core.md, "Forces". A new force is a struct here,
+// a name in bindings/mechanism.cpp and a class in mechanics/forces.py: docs/extending.md.
 //
-// An element acts on one coordinate and has one of these or both:
+// An element acts on one coordinate and has one or both of
 //
 //     potential(q)    an energy V, part of the Lagrangian: -V' belongs to L_q, -V'' to the diagonal of L_qq
-//     force(q, v)     a force F beside L_q that is no gradient, with its derivatives and the power it turns into heat;
+//     force(q, v)     a force F without potential, besides L_q, with its derivatives and dissipated power;
 //                     force(q, v, f) if it depends on f, the constant force of controls on its joint, to which it adds
 //
-// Jets, step equations, guards, linearizations and forward dynamics each take from the list what is theirs. With
-// T = Dual and (q, v, f) moving along a direction, the slopes of -V'', dF/dq, dF/dv and dF/df are second derivatives of
-// the forces.
+// Jets, step equations, guards, linearizations and forward dynamics use this list. With T = Dual and (q, v, f) along a
+// direction, the slopes of -V'', dF/dq, dF/dv and dF/df are second derivatives of the forces.
 #pragma once
 
 #include <algorithm>
@@ -23,15 +22,15 @@
 
 namespace varpin {
 
-// An energy V, and -V and its derivatives as L has them.
+// An energy V, and the derivatives of -V.
 template <class T>
 struct Potential {
     T energy{};          // V [J]
     T force{};           // -V' [N m or N]
     T curvature{};       // -V''
-    double scale = 0.0;  // of the terms that cancel in the force
+    double scale = 0.0;  // magnitude of the terms that cancel in the force
 
-    // Of the terms that make up the energy at q, whose own rounding moves it.
+    // Magnitude of the terms of the energy at q, including its change by rounding of q.
     double magnitude(double q) const { return std::abs(value_of(energy)) + std::abs(value_of(force) * q); }
 };
 
@@ -42,8 +41,8 @@ struct JointForce {
     T by_q{};            // dF/dq
     T by_v{};            // dF/dv
     T by_f{};            // dF/df
-    double scale = 0.0;  // sum of the magnitudes that make it up
-    double lost = 0.0;   // into heat [W]
+    double scale = 0.0;  // sum of the magnitudes of its terms
+    double lost = 0.0;   // dissipated power [W]
 
     JointForce& operator+=(const JointForce& other) {
         value += other.value;
@@ -59,7 +58,7 @@ struct JointForce {
 struct JointSpring {
     int coordinate = 0;
     double stiffness = 0.0;  // [N m/rad or N/m]
-    double rest = 0.0;       // where it is slack [rad or m]
+    double rest = 0.0;       // position without force [rad or m]
 
     static constexpr bool anchored = true;
     static constexpr bool linear() { return true; }
@@ -87,12 +86,12 @@ struct JointDamper {
     }
 };
 
-// Dry friction -g(v) tanh(v / width), g falling from `breakaway` at rest to `level` on the way (Stribeck):
+// Dry friction -g(v) tanh(v / width); g falls from `breakaway` at rest to `level` with increasing speed (Stribeck):
 // g = level + (breakaway - level) exp(-(v / stribeck_velocity)^2).
 struct CoulombFriction {
     int coordinate = 0;
     double level = 0.0;              // [N m or N]
-    double width = 0.0;              // of velocities at which it turns round [rad/s or m/s]
+    double width = 0.0;              // velocity scale of the change of sign [rad/s or m/s]
     double breakaway = 0.0;          // [N m or N]
     double stribeck_velocity = 0.0;  // [rad/s or m/s]
 
@@ -120,8 +119,8 @@ struct CoulombFriction {
     }
 };
 
-// A spring and a damper beyond each end of a joint's way. Their stiffness and damping rise from 0 to the whole over the
-// first `width` beyond the end, by s(y) = 3 y^2 - 2 y^3, y = depth / width: forces have continuous derivatives.
+// A spring and a damper beyond each end of a joint's range. Stiffness and damping rise from 0 to their full values over
+// the first `width` beyond the end, by s(y) = 3 y^2 - 2 y^3, y = depth / width: forces have continuous derivatives.
 struct JointStop {
     int coordinate = 0;
     double lower = 0.0, upper = 0.0;  // infinite where there is none [rad or m]
@@ -178,8 +177,8 @@ struct JointStop {
     }
 };
 
-// A position servo. With f = stiffness * command it makes f the drive's force S(f - stiffness q - damping v), S being
-// the identity up to 0.9 of the effort; from there to 1.1 a parabola bends it to the effort, where it stays.
+// A position servo. It replaces f = stiffness * command by the drive's force S(f - stiffness q - damping v). S is the
+// identity up to 0.9 of the effort, a parabola from 0.9 to 1.1, and constant at the effort beyond.
 struct PositionServo {
     int coordinate = 0;
     double stiffness = 0.0;  // [N m/rad or N/m]
@@ -211,11 +210,11 @@ struct PositionServo {
     }
 };
 
-// Every kind of element. `anchored` says that it matters where the joint stands, whole turns included; `linear`, that
-// the force is a linear function of (q, v).
+// Every kind of element. `anchored`: the force depends on the joint's position, whole turns included. `linear`: the
+// error estimate of Newton's method (collocation.hpp) treats the force as linear in (q, v).
 using Element = std::variant<JointSpring, JointDamper, CoulombFriction, JointStop, PositionServo>;
 
-// The list. Elements of a kind stand together, so that a scene pays nothing for a kind that it has none of.
+// The list of elements, grouped by kind, so that kinds without elements cost nothing.
 class Forces {
   public:
     Forces() = default;
@@ -228,7 +227,7 @@ class Forces {
     // Whether all forces are linear functions of (q, v).
     bool linear() const { return linear_; }
 
-    // Whether an element minds where coordinate c stands.
+    // Whether an element on coordinate c is anchored.
     bool anchors(int c) const { return c < static_cast<int>(anchored_.size()) && anchored_[c] != 0; }
 
     // Calls visit(coordinate, Potential) for each element that has one, at q (n).
@@ -240,7 +239,8 @@ class Forces {
         });
     }
 
-    // The sum (n) of the forces beside L_q on each coordinate at q, v and f (n), into zeros if there is no element.
+    // The sum (n) of the forces besides L_q on each coordinate at q, v and f (n). Without elements `out` is not written
+    // and must be zero.
     template <class T>
     void sum(int n, const T* q, const T* v, const T* f, JointForce<T>* out) const {
         if (!any_) return;
@@ -252,10 +252,10 @@ class Forces {
         });
     }
 
-    // Whether an element makes something else of the constant force on its joint.
+    // Whether an element changes the constant force on its joint.
     bool drives() const { return drives_; }
 
-    // Turns the constant forces f (n) into what such elements make of them at q and v (n).
+    // Replaces the constant forces f (n) on the joints of such elements by the forces of their drives at q and v (n).
     void drive(const double* q, const double* v, double* f) const {
         each([&](const auto& element) {
             const int c = element.coordinate;

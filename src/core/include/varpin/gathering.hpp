@@ -1,5 +1,4 @@
-// What bodies gather of those they carry while they are eliminated one by one, the last one first, and the coordinates
-// that several of them share.
+// Storage for the elimination of bodies, from the last to the first, and for coordinates that several bodies share.
 #pragma once
 
 #include <algorithm>
@@ -11,21 +10,21 @@
 
 namespace varpin {
 
-// Coordinates that move several bodies: those that mimic joints follow. Such a coordinate cannot be eliminated with one
-// of its bodies. It borders what is handed on from the first of them on, in a slot, up to the body that carries all of
-// them, or is one of them and carries the others; there it is eliminated. Slots are used again.
+// Ties: coordinates that move several bodies, because mimic joints follow them. Such a coordinate cannot be eliminated
+// with one of its bodies. From the first of its bodies on, the matrices that bodies pass to their parents have a row
+// and a column for it, its slot. It is eliminated at the body whose subtree has all of its bodies. Slots are reused.
 struct Ties {
     struct Tied {
         int coordinate = 0;
         int slot = 0;
-        int body = 0;  // the first that it moves
+        int body = 0;  // the first body that it moves
     };
 
     explicit Ties(const Tree& tree) : slot(tree.dof(), -1), ending_(tree.size() + 1) {
         if (tree.size() == tree.dof()) return;
         std::vector<std::vector<int>> moved(tree.dof());
         for (int j = 0; j < tree.size(); ++j) moved[tree.bodies[j].coordinate].push_back(j);
-        // From the root on, that there are as few slots as can be.
+        // From the root on, for the smallest number of slots.
         std::vector<std::pair<int, int>> tops;
         for (int c = 0; c < tree.dof(); ++c) {
             if (moved[c].size() < 2) continue;
@@ -34,7 +33,7 @@ struct Ties {
             tops.emplace_back(top, c);
         }
         std::sort(tops.begin(), tops.end());
-        std::vector<std::vector<char>> taken;  // (slots) by a coordinate that borders what a body hands on
+        std::vector<std::vector<char>> taken;  // (slots) for each body, slots in use in the matrix it passes on
         for (const auto& [top, c] : tops) {
             std::vector<char> bordered(tree.size() + 1);
             for (int j : moved[c]) {
@@ -61,13 +60,13 @@ struct Ties {
     int slots = 0;
     std::vector<int> slot;  // (n) -1 for a coordinate of one body
 
-    // The coordinates that are eliminated with body j after its own, or at last, for j = -1.
+    // The tied coordinates that are eliminated at body j, after its own; for j = -1, at the end.
     const std::vector<Tied>& ending(int j) const { return ending_[j + 1]; }
 
   private:
     std::vector<std::vector<Tied>> ending_;  // (b + 1)
 
-    // The last body that carries both or is one of them; -1 where there is none.
+    // The last body whose subtree has both; -1 if there is none.
     static int common(const Tree& tree, int i, int j) {
         while (i != j) {
             int& later = i > j ? i : j;
@@ -77,8 +76,8 @@ struct Ties {
     }
 };
 
-// Where each body gathers what it carries while bodies are eliminated, the last one first. Places are used again: along
-// a chain there is one, and it stays in the cache. What stands still gathers ties alone, at a cell after the bodies'.
+// The storage cells in which bodies sum the contributions of their subtrees, from the last body to the first. Cells
+// are reused: a chain needs one, which stays in the cache. The fixed base has a cell after those of bodies, for ties.
 struct Gathering {
     explicit Gathering(const Tree& tree)
         : ties(tree), cell(tree.size() + 1, -1), joins(tree.size(), 0), leaf(tree.size() + 1, 1) {
@@ -103,29 +102,29 @@ struct Gathering {
 
     Ties ties;
     int cells = 0;
-    std::vector<int> cell;    // of each body; the first child's is its parent's
-    std::vector<char> joins;  // adds to what its parent has already, from a cell of its own
-    std::vector<char> leaf;   // nothing is in its cell before it
+    std::vector<int> cell;    // of each body; a first child has the cell of its parent
+    std::vector<char> joins;  // has a cell of its own, which is added to that of its parent
+    std::vector<char> leaf;   // has no children: its cell is empty
 };
 
 namespace detail {
 
-// What bodies have gathered while the last of them are eliminated; `entries` numbers in each cell.
+// The contributions of subtrees during elimination, `entries` numbers in each cell.
 class Gathered {
   public:
     Gathered(std::shared_ptr<const Gathering> order, int entries)
         : order_(std::move(order)), entries_(entries), at_(order_->cells * entries) {}
 
-    // What body j has of those it carries.
+    // The sum of the children of body j.
     double* of(int j) {
         double* entries = of_again(j);
         if (order_->leaf[j]) std::fill(entries, entries + entries_, 0.0);
         return entries;
     }
     double* of_again(int j) { return at_.data() + order_->cell[j] * entries_; }
-    // What all have left that stands on the ground, where there are ties.
+    // The sum of the roots, for ties.
     double* of_ground() { return at_.data() + order_->cell.back() * entries_; }
-    // Body j is done with: its parent goes on with what it leaves, or adds that to its own.
+    // Pass the contribution of body j to its parent.
     void hand_on(int j, int parent) {
         if (!order_->joins[j]) return;
         const double* entries = of_again(j);

@@ -1,14 +1,15 @@
-// When a step is accepted. docs/mathematics.md, "The principal branch".
+// Conditions on accepted steps. docs/mathematics.md, "The principal branch".
 //
-// The branch guard: the step equation has other roots than the one that is connected to h -> 0. There the symmetric
-// part of N = -dr/dv is positive definite; its pivots are compared with those of M, the destabilising term exaggerated.
-// The smallest ratio is no smaller than the least eigenvalue of one in the metric of the other, and has its sign.
+// The branch guard: the step equation has other roots than the one that is connected to h -> 0. At that root the
+// symmetric part of N = -dr/dv is positive definite. Its pivots, with an exaggerated destabilising term, are compared
+// with those of M. The smallest ratio is no smaller than the least eigenvalue of one in the metric of the other, and
+// has its sign.
 //
-// Energy: |dE - work of the forces| over a substep must be a small part of the energy turned over, for each
-// mechanically independent group. What rides on something far heavier is lost in that balance, so light parts have one
-// of their own: with coordinates i of its own and a of what carries it, the Jacobi energy J = sum_i p_i v_i - L of the
-// part's bodies changes by dJ = sum_i F_i dq_i - sum_a (L_q,a dq_a + L_v,a dv_a), L_q,a and L_v,a by the trapezoidal
-// rule.
+// The energy guard: |dE - work of the forces| over a substep must be a small part of the energy turned over, for each
+// mechanically independent group. That balance does not resolve parts that ride on far heavier ones, so light parts
+// have a balance of their own. With coordinates i of the part and coordinates a of its carrier, the Jacobi energy
+// J = sum_i p_i v_i - L of the part's bodies changes by dJ = sum_i F_i dq_i - sum_a (L_q,a dq_a + L_v,a dv_a), with
+// L_q,a and L_v,a by the trapezoidal rule.
 // Equation (G1) of docs/mathematics.md.
 #pragma once
 
@@ -27,13 +28,13 @@
 namespace varpin {
 
 struct Guards {
-    bool active = true;             // else a step is accepted whenever its equation is solved
-    double branch_margin = 0.5;     // how far from the fold a root must stay, in [0, 1)
+    bool active = true;             // else every step whose equation is solved is accepted
+    double branch_margin = 0.5;     // required distance of a root from the fold, in [0, 1)
     double energy_balance = 0.005;  // largest energy error of a substep, in units of the energy it turns over
-    double energy_budget = 0.02;  // of the errors added up, in units of the most energy that moved in a substep so far
+    double energy_budget = 0.02;    // largest sum of errors, in units of the largest energy moved in a substep so far
     int most_halvings = 20;
 
-    // How often a part that is taken again may be halved: without guards it is taken as it is.
+    // Most halvings of a part that is repeated; none without guards.
     int halvings_again() const { return active ? most_halvings : 0; }
 };
 
@@ -41,12 +42,12 @@ struct Guards {
 struct Ledger {
     double kinetic = 0.0;
     double potential = 0.0;
-    double defect = 0.0;  // errors added up
-    double most = 0.0;    // largest kinetic energy that moved in a substep
+    double defect = 0.0;  // sum of errors
+    double most = 0.0;    // largest kinetic energy moved in a substep
 };
 
-// What of the kinetic energy is one coordinate's own while those before it, or those it carries where M is not formed,
-// are free; its bounds of late.
+// The share of a coordinate in the kinetic energy while the coordinates before it, or in its subtree if M is not
+// formed, are free; its recent bounds.
 struct Share {
     double now = 0.0;
     double least = 0.0;
@@ -57,7 +58,7 @@ struct Share {
 struct PartLedger {
     double jacobi = 0.0;
     double potential = 0.0;
-    double scale = 0.0;  // of the terms that make them up
+    double scale = 0.0;  // magnitude of their terms
     double defect = 0.0;
     double most = 0.0;
     std::vector<double> Lq, Lv;  // (n)
@@ -92,11 +93,11 @@ struct Trial {
     explicit Trial(int n) : position(n), p(n), at(n), momentum(n), v(n), work(n), dissipated(n), magnitude(n) {}
     std::vector<Coordinate> position;
     std::vector<Compensated> p;
-    std::vector<double> at, momentum;  // (n) the same as plain numbers, for sweeps
+    std::vector<double> at, momentum;  // (n) rounded, for sweeps
     std::vector<double> v;             // (n) M^-1 p
     std::vector<double> work;          // (n) of the forces on each coordinate over the substep [J]
     std::vector<double> dissipated;    // (n) by friction [J]
-    std::vector<double> magnitude;     // (n) of the work of all terms of the force on each coordinate [J]
+    std::vector<double> magnitude;     // (n) sum of |work| of all terms of the force on each coordinate [J]
 };
 
 template <class Size = int>
@@ -142,7 +143,7 @@ class EnergyGuard {
         return true;
     }
 
-    // Energies and the factors L D L' of M at q, where bodies are not articulated; the blocks' lower triangles.
+    // Energies and the factors L D L' of M at q, in the lower triangles of blocks, if bodies are not articulated.
     bool factor(const double* q) {
         mass_matrix(mechanism, q, jet);
         for (const Block& block : blocks_of(mechanism.tree, n)) {
@@ -154,8 +155,8 @@ class EnergyGuard {
     }
     const std::vector<double>& factors() const { return ldl; }
 
-    // v = M^-1 p from the factors L D L' that `node` left. The terms of the kinetic energy 1/2 y' D^-1 y with L y = p,
-    // none of which is negative, are the coordinates' shares.
+    // v = M^-1 p from the factors of `node`. The shares of the coordinates are the terms of the kinetic energy
+    // 1/2 y' D^-1 y with L y = p, which are not negative.
     void velocity(const double* p, double* v) {
         std::fill(kinetic.begin(), kinetic.end(), 0.0);
         if (!known && articulated) {
@@ -181,7 +182,7 @@ class EnergyGuard {
         for (const Block& block : blocks_of(mechanism.tree, n)) solve_ldl(ldl.data(), n, block, b, x);
     }
 
-    // A fresh start at a node: no errors lie behind it.
+    // Start at a node, without earlier errors.
     void begin(const double* q, const double* p, const double* v, Energies& energies) {
         for (int r = 0; r < mechanism.tree.groups; ++r) energies.group[r] = {kinetic[r], jet.potential[r], 0.0, 0.0};
         for (int i = 0; i < n; ++i) energies.share[i] = {share[i], share[i], share[i]};
@@ -192,7 +193,7 @@ class EnergyGuard {
         }
     }
 
-    // The momentum has been kicked: velocity and energy come along, and no error is entered.
+    // Update velocity and energy after a kick of the momentum, without an error.
     void kicked(const double* q, const double* p, double* v, Energies& energies) {
         velocity(p, v);
         find_turnover(energies);
@@ -209,9 +210,9 @@ class EnergyGuard {
         }
     }
 
-    // How far the root is from the fold where branches of solutions meet: 1 as h -> 0, <= 0 where refused. The smallest
-    // ratio of a pivot of M - (h/2) dF/dv + h skew (A + A') - h^2 reach (L_qq + dF/dq) / (1 - margin) to the same pivot
-    // of M, all averaged over the stages with b.
+    // The distance of the root from the fold where branches of solutions meet: 1 as h -> 0, <= 0 for a refused root. It
+    // is the smallest ratio of a pivot of M - (h/2) dF/dv + h skew (A + A') - h^2 reach (L_qq + dF/dq) / (1 - margin)
+    // to the same pivot of M, all averaged over the stages with b.
     template <class Stages>
     double branch_margin(double h, const Guards& guards, Collocation<Size, Stages>& step) {
         const Tableau& tableau = step.tableau;
@@ -250,8 +251,8 @@ class EnergyGuard {
         return least;
     }
 
-    // Velocity and energy of the node that a substep has reached, and whether its energy balance closes; enters it if
-    // so. Where M has been factored there, it is not again.
+    // Velocity and energy at the end of a substep, and whether its energy balance closes; if so, updates the ledgers.
+    // `factored`: the factors of M at the end are known.
     Outcome accept(const Guards& guards, const Tableau& tableau, Energies& energies,
                    const std::vector<Coordinate>& from, const std::vector<double>& from_v, Trial& trial,
                    bool factored = false) {
@@ -274,7 +275,7 @@ class EnergyGuard {
             work[tree.group[i]] += trial.work[i];
             lost[tree.group[i]] += trial.dissipated[i];
         }
-        // Methods of first order: Midpoint's with another alpha, and Radau's with one stage, which is alpha = 1.
+        // Methods of first order: Midpoint with another alpha, and Radau with one stage, which is alpha = 1.
         const double off_middle = tableau.stages == 1 && tableau.stiffly_accurate ? 1.0 : 2.0 * std::abs(tableau.skew);
         const Limit limit{guards.energy_balance * (1.0 + 9.0 * off_middle), guards.energy_budget};
         if (guards.active) {
@@ -297,16 +298,16 @@ class EnergyGuard {
 
   private:
     static constexpr bool known = !std::is_same_v<Size, int>;
-    static constexpr double fade = 1.0 / 256.0;     // by which a substep forgets how far kinetic energies have varied
-    static constexpr double rounding = 1e-12;       // of the magnitudes that make up an energy or a work
-    static constexpr double part_factor = 4.0;      // times the limits of whole groups: the trapezoidal rule errs too
-    static constexpr double least_fraction = 0.02;  // is always left, or a full ledger could never be worked off
+    static constexpr double fade = 1.0 / 256.0;     // decay per substep of the recorded variation of kinetic energies
+    static constexpr double rounding = 1e-12;       // relative to the magnitudes of the terms of an energy or a work
+    static constexpr double part_factor = 4.0;      // for light parts, because of the error of the trapezoidal rule
+    static constexpr double least_fraction = 0.02;  // of the limit remains, or a full ledger would stop the motion
 
     struct Limit {
         double balance = 0.0;
         double budget = 0.0;
 
-        // The largest error over a substep. An error that adds to those before it has less room the fuller the ledger.
+        // The largest error over a substep. For an error of the sign of `defect`, it decreases as the ledger fills.
         double of(double error, double defect, double turnover, double exchanged, double most) const {
             double limit = balance * (turnover + exchanged);
             if (std::abs(defect + error) > std::abs(defect)) {
@@ -324,14 +325,14 @@ class EnergyGuard {
     std::vector<double> ldl;                // (n, n) factors of M, unless bodies are articulated
     std::vector<double> kinetic, turnover;  // of each group [J]
     std::vector<double> work, lost;         // of each group over the substep, and by friction [J]
-    std::vector<double> magnitude;          // of each group, as of Trial
+    std::vector<double> magnitude;          // of each group, as in Trial
     std::vector<double> share;              // (n)
     std::vector<double> diagonal;           // (n) of the branch guard
     std::vector<double> curved, mass;  // (n, n) of the branch guard, unless the step equation is solved by elimination
-    std::vector<PartLedger> part;      // of the node that is tried
+    std::vector<PartLedger> part;      // at the trial node
 
-    // The kinetic energy that a coordinate may be said to turn over. Its share counts as far as it has varied of late:
-    // a heavy wheel that turns on and on would else leave room for any error of what it carries.
+    // The kinetic energy that a coordinate turns over: the recent variation of its share. The share itself would permit
+    // any error of what a heavy, evenly turning wheel carries.
     double varied(const Energies& energies, int i) const {
         const Share& range = energies.share[i];
         return std::min(std::max(range.now, share[i]),
@@ -355,13 +356,13 @@ class EnergyGuard {
         }
     }
 
-    // How much the energy of group r has changed that no force accounts for [J].
+    // The change of the energy of group r minus the work of forces [J].
     double error_of(const Ledger& ledger, int r) const {
         return (kinetic[r] - ledger.kinetic) + (jet.potential[r] - ledger.potential) - work[r];
     }
 
-    // What a stiffly accurate method takes out of modes that friction stops within the step has no balance but that
-    // friction's own share bounds it.
+    // Whether the balance of group r closes. Stiffly accurate methods damp modes that friction stops within a step; for
+    // them, errors up to the work of friction are accepted.
     bool balanced(const Limit& limit, double off_middle, bool stiffly_accurate, const Ledger& ledger, int r) const {
         const double error = error_of(ledger, r);
         if (stiffly_accurate && std::abs(error) <= lost[r]) return true;
@@ -372,14 +373,14 @@ class EnergyGuard {
         return std::abs(error) <= limit.of(error, ledger.defect, turnover[r], exchanged, ledger.most) + rounding_margin;
     }
 
-    // Enter an accepted substep. What friction takes, it takes of the errors too.
+    // Update a ledger after an accepted substep. Friction reduces earlier errors together with the energy.
     void update_ledger(Ledger& ledger, int r) const {
         double defect = ledger.defect + error_of(ledger, r);
         if (lost[r] > 0.0) defect *= std::max(0.0, 1.0 - lost[r] / (lost[r] + std::max(kinetic[r], ledger.kinetic)));
         ledger = {kinetic[r], jet.potential[r], defect, std::max(ledger.most, turnover[r])};
     }
 
-    // Whether a body is `top` or hangs on it; parents come first.
+    // Whether a body is in the subtree of `top`; parents come first.
     bool below(int body, int top) const {
         while (body > top) body = mechanism.tree.bodies[body].parent;
         return body == top;
@@ -398,14 +399,14 @@ class EnergyGuard {
             const auto& top = jet.body[light.body];
             const int carrier = tree.bodies[light.body].parent;
             const double carried = 0.5 * dot(jet.body[carrier].velocity, top.momentum);
-            // Of what carries the part's origin up and down the carrier's L_q is spared too.
+            // The height of the part's origin is left out of the potential, and of the carrier's L_q.
             ledger.potential = -dot(g, top.inertia.moment);
             ledger.scale = strength * detail::norm1(top.inertia.moment) + std::abs(carried);
             for (int b = light.body; b < tree.size(); ++b) {
                 const Body& link = tree.bodies[b];
                 if (!link.origin || !below(b, light.body)) continue;
                 const auto& there = jet.body[b];
-                // Moments past an origin are about it, and it slides.
+                // Moments below an origin are taken about it, and it translates.
                 if (b > light.body) {
                     ledger.potential -= dot(g, there.inertia.moment);
                     ledger.scale += strength * detail::norm1(there.inertia.moment);
@@ -429,7 +430,7 @@ class EnergyGuard {
                 ledger.potential += element.energy;
                 ledger.scale += element.magnitude(q[c]);
             });
-            // A coupling that moves the part is part of its Lagrangian, and moves with others too.
+            // A coupling on the part belongs to its Lagrangian, and depends on other coordinates too.
             mechanism.couplings.potentials(
                 q, jet.couplings, [&](const auto& arms, const auto& coupling, double, double size) {
                     const auto carried = [&](const Arm<double>& arm) { return light.carried[arm.coordinate] != 0; };
@@ -453,7 +454,7 @@ class EnergyGuard {
         }
     }
 
-    // Whether the balance of light part r closes over a substep; leaves its ledger in `part`.
+    // Whether the balance of light part r closes over a substep; writes its ledger into `part`.
     bool part_balanced(const Limit& limit, const Energies& energies, const std::vector<Coordinate>& from,
                        const std::vector<double>& from_v, const Trial& trial, std::size_t r) {
         const PartLedger& old = energies.part[r];

@@ -1,15 +1,15 @@
 // The Lagrangian jet: one forward and one backward sweep over the tree give L and all its derivatives up to second
 // order. docs/mathematics.md, "The Lagrangian jet". With S the axis of a joint, V the velocity of its body, W = V x S,
-// Y and H inertia and momentum of all that it carries, F = Y S, B = Y W + S x* H, g gravity, i an ancestor of j or j
+// Y and H the inertia and momentum of its subtree, F = Y S, B = Y W + S x* H, g gravity, and i an ancestor of j or j
 // itself:
 //
 //     L_v[j] = S_j . H_j        M[i,j] = S_i . F_j        L_qq[i,j] = W_i . B_j - F_j . (S_i x g)
 //     L_q[j] = W_j . H_j + S_j . (Y_j g)                  A[i,j] = S_i . B_j,  A[j,i] = W_i . F_j
 //
-// Vectors are taken about the root of their branch, or the last joint of a run of sliders there: it moves with them, so
-// that what stands or slides far away keeps its digits. With T = Dual and (q, v) moving along a direction, the slopes
-// of M, A and L_qq are third derivatives of L, contracted with the direction.
-// Equations (J1) and (J2) of docs/mathematics.md.
+// Vectors are taken about the root of their branch, or about the last of the prismatic joints that follow it. This
+// point moves with the branch, so that robots far from the world's origin lose no digits. With T = Dual and (q, v)
+// along a direction, the slopes of M, A and L_qq are third derivatives of L, contracted with the direction. Equations
+// (J1) and (J2) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>
@@ -25,15 +25,15 @@
 
 namespace varpin {
 
-// Sums of norms, in which nothing cancels, of the terms that make up a body's velocity, momentum and first moment:
-// rounding errors are in proportion to them and not to the results.
+// Sums of the norms of the terms of a body's velocity, momentum and first moment, without cancellation. Rounding errors
+// are proportional to them, not to the results.
 struct Magnitudes {
     double velocity = 0.0, turning = 0.0;  // V: linear, angular
     double momentum = 0.0, spin = 0.0;     // H: linear, angular
     double moment = 0.0;                   // m c
 };
 
-// What the axis of a body has of a force, and its rate, side by side: of doubles both at once.
+// Products of the axis of a body, and of its rate, with a force; for doubles in one vector register.
 template <class T>
 struct AxisAndRate {
     Motion<T> axis{}, rate{};
@@ -72,10 +72,10 @@ struct AxisAndRate<double> {
     }
 };
 
-// Work arrays of a sweep, and where it leaves its results; matrices are (n, n), row by row.
+// Work arrays and results of a sweep; matrices are (n, n), row-major.
 template <class T, class Size = int>
 struct Jet {
-    // Only steps ask how much rounding there is in L_q, L_v and the potential.
+    // Only steps need the rounding errors of L_q, L_v and the potential.
     static constexpr bool scaled = std::is_same_v<T, double>;
 
     struct BodyState {
@@ -90,7 +90,7 @@ struct Jet {
         Magnitudes magnitude{};
     };
 
-    // Without room for matrices only the functions that do not write any may be called.
+    // Without `matrices`, only functions that do not write any may be called.
     explicit Jet(const Tree& tree, bool matrices = true)
         : body(tree.bodies.size()),
           dof(tree.dof()),
@@ -112,7 +112,7 @@ struct Jet {
     T kinetic{};               // [J]
     std::vector<T> potential;  // of each group [J]
     std::vector<T> Lq, Lv, M, A, Lqq;
-    std::vector<double> potential_scale, Lq_scale, Lv_scale;  // sums of the magnitudes that make them up
+    std::vector<double> potential_scale, Lq_scale, Lv_scale;  // sums of the magnitudes of their terms
     CouplingWorkspace<T> couplings;
 
     T total_potential() const {
@@ -129,8 +129,8 @@ double norm1(const Vec3<T>& a) {
     return std::abs(a.x) + std::abs(a.y) + std::abs(a.z);
 }
 
-// Orientation, position and axis of a body. What every sweep does for every body is told to be part of it: that takes
-// 15 % off a sweep.
+// Orientation, position and axis of a body. Functions that every sweep calls for every body are forced inline, which
+// saves 15 % of a sweep.
 template <class T, class Size>
 [[gnu::always_inline]] inline void place_body(const Tree& tree, int j, const T* q, Jet<T, Size>& w) {
     using std::cos, std::sin;
@@ -195,7 +195,7 @@ template <class Size>
     if (link.mass > 0.0) magnitude.spin += magnitude.moment / link.mass * magnitude.momentum;
 }
 
-// Gravity's potential energy of what an origin carries: of its moments, and of all masses' shift.
+// Potential energy in gravity of the subtree of an origin: from its moments, and from the position of the origin.
 template <class T, class Size>
 void add_potential(const Mechanism& mechanism, int j, const T* q, Jet<T, Size>& w) {
     const Body& link = mechanism.tree.bodies[j];
@@ -211,7 +211,7 @@ void add_potential(const Mechanism& mechanism, int j, const T* q, Jet<T, Size>& 
     }
 }
 
-// The share of what body j carries in L_q and L_v.
+// Contribution of the subtree of body j to L_q and L_v.
 template <class T, class Size>
 [[gnu::always_inline]] inline void project_first(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
     const Body& link = mechanism.tree.bodies[j];
@@ -234,7 +234,7 @@ template <class T, class Size>
     }
 }
 
-// The share of what body j carries in M, A and L_qq.
+// Contribution of the subtree of body j to M, A and L_qq.
 template <class T, class Size>
 void project_second(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
     const Tree& tree = mechanism.tree;
@@ -280,7 +280,7 @@ void project_mass(const Tree& tree, int j, Jet<T, Size>& w) {
     }
 }
 
-// Hand what body j carries on to its parent. Above an origin all slide: they see masses and linear momenta alone.
+// Add the subtree of body j to its parent. Joints above an origin are prismatic: only masses and linear momenta count.
 template <class T>
 [[gnu::always_inline]] inline void pass_inertia(const Body& link, const Inertia<T>& carried, Inertia<T>& up,
                                                 bool second) {
@@ -311,7 +311,7 @@ void clear_first(Jet<T, Size>& w) {
     }
 }
 
-// Zero the blocks of a matrix; outside of them nothing is ever written.
+// Set the blocks of a matrix to zero; entries outside of them are never written.
 template <class T, class Size>
 void clear_blocks(const Tree& tree, Size n, std::vector<T>& matrix) {
     if (blocks_of(tree, n).size() == 1) {
@@ -325,7 +325,8 @@ void clear_blocks(const Tree& tree, Size n, std::vector<T>& matrix) {
     }
 }
 
-// The couplings' potential energy, and its derivatives up to an order. Inlined it would slow down sweeps without any.
+// Potential energy of the couplings and its derivatives up to an order. Not inlined, since that would slow down sweeps
+// without couplings.
 template <class T, class Size>
 [[gnu::noinline]] void add_couplings(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int order) {
     mechanism.couplings.potentials(q, w.couplings,
@@ -344,7 +345,7 @@ template <class T, class Size>
                                    });
 }
 
-// The elements' potential energy, and its derivatives up to an order.
+// Potential energy of the elements and its derivatives up to an order.
 template <class T, class Size>
 void add_elements(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int order) {
     mechanism.forces.potentials(q, [&](int c, const Potential<T>& potential) {
@@ -360,7 +361,7 @@ void add_elements(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int o
     if (mechanism.couplings.any()) add_couplings(mechanism, q, w, order);
 }
 
-// Armature's momentum, and the kinetic energy.
+// Momentum of the armature, and the kinetic energy.
 template <class T, class Size>
 void add_armature(const Tree& tree, const T* v, Jet<T, Size>& w) {
     w.kinetic = T{};
@@ -374,7 +375,7 @@ void add_armature(const Tree& tree, const T* v, Jet<T, Size>& w) {
 
 }  // namespace detail
 
-// The whole jet at (q, v), left in w.
+// The whole jet at (q, v), into w.
 template <class T, class Size>
 void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, Size>& w) {
     const Tree& tree = mechanism.tree;
@@ -406,7 +407,7 @@ void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, S
     detail::add_armature(tree, v, w);
 }
 
-// L_q, L_v and the energies at (q, v) alone. Moments of inertia stay in their bodies' axes.
+// Only L_q, L_v and the energies at (q, v). Moments of inertia stay in body axes.
 template <class Size>
 void first_order(const Mechanism& mechanism, const double* q, const double* v, Jet<double, Size>& w) {
     const Tree& tree = mechanism.tree;
@@ -439,8 +440,8 @@ void first_order(const Mechanism& mechanism, const double* q, const double* v, J
     detail::add_armature(tree, v, w);
 }
 
-// The potential energy at q alone. `enter` sees each body placed with its inertia by itself, the first one first; then
-// `project` each with the inertia of all it carries, the last one first.
+// Only the potential energy at q. `enter` visits each placed body with its own inertia, from the first to the last;
+// then `project` visits each with the inertia of its subtree, from the last to the first.
 template <class Size, class Visit, class Project>
 void inertias(const Mechanism& mechanism, const double* q, Jet<double, Size>& w, const Visit& visit,
               const Project& project) {
@@ -464,7 +465,7 @@ void inertias(const Mechanism& mechanism, const double* q, Jet<double, Size>& w,
     detail::add_elements(mechanism, q, w, 0);
 }
 
-// M and the potential energy at q alone.
+// Only M and the potential energy at q.
 template <class Size>
 void mass_matrix(const Mechanism& mechanism, const double* q, Jet<double, Size>& w) {
     detail::clear_blocks(mechanism.tree, w.dof, w.M);

@@ -1,5 +1,5 @@
-// Where bodies, frames and the centre of mass are, their Jacobians, and by how much rotations differ.
-// docs/mathematics.md, "Costs in the task". Positions are the world's, unlike those of the jet.
+// Positions of bodies, frames and the centre of mass, their Jacobians, and differences of rotations.
+// docs/mathematics.md, "Costs in the task". Positions are in world axes from the world's origin, unlike in the jet.
 #pragma once
 
 #include <algorithm>
@@ -23,14 +23,14 @@ constexpr PlacementOf<T> operator*(const PlacementOf<T>& a, const Placement& b) 
     return {a.rotation * b.rotation, a.position + a.rotation * b.position};
 }
 
-// Some bodies of a tree and all their ancestors, among n coordinates.
+// Some bodies of a tree with all their ancestors; n coordinates of the tree.
 struct Links {
     std::vector<Body> bodies;
     int dof = 0;
 
     int size() const { return static_cast<int>(bodies.size()); }
 
-    // The bodies on the way from the root to one of them, and that one.
+    // The bodies from the root to a body, that body included.
     std::vector<int> path(int body) const {
         std::vector<int> out;
         for (int j = body; j >= 0; j = bodies[j].parent) out.push_back(j);
@@ -45,7 +45,7 @@ class LinkCollector {
     LinkCollector(const std::vector<Body>& bodies, Links& links)
         : bodies_(bodies), links_(links), own_(bodies.size(), -1) {}
 
-    // The place of a body among the links, into which it comes behind all its ancestors; -1 is the world.
+    // The index of a body among the links, to which it is added after its ancestors; -1 is the world.
     int take(int body) {
         if (body < 0) return -1;
         if (own_[body] < 0) {
@@ -89,14 +89,14 @@ void forward_kinematics(const Links& links, const T* q, PlacementOf<T>* at) {
     }
 }
 
-// The velocity that a joint gives to a point which it carries, per unit of its rate, in world axes.
+// The velocity of a point in a joint's subtree per unit of the joint's rate, in world axes.
 template <class T>
 Motion<T> given_by(const Body& link, const PlacementOf<T>& at, const Vec3<T>& point) {
     const Vec3<T>& axis = at.rotation.z;
     return link.prismatic ? Motion<T>{axis, {}} : Motion<T>{cross(axis, point - at.position), axis};
 }
 
-// The Jacobian (6, n) of a frame at a point that the last body carries: linear over angular velocity in world axes.
+// The Jacobian (6, n) of a frame at a point of the last body: linear, then angular velocity, in world axes.
 inline void frame_jacobian(const Links& links, const Placement* at, const Vec3<double>& point, double* J) {
     const int n = links.dof;
     std::fill(J, J + 6 * n, 0.0);
@@ -113,13 +113,13 @@ inline void frame_jacobian(const Links& links, const Placement* at, const Vec3<d
     }
 }
 
-// Mass and first moment of what a joint carries.
+// Mass and first moment of a joint's subtree.
 struct Load {
     double mass = 0.0;      // [kg]
     Vec3<double> moment{};  // [kg m]
 };
 
-// The centre of mass of all bodies and, where there is room for it, its Jacobian (3, n). `loads` are work, one a body.
+// The centre of mass of all bodies and its Jacobian J (3, n), which may be null. `loads` is work, one for each body.
 inline Vec3<double> center_of_mass(const Links& links, const Placement* at, Load* loads, double* J) {
     const int n = links.dof;
     for (int j = 0; j < links.size(); ++j) {
@@ -134,7 +134,7 @@ inline Vec3<double> center_of_mass(const Links& links, const Placement* at, Load
     if (J != nullptr) {
         std::fill(J, J + 3 * n, 0.0);
         for (int j = 0; j < links.size(); ++j) {
-            // The joint moves what it carries as one body.
+            // The joint moves its subtree as one body.
             const Body& link = links.bodies[j];
             const auto& [mass, moment] = loads[j];
             const Vec3<double>& axis = at[j].rotation.z;
@@ -153,8 +153,8 @@ struct Quaternion {
     Vec3<double> vector{};
 };
 
-// A multiple of the quaternion of a rotation, w not negative. From the largest of its entries, so that none is a
-// difference of what cancels (Shepperd, "Quaternion from rotation matrix", 1978).
+// A multiple of the quaternion of a rotation, with w >= 0. It is computed from its largest entry to avoid cancellation
+// (Shepperd, "Quaternion from rotation matrix", 1978).
 inline Quaternion quaternion(const Mat3<double>& R) {
     const auto& [x, y, z] = R;
     const double trace = x.x + y.y + z.z;
@@ -179,7 +179,7 @@ inline Vec3<double> logarithm(const Mat3<double>& E) {
     return (sine > 0.0 ? 2.0 * std::atan2(sine, z.w) / sine : 0.0) * z.vector;
 }
 
-// The D with dr = D w dt for the logarithm r of a rotation that turns with w in its own axes,
+// The D with dr = D w dt for the logarithm r of a rotation with angular velocity w in its own axes,
 //     D = 1 + [r]/2 + (1 - (a/2) cot(a/2)) [r]^2 / a^2,    a = |r|
 // (Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, 2011, 10.86).
 inline Mat3<double> logarithm_derivative(const Vec3<double>& r) {

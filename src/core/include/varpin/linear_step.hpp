@@ -1,4 +1,4 @@
-// One step of a backward pass as (x, u) sees it: where it leads, the samples of its running cost, what noise does.
+// One step of a backward pass in (x, u): its linearization, the samples of its running cost, and the jumps of noise.
 // docs/mathematics.md, "The backward pass".
 #pragma once
 
@@ -25,7 +25,7 @@ class LinearStep {
           rates(2 * dof, dof),
           speeds(dof, 2 * dof + controls) {}
 
-    // Step s: J, and what the other functions need.
+    // Load step s: J, and the data of the other functions.
     void load(const ExpandedSteps& steps, std::ptrdiff_t s) {
         const int m = size - x;
         for (int i = 0; i < x; ++i) {
@@ -45,7 +45,7 @@ class LinearStep {
         add_transposed_product(rates, J, x, speeds, n);
     }
 
-    // D, of (q, v) at a sample.
+    // D, the derivative of (q, v) at a sample.
     void expand(const Sample& sample) {
         for (int half = 0; half < 2; ++half) {
             const Sample::Sum& of = half == 0 ? sample.q : sample.v;
@@ -59,7 +59,7 @@ class LinearStep {
         }
     }
 
-    // P, of (q, v) at a sample in the state after the step; false where that does not matter.
+    // P, the derivative of (q, v) at a sample in the state after the step; false if it is zero.
     bool expand_after(const Sample& sample) {
         P.clear();
         for (int i = 0; i < n; ++i) {
@@ -69,7 +69,7 @@ class LinearStep {
         return sample.q.q1 != 0.0 || sample.q.v1 != 0.0 || sample.v.q1 != 0.0 || sample.v.v1 != 0.0;
     }
 
-    // The jump of process w, and F; false where F is zero.
+    // The jump of process w, and F; false if F is zero.
     bool read_process(const ExpandedSteps& steps, std::ptrdiff_t s, int w) {
         const int m = size - x;
         bool depends = false;
@@ -85,12 +85,12 @@ class LinearStep {
 
     TiledMatrix J;             // (2n, 2n + m) [A B]
     TiledMatrix D;             // (2n, 2n + m) of (q, v) at the sample
-    TiledMatrix P;             // (2n, 2n) of the same in the state after the step
+    TiledMatrix P;             // (2n, 2n) of (q, v) in the state after the step
     TiledMatrix F;             // (2n, 2n + m) of a process' jump
     std::vector<double> jump;  // (2n)
 
   private:
-    // Row i of in_q dq/dx + in_v dv/dx at a node, where dv/dx (n, 2n) is null if x holds v itself.
+    // Row i of in_q dq/dx + in_v dv/dx at a node; dv/dx (n, 2n) is null for x = (q, v).
     void add_node(double in_q, double in_v, const double* velocity, int i, double* out) const {
         out[i] += in_q;
         if (!velocity) {

@@ -1,13 +1,13 @@
 // Derivatives of the steps of a trajectory, first and second. docs/mathematics.md, "Linearization" and
 // "Second derivatives".
 //
-// For z = (zq, zp) the step equation is joined to phi = zq . q1 + zp . p1 with multipliers lam_i that make the sum
-// stationary in V: N' lam = dphi/dV. What is not linear in (q0, p0, f, V) there is
+// For z = (zq, zp), phi = zq . q1 + zp . p1 is added to the step equation with multipliers lam_i that make the sum
+// stationary in V: N' lam = dphi/dV. The part of the sum that is nonlinear in (q0, p0, f, V) is
 //
 //     psi = sum_i alpha_i . L_q(Q_i, V_i) + beta_i . L_v(Q_i, V_i) + gamma_i . F(Q_i, V_i, f),
 //     alpha_i = h (b_i zp + sum_j abar_ji lam_j),    beta_i = -lam_i,    gamma_i = h (b_i zp + sum_j f_ji lam_j),
 //
-// and at a root first derivatives of V are enough: d2 phi = sum_i (dQ_i, dV_i, df)' d2 psi_i (dQ_i, dV_i, df).
+// and at a root first derivatives of V suffice: d2 phi = sum_i (dQ_i, dV_i, df)' d2 psi_i (dQ_i, dV_i, df).
 // Equation (L4) of docs/mathematics.md.
 #pragma once
 
@@ -24,8 +24,8 @@ namespace varpin {
 template <class Size = int, class Stages = int>
 class VariationalLinearization {
   public:
-    // Where guards are active, a part that they refuse is taken in halves: a step that noise kicked may need other
-    // parts without it. Where they are not, the parts are those given and no others.
+    // With active guards, a part that they refuse is halved, since a step may need other parts without its noise.
+    // Without them, the parts are exactly those given.
     VariationalLinearization(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                              Solver solver = Solver::automatic)
         : stepper(mechanism, tableau, tolerance, guards, 1.0, solver),
@@ -48,14 +48,13 @@ class VariationalLinearization {
           along_v(n),
           along_f(n) {}
 
-    // Whether each step has a force (s, n) at its stages, rather than one (n) that is constant over it; and whether
-    // derivatives in f are in a force that grows from 0 at the start of the step to f at its end.
+    // varies: each step has forces (s, n) at its stages instead of a constant force (n). ramp: derivatives in f are
+    // those in a force that grows linearly from 0 at the start of the step to f at its end.
     bool varies = false, ramp = false;
 
-    // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f. A step
-    // that was taken whole is solved once more from a guess (s, n) next to its root; in the rows before q, p and force
-    // there are `past` others. Of another `halvings` are those of its parts: these are taken again, and their
-    // derivatives are chained.
+    // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f. An undivided step
+    // is solved again from a guess (s, n) close to its root; the arrays q, p and force have `past` earlier steps before
+    // the pointers. A divided step has `halvings`: its parts are repeated, and their derivatives are multiplied.
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
                   std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0) {
         if (halvings.empty() && !stepper.guards.active) {
@@ -84,8 +83,8 @@ class VariationalLinearization {
         return Outcome::solved;
     }
 
-    // z . d2(q1, p1)/d(q0, p0, f)2 of one step, into H (3n, 3n). A step taken in parts: z goes back by each part's
-    // derivative, and the curvature of each part to the start of the step.
+    // z . d2(q1, p1)/d(q0, p0, f)2 of one step, into H (3n, 3n). For a divided step, z is propagated backward by the
+    // derivative of each part, and the second derivatives of each part are transformed to the start of the step.
     Outcome second(double h, const double* q, const double* p, const double* guess, const double* force,
                    std::span<const std::uint8_t> halvings, const double* z, double* H, int past = 0) {
         std::fill(H, H + entries(3 * n, 3 * n), 0.0);
@@ -120,7 +119,7 @@ class VariationalLinearization {
     }
 
   private:
-    // A root that is known to 1e-10 is good enough for derivatives.
+    // Factor of the tolerance for derivatives, which need a root to about 1e-10 only.
     static constexpr double loose = 1e6;
 
     // A part of a step that has been solved.
@@ -150,8 +149,8 @@ class VariationalLinearization {
     std::vector<Dual> coupled_q, coupled_v;                   // (n, n) of couplings, along a direction
     std::vector<JointForce<Dual>> along_q, along_v, along_f;  // (n) of the elements, with derivatives in q, in v, in f
 
-    // The root of a step that was taken whole: from a guess (s, n); where that is too far away, as where friction turns
-    // round within the step, from its first velocity, and from the steps before as the motion had it.
+    // The root of an undivided step, from a guess (s, n). If the guess is too far away, for example because friction
+    // changes its sign within the step, from the initial velocity, and then by repetition of the steps before.
     Outcome root(double h, const double* q, const double* p, const double* guess, const double* force, int past) {
         std::copy(guess, guess + stages * n, stepper.step_equation.V.begin());
         Outcome outcome = root_at(h, q, p, force);
@@ -168,7 +167,7 @@ class VariationalLinearization {
         return root_at(h, q, p, force);
     }
 
-    // From the guess in the step equation.
+    // The root from the guess in the step equation.
     Outcome root_at(double h, const double* q, const double* p, const double* force) {
         for (int i = 0; i < n; ++i) {
             state.position[i] = {{q[i], 0.0}, 0.0};
@@ -189,8 +188,8 @@ class VariationalLinearization {
                                            loose, true, stepper.effort);
     }
 
-    // Take the parts of a step again; of each that is solved `visit` is told where it begins, in units of the step, and
-    // its length, its root in the stepper.
+    // Repeat the parts of a step. After each solved part, with its root in the stepper, calls visit(begin, length),
+    // with the begin in units of the step.
     template <class Visit>
     Outcome parts(double h, const double* q, const double* p, const double* force,
                   std::span<const std::uint8_t> halvings, const Visit& visit) {
@@ -205,7 +204,7 @@ class VariationalLinearization {
         });
     }
 
-    // Of the part whose root is in the stepper.
+    // Derivatives of the part whose root is in the stepper.
     void part_derivatives(double length) {
         stepper.step_equation.derivatives(length, dV, chained.part.data(), chained.part_f.data());
     }
@@ -219,7 +218,7 @@ class VariationalLinearization {
         return both;
     }
 
-    // Add start' (z . d2(q1, p1)) start at the root in the stepper, its dV at hand; `start` (2n, 3n) may be null.
+    // Add start' (z . d2(q1, p1)) start at the stepper's root, after part_derivatives; `start` (2n, 3n) may be null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
         const Tableau& tableau = equation.tableau;
@@ -289,7 +288,7 @@ class VariationalLinearization {
         }
     }
 
-    // Add to `inner`, and in f to H, what stage i's gamma . F has of second derivatives, all on diagonals.
+    // Add the diagonal second derivatives of gamma . F of elements at stage i to `inner`, and those in f to H.
     void add_elements(double h, int i, const double* z, double* H) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
         const int w = 3 * n;
@@ -320,7 +319,7 @@ class VariationalLinearization {
         }
     }
 
-    // The weight gamma of stage i's force on coordinate c in what second derivatives are taken of.
+    // The weight gamma of the force of stage i on coordinate c.
     double weight(double h, int i, int c, const double* z) const {
         const Tableau& tableau = stepper.step_equation.tableau;
         double gamma = tableau.b[i] * z[n + c];
@@ -328,7 +327,7 @@ class VariationalLinearization {
         return h * gamma;
     }
 
-    // Add to `inner` what stage i's gamma . F of couplings has of second derivatives, column by column of the Hessian.
+    // Add the second derivatives of gamma . F of couplings at stage i to `inner`, by columns of the Hessian.
     void add_couplings(double h, int i, const double* z) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
         const int w = 3 * n;
@@ -358,7 +357,7 @@ class VariationalLinearization {
         }
     }
 
-    // dV in (q0, p0, f) of the part becomes that of the step: dV start, f being common to both.
+    // Transform dV in (q0, p0, f) of the part to that of the step: dV start, with the same f.
     void bring_to_start(const double* start) {
         const int w = 3 * n;
         std::vector<double> row(w);

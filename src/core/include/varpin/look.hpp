@@ -1,5 +1,5 @@
-// The look at a finished motion: the energy that it turns over, rates of the scene that its steps cannot resolve, and
-// whether steps of twice the length make the same of it. Thresholds are the caller's.
+// Checks of a finished motion: the energy that it turns over, rates of the scene that its steps cannot resolve, and
+// whether other steps give the same motion. The caller sets the thresholds.
 #pragma once
 
 #include <algorithm>
@@ -15,7 +15,7 @@
 
 namespace varpin {
 
-// The largest, the least and the largest magnitude of some numbers.
+// Maximum, minimum and largest magnitude of some numbers.
 struct Extent {
     double least = std::numeric_limits<double>::infinity();
     double most = -std::numeric_limits<double>::infinity();
@@ -27,11 +27,11 @@ struct Extent {
         magnitude = larger(magnitude, std::abs(x));
     }
     double width() const { return most - least; }
-    // By how much a velocity changes, at least by the part `even` of its largest: what turns evenly turns that over.
+    // The change of a velocity, at least the share `even` of its largest magnitude, for joints that turn evenly.
     double change(double even) const { return std::min(larger(width(), even * magnitude), magnitude); }
 };
 
-// M at configurations, one after another, and the matrices made of it, of L_qq at rest and of the forces' derivatives.
+// M at consecutive configurations, and matrices of M, L_qq at rest and the derivatives of forces.
 class Inertias {
   public:
     explicit Inertias(const Mechanism& mechanism)
@@ -54,8 +54,8 @@ class Inertias {
     }
     double diagonal(int c) const { return jet_.M[c * jet_.dof + c]; }
 
-    // Whether rate M - D, D = -dF/dv, is positive definite: whether all that damps is slower than the rate. Friction
-    // that falls with the velocity drives, and stops nothing.
+    // Whether rate M - D, D = -dF/dv, is positive definite: all damping is slower than the rate. Friction that
+    // decreases with the velocity does not damp.
     bool outpaces_dampers(double rate) {
         std::transform(jet_.M.begin(), jet_.M.end(), work_.begin(), [&](double m) { return rate * m; });
         for (int c = 0; c < dof(); ++c) work_[c * dof() + c] += std::min(forces_[c].by_v, 0.0);
@@ -100,8 +100,7 @@ struct States {
     std::size_t rows = 0;
 };
 
-// The fastest rate of what damps [1/s], the largest eigenvalue of M^-1 D, over some states; 0 where none is faster than
-// `least`.
+// The fastest damping rate [1/s], the largest eigenvalue of M^-1 D, over some states; 0 if none is faster than `least`.
 inline double fastest_damping(Inertias& inertias, const States& states, double least) {
     double fastest = 0.0;
     for (std::size_t r = 0; r < states.rows; ++r) {
@@ -123,7 +122,7 @@ inline double fastest_damping(Inertias& inertias, const States& states, double l
     return fastest;
 }
 
-// Whether springs, servos or gravity turn a mode by more than a radian over h [s] in one of some states.
+// Whether springs, servos or gravity advance a mode by more than a radian over h [s] in one of some states.
 inline bool pulls_fast(Inertias& inertias, const States& states, double h) {
     for (std::size_t r = 0; r < states.rows; ++r) {
         const std::size_t row = r * inertias.dof();
@@ -133,7 +132,7 @@ inline bool pulls_fast(Inertias& inertias, const States& states, double h) {
     return false;
 }
 
-// N steps and their nodes, row by row.
+// N steps and their nodes, row-major.
 struct Record {
     std::int64_t steps = 0;
     const double* q = nullptr;  // (N + 1, n)
@@ -146,12 +145,12 @@ struct Record {
 // The energy that a motion turns over [J].
 struct Turnover {
     double kinetic = 0.0;            // the largest kinetic energy
-    double work = 0.0;               // the controls' so far, where it is largest; of servos what their drives do
-    std::vector<double> kinetic_of;  // (n) of the largest change of each joint's velocity, for all it has to move
-    std::vector<double> work_of;     // (n) as `work`, at each joint
+    double work = 0.0;               // the largest accumulated work of controls, for servos that of their drives
+    std::vector<double> kinetic_of;  // (n) for the largest change of each joint's velocity, with the inertia it moves
+    std::vector<double> work_of;     // (n) as `work`, for each joint
 };
 
-// Inertias are taken at `looks` nodes, spread evenly.
+// Inertias are evaluated at `looks` evenly spaced nodes.
 inline Turnover turnover(const Mechanism& mechanism, const Record& record, double even, int looks) {
     const int n = mechanism.dof(), m = mechanism.controls;
     const auto nodes = static_cast<std::size_t>(record.steps) + 1;
@@ -205,15 +204,15 @@ inline Turnover turnover(const Mechanism& mechanism, const Record& record, doubl
     return found;
 }
 
-// What a record says at a glance.
+// Quick facts about a record.
 struct Glance {
-    double fastest = 0.0;  // the largest velocity of all [rad/s or m/s]
-    bool split = false;    // whether a step was taken in parts
+    double fastest = 0.0;  // the largest velocity of all joints [rad/s or m/s]
+    bool split = false;    // whether a step was divided
     bool steady = true;    // whether all steps have the same controls
     bool pulled = false;   // pulls_fast over a step, at the first node or at the last
 };
 
-// `substeps` (N) may be null for steps that are whole.
+// `substeps` (N) may be null for undivided steps.
 inline Glance glance(const Mechanism& mechanism, const Record& record, const std::int64_t* substeps) {
     const std::size_t n = mechanism.dof(), m = mechanism.controls, steps = record.steps;
     Glance seen;
@@ -233,19 +232,19 @@ inline Glance glance(const Mechanism& mechanism, const Record& record, const std
     return seen;
 }
 
-// How far a motion may be from that of other steps: errors of q in units of a joint's way, of v in units of its largest
-// velocity. What moves `little` less than others of its kind, and `light` less fast than what would have their energy,
-// is measured in these parts of theirs.
+// Largest differences between motions with different steps: of q relative to a joint's travel, of v relative to its
+// largest velocity. Lower bounds of these units are the share `little` of the travel of other joints of the same kind,
+// and the share `light` of the velocity that would have their energy.
 struct Allowed {
     double way = 0.0;
     double velocity = 0.0;
     double little = 0.0;
     double light = 0.0;
-    double even = 0.0;  // as of Extent::change
+    double even = 0.0;  // as in Extent::change
 };
 
-// Whether windows of a motion, `length` steps of h [s] from the nodes `begins` on, are what other steps made of them:
-// `again_q` and `again_v` (windows, looks, n), each after as many of the motion's own.
+// Whether windows of a motion, `length` steps of h [s] from the nodes `begins` on, agree with the results `again_q` and
+// `again_v` (windows, looks, n) of other steps, at `looks` evenly spaced nodes of each window.
 inline bool agree_in_windows(const Mechanism& mechanism, const double* q, const double* v, const std::int64_t* begins,
                              std::size_t windows, std::size_t length, double h, const double* again_q,
                              const double* again_v, std::size_t looks, const Allowed& allowed) {
@@ -257,7 +256,8 @@ inline bool agree_in_windows(const Mechanism& mechanism, const double* q, const 
     Inertias inertias(mechanism);
     std::vector<Extent> position(n), speed(n);
     std::vector<double> off_q(n), off_v(n), root(n), unit(n);
-    // Errors within the parts allowed of `unit`, itself at least `least` and a part of the largest of the same kind.
+    // Whether errors are within the allowed share of `unit`, which has lower bounds: `least`, and a share of the
+    // largest unit of the same kind.
     const auto within = [&](const std::vector<double>& off, double part, double energy, double time) {
         double largest[2] = {0.0, 0.0};
         for (int c = 0; c < n; ++c) largest[int{slides[c]}] = larger(largest[int{slides[c]}], unit[c]);
@@ -307,24 +307,23 @@ inline bool agree_in_windows(const Mechanism& mechanism, const double* q, const 
     return true;
 }
 
-// A stretch of turns of a velocity's second differences, one after another: of which coordinate, how many, and the node
-// where they begin.
+// A sequence of consecutive sign changes in the second differences of a velocity: coordinate, number, first node.
 struct Alternation {
     std::int64_t joint = 0;
     std::int64_t changes = 0;
     std::int64_t first = 0;
 };
 
-// What counts as a turn: bends above `counts` of the joint's largest velocity and above `idle` of that of all joints,
-// which differ by less than the factor `even`.
+// Second differences that count: above `counts` of the joint's largest velocity and above `idle` of that of all joints;
+// consecutive ones differ by less than the factor `even`.
 struct Turns {
     double counts = 0.0;
     double idle = 0.0;
     double even = 0.0;
 };
 
-// The longest stretch over N + 1 nodes of v (N + 1, n). Where one of the controls u (N, m) turns back by more than the
-// part `counts` of its largest, the motion has a reason to; u is null for none.
+// The longest sequence over N + 1 nodes of v (N + 1, n). It is interrupted where a control of u (N, m) reverses by more
+// than the share `counts` of its largest value, since the control then explains it; u may be null.
 inline Alternation longest_alternation(const double* v, std::int64_t steps, int n, const double* u, int m,
                                        const Turns& what) {
     const auto bend = [&](std::int64_t k, int c) {

@@ -9,18 +9,18 @@
 
 namespace varpin {
 
-// J = L Q by Householder's transformations, L (d, d) lower triangular: w = |det L|, and dw/dJ is the matrix of L's
-// cofactors times Q, by the sign of det L. Cofactors hold where J is singular, too.
+// J = L Q by Householder transformations, L (d, d) lower triangular: w = |det L|, and dw/dJ is the cofactor matrix of L
+// times Q, times the sign of det L. Cofactors are also valid where J is singular.
 class Manipulability {
   public:
-    // For up to `rows` rows of `columns`, rows <= columns.
+    // Allocate for at most `rows` rows with `columns` entries, rows <= columns.
     void allocate(int rows, int columns) {
         const std::size_t size = static_cast<std::size_t>(rows) * static_cast<std::size_t>(columns);
         if (L_.size() >= size) return;
         for (std::vector<double>* array : {&L_, &normals_, &slope_}) array->resize(size);
     }
 
-    // Of the rows `chosen` of a Jacobian (6, n).
+    // w of the rows `chosen` of a Jacobian (6, n).
     double measure(const double* jacobian, const std::vector<int>& chosen, int n) {
         rows_ = static_cast<int>(chosen.size());
         columns_ = n;
@@ -30,7 +30,7 @@ class Manipulability {
         return std::abs(determinant_);
     }
 
-    // dw/dJ (d, n) of what was measured last.
+    // dw/dJ (d, n) at the last Jacobian of `measure`.
     const double* slope() {
         for (int r = 0; r < rows_; ++r) cofactors(r);
         for (int k = rows_ - 1; k >= 0; --k)
@@ -41,9 +41,9 @@ class Manipulability {
   private:
     int rows_ = 0, columns_ = 0;
     double determinant_ = 0.0;
-    std::vector<double> L_, normals_, slope_;  // (d, n); of length sqrt(2) is what each reflection is along
+    std::vector<double> L_, normals_, slope_;  // (d, n); normals of the reflections have length sqrt(2)
 
-    // Turns row k so that nothing is left of it beyond its diagonal entry, which is returned.
+    // Reflects row k onto its diagonal entry, which is returned.
     double reflect(int k) {
         double* row = L_.data() + k * columns_;
         double* normal = normals_.data() + k * columns_;
@@ -61,7 +61,7 @@ class Manipulability {
         return end;
     }
 
-    // Reflection k of a row.
+    // Apply reflection k to a row.
     void apply(int k, double* row) const {
         const double* normal = normals_.data() + k * columns_;
         double along = 0.0;
@@ -71,8 +71,8 @@ class Manipulability {
 
     double at(int i, int k) const { return L_[i * columns_ + k]; }
 
-    // Row r of the cofactors of L, with the sign of det L: L x = det(L) e_r by substitution, without the quotients,
-    // as they go into the products of the diagonal entries beside.
+    // Row r of the cofactors of L, times the sign of det L: L x = det(L) e_r by substitution, without divisions, since
+    // the quotients cancel with factors of the determinant.
     void cofactors(int r) {
         double* x = slope_.data() + r * columns_;
         std::fill(x, x + columns_, 0.0);

@@ -1,11 +1,11 @@
-// What a rollout of P paths over N steps writes: the node after each step, and what the step took.
+// The output of a rollout of P paths over N steps: the node after each step, and solver statistics.
 #pragma once
 
 #include <cstdint>
 
 namespace varpin {
 
-// Why a rollout of a path ended; Python has the words.
+// The reason for the end of a path's rollout; Python has the messages.
 enum class Outcome : std::int64_t {
     solved = 0,
     diverged = 1,    // a correction exceeded half of the one before
@@ -13,8 +13,8 @@ enum class Outcome : std::int64_t {
     fold = 3,        // another branch of the step equation's solutions
     energy = 4,      // the energy balance of the step does not close
     singular = 5,    // the mass matrix is not positive definite
-    toggle = 6,      // constraints are about to depend on each other, or cease to
-    assembly = 7,    // constraints turn so far in the step that it may end in another assembly
+    toggle = 6,      // the constraints are about to become dependent, or to cease to be
+    assembly = 7,    // the constraints turn so far in the step that it may end in another assembly
 };
 
 // Views of arrays (P, N, ...), row by row.

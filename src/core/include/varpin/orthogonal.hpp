@@ -1,5 +1,5 @@
-// Triangular form of a stack of rows by Householder's transformations, which leave every sum of squares as it is:
-// a = Q R, a'a = R'R. docs/mathematics.md, "Digits".
+// Triangular form of a stack of rows by Householder transformations, which preserve sums of squares: a = Q R,
+// a'a = R'R. docs/mathematics.md, "Digits".
 #pragma once
 
 #include <algorithm>
@@ -7,11 +7,11 @@
 
 namespace varpin {
 
-// The leading rows of R in place of those of a (rows, columns), whose `leading` first columns are triangular then;
-// `leading` is no more than rows or columns, and signs of rows are as they come. `work` is (columns).
+// Overwrites a (rows, columns) so that its first `leading` columns are triangular, leading <= min(rows, columns). The
+// signs of rows are arbitrary. `work` is (columns).
 //
-// The row that is largest in a column leads it: otherwise a large row that has nothing there would take the digits of
-// small ones that have (Powell and Reid, "On applying Householder transformations to linear least squares problems",
+// The row with the largest entry in a column is the pivot row. Otherwise a large row with a zero there would destroy
+// digits of small rows (Powell and Reid, "On applying Householder transformations to linear least squares problems",
 // 1969).
 inline void triangularize(double* a, int rows, int columns, int leading, double* __restrict work) {
     for (int k = 0; k < leading; ++k) {
@@ -30,7 +30,7 @@ inline void triangularize(double* a, int rows, int columns, int leading, double*
         if (best != k) std::swap_ranges(top, top + columns, a + best * columns);
         const double norm = largest * std::sqrt(total);
         const double end = top[k] > 0.0 ? -norm : norm;
-        // Scaled by its first entry the vector of the reflection is (1, w), of length^2 = 2 norm / (norm + |a_kk|).
+        // The vector of the reflection, scaled by its first entry, is (1, w) with length^2 = 2 norm / (norm + |a_kk|).
         const double first = top[k] - end, factor = (norm + std::abs(top[k])) / norm;
         for (int j = k + 1; j < columns; ++j) work[j] = top[j];
         for (int i = k + 1; i < rows; ++i) {

@@ -1,12 +1,12 @@
-// Two numbers that a processor adds and multiplies at once. Compilers find out by themselves for long loops, not for
-// the short ones over the entries of a six-vector.
+// Two numbers in one vector register. Compilers vectorize long loops by themselves, but not the short loops over the
+// entries of a six-vector.
 #pragma once
 
 namespace varpin {
 
 #if defined(__GNUC__)
 
-// Lies anywhere in an array of double.
+// Without alignment beyond that of double.
 typedef double Pair __attribute__((vector_size(16), aligned(8), may_alias));
 
 inline Pair pair_at(const double* x) { return *reinterpret_cast<const Pair*>(x); }

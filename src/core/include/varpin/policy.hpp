@@ -1,7 +1,7 @@
-// What drives a step from outside: controls with their feedback, and the impulses of noise.
-// docs/mathematics.md, "Noise". Controls u = u_r + gains_r (x - reference_r), r the decision; an impulse is
-// sum_i F_i(q, u) dw_i. Controls that change within a step are given at the stages of the method; u is their mean then.
-// Or they are linear in time over each decision's steps: from the control before to u, which is reached at their end.
+// Inputs of a step: controls with feedback, and noise impulses. docs/mathematics.md, "Noise". Controls are
+// u = u_r + gains_r (x - reference_r) with decision r; a noise impulse is sum_i F_i(q, u) dw_i. Controls that change
+// within a step are given at the stages of the method, and u is their mean. Or controls are linear in time over the
+// steps of each decision, from the previous control to u at the end.
 #pragma once
 
 #include <cmath>
@@ -12,22 +12,22 @@
 
 namespace varpin {
 
-// Decisions, each held over `hold` steps; x is (first, second) or (first, second, the control before).
+// R decisions, each held over `hold` steps; x is the state, optionally followed by the previous control.
 struct Commands {
     int controls = 0;                   // m
-    int hold = 1;                       // steps between two looks at the state
+    int hold = 1;                       // steps of a decision
     const double* u = nullptr;          // (R, m)
     const double* gains = nullptr;      // (R, m, width), or null for none
     const double* reference = nullptr;  // (R, width)
-    int width = 0;                      // 2n, or 2n + m where the control before belongs to x
+    int width = 0;                      // 2n, or 2n + m if x has the previous control
     const double* least = nullptr;      // (m) infinite where there is no limit
     const double* greatest = nullptr;   // (m)
-    const double* before = nullptr;     // (P, m) the control before the first of each path, or null for the reference's
-    const double* within = nullptr;     // (N, s, m) at the stages of each step, or null where they are held over it
-    const double* places = nullptr;     // (s) of the stages in a step where controls are linear, with `before`; or null
+    const double* before = nullptr;     // (P, m) control of each path before its first, or null for the reference
+    const double* within = nullptr;     // (N, s, m) controls at the stages of each step, or null for constant ones
+    const double* places = nullptr;     // (s) times of the stages for linear controls, which need `before`; or null
 };
 
-// Controls of step s of a path into row s of u (N, m). Beyond a limit a control is that limit.
+// Controls of step s of a path, clipped to their limits, into row s of u (N, m).
 inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, int n, const double* first,
                          const double* second, double* u) {
     const int m = commands.controls;
@@ -51,15 +51,15 @@ inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptr
                 for (int j = 0; j < m; ++j) total += gains[2 * n + j] * (last[j] - reference[2 * n + j]);
             }
         }
-        // Neither comparison is true of NaN, which stays.
+        // Both comparisons are false for NaN, which is kept.
         if (total < commands.least[c]) total = commands.least[c];
         if (total > commands.greatest[c]) total = commands.greatest[c];
         decision[c] = total;
     }
 }
 
-// The controls (stages, m) at the stages of step s of a path, whose rows of u the policy has been applied to; null
-// where they are held over it. Those of a line go into `line`.
+// The controls (stages, m) at the stages of step s of a path, after apply_policy; null if they are constant over the
+// step. Linear controls are written to `line`.
 inline const double* stage_controls(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, int stages,
                                     const double* u, std::vector<double>& line) {
     const int m = commands.controls;
@@ -76,14 +76,14 @@ inline const double* stage_controls(const Commands& commands, std::ptrdiff_t pat
     return line.data();
 }
 
-// The force drift + B u that is constant over a step; drift (n) is null for none.
+// The force drift + B u of a step with constant controls; drift (n) may be null.
 inline void constant_force(const Mechanism& mechanism, const double* drift, const double* u, double* force) {
     for (int r = 0; r < mechanism.dof(); ++r) force[r] = drift ? drift[r] : 0.0;
     for (const Transmission& transmission : mechanism.actuation)
         force[transmission.coordinate] += transmission.ratio * u[transmission.control];
 }
 
-// The same at each of `stages` stages, whose controls are the rows of u, into the rows of force (stages, n).
+// The forces (stages, n) at the stages of a step, from controls u (stages, m).
 inline void stage_forces(const Mechanism& mechanism, const double* drift, const double* u, int stages, double* force) {
     for (int i = 0; i < stages; ++i)
         constant_force(mechanism, drift, u + i * mechanism.controls, force + i * mechanism.dof());
@@ -106,7 +106,7 @@ inline void noise_impulse(const Mechanism& mechanism, double part, const double*
     }
 }
 
-// The centres of the diffusion fields of a rollout that starts at q.
+// The centres of the diffusion fields for a rollout from q.
 inline void diffusion_centers(const Mechanism& mechanism, const double* q, double* center) {
     const Diffusion& fields = mechanism.diffusion;
     const int k = fields.processes;

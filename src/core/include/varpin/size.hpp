@@ -1,5 +1,4 @@
-// How many there are of something, and what follows from it for a tree. A number known to the compiler makes loops over
-// it straight lines; an int is the same code for any number.
+// Sizes known at compile time, for which the compiler unrolls loops, or at run time, as int, with the same code.
 #pragma once
 
 #include <array>
@@ -9,15 +8,15 @@
 
 namespace varpin {
 
-// Stands where an int would.
+// A size known at compile time, in the place of an int.
 template <int count>
 struct Known {
     constexpr Known(int) {}
     constexpr operator int() const { return count; }
 };
 
-// Bodies and blocks of a tree of n coordinates. That n is known says of a tree that each body has a coordinate of its
-// own, and that all make one block.
+// Bodies and blocks of a tree of n coordinates. With n known at compile time, each body has a coordinate of its own,
+// and all coordinates form one block.
 inline int bodies_of(const Tree& tree, int) { return tree.size(); }
 inline const std::vector<Block>& blocks_of(const Tree& tree, int) { return tree.blocks; }
 template <int n>

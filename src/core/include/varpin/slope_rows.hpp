@@ -6,20 +6,20 @@
 
 namespace varpin {
 
-// Of rows (n, columns), which are filled up with zeros to a multiple of four.
+// Rows (n, columns), padded with zeros to a multiple of four columns.
 struct SlopeRows {
     static constexpr int padding = 4;
     static constexpr int most_others = 2;
     static int columns(int n) { return (3 * n + padding - 1) / padding * padding; }
 
-    // A share in the right sides of what others there are.
+    // A term of the right-hand side.
     struct Other {
         const double* weight;  // W (n, n)
         const double* x;       // X (n, columns)
     };
 
     int n = 0;
-    const double* ldl = nullptr;  // L D L' of M, rows `ldl_stride` apart
+    const double* ldl = nullptr;  // L D L' of M, with rows at distance `ldl_stride`
     int ldl_stride = 0;
     Other other[most_others] = {};
     int others = 0;
@@ -27,7 +27,7 @@ struct SlopeRows {
 
 namespace detail {
 
-// `fours` times four columns, whose sums stay in registers.
+// 4 * fours columns, whose sums stay in registers.
 template <int fours>
 [[gnu::always_inline]] inline void solve_some(const SlopeRows& rows, int columns, double* __restrict x, int first) {
     const int n = rows.n;
@@ -66,7 +66,7 @@ template <int fours>
     }
 }
 
-// Sums of 3 times four fill the registers of two numbers, of 6 times those of four.
+// 3 times four sums fill the registers with two numbers each, 6 times four those with four numbers each.
 template <int most>
 [[gnu::always_inline]] inline void solve_all(const SlopeRows& rows, double* x) {
     const int columns = SlopeRows::columns(rows.n);
@@ -91,7 +91,7 @@ template <int most>
 
 }  // namespace detail
 
-// The X in place of B (n, columns).
+// Overwrites B (n, columns) by X.
 #if defined(__GNUC__) && !defined(__clang__)
 [[gnu::optimize("no-tree-loop-vectorize")]]
 #endif

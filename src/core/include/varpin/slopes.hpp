@@ -1,4 +1,4 @@
-// Derivatives in a coordinate and in its velocity side by side.
+// Derivatives in a coordinate and in its velocity, in one vector register.
 #pragma once
 
 #include "varpin/pair.hpp"
@@ -6,7 +6,7 @@
 
 namespace varpin {
 
-// Derivatives of something in a coordinate and in its velocity, which go through the processor together.
+// The derivatives of a number in a coordinate and in its velocity.
 struct Slopes {
     Pair both{0.0, 0.0};
 

@@ -1,5 +1,5 @@
 // Spatial algebra (Featherstone 2008): motions and forces as (linear, angular) pairs, inertias as mass, first and
-// second moments, all about one point and in one set of axes. T is double, or Dual for derivatives along a direction.
+// second moments, all about one point and in the same axes. T is double, or Dual for derivatives along a direction.
 #pragma once
 
 namespace varpin {
@@ -118,18 +118,18 @@ constexpr auto dot(const Motion<T>& a, const Force<U>& f) -> decltype(a.linear.x
     return a.linear.x * f.linear.x + a.linear.y * f.linear.y + a.linear.z * f.linear.z + a.angular.x * f.angular.x +
            a.angular.y * f.angular.y + a.angular.z * f.angular.z;
 }
-// a x b, the rate of a motion that is carried along by a.
+// a x b, the rate of a motion that is fixed to a body with velocity a.
 template <class T>
 constexpr Motion<T> cross(const Motion<T>& a, const Motion<T>& b) {
     return {cross(a.angular, b.linear) + cross(a.linear, b.angular), cross(a.angular, b.angular)};
 }
-// a x* f, the rate of a force that is carried along by a.
+// a x* f, the rate of a force that is fixed to a body with velocity a.
 template <class T>
 constexpr Force<T> cross(const Motion<T>& a, const Force<T>& f) {
     return {cross(a.angular, f.linear), cross(a.angular, f.angular) + cross(a.linear, f.linear)};
 }
 
-// Mass, first moment m c and second moments about the point that everything is taken at.
+// Mass, first moment m c and second moments about the common reference point.
 template <class T>
 struct Inertia {
     T mass{};
@@ -142,7 +142,7 @@ constexpr auto operator*(const Inertia<T>& Y, const Motion<U>& a) -> Force<declt
     return {Y.mass * a.linear + cross(a.angular, Y.moment), Y.second * a.angular + cross(Y.moment, a.linear)};
 }
 
-// Of a body: mass m, centre c and inertia I about it, both in the body's axes, which R and p place.
+// The inertia of a body with mass m, centre c and inertia I about c, in body axes with orientation R and position p.
 template <class T>
 constexpr Inertia<T> placed(const Mat3<T>& R, const Vec3<T>& p, double m, const Vec3<double>& c,
                             const Sym3<double>& I) {

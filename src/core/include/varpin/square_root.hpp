@@ -1,17 +1,17 @@
-// The backward pass on a square root of the value's Hessian, for where the plain recursion runs out of digits.
-// docs/mathematics.md, "Digits".
+// The backward pass on a square root of the value's Hessian, for problems in which the plain recursion loses all
+// digits. docs/mathematics.md, "Digits".
 //
-// The value is kept as a sum of squares (1/2) |R x + r|^2, and its Hessian R'R never formed. With the running cost as
-// squares (1/2) |L z + l|^2 too, the cost to go from a step is a sum of squares in (u, x). An orthogonal transformation
+// The value is stored as a sum of squares (1/2) |R x + r|^2, without its Hessian R'R. With the running cost as squares
+// (1/2) |L z + l|^2 too, the cost to go from a step is a sum of squares in (u, x). An orthogonal transformation
 // brings their rows to
 //
 //     ( R_uu  R_ux  r_u )        K = -R_uu^-1 R_ux,  k = -R_uu^-1 r_u,
 //     (   0   R_xx  r_x )        and the last rows are the value before the step
 //
-// (Kailath, Sayed and Hassibi, Linear Estimation, 2000, chapter 12). What is eps of the Hessian's largest terms to the
-// plain recursion is eps of their root here, so that weights may be twice as many digits apart. Every Hessian must be
-// positive semidefinite; the part of a gradient that it knows nothing of is carried along as it is. Where the change of
-// the control costs something, the control before is part of x.
+// (Kailath, Sayed and Hassibi, Linear Estimation, 2000, chapter 12). Rounding errors are eps times the root of the
+// largest terms, instead of eps times these terms in the plain recursion, so that weights may differ by twice as many
+// orders of magnitude. Every Hessian must be positive semidefinite; the part of a gradient outside its range is stored
+// separately. With a cost of changes of the control, x includes the previous control.
 // Equation (O3) of docs/mathematics.md.
 #pragma once
 
@@ -28,9 +28,9 @@
 
 namespace varpin {
 
-// Convex quadratic functions (1/2) |L z + r|^2 + c . z, but for constants.
+// Convex quadratic functions (1/2) |L z + r|^2 + c . z, up to constants.
 struct Squares {
-    const double* root = nullptr;  // L (N, z, z), or one for all
+    const double* root = nullptr;  // L (N, z, z), or one for all functions
     bool one_root = false;
     const double* shift = nullptr;   // r (N, z)
     const double* linear = nullptr;  // c (N, z)
@@ -38,7 +38,7 @@ struct Squares {
     const double* root_of(std::ptrdiff_t point, int size) const { return one_root ? root : root + point * size * size; }
 };
 
-// Rows of equal length, one below the other.
+// A stack of rows of equal length.
 class RowStack {
   public:
     void reset(int width) {
@@ -50,7 +50,7 @@ class RowStack {
     double* operator[](int i) { return values_.data() + i * width_; }
     const double* operator[](int i) const { return values_.data() + i * width_; }
 
-    // One more row, of zeros. Rows from before may move.
+    // Append a row of zeros. Pointers to earlier rows become invalid.
     double* push() {
         const auto end = static_cast<std::size_t>(rows_ + 1) * width_;
         if (values_.size() < end) values_.resize(end);
@@ -59,7 +59,7 @@ class RowStack {
         return row;
     }
 
-    // Orthogonally to rows whose leading columns are triangular, as many as there are leading columns or more.
+    // Make the leading columns triangular by an orthogonal transformation; appends rows of zeros up to `leading` rows.
     void triangularize(int leading) {
         while (rows_ < leading) push();
         work_.resize(width_);
@@ -73,7 +73,7 @@ class RowStack {
 
 class RootPass {
   public:
-    // From the terminal cost in x (2n), and its gradient.
+    // Starts from the terminal cost in x (2n), and its gradient.
     RootPass(int dof, int controls, const Squares& terminal, const double* terminal_gradient)
         : n(dof),
           m(controls),
@@ -107,8 +107,8 @@ class RootPass {
         column_norms(root, 0, scale.data(), x);
     }
 
-    // Over a block of steps, as BackwardPass::run. `running` costs are those of the samples; `change` is what the
-    // changes of the control cost as a function of them, where they do.
+    // A pass over a block of steps, as BackwardPass::run. `running` has the costs of the samples, `change` the costs of
+    // changes of the control, if any.
     std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Squares& running,
                        const Squares& change, const Gains& gains) {
         for (std::ptrdiff_t s = steps.steps - 1; s >= 0; --s) {
@@ -138,7 +138,7 @@ class RootPass {
     Found found;
 
   private:
-    // Rows of `stack` are in (u, x, the control before if its change costs something, shift); all else is in (x, u).
+    // Rows of `stack` are in (u, x, previous control if changes have a cost, shift); everything else is in (x, u).
     void add_to_row(double factor, const double* from, double* row) const {
         if (factor == 0.0) return;
         for (int c = 0; c < x; ++c) row[m + c] += factor * from[c];
@@ -149,7 +149,7 @@ class RootPass {
     }
     double& shift(int i) { return stack[i][stack.width() - 1]; }
 
-    // The value after step s as rows in (x, u); what is linear in it, the gradient, and the size of its terms.
+    // The value after step s as rows in (x, u); its linear part, its gradient, and the scale of its terms.
     void carry(const ExpandedSteps& steps, std::ptrdiff_t s, bool held) {
         step.load(steps, s);
         for (int i = 0; i < root.rows(); ++i) {
@@ -174,7 +174,7 @@ class RootPass {
         for (int c = x; c < size; ++c) terms[c] = std::hypot(terms[c], scale[c]);
     }
 
-    // Rows N of what a jump of the state meets: first the value, then the samples after it. S = N'N.
+    // Rows N with S = N'N for a jump of the state: from the value, then from the samples after the jump.
     void add_value_to_noise_root(double factor) {
         for (int i = 0; i < root.rows(); ++i) {
             double* row = noise_root.push();
@@ -209,7 +209,7 @@ class RootPass {
         }
     }
 
-    // A gradient in (q, v, u) at the sample, as one in (x, u).
+    // Add a gradient in (q, v, u) at the sample to one in (x, u).
     void expand_gradient(double weight, const double* from, std::vector<double>& to) const {
         for (int i = 0; i < x; ++i) add_row(weight * from[i], step.D[i], to);
         for (int c = x; c < size; ++c) to[c] += weight * from[c];
@@ -252,13 +252,13 @@ class RootPass {
         }
     }
 
-    // Gains of decision r, and the value under them; false where there is no minimum.
+    // Gains of decision r, and the value under them; false if there is no minimum.
     bool decide(double regularization, const ExpandedSteps& steps, std::ptrdiff_t r, const Squares& change,
                 const Gains& gains) {
         if (steps.rate) add_change(change, steps.pull + r * m, r);
         column_norms(stack, 0, control_norm.data(), m);
         column_norms(stack, m, terms.data(), x);
-        const int others = stack.width() - 1 - m;  // x, and the control before
+        const int others = stack.width() - 1 - m;  // x, and the previous control
         stack.triangularize(m + others);
         if (!std::all_of(stack[0], stack[m + others],
                          [](double entry) { return std::abs(entry) < std::numeric_limits<double>::infinity(); }))
@@ -282,14 +282,14 @@ class RootPass {
             found.slope += Qu[i] * k[i];
             found.curvature += Ruu_k[i] * Ruu_k[i];
         }
-        // What no control takes away. Without regularization and limits it is zero, but for rounding.
+        // The rest of the controls' rows; zero up to rounding without regularization and limits.
         const bool whole = regular && std::none_of(box.held.begin(), box.held.end(), [](char held) { return held; });
         minimized_value(others, !whole);
         set_control_before(steps, r, others);
         return true;
     }
 
-    // What the change of a control costs, in the control and the one before.
+    // Add the cost of the change of a control, in the control and the previous one.
     void add_change(const Squares& change, const double* pull, std::ptrdiff_t r) {
         const double* L = change.root_of(r, m);
         for (int i = 0; i < m; ++i) {
@@ -303,8 +303,8 @@ class RootPass {
         }
     }
 
-    // The controls' rows with each regularized by the norm of its own column; one that nothing depends on stays as it
-    // is, if there are others. True where there is nothing to add.
+    // Regularize the rows of controls, each in proportion to the norm of its own column. A control without any effect
+    // is not regularized, if there are others. True if there is nothing to add.
     bool regularize(double regularization, double largest) {
         bool regular = true;
         for (int i = 0; i < m; ++i) {
@@ -320,7 +320,7 @@ class RootPass {
         return false;
     }
 
-    // k and K (m, others) from the firm rows, within limits if there are any, where the state is `ahead` if not null.
+    // k and K (m, others) from the firm rows, within limits if there are any, at the deviation `ahead`, null for zero.
     bool minimize(const double* slack, const double* ahead, int others, double* k) {
         std::fill_n(k, m, 0.0);
         std::fill_n(K.begin(), m * others, 0.0);
@@ -392,7 +392,7 @@ class RootPass {
         }
     }
 
-    // The value before a decision: the rows that know no control, and what is left of the others.
+    // The value before a decision: the rows without controls, and the rest of the others if `left`.
     void minimized_value(int others, bool left) {
         root.reset(size + 1);
         for (int i = left ? 0 : m; i < m + others; ++i) {
@@ -408,7 +408,7 @@ class RootPass {
         std::copy_n(terms.begin(), x, scale.begin());
     }
 
-    // The linear parts of the value before decision r, of which those in u become those in the control before.
+    // The linear parts of the value before decision r; those in u become those in the previous control.
     void set_control_before(const ExpandedSteps& steps, std::ptrdiff_t r, int others) {
         std::fill_n(before.begin(), size, 0.0);
         std::copy_n(linear.begin(), x, before.begin());
@@ -433,7 +433,7 @@ class RootPass {
     static constexpr double epsilon = std::numeric_limits<double>::epsilon();
 
     int n, m, x, size;  // x = 2n states, and controls
-    // The value: rows (R r) in (x, u), what is linear in it, and as in BackwardPass:
+    // The value: rows (R r) in (x, u), its linear part, and as in BackwardPass:
     RowStack root;
     std::vector<double> linear;
     std::vector<double> costate;
@@ -441,15 +441,15 @@ class RootPass {
 
     // Work arrays of a step.
     LinearStep step;
-    RowStack stack;                // of what adds up to the cost in (u, x, ...)
+    RowStack stack;                // rows of the cost in (u, x, ...)
     RowStack noise_root;           // (., x) N
     std::vector<double> before;    // (size) the next `linear`
     std::vector<double> gradient;  // (size) the next costate
     std::vector<double> terms;     // (size) the next scale
-    // And of a decision.
-    RowStack firm, U;                          // rows of the controls, regularized; of the free ones
+    // Work arrays of a decision.
+    RowStack firm, U;                          // regularized rows of the controls; rows of the free controls
     std::vector<double> control_norm, weight;  // (m) norms of the controls' columns; regularization
-    std::vector<double> Qu, pulled;            // gradient, also where the state is expected
+    std::vector<double> Qu, pulled;            // gradient; gradient at the expected state
     std::vector<double> Ruu_k, forced, H, K;   // R_uu k; U'^-1 linear; (m, m); (m, others)
     std::vector<int> free;
     BoxMinimum box;

@@ -1,14 +1,14 @@
-// Elimination (elimination.hpp) for collocation of more than one stage. docs/mathematics.md, "Linear in the number of
+// Elimination (elimination.hpp) for collocation with several stages. docs/mathematics.md, "Linear in the number of
 // joints". A joint has one unknown for each stage, and
 //
 //     N_im = delta_im M_i + h (a_im A_i - abar_im A_m') - h^2 sum_c abar_ic a_cm L_qq,c + diag(d_im)
 //
-// is a sum over stages c of what elimination.hpp has for one, with
+// is a sum over stages c of the form in elimination.hpp, with
 //
 //     row_i = (delta_ic S - h abar_ic W, h abar_ic S(angular))_c      u0_m = h a_cm (S x* H, g x (Y S)(linear))_c
 //     column_m = (delta_cm S + h a_cm W, h a_cm S(angular))_c         l0_i = -h abar_ic (S x* H, -g x (Y S)(linear))_c
 //
-// all of nine entries for each c; D is a small matrix in place of a number.
+// each with nine entries for each c; D is a matrix (s, s).
 // Equations (E1), (E2), (E3) and (E4) of docs/mathematics.md.
 #pragma once
 
@@ -35,13 +35,13 @@ class StageElimination {
     StageElimination(const Mechanism& mechanism, const Tableau& tableau)
         : StageElimination(mechanism, tableau, std::make_shared<Gathering>(mechanism.tree)) {}
 
-    // Take over from stage c's sweep of first order what follows is about.
+    // Set the state of stage c from its sweep of first order.
     void take(int c, const Jet<double>& jet) {
         for (int j = 0; j < tree_->size(); ++j) state_[j * stages_ + c] = EliminatedBody::of(*mechanism_, j, jet);
     }
 
-    // Factor N with diagonals d (s, s, n), armature included; false where its determinant is not positive, or with one
-    // stage a pivot.
+    // Factor N with diagonals d (s, s, n), armature included; false if its determinant, or with one stage a pivot, is
+    // not positive.
     bool factor(double h, const double* diagonal) {
         h_ = h;
         diagonal_ = diagonal;
@@ -51,7 +51,7 @@ class StageElimination {
         return sign_ > 0;
     }
 
-    // x with N x = b, (s, n) both.
+    // x with N x = b, both (s, n).
     void solve(const double* b, double* x) {
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
@@ -81,7 +81,7 @@ class StageElimination {
         }
     }
 
-    // y_c = A_c' x_c + L_qq,c h sum_m a_cm x_m, (s, n), of the x that `solve` left.
+    // y_c = A_c' x_c + L_qq,c h sum_m a_cm x_m, (s, n), for the x of the last `solve`.
     void change_of_slope(const double* x, double* y) {
         const int n = tree_->dof();
         std::fill(y, y + stages_ * n, 0.0);
@@ -121,8 +121,8 @@ class StageElimination {
         return total;
     }
 
-    // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same one of M, armature included, all
-    // averaged over the stages with b; 0 if one is not positive. What `factor` left remains.
+    // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same pivot of M, armature included, all
+    // averaged over the stages with b; 0 if one is not positive. The factors of `factor` are kept.
     double least_pivot_ratio(double coupling, double k, const double* diagonal) {
         for (int j = tree_->size() - 1; j >= 0; --j) {
             for (int c = 0; c < stages_; ++c) {
@@ -162,8 +162,8 @@ class StageElimination {
     }
 
   private:
-    // Of one body: (s, width), and the inverse of D (s, s). l is multiplied by it. Of a tied coordinate u, l and D are
-    // with the first body that it moves.
+    // Factors of one body: (s, width), and the inverse of D (s, s). l is multiplied by this inverse. u, l and D of a
+    // tied coordinate are stored with the first body that it moves.
     struct Factors {
         double *row, *column, *u, *l, *inverse;
     };
@@ -256,7 +256,7 @@ class StageElimination {
         }
     }
 
-    // Eliminate coordinate c with its u, l and, but for its diagonal, D; takes the sign of D's determinant into sign_.
+    // Eliminate coordinate c with its u, l and D, to which its diagonal is added; updates sign_ by that of det D.
     void take_out(int c, const Factors& factors_here, double* X) {
         for (int k = 0; k < stages_ * stages_; ++k) lu_[k] += diagonal_[k * tree_->dof() + c];
         const int sign = factor_lu_pivoting(lu_.data(), stages_, rows_.data());
@@ -278,7 +278,7 @@ class StageElimination {
         }
     }
 
-    // t = D^-1 (b - small_) of coordinate c into x, and what it leaves.
+    // t = D^-1 (b - small_) of coordinate c into x; adds u t to z.
     void substitute(int c, int body, const double* b, double* z, double* x) {
         const int n = tree_->dof();
         const Factors factors_here = factors(body);
@@ -304,7 +304,7 @@ class StageElimination {
         for (int m = 0; m < stages_; ++m)
             x[m * tree_->dof() + c] -= detail::product(width_, factors(body).l + m * width_, above);
     }
-    // The last one eliminated is known first.
+    // In the order opposite to elimination.
     void move_ties(int j, double* x) {
         const std::vector<Ties::Tied>& ending = ties().ending(j);
         for (auto tied = ending.rbegin(); tied != ending.rend(); ++tied) {
@@ -313,7 +313,7 @@ class StageElimination {
         }
     }
 
-    // Rows and columns of body j, and u and l as far as they are its own.
+    // Rows and columns of body j, and the parts of u and l from its own inertia.
     void write_rows(int j, const Factors& factors_here) const {
         for (int i = 0; i < stages_; ++i) {
             for (int c = 0; c < stages_; ++c) {
@@ -351,11 +351,11 @@ class StageElimination {
     int stages_;
     std::shared_ptr<const Gathering> order_;
     int bodies_;                         // nine entries for each stage
-    int width_;                          // with one for each stage and slot of ties, and a zero where that is odd
+    int width_;                          // plus one for each stage and slot of ties, rounded up to an even number
     std::vector<EliminatedBody> state_;  // (b, s)
     std::vector<double> factors_;
     detail::Gathered matrix_, force_;
-    std::vector<double> motion_;  // (b + 1, width) under the x of `solve`, after what stands still
+    std::vector<double> motion_;  // (b + 1, width) for the x of `solve`, after a zero for the base
     std::vector<Motion<double>> twist_;
     std::vector<double> small_, lu_;
     std::vector<int> rows_;

@@ -1,5 +1,5 @@
-// What a backward pass is given of N steps, and what it writes: views of arrays, row by row, with x = (q, p) or (q, v)
-// of 2n entries and m controls. docs/mathematics.md, "The backward pass".
+// Input and output of a backward pass over N steps: views of row-major arrays, with x = (q, p) or (q, v) of 2n entries
+// and m controls. docs/mathematics.md, "The backward pass".
 #pragma once
 
 #include <algorithm>
@@ -8,7 +8,8 @@
 
 namespace varpin {
 
-// A sample of the running cost in a step. Its q and v are sums of those of the nodes before (0) and after (1) the step.
+// A sample of the running cost in a step. Its q and v are linear combinations of those at the nodes before (0) and
+// after (1) the step.
 struct Sample {
     struct Sum {
         double q0 = 0.0, v0 = 0.0, q1 = 0.0, v1 = 0.0;
@@ -25,22 +26,22 @@ struct ExpandedSteps {
     int processes = 0;                 // k
     const double* A = nullptr;         // (N, 2n, 2n)
     const double* B = nullptr;         // (N, 2n, m)
-    const double* G = nullptr;         // (N, 2n, k) what each process does to x
+    const double* G = nullptr;         // (N, 2n, k) change of x per unit of each process
     const double* Gx = nullptr;        // (N, 2n, k, 2n)
     const double* Gu = nullptr;        // (N, 2n, k, m)
     std::vector<Sample> rule;          // s in each step
     const double* gradient = nullptr;  // (N s, 2n + m) of the running cost at the samples (q, v, u)
-    const double* hessian = nullptr;   // (N s, 2n + m, 2n + m), or one for all
+    const double* hessian = nullptr;   // (N s, 2n + m, 2n + m), or one for all samples
     bool one_hessian = false;
-    const double* velocity = nullptr;   // (N + 1, n, 2n) dv/dx at the nodes, or null where x holds v itself
-    const double* curvature = nullptr;  // (N, 2n + m, 2n + m) to be added to the Hessian in (x, u), or null
-    // Of R decisions:
-    const double* slack = nullptr;  // (R, 2, m) least and greatest change of each control, or null without limits
-    // (R, 2n + m) where the state, and the control before, are expected when a decision is made: there controls are
-    // kept within their limits; null for the nominal ones.
+    const double* velocity = nullptr;   // (N + 1, n, 2n) dv/dx at the nodes, or null for x = (q, v)
+    const double* curvature = nullptr;  // (N, 2n + m, 2n + m) added to the Hessian in (x, u), or null
+    // For each of R decisions:
+    const double* slack = nullptr;  // (R, 2, m) lower and upper limit of the change of each control, or null
+    // (R, 2n + m) expected state and previous control, at which controls are kept within their limits; null for the
+    // nominal ones.
     const double* expected = nullptr;
-    const double* rate = nullptr;  // (R, m, m) Hessian of what the change from the control before costs, or null
-    const double* pull = nullptr;  // (R, m) its gradient in the control
+    const double* rate = nullptr;  // (R, m, m) Hessian of the cost of the change from the previous control, or null
+    const double* pull = nullptr;  // (R, m) gradient of this cost in the control
 
     int states() const { return 2 * dof; }
     int size() const { return 2 * dof + controls; }
@@ -50,19 +51,19 @@ struct ExpandedSteps {
     }
 };
 
-// u + k + K (x - x_nominal), for each of R decisions, and what goes with them.
+// Gains of u + k + K (x - x_nominal) for each of R decisions, and further results.
 struct Gains {
     double* feedforward = nullptr;       // (R, m)
     double* feedback = nullptr;          // (R, m, 2n)
-    double* previous = nullptr;          // (R, m, m) gains on the control before, where its change costs something
-    double* control_gradient = nullptr;  // (R, m) of the cost in each control
+    double* previous = nullptr;          // (R, m, m) gains on the previous control, if its change has a cost
+    double* control_gradient = nullptr;  // (R, m) gradient of the cost in each control
     double* costate = nullptr;           // (N, 2n) gradient of the cost after each step in the state there, or null
-    double* spread = nullptr;            // (N, 2n, 2n) S, where there is noise
+    double* spread = nullptr;            // (N, 2n, 2n) S, with noise only
 };
 
-// Where the linearized motion goes under the gains, each control clipped to its limits, from `state` (2n + m): the
-// deviation before the first step, and that of the control before it, which become those after the last. Into
-// `expected` (R, 2n + m) before each decision, and the changes `moves` (R, m) of the controls.
+// The linearized motion under the gains, each control clipped to its limits, from `state` (2n + m): the deviation of
+// the state and of the previous control at the start, overwritten by those at the end. Writes the deviations before
+// each decision into `expected` (R, 2n + m), and the changes of the controls into `moves` (R, m).
 inline void predict(int hold, const ExpandedSteps& steps, const Gains& gains, double* state, double* expected,
                     double* moves) {
     const int x = steps.states(), m = steps.controls, size = steps.size();
@@ -101,8 +102,8 @@ inline void predict(int hold, const ExpandedSteps& steps, const Gains& gains, do
 struct Found {
     double slope = 0.0;      // of Qu . k
     double curvature = 0.0;  // of k . Quu k
-    double noise = 0.0;      // what noise adds to the cost
-    double loss = 0.0;       // the largest relative error of a pivot of Quu, or of its root, by rounding
+    double noise = 0.0;      // of the cost of noise
+    double loss = 0.0;       // largest relative rounding error of a pivot of Quu, or of its root
 };
 
 }  // namespace varpin

@@ -1,5 +1,5 @@
-// A step in parts: whole, or in halves, and halves of halves. docs/mathematics.md, "The principal branch". A part that
-// was halved `level` times is h / 2^level long and begins at a multiple of 1 / 2^level of the step.
+// Division of a step into parts by repeated halving. docs/mathematics.md, "The principal branch". A part after `level`
+// halvings has length h / 2^level and begins at a multiple of 1 / 2^level of the step.
 #pragma once
 
 #include <algorithm>
@@ -12,7 +12,7 @@
 
 namespace varpin {
 
-// What h becomes by so many halvings.
+// The length h / 2^level of a part.
 inline double length_of(double h, int level) { return h / static_cast<double>(std::int64_t{1} << level); }
 
 // A step that needs more parts than so many is given up. Few steps need short parts all over: dry friction that turns
@@ -24,10 +24,10 @@ struct Division {
     int deepest = 0;  // halvings of the shortest part
 };
 
-// Take a step in as many parts as it needs, the first one halved `level` times. attempt(level, begin, extrapolated)
-// takes a part that begins at `begin`, in units of the step. One that fails is halved, unless only the guess may be to
-// blame, which is `extrapolated` the first time at most; after a success at an even place parts are doubled again.
-// `halvings` are those of each part; none if the step was taken whole.
+// Take a step in as many parts as it needs, the first one after `level` halvings. attempt(level, begin, extrapolated)
+// takes a part at `begin`, in units of the step. A part that fails is halved; if its guess was extrapolated, which only
+// the first guess is, it is first repeated without extrapolation. After a success that ends at an even position, the
+// next part is twice as long. `halvings` are those of each part, empty for an undivided step.
 template <class Attempt>
 Division divide(int level, bool extrapolated, int most_halvings, std::vector<std::uint8_t>& halvings,
                 const Attempt& attempt) {
@@ -54,7 +54,7 @@ Division divide(int level, bool extrapolated, int most_halvings, std::vector<std
     return {Outcome::solved, deepest};
 }
 
-// Take a part again: part(level, begin), or both of its halves where that fails.
+// Repeat a part: part(level, begin), or both of its halves if that fails.
 template <class Part>
 Outcome part_again(int level, double begin, int most_halvings, const Part& part) {
     const Outcome outcome = part(level, begin);
@@ -64,7 +64,7 @@ Outcome part_again(int level, double begin, int most_halvings, const Part& part)
     return part_again(level + 1, begin + length_of(1.0, level + 1), most_halvings, part);
 }
 
-// Take a step again in the parts of these halvings, or whole if there are none.
+// Repeat a step in the parts of these halvings, or undivided if there are none.
 template <class Part>
 Outcome parts_again(std::span<const std::uint8_t> halvings, int most_halvings, const Part& part) {
     if (halvings.empty()) return part_again(0, 0.0, most_halvings, part);
@@ -90,14 +90,14 @@ class ChainedDerivatives {
 
     std::vector<double> part, part_f, part_rate;  // of the last part
 
-    // Of a step of no length.
+    // The derivatives of a step of zero length.
     void begin(double* Jx, double* Jf) const {
         std::fill(Jx, Jx + 4 * n_ * n_, 0.0);
         std::fill(Jf, Jf + 2 * n_ * n_, 0.0);
         for (int i = 0; i < 2 * n_; ++i) Jx[i * 2 * n_ + i] = 1.0;
     }
 
-    // Let the last part follow those before; the same of derivatives in rates (2n, rates).
+    // Multiply by the derivatives of the last part; follow_rates does so for derivatives in rates (2n, rates).
     void follow_rates(double* Jr) {
         times(rates_, Jr);
         for (int i = 0; i < 2 * n_ * rates_; ++i) Jr[i] += part_rate[i];

@@ -1,4 +1,4 @@
-// Elimination (elimination.hpp) of a symmetric matrix with rows of any size, in trees with ties too.
+// Elimination (elimination.hpp) of a symmetric matrix with rows of any size, also in trees with ties.
 #pragma once
 
 #include <algorithm>
@@ -25,8 +25,8 @@ inline double product(int size, const double* a, const double* b) {
 inline void add_scaled(int size, double factor, const double* a, double* __restrict b) {
     for (int c = 0; c < size; ++c) b[c] += factor * a[c];
 }
-// Of the first `size` entries those that are no linear parts become zero, linear ones being the first three of every
-// `part`.
+// Set the entries that are no linear parts to zero, among the first `size`; the linear parts are the first three
+// entries of every `part`.
 inline void keep_linear(int size, int part, double* z) {
     for (int r = 0; r < size; ++r) {
         if (r % part >= 3) z[r] = 0.0;
@@ -41,7 +41,7 @@ inline void keep_linear_rows(int size, int part, int width, double* X) {
         }
     }
 }
-// Rows and columns from `at` on become zero: their coordinate is eliminated, and another one takes the slot.
+// Set `size` rows and columns from `at` on to zero after elimination of their coordinate, to reuse the slot.
 inline void clear_slot(int at, int size, int width, double* X) {
     std::fill(X + at * width, X + (at + size) * width, 0.0);
     for (int r = 0; r < width; ++r) std::fill(X + r * width + at, X + r * width + at + size, 0.0);
@@ -51,9 +51,9 @@ inline int even(int size) { return size + size % 2; }
 
 }  // namespace detail
 
-// u = X row + u0, D = d + row . u, X - u u' / D is handed on. Rows have `size` entries, six for each motion, and after
-// those one for each slot of ties. A body whose coordinate is tied hands on X and, where its coordinate borders that,
-// adds u to the row and the column, and row . u and twice the slot's entry of u to the diagonal.
+// u = X row + u0, D = d + row . u, and X - u u' / D is passed to the parent. Rows have `size` entries, six for each
+// motion, and then one for each slot of ties. A body with a tied coordinate passes X, with u added to the row and
+// column of the slot, and row . u and twice the slot's entry of u added to its diagonal.
 class SymmetricElimination {
   public:
     SymmetricElimination(const Tree& tree, const std::shared_ptr<const Gathering>& order, int size)
@@ -69,12 +69,12 @@ class SymmetricElimination {
           force_(order, width_),
           motion_(width_ * (tree.size() + 1)) {}
 
-    // What is to be written before body j is eliminated, (size) each: its row, and u0 with its own inertia's part of u.
+    // To be written before body j is eliminated, (size) each: its row, and u0 plus the part of u from its own inertia.
     double* row(int j) { return row_.data() + width_ * j; }
     double* u() { return u_.data(); }
 
-    // One body after another, from the last to the first; false at a pivot that is not positive. `add_own` adds the
-    // body's own inertias to X, whose rows have the length it is told.
+    // Eliminate body j, from the last body to the first; false at a pivot that is not positive. `add_own` adds the
+    // body's own inertias to X, given the length of its rows.
     template <class AddOwn>
     bool eliminate(int j, const double* diagonal, const AddOwn& add_own) {
         const Body& link = tree_->bodies[j];
@@ -102,7 +102,7 @@ class SymmetricElimination {
 
     double pivot(int coordinate) const { return pivot_[coordinate]; }
 
-    // x with the matrix times x = b, and shares of 1/2 b . x, as of ArticulatedBodies.
+    // x with the matrix times x = b, and shares of 1/2 b . x, as in ArticulatedBodies.
     void solve(const double* b, double* x, double* share) {
         const auto substitute = [&](int c, int body, double left, double* z) {
             x[c] = left / pivot_[c];
@@ -147,7 +147,7 @@ class SymmetricElimination {
   private:
     double* answer(int j) { return answer_.data() + width_ * j; }
 
-    // Eliminate coordinate c with its u and D; body j keeps what of them is asked for again.
+    // Eliminate coordinate c with its u and D; `solve` needs u / D, which is stored with body j.
     bool take_out(int c, int j, double pivot, double* X) {
         pivot_[c] = pivot;
         if (!(pivot > 0.0)) return false;
@@ -171,7 +171,7 @@ class SymmetricElimination {
         return true;
     }
 
-    // The last one eliminated is known first.
+    // In the order opposite to elimination.
     void move_ties(int j, double* moved, double* x) {
         const std::vector<Ties::Tied>& ending = order_->ties.ending(j);
         for (auto tied = ending.rbegin(); tied != ending.rend(); ++tied) {
@@ -184,10 +184,10 @@ class SymmetricElimination {
     std::shared_ptr<const Gathering> order_;
     int size_, width_;
     std::vector<double> u_;
-    std::vector<double> row_, answer_;  // (b, width) row, and u by the pivot
+    std::vector<double> row_, answer_;  // (b, width) row, and u / D
     std::vector<double> pivot_;         // (n)
     detail::Gathered matrix_, force_;
-    std::vector<double> motion_;  // (b + 1, width) of each body, after what stands still
+    std::vector<double> motion_;  // (b + 1, width) of each body, after a zero for the base
 };
 
 }  // namespace varpin

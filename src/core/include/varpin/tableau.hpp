@@ -19,13 +19,12 @@ struct Tableau {
     std::vector<double> force;      // (s, s) f
     std::vector<double> b;          // (s)
     std::vector<double> c;          // (s)
-    std::vector<double> ahead;      // (s, s + 1) values at the next step's stages of the polynomial through this one's
-                                    // stages and its end
+    std::vector<double> ahead;      // (s, s + 1) extrapolation from the stages and end of a step to the next stages
     double reach = 0.0;             // the largest Rayleigh quotient of abar a in the metric of b
-    double skew = 0.0;              // alpha - 1/2 of the midpoint rule: off the middle it is of first order
-    bool stiffly_accurate = false;  // ends in its last stage, and damps what friction damps faster than the step
+    double skew = 0.0;              // alpha - 1/2 of the midpoint rule; the order is 2 only where it is zero
+    bool stiffly_accurate = false;  // the last stage is the end of the step; damping faster than the step decays
 
-    // The Lagrange polynomial of stage j, at a place in units of the step.
+    // The Lagrange polynomial of stage j at a time in units of the step.
     double lagrange(int j, double at) const {
         double value = 1.0;
         for (int k = 0; k < stages; ++k) {
@@ -35,8 +34,8 @@ struct Tableau {
     }
 };
 
-// Rows (s, n) at the stages of the part of a step that begins at `begin` and is `share` long, both in units of the
-// step: of the polynomial through the rows `given` at the stages of the whole.
+// Rows (s, n) at the stages of the part of a step at `begin` with length `share`, both in units of the step, from the
+// polynomial through the rows `given` (s, n) at the stages of the whole step.
 inline void bring_to_part(const Tableau& tableau, int n, const double* given, double begin, double share, double* out) {
     for (int i = 0; i < tableau.stages; ++i) {
         const double at = begin + share * tableau.c[i];

@@ -1,5 +1,5 @@
 // Products of small matrices in tiles of 4 x 4 entries, whose sums stay in registers. Matrices are padded with zeros to
-// whole tiles, so that no product has an odd row or column to look after.
+// whole tiles, so that products have no remaining rows or columns.
 #pragma once
 
 #include <algorithm>
@@ -75,7 +75,7 @@ inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, i
     detail::add_tiles(a, b, depth, out, rows, part);
 }
 
-// The lower triangle from the upper one.
+// Copy the upper triangle to the lower one.
 inline void mirror(TiledMatrix& a, int size) {
     for (int i = 1; i < size; ++i) {
         for (int j = 0; j < i; ++j) a[i][j] = a[j][i];

@@ -1,4 +1,4 @@
-// The robot as a tree of bodies, each on one joint about or along the z axis of its own frame, and what a scene adds.
+// The robot as a tree of bodies, each on one joint about or along the z axis of its own frame, in a scene.
 #pragma once
 
 #include <algorithm>
@@ -17,7 +17,7 @@
 
 namespace varpin {
 
-// How many entries a matrix has. Indices into matrices are ints: a larger one is refused before there is room for it.
+// Number of entries of a matrix. Indices into matrices are ints, so larger matrices are refused before allocation.
 inline int entries(std::int64_t rows, std::int64_t columns) {
     if (columns > 0 && rows > std::numeric_limits<int>::max() / columns)
         throw std::length_error("a matrix of " + std::to_string(rows) + " by " + std::to_string(columns) +
@@ -26,25 +26,25 @@ inline int entries(std::int64_t rows, std::int64_t columns) {
     return static_cast<int>(rows * columns);
 }
 
-// Coordinates [begin, end) outside of which a block of M, L_vq and L_qq vanishes.
+// Coordinates [begin, end) of a diagonal block of M, L_vq and L_qq.
 struct Block {
     int begin = 0;
     int end = 0;
 };
 
-// A part that is light beside what carries it, with an energy balance of its own (guards.hpp).
+// A subtree that is light compared with the bodies that carry it, with an energy balance of its own (guards.hpp).
 struct LightPart {
-    int body = 0;               // with which it begins
+    int body = 0;               // root of the subtree
     std::vector<char> carried;  // (n) whether a coordinate belongs to it
 };
 
 struct Tree {
     std::vector<Body> bodies;
     std::vector<double> armature;  // (n) [kg m^2 or kg]
-    std::vector<char> periodic;    // (n) the Lagrangian without elements is the same after a whole turn
+    std::vector<char> periodic;    // (n) whether the Lagrangian without elements is periodic in a whole turn
     std::vector<int> group;        // (n) mechanically independent group of a coordinate
     int groups = 0;
-    std::vector<Block> blocks;  // in order; together they hold all coordinates
+    std::vector<Block> blocks;  // in order; they cover all coordinates
     std::vector<LightPart> light_parts;
 
     int dof() const { return static_cast<int>(armature.size()); }
@@ -52,7 +52,7 @@ struct Tree {
 };
 
 // Diffusion fields F_i of k Wiener processes, entry by entry
-// F = constant + control u + quadratic (q - center)^2; a center of NaN stands for the q at which a rollout starts.
+// F = constant + control u + quadratic (q - center)^2; a center of NaN is the initial q of a rollout.
 struct Diffusion {
     int processes = 0;
     std::vector<double> constant;   // (n, k) generalized force per square root of time
@@ -61,14 +61,14 @@ struct Diffusion {
     std::vector<double> center;     // (n, k) [rad or m]
 };
 
-// Generalized force per unit of a control, one of the entries of B that are not zero.
+// A nonzero entry of B, generalized force per unit of a control.
 struct Transmission {
     int coordinate = 0;
     int control = 0;
     double ratio = 0.0;
 };
 
-// A tree in its surroundings.
+// A tree with the forces, constraints, actuation and noise of a scene.
 struct Mechanism {
     Tree tree;
     Vec3<double> gravity{};  // [m/s^2]
@@ -77,16 +77,17 @@ struct Mechanism {
     int controls = 0;        // m
     std::vector<Transmission> actuation;
     Diffusion diffusion;
-    Constraints constraints;  // holonomic; steps that keep them are those of constrained.hpp
+    Constraints constraints;  // holonomic; constrained.hpp has the steps that satisfy them
 
     int dof() const { return tree.dof(); }
 
-    // Whether there are forces beside L_q.
+    // Whether there are forces besides L_q.
     bool pushes() const { return forces.any() || couplings.pushes(); }
 };
 
-// The sum (n) of the forces beside L_q on each coordinate at q, v and the controls' f (n), into what is zero if there
-// are none. Of couplings its derivatives are diagonal no more: they go into by_q and by_v (n, n), which may be null.
+// The sum (n) of the forces besides L_q on each coordinate at q, v and the controls' f (n). Without such forces the
+// output is not written and must be zero. Derivatives of couplings, which are not diagonal, go into by_q and by_v (n,
+// n), which may be null.
 template <class T>
 void sum_forces(const Mechanism& mechanism, const T* q, const T* v, const T* f, JointForce<T>* out,
                 CouplingWorkspace<T>& workspace, T* by_q, T* by_v) {

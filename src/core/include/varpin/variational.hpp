@@ -1,6 +1,6 @@
-// The variational stepper: collocation steps, accepted by the guards or else taken in halves, and halves of halves;
-// kicks of noise before the step, or half before and half after. docs/mathematics.md, "The principal branch" and
-// "Noise".
+// The variational stepper: collocation steps that the guards accept or that are halved, repeatedly if need be; noise
+// impulses (kicks) before the step, or one half before and one half after. docs/mathematics.md, "The principal branch"
+// and "Noise".
 // Equations (C2) and (N2) of docs/mathematics.md.
 #pragma once
 
@@ -17,9 +17,9 @@
 
 namespace varpin {
 
-// Where a path stands.
+// State of a path.
 struct PathState {
-    // More would add up to more of their rounding.
+    // Most rows of backward differences; more rows would amplify rounding.
     static constexpr int most_misses = 3;
 
     PathState(const Mechanism& mechanism, int stages)
@@ -37,24 +37,24 @@ struct PathState {
 
     std::vector<Coordinate> position;
     std::vector<Compensated> p;
-    std::vector<double> q;         // (n) as it is shown
+    std::vector<double> q;         // (n) rounded, with whole turns
     std::vector<double> momentum;  // (n) p, rounded
     std::vector<double> v;         // (n) M(q)^-1 p
     Energies energies;
     std::vector<double> center;          // (n, k) of the diffusion fields, for this rollout
     std::vector<double> past;            // (s, n) stage velocities of the last whole step
-    std::vector<double> miss;            // (misses, s, n) by how much its guess had missed them, and backward
-                                         // differences of that over the steps before
-    std::vector<double> past_end;        // (n) velocity at its end
-    std::vector<double> past_force;      // (n)
-    int known = 0;                       // steps of the past without a break, as far as they count
-    int trend = 0;                       // rows of `miss` that would have made the best guess of the last step
+    std::vector<double> miss;            // (misses, s, n) error of the guess of these velocities, and its backward
+                                         // differences over the steps before
+    std::vector<double> past_end;        // (n) velocity at the end of that step
+    std::vector<double> past_force;      // (n) force of that step
+    int known = 0;                       // consecutive whole steps before, up to the number in use
+    int trend = 0;                       // number of rows of `miss` that would have predicted the last step best
     int level = 0;                       // halvings of the last step
-    std::vector<std::uint8_t> halvings;  // of each part of every step of the last `roll` that was not taken whole
+    std::vector<std::uint8_t> halvings;  // of each part of every divided step in the last `roll`
 };
 
-// By how much a guess of `size` numbers has missed the root, and the backward differences of that over `known` guesses,
-// into `miss` (misses, size). The difference of order r is what r rows would have left: returns the r of the least.
+// Writes the error of a guess (size) and its backward differences over `known` guesses into `miss` (misses, size). The
+// difference of order r is the error that a correction with r rows would have left; returns the best r.
 inline int follow_misses(const double* root, const double* guess, int size, int known, double* miss) {
     constexpr int most = PathState::most_misses;
     const int orders = std::min(known, most + 1);
@@ -72,7 +72,7 @@ inline int follow_misses(const double* root, const double* guess, int size, int 
     return orders == 1 ? 1 : static_cast<int>(std::min_element(left, left + orders) - left);
 }
 
-// What a step took.
+// Writes the solver statistics of a step.
 inline void record_effort(const Effort& effort, const Nodes& nodes, std::int64_t row) {
     std::int64_t* tally = nodes.tally + 4 * row;
     tally[0] = effort.newton_iterations;
@@ -83,7 +83,7 @@ inline void record_effort(const Effort& effort, const Nodes& nodes, std::int64_t
     nodes.quality[3 * row + 1] = effort.branch_margin;
 }
 
-// The node that it led to.
+// Writes the node after a step.
 inline void record_node(const PathState& state, int n, const Nodes& nodes, std::int64_t row) {
     std::copy(state.q.begin(), state.q.end(), nodes.q + row * n);
     std::copy(state.momentum.begin(), state.momentum.end(), nodes.p + row * n);
@@ -118,16 +118,16 @@ class VariationalStepper {
     const Tableau tableau;
     double tolerance;
     Guards guards;
-    double left;  // part of each kick that comes before the step; the rest comes after it
+    double left;  // share of each kick before the step; the rest acts after it
     Collocation<Size, Stages> step_equation;
     EnergyGuard<Size> energy_guard;
     [[no_unique_address]] Size n;
-    std::vector<double> force;           // (n) constant over the step; (s, n) at its stages, or those of a part of it
-    int stride = 0;                      // from one row of `force` to the next
+    std::vector<double> force;           // (n) constant over the step, or (s, n) at the stages of the step or its part
+    int stride = 0;                      // distance of rows of `force`; 0 for a constant
     Effort effort;                       // of the last step
-    std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
+    std::vector<std::uint8_t> halvings;  // of each part of the last step; empty for an undivided step
 
-    // Put a path at (q, p), with nothing known of the past; false where M(q) is not positive definite.
+    // Start a path at (q, p) without history; false where M(q) is not positive definite.
     bool begin_at(const double* q, const double* p, PathState& state) {
         for (int i = 0; i < n; ++i) {
             state.position[i] = {{q[i], 0.0}, 0.0};
@@ -143,7 +143,7 @@ class VariationalStepper {
         return true;
     }
 
-    // Put a path at (q, v).
+    // Start a path at (q, v).
     bool begin(const double* q, const double* v, PathState& state) {
         Jet<double, Size>& jet = step_equation.stage[0];
         first_order(mechanism, q, v, jet);
@@ -152,13 +152,13 @@ class VariationalStepper {
         return true;
     }
 
-    // The factors of M at a path's node, for kicks and guesses.
+    // Factor M at a path's node, for kicks and guesses.
     bool look_at(PathState& state) {
         for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
         return energy_guard.node(at.data(), state.momentum.data(), state.v.data());
     }
 
-    // Add an impulse (n) to the momentum. What it does to the energy is work, and no error.
+    // Add an impulse (n) to the momentum. Its change of the energy counts as work, not as an error.
     void kick(const double* impulse, PathState& state) {
         for (int i = 0; i < n; ++i) {
             state.p[i] = state.p[i].plus(impulse[i]);
@@ -168,21 +168,21 @@ class VariationalStepper {
         energy_guard.kicked(at.data(), state.momentum.data(), state.v.data(), state.energies);
     }
 
-    // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`.
+    // Set the force of a step: (n) constant over it, or (s, n) at its stages if it `varies`.
     void take_force(const double* own, bool varies) {
         stride = varies ? static_cast<int>(n) : 0;
         std::copy(own, own + (varies ? step_equation.stages * n : 1 * n), force.begin());
         if (varies) given = force;
     }
 
-    // Where the force varies, bring it to the stages of the part of the step that begins at `begin` and is `share`
-    // long, both in units of the step: by the polynomial through the stages of the whole.
+    // Interpolate a varying force to the stages of the part of the step at `begin` with length `share`, both in units
+    // of the step, by the polynomial through the stages of the whole step.
     void force_in_part(double begin, double share) {
         if (stride != 0) bring_to_part(tableau, n, given.data(), begin, share, force.data());
     }
 
-    // One whole step with the force that was taken, in as many substeps as the guards ask for. The first attempt starts
-    // from the extrapolated past, the others from the current velocity.
+    // One step with the force that was set, in as many substeps as the guards require. The first attempt starts from
+    // the extrapolated past, the others from the current velocity.
     Outcome step(double h, PathState& state) {
         effort = {};
         const int level = std::max(state.level - 1, 0);
@@ -207,19 +207,18 @@ class VariationalStepper {
         return Outcome::solved;
     }
 
-    // The part of a step of length h that was halved `level` times and begins at `begin` in units of the step; begun as
-    // a part always is, from the current velocity. Leaves the jets of its root in step_equation.
+    // The part of a step of length h at `begin`, in units of the step, after `level` halvings. The guess is the current
+    // velocity, as for every part. Leaves the jets at the root in step_equation.
     Outcome part(double h, int level, double begin, PathState& state) {
         force_in_part(begin, length_of(1.0, level));
         guess_velocity(state);
         return attempt(length_of(h, level), state, true);
     }
 
-    // Steps of every path from where it stands. Writes into `nodes` the node after each step, what was applied in it
-    // and what it took. A path that fails stops there; nodes.ended and nodes.done say how and where. `increments` of
-    // the Wiener processes (P, N, k), `drift`, a force besides the controls' (P, N, n), and `impulses` besides the
-    // noise's, before and after each step (P, N, 2, n), may be null. A path alone may be under a watch, which may end
-    // it.
+    // Advances every path by N steps. Writes the node after each step, its controls and its statistics into `nodes`. A
+    // path that fails stops; nodes.ended and nodes.done hold the reason and the number of steps. These may be null:
+    // `increments` of the Wiener processes (P, N, k), `drift`, a force in addition to the controls (P, N, n), and
+    // `impulses` in addition to the noise, before and after each step (P, N, 2, n). A `watch` may stop a single path.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
               std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) {
         const std::int64_t steps = nodes.steps;
@@ -259,7 +258,7 @@ class VariationalStepper {
         }
     }
 
-    // Whether the Lagrangian does not know how often coordinate i went round.
+    // Whether the Lagrangian is periodic in coordinate i, so that whole turns may be removed.
     bool unwinds(int i) const {
         return mechanism.tree.periodic[i] && !mechanism.forces.anchors(i) && !mechanism.couplings.has_outer();
     }
@@ -270,9 +269,9 @@ class VariationalStepper {
 
   private:
     Trial trial;
-    std::vector<double> given;  // (s, n) force at the stages of the whole step, where it varies
-    std::vector<double> line;   // (s, m) controls there, where they are linear
-    std::vector<double> guess;  // (s, n) what was extrapolated
+    std::vector<double> given;  // (s, n) varying force at the stages of the whole step
+    std::vector<double> line;   // (s, m) linear controls at these stages
+    std::vector<double> guess;  // (s, n) extrapolated stage velocities
     std::vector<double> bend;   // (2, n)
     std::vector<double> at;     // (n)
 
@@ -281,7 +280,7 @@ class VariationalStepper {
             std::copy(state.v.begin(), state.v.end(), step_equation.V.begin() + i * n);
     }
 
-    // One substep from where the path stands and the guess in step_equation.V; moves the path only if it is accepted.
+    // One substep from the guess in step_equation.V; advances the path only if the substep is accepted.
     Outcome attempt(double h, PathState& state, bool jets_wanted) {
         auto& equation = step_equation;
         const Outcome solved = equation.solve(h, {state.position.data(), state.p.data(), force.data(), stride},
@@ -305,13 +304,13 @@ class VariationalStepper {
         return Outcome::solved;
     }
 
-    // Where the root takes the path, into `trial`, and the work on the way.
+    // The node after the substep, and the work of forces in it, into `trial`.
     [[gnu::always_inline]] inline void advance(const int stages, double h, const PathState& state) {
         const auto& equation = step_equation;
         for (int c = 0; c < n; ++c) {
             double move = 0.0, impulse = 0.0;
             trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
-            // Whole turns are no distance.
+            // The rounding of q is proportional to its distance from 0, without whole turns.
             const double distance =
                 std::min(std::abs(state.position[c].value.high), unwinds(c) ? Coordinate::turn : infinity);
             for (int i = 0; i < stages; ++i) {
@@ -323,7 +322,7 @@ class VariationalStepper {
                 trial.work[c] += share * (given_force + element.value) * velocity;
                 trial.dissipated[c] += share * element.lost;
                 const double scale = equation.stage[i].Lq_scale[c] + std::abs(given_force) + element.scale;
-                // Beside what cancels, rounding of q moves the potential.
+                // Rounding of the terms that cancel, and change of the potential by rounding of q.
                 trial.magnitude[c] +=
                     share * scale * std::abs(velocity) + tableau.b[i] * std::abs(equation.stage[i].Lq[c]) * distance;
             }
@@ -332,10 +331,9 @@ class VariationalStepper {
         }
     }
 
-    // Extrapolate the last whole step into the stage velocities. The polynomial through them and the velocity at its
-    // end goes on, moved by what a kick has since done to the velocity, and bent by what has changed in a held force.
-    // By how much it misses goes on too: by the backward differences of as high an order as would have served the last
-    // step best.
+    // Extrapolate the last whole step to the stage velocities: the polynomial through its stages and its end, shifted
+    // by later kicks of the velocity, and corrected for the change of a constant force. The error of this guess is
+    // extrapolated too, by backward differences of the order that would have predicted the last step best.
     void extrapolate(double h, const PathState& state) {
         const Stages stages = step_equation.stages;
         double *change = bend.data(), *acceleration = change + n;

@@ -1,4 +1,4 @@
-// The running cost of a motion while it is made, and whether the motion is worth going on with.
+// The running cost of a motion during its simulation, and whether to stop the motion early.
 #pragma once
 
 #include <cstddef>
@@ -14,12 +14,13 @@ class Watch {
   public:
     enum class Verdict : std::int64_t {
         going = 0,
-        cut = 1,   // its steps are cut into too many parts
-        dear = 2,  // it costs too much already
+        cut = 1,   // its steps are divided into too many parts
+        dear = 2,  // its cost exceeds the limit
     };
 
-    // Of a motion over N steps whose nodes q and v (N + 1, n) and controls u (N, m) are being written; the first node
-    // is there. Values of the terms go into `values` (N s, terms), at the s samples of each step by `rule` (s, 9).
+    // Watches a motion over N steps, whose nodes q and v (N + 1, n) and controls u (N, m) are written during the watch,
+    // except the first node. Writes the cost terms at the s samples of each step by `rule` (s, 9) into `values` (N s,
+    // terms).
     Watch(const CostTerms& costs, const double* rule, std::size_t samples, const double* q, const double* v,
           const double* u, double* values)
         : costs_(costs),
@@ -34,12 +35,12 @@ class Watch {
           at_v_(at_q_.size()) {}
 
     double weight = 1.0;                                          // of a value in the cost
-    double most = std::numeric_limits<double>::infinity();        // what the motion may cost,
-    std::ptrdiff_t from = 0;                                      // looked at after this many steps and more
-    double most_parts = std::numeric_limits<double>::infinity();  // what its first `from` steps may take together
+    double most = std::numeric_limits<double>::infinity();        // largest cost,
+    std::ptrdiff_t from = 0;                                      // checked from this number of steps on
+    double most_parts = std::numeric_limits<double>::infinity();  // most parts of the first `from` steps together
     Verdict verdict = Verdict::going;
 
-    // Look at step s, which was taken in so many parts; false where the motion is to end there.
+    // Account for step s, which was divided into `parts`; false to stop the motion.
     bool after(std::ptrdiff_t s, std::int64_t parts) {
         const auto n = static_cast<std::size_t>(costs_.dof), m = static_cast<std::size_t>(costs_.controls);
         const auto step = static_cast<std::size_t>(s);

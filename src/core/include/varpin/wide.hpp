@@ -1,5 +1,5 @@
-// Whether the processor takes four numbers at once. What is worth it is compiled twice, as one inlined function; no
-// product is fused with a sum, so the bytes are those of two at a time, with half of the instructions.
+// Whether the processor has vectors of four numbers. Functions that profit are compiled twice from one inlined
+// function, without fused multiply-add: identical results with half the instructions of vectors of two.
 #pragma once
 
 #if defined(__x86_64__) && defined(__GNUC__)
