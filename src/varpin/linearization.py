@@ -119,13 +119,19 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     """
     integrator = _matching(require_scene(scene), trajectory, integrator)
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0])
+    if not integrator.variational:
+        found = replace(found, K=_kick_columns(scene, trajectory, found.J))
     if not trajectory.u_stages.shape[1]:
         return found
     return replace(found, ramp=integrator.ramps(scene, trajectory) @ scene.actuation)
 
 
 def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:
-    """:func:`linearize` of a part of a motion that began at configuration ``first`` (n,); nothing is checked."""
+    """:func:`linearize` of a part of a motion that began at configuration ``first`` (n,); nothing is checked.
+
+    For integrators on (q, v) its K is empty (N, 2n, 0): it would take the inverses of all mass matrices, and no plan
+    asks for it.
+    """
     n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
     Jx, Jf, Jk = integrator.linearize(scene, trajectory)
     q, v = trajectory.q, trajectory.v
@@ -135,7 +141,7 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
             B=(Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(
                 steps, 2 * n, m
             ),  # one product instead of many small ones
-            K=_kick_columns(scene, trajectory, integrator, Jk),
+            K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
             J=Jk,
             F=np.zeros((steps, n, 0)),
             G=np.zeros((steps, 2 * n, 0)),
@@ -171,7 +177,7 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     return Linearization(
         A=A,
         B=B,
-        K=_kick_columns(scene, trajectory, integrator, Jk),
+        K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
         J=Jk,
         F=np.broadcast_to(start.F, (steps, n, scene.processes)),
         G=G,
@@ -244,10 +250,8 @@ def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrat
     return Curvature(xx=H[:, x, x], ux=B.T @ H[:, f, x], uu=B.T @ H[:, f, f] @ B)
 
 
-def _kick_columns(scene: Scene, trajectory: Trajectory, integrator: Integrator, Jk: Floats) -> Floats:
-    """What a jump of the momentum does: ``Jk`` itself for integrators on (q, p)."""
-    if integrator.variational:
-        return Jk
+def _kick_columns(scene: Scene, trajectory: Trajectory, Jk: Floats) -> Floats:
+    """What a jump of the momentum does to (q, v), from what one of the velocity does."""
     M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
     columns: Floats = Jk @ np.linalg.inv(M)
     return columns

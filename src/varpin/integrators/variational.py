@@ -211,7 +211,7 @@ class Variational(Integrator):
 
     def fork(self, state: VariationalRun) -> VariationalRun:
         """See :meth:`Integrator.fork`."""
-        return replace(state, paths=state.paths.fork(self._guards_of(moved=state.moved)))
+        return VariationalRun(state.paths.fork(self._guards_of(moved=state.moved)), state.start, state.moved)
 
     def rollout_compiled(
         self,
