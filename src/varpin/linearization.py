@@ -118,13 +118,19 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     """
     integrator = _matching(require_scene(scene), trajectory, integrator)
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0])
+    if not integrator.variational:
+        found = replace(found, K=_kick_columns(scene, trajectory, found.J))
     if not trajectory.u_stages.shape[1]:
         return found
     return replace(found, ramp=integrator.ramps(scene, trajectory) @ scene.actuation)
 
 
 def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:
-    """:func:`linearize` without checks, of a part of a motion that began at configuration ``first`` (n,)."""
+    """:func:`linearize` without checks, of a part of a motion that began at configuration ``first`` (n,).
+
+    For integrators on (q, v), K is empty (N, 2n, 0): it needs the inverses of all mass matrices, and plans do not use
+    it.
+    """
     n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
     Jx, Jf, Jk = integrator.linearize(scene, trajectory)
     q, v = trajectory.q, trajectory.v
@@ -134,7 +140,7 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
             B=(Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(
                 steps, 2 * n, m
             ),  # one product instead of many small ones
-            K=_kick_columns(scene, trajectory, integrator, Jk),
+            K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
             J=Jk,
             F=np.zeros((steps, n, 0)),
             G=np.zeros((steps, 2 * n, 0)),
@@ -170,7 +176,7 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     return Linearization(
         A=A,
         B=B,
-        K=_kick_columns(scene, trajectory, integrator, Jk),
+        K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
         J=Jk,
         F=np.broadcast_to(start.F, (steps, n, scene.processes)),
         G=G,
@@ -244,10 +250,8 @@ def second_order_steps(scene: Scene, trajectory: Trajectory, z: Floats, integrat
     return Curvature(xx=H[:, x, x], ux=B.T @ H[:, f, x], uu=B.T @ H[:, f, f] @ B)
 
 
-def _kick_columns(scene: Scene, trajectory: Trajectory, integrator: Integrator, Jk: Floats) -> Floats:
-    """Derivatives in a jump of the momentum: ``Jk`` itself for integrators on (q, p)."""
-    if integrator.variational:
-        return Jk
+def _kick_columns(scene: Scene, trajectory: Trajectory, Jk: Floats) -> Floats:
+    """Derivatives of (q, v) in a jump of the momentum, from those in a jump of the velocity."""
     M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
     columns: Floats = Jk @ np.linalg.inv(M)
     return columns

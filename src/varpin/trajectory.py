@@ -250,28 +250,33 @@ class Trajectory(Frozen):
             object.__setattr__(self, "constraint_forces", np.zeros((max(np.size(self.t) - 1, 0), 0)))
         nodes, n = np.size(self.t), len(self.joint_names)
         # Readers of a record rely on these shapes.
-        for name, lead in {"t": nodes, "energy": nodes, "q": nodes, "v": nodes, "p": nodes}.items():
-            self._require(name, (lead, n) if name in "qvp" else (lead,))
-        for name in ("u", "dw"):
-            self._require(name, (nodes - 1, *np.shape(getattr(self, name))[1:2]))
+        self._require({"t": (nodes,), "energy": (nodes,), "q": (nodes, n), "v": (nodes, n), "p": (nodes, n)})
+        self._require({name: (nodes - 1, *np.shape(getattr(self, name))[1:2]) for name in ("u", "dw")})
         if nodes < 1 or self.u.ndim != 2 or self.dw.ndim != 2:
             raise InputError("a trajectory must have at least one node, and controls and increments (N, ...)")
-        self._require("constraint_forces", (nodes - 1, len(self.constraint_labels)))
+        m = self.u.shape[1]
         if not np.size(self.u_stages):
-            object.__setattr__(self, "u_stages", np.zeros((nodes - 1, 0, self.u.shape[1])))
-        self._require("u_stages", (nodes - 1, np.shape(self.u_stages)[1], self.u.shape[1]))
+            object.__setattr__(self, "u_stages", np.zeros((nodes - 1, 0, m)))
         if not np.size(self.u_nodes):
             object.__setattr__(self, "u_nodes", np.zeros((nodes, 0)))
-        self._require("u_nodes", (nodes, self.u.shape[1] if self.u_nodes.shape[1] else 0))
+        stages, lines = np.shape(self.u_stages)[1:2], np.shape(self.u_nodes)[1:2]
+        self._require(
+            {
+                "constraint_forces": (nodes - 1, len(self.constraint_labels)),
+                "u_stages": (nodes - 1, *stages, m),
+                "u_nodes": (nodes, m if lines != (0,) else 0),
+            }
+        )
         for name in (*_ARRAYS, "constraint_forces", "u_stages", "u_nodes"):
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)
 
-    def _require(self, name: str, shape: tuple[int, ...]) -> None:
-        array = getattr(self, name)
-        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
-            raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")
+    def _require(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != np.float64:
+                raise InputError(f"a trajectory's {name} must be a float64 array {shape}, got {reprlib.repr(array)}")
 
     @property
     def steps(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -479,7 +480,8 @@ class Along:
         cost = Expansion(end.gradient[:1, x], end.hessian[:1, x, x])
         g, H, D = cost.gradient[0], cost.hessian[0], np.eye(2 * n)
         if problem.integrator.variational:
-            slopes = velocity_at_nodes(problem.scene, q, v) if self.kept is None else self.kept[1]
+            # A motion of one block is linearized for every pass along it, and that knows its last node, too.
+            slopes = self.linearized(0, problem.steps)[1] if len(self.blocks) == 1 else D[:0, n:]
             D[n:] = slopes[-1] if len(slopes) else velocity_at_nodes(problem.scene, q, v)[0]
             g, H = D.T @ g, D.T @ H @ D
         return _Terminal(cost, D, g, H)
@@ -645,7 +647,7 @@ def _one_pass(
         if failed >= 0:
             return None, costate
     found = plain if by_roots is None else by_roots.run
-    if not (np.isfinite(found.slope) and np.isfinite(found.curvature)):
+    if not (math.isfinite(found.slope) and math.isfinite(found.curvature)):
         return None, costate
     plan = Plan(
         feedforward,
@@ -695,7 +697,7 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
     else:
         found = core.BackwardPass(m, end_gradient, end_hessian)
         failed = found.run(*how, steps, gains)
-    if failed >= 0 or not (np.isfinite(found.slope) and np.isfinite(found.curvature)):
+    if failed >= 0 or not (math.isfinite(found.slope) and math.isfinite(found.curvature)):
         return None
     return Plan(
         feedforward,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -424,7 +425,7 @@ class OptimalControlProblem(Frozen):
         """(q, v, u) at the points of :attr:`model_rule`, as :meth:`samples`."""
         return self.samples(q, v, u)
 
-    @property
+    @cached_property
     def limited(self) -> bool:
         """Whether any control has a limit."""
         return bool(np.isfinite(self.control_limits).any())

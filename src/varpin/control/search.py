@@ -10,7 +10,7 @@ import contextlib
 import functools
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from typing import Any, Literal
 
@@ -419,10 +419,11 @@ def _onto_limits(u: Floats, limits: Floats) -> Floats:
     return u
 
 
-def _lengths(backtracking: float) -> list[float]:
+@functools.lru_cache(maxsize=16)
+def _lengths(backtracking: float) -> tuple[float, ...]:
     """Of the steps that a line search tries, the longest first."""
     shorter = max(1, round(np.log(_SHORTEST) / np.log(backtracking)))
-    return [backtracking**i for i in range(min(1 + shorter, _TRIALS))]
+    return tuple(backtracking**i for i in range(min(1 + shorter, _TRIALS)))
 
 
 @functools.lru_cache(maxsize=256)
@@ -842,7 +843,7 @@ class _Search:
         added = noise_shares(self.problem, self.trajectory, self.plan)
         taken, length, tried, trials = _Trial(), 0.0, None, 0
         feedback = self._feedback(self.plan)
-        left = _lengths(self.backtracking)
+        left: Sequence[float] = _lengths(self.backtracking)
         for bounds in self._bounds():
             cut = []
             for step in left:
@@ -934,9 +935,8 @@ class _Search:
     def _feedback(self, plan: Plan) -> Commands:
         """The commands of trials, but for the feed-forward part that theirs is on top of."""
         problem, here = self.problem, self.trajectory
-        commands = _held(problem.decided(here), problem)
         if self.forward == "open":
-            return commands
+            return _held(problem.decided(here), problem)
         gains, reference = plan.feedback, states(problem, here)[: -1 : problem.hold]
         if problem.linear and plan.previous is not None:
             gains = np.concatenate([plan.feedback, plan.previous], axis=2)[1:]
@@ -946,7 +946,17 @@ class _Search:
             gains = np.concatenate([gains, plan.previous], axis=2)
             # The first change is from a control that is given.
             reference = np.hstack([reference, np.vstack([here.u[:1], before])])
-        return commands._replace(gains=gains, reference=np.ascontiguousarray(reference))
+        if problem.linear:
+            commands = _held(problem.decided(here), problem)
+            return commands._replace(gains=gains, reference=np.ascontiguousarray(reference))
+        return Commands(
+            u=problem.decided(here),
+            gains=gains,
+            reference=np.ascontiguousarray(reference),
+            hold=problem.hold,
+            limits=problem.control_limits,
+            before=np.zeros((0, problem.scene.controls)),
+        )
 
     def _last_plan(self) -> Plan | None:
         if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):

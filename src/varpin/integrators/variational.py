@@ -222,7 +222,7 @@ class Variational(Integrator):
 
     def fork(self, state: VariationalRun) -> VariationalRun:
         """See :meth:`Integrator.fork`."""
-        return replace(state, paths=state.paths.fork(self._guards_of(driven=state.driven)))
+        return VariationalRun(state.paths.fork(self._guards_of(driven=state.driven)), state.start, state.driven)
 
     def rollout_compiled(
         self,

@@ -44,10 +44,10 @@ class BackwardPass {
           S(x, x),
           T(size, size),
           Q(size, size),
-          Qz(size),
-          Cz(size),
+          Qz(TiledMatrix::padded(size)),
+          Cz(TiledMatrix::padded(size)),
           terms(size),
-          row(size),
+          row(TiledMatrix::padded(size)),
           Quu(m * m),
           factors(m * m),
           K(m, x),
@@ -100,17 +100,17 @@ class BackwardPass {
             const double* __restrict row_of_J = step.J[i];
             double* __restrict magnitude = terms.data();
             for (int c = 0; c < size; ++c) magnitude[c] += std::abs(row_of_J[c]) * scale[i];
-            add_row(gradient[i], row_of_J, Qz);
-            add_row(costate[i], row_of_J, Cz);
         }
+        add_rows(gradient.data(), step.J, x, Qz.data(), size);
+        add_rows(costate.data(), step.J, x, Cz.data(), size);
         for (int c = x; c < size; ++c) terms[c] = std::sqrt(terms[c] * terms[c] + scale[c] * scale[c]);
-        Q.clear();
+        transposed_product(W, step.J, x, T, held ? size : x);
         if (steps.curvature) {
             for (int r = 0; r < size; ++r) std::copy_n(steps.curvature + (s * size + r) * size, size, Q[r]);
+            add_transposed_product(step.J, T, x, Q, size, Part::upper);
+        } else {
+            transposed_product(step.J, T, x, Q, size, Part::upper);
         }
-        T.clear();
-        add_transposed_product(W, step.J, x, T, held ? size : x);
-        add_transposed_product(step.J, T, x, Q, size, Part::upper);
         if (!held) return;
         for (int r = x; r < size; ++r) {
             for (int c = 0; c < size; ++c) Q[c][r] += T[r][c];
@@ -148,7 +148,7 @@ class BackwardPass {
             step.expand(steps.rule[sample]);
             std::fill_n(row.begin(), x, 0.0);
             std::copy_n(g + x, m, row.begin() + x);
-            for (int i = 0; i < x; ++i) add_row(g[i], step.D[i], row);
+            add_rows(g, step.D, x, row.data(), size);
             add_row(weight, row.data(), Qz);
             add_row(weight, row.data(), Cz);
             const int rows = weigh(weight, H, step.D);
@@ -188,8 +188,7 @@ class BackwardPass {
                 add_row(row[i], step.F[i], Qz);
                 add_row(row[i], step.F[i], Cz);
             }
-            T.clear();
-            add_transposed_product(S, step.F, x, T, x);
+            transposed_product(S, step.F, x, T, x);
             add_transposed_product(step.F, T, x, Q, size, Part::upper);
         }
     }
@@ -202,6 +201,7 @@ class BackwardPass {
             scale[c] = c < x ? std::sqrt(std::abs(Q[c][c])) : terms[c];
             std::copy_n(Q[c], size, W[c]);
         }
+        of_control = true;
     }
 
     // Gains of decision r, and the value under them; false where Quu is not positive definite.
@@ -314,20 +314,16 @@ class BackwardPass {
         for (int i = 0; i < m; ++i) {
             double moved = 0.0;
             std::copy_n(Qux[i], x, rest[i]);
-            for (int j = 0; j < m; ++j) {
-                const double entry = Q[x + i][x + j];
-                moved += entry * k[j];
-                const double* __restrict other = K[j];
-                double* __restrict row = rest[i];
-                for (int c = 0; c < x; ++c) row[c] += entry * other[c];
-            }
+            for (int j = 0; j < m; ++j) moved += Q[x + i][x + j] * k[j];
+            add_rows(Q[x + i] + x, K, m, rest[i], x);
             found.slope += Qz[x + i] * k[i];
             found.curvature += k[i] * moved;
             residual[i] = moved + Qz[x + i];
             add_row(residual[i], K[i], Qz, x);
             add_row(k[i], Qux[i], Qz, x);
         }
-        W.clear();
+        if (of_control) W.clear();
+        of_control = false;
         for (int b = 0; b < x; ++b) {
             gradient[b] = Qz[b];
             costate[b] = Cz[b];
@@ -346,6 +342,7 @@ class BackwardPass {
             for (int c = 0; c < m; ++c) G[i * m + c] = box.held[i] ? 0.0 : R[i * m + c];
         }
         solve_ldl_rows(factors.data(), m, G, m);
+        of_control = true;
         for (int c = 0; c < m; ++c) {
             gradient[x + c] = costate[x + c] = -pull[c];
             scale[x + c] = std::sqrt(std::abs(R[c * m + c]));
@@ -382,6 +379,7 @@ class BackwardPass {
     int n, m, x, size;  // x = 2n states, and controls
     // The value: its Hessian, its gradient, and
     TiledMatrix W;
+    bool of_control = false;  // whether it has rows for a control
     std::vector<double> gradient;
     std::vector<double> costate;  // the gradient of the cost, without feedback and feed-forward
     std::vector<double> scale;    // the rounding error of entry (i, j) of W is about eps scale_i scale_j
@@ -391,10 +389,10 @@ class BackwardPass {
     TiledMatrix S;              // (x, x)
     TiledMatrix T;              // (size, size) a product
     TiledMatrix Q;              // (size, size); upper triangle alone until the decision
-    std::vector<double> Qz;     // (size) gradient
-    std::vector<double> Cz;     // (size) gradient of the cost itself
+    std::vector<double> Qz;     // (size) gradient, in whole tiles
+    std::vector<double> Cz;     // (size) gradient of the cost itself, in whole tiles
     std::vector<double> terms;  // (size) of Q, as the scale of the value
-    std::vector<double> row;    // (size)
+    std::vector<double> row;    // (size) in whole tiles
     // And of a decision.
     std::vector<double> Quu, factors;  // (m, m) regularized; L D L' of its free part
     TiledMatrix K, Qux, rest;          // (m, x); the last is Quu K + Qux

@@ -95,8 +95,7 @@ class ForwardDynamics {
         jet_.M.resize(entries(n, n));
         ldl_.resize(n * n);
         if (!derivatives) return;
-        slopes_.resize(n * n);
-        weights_.resize(entries(SlopeRows::most_others * n, n));
+        slopes_.resize(entries(n, 2 * n));
         if (mechanism.couplings.any()) {
             for (auto* matrix : {&coupled_q_, &coupled_v_, &coupled_curvature_}) matrix->resize(n * n);
         }
@@ -135,7 +134,7 @@ class ForwardDynamics {
                 momentum_[c] += link.ratio * dot(jet_.body[j].axis, jet_.body[j].momentum);
                 if (link.parent >= 0) jet_.body[link.parent].momentum += jet_.body[j].momentum;
             } else {
-                detail::project_mass(tree, j, jet_);
+                body_[j].mass = detail::project_mass(tree, j, jet_);
             }
             bias_[link.coordinate] += link.ratio * dot(jet_.body[j].axis, body_[j].force);
             if (link.parent >= 0) {
@@ -187,10 +186,21 @@ class ForwardDynamics {
     void differentiate(const double* v, const double* a) {
         const Tree& tree = mechanism_->tree;
         const int n = jet_.dof;
-        detail::clear_blocks(tree, n, slopes_);
-        for (int i = 0; i < n; ++i) slopes_[i * n + i] = {-acting_[i].by_q - curvature_[i], -acting_[i].by_v};
-        for (std::size_t k = 0; k < coupled_curvature_.size(); ++k)
-            slopes_[k] += {-coupled_q_[k] - coupled_curvature_[k], -coupled_v_[k]};
+        for (const Block& block : tree.blocks) {
+            for (int i = block.begin; i < block.end; ++i) {
+                double* row = slopes_.data() + i * 2 * n;
+                std::fill(row + block.begin, row + block.end, 0.0);
+                std::fill(row + n + block.begin, row + n + block.end, 0.0);
+                row[i] = acting_[i].by_q + curvature_[i];
+                row[n + i] = acting_[i].by_v;
+            }
+        }
+        for (int i = 0; i < n && !coupled_curvature_.empty(); ++i) {
+            for (int k = 0; k < n; ++k) {
+                slopes_[i * 2 * n + k] += coupled_q_[i * n + k] + coupled_curvature_[i * n + k];
+                slopes_[i * 2 * n + n + k] += coupled_v_[i * n + k];
+            }
+        }
         for (int j = 0; j < tree.size(); ++j) {
             const auto& here = jet_.body[j];
             accelerate(j, v, a);
@@ -217,12 +227,11 @@ class ForwardDynamics {
         const int n = jet_.dof;
         for (const Block& block : mechanism_->tree.blocks) {
             const int size = block.end - block.begin, corner = block.begin * n + block.begin;
-            for (int at = corner; at < block.end * n; at += n) {
-                for (int j = 0; j < size; ++j) {
-                    in_q[at + j] = -slopes_[at + j].q();
-                    in_v[at + j] = -slopes_[at + j].v();
-                }
-                in_force[at + at / n - block.begin] = 1.0 + acting_[at / n].by_f;
+            for (int i = block.begin; i < block.end; ++i) {
+                const double* by = slopes_.data() + i * 2 * n + block.begin;
+                std::copy_n(by, size, in_q + i * n + block.begin);
+                std::copy_n(by + n, size, in_v + i * n + block.begin);
+                in_force[i * n + i] = 1.0 + acting_[i].by_f;
             }
             for (double* x : {in_q, in_v, in_force}) {
                 solve_ldl_rows(ldl_.data(), n, block, x + corner, size, n);
@@ -239,33 +248,23 @@ class ForwardDynamics {
 
     // How the accelerations of one block of b coordinates change with q, v and force, columns side by side in `a`
     // (b, columns), once after differentiate(): M^-1 (-tau_q, -tau_v - reach tau_q, ramp) with reach = 0 and ramp
-    // 1; in_q x and in_v x are changes of q and v besides. No more than two others share.
+    // 1; in_q x and in_v x are changes of q and v besides, of which no more than two share.
     void slope(Block block, double* a, double reach, const Before* others, int count, double ramp) {
         const int n = jet_.dof, size = block.end - block.begin, columns = SlopeRows::columns(size);
-        SlopeRows rows{size, ldl_.data() + block.begin * n + block.begin, n, {}, 0};
+        const double *by_q = slopes_.data() + block.begin * 2 * n + block.begin, *by_v = by_q + n;
+        SlopeRows rows{size, ldl_.data() + block.begin * n + block.begin, n, 2 * n, {}, 0};
         for (int i = 0; i < size; ++i) {
-            const Slopes* by = slopes_.data() + (block.begin + i) * n + block.begin;
             double* row = a + i * columns;
-            for (int j = 0; j < size; ++j) {
-                row[j] = -by[j].q();
-                row[size + j] = -by[j].v() - reach * by[j].q();
-                row[2 * size + j] = 0.0;
-            }
-            for (int c = 3 * size; c < columns; ++c) row[c] = 0.0;
+            const double *of_q = by_q + i * 2 * n, *of_v = by_v + i * 2 * n;
+            std::copy_n(of_q, size, row);
+            for (int j = 0; j < size; ++j) row[size + j] = of_v[j] + reach * of_q[j];
+            std::fill(row + 2 * size, row + columns, 0.0);
             row[2 * size + i] = ramp * (1.0 + acting_[block.begin + i].by_f);
         }
         for (int k = 0; k < count; ++k) {
-            if (others[k].in_q == 0.0 && others[k].in_v == 0.0) continue;
-            const Pair both{others[k].in_q, others[k].in_v};
-            double* weight = weights_.data() + rows.others * size * size;
-            rows.other[rows.others++] = {weight, others[k].x};
-            for (int i = 0; i < size; ++i) {
-                const Slopes* by = slopes_.data() + (block.begin + i) * n + block.begin;
-                for (int j = 0; j < size; ++j) {
-                    const Pair parts = both * by[j].both;
-                    *weight++ = parts[0] + parts[1];
-                }
-            }
+            const Before& other = others[k];
+            if (other.in_q != 0.0) rows.other[rows.others++] = {other.in_q, by_q, other.x};
+            if (other.in_v != 0.0) rows.other[rows.others++] = {other.in_v, by_v, other.x};
         }
         solve_slope_rows(rows, a);
     }
@@ -277,6 +276,7 @@ class ForwardDynamics {
         Vec3<Slopes> turning_slopes{};         // U, angular
         Motion<Slopes> acceleration_slopes{};  // X
         Force<double> force{};                 // Phi
+        Force<double> mass{};                  // F
         Coupling coupling{};
     };
 
@@ -332,26 +332,28 @@ class ForwardDynamics {
     // Contribution of the subtree of body j to the derivatives of inverse dynamics.
     void project_slopes(int j) {
         const Tree& tree = mechanism_->tree;
-        const int n = jet_.dof;
         const Body& link = tree.bodies[j];
         const auto& here = jet_.body[j];
         const BodyState& own = body_[j];
-        const Force<double> F = here.inertia * here.axis;
+        const Force<double> F = own.mass;
         const Vec3<double> back = own.coupling.back(here.axis);
         const Force<double> turned = cross(here.axis, own.force);
         Force<Slopes> moved = here.inertia * own.acceleration_slopes + own.coupling * own.turning_slopes;
         moved += {slopes(turned.linear, {}), slopes(turned.angular, {})};
-        Slopes* row = slopes_.data() + link.coordinate * n;
+        const int n = jet_.dof;
+        double* const to = slopes_.data();
+        const auto add = [&](int row, int column, Slopes more) {
+            double* entry = to + row * 2 * n + column;
+            entry[0] += more.q();
+            entry[n] += more.v();
+        };
         for (int i = j; i >= 0; i = tree.bodies[i].parent) {
             const Body& above = tree.bodies[i];
             const BodyState& there = body_[i];
-            row[above.coordinate] +=
-                (above.ratio * link.ratio) * (dot(there.acceleration_slopes, F) + dot(there.turning_slopes, back));
-        }
-        Slopes* column = slopes_.data() + link.coordinate;
-        for (int i = link.parent; i >= 0; i = tree.bodies[i].parent) {
-            const Body& above = tree.bodies[i];
-            column[above.coordinate * n] += (above.ratio * link.ratio) * dot(jet_.body[i].axis, moved);
+            const double ratio = -above.ratio * link.ratio;
+            add(link.coordinate, above.coordinate,
+                ratio * (dot(there.acceleration_slopes, F) + dot(there.turning_slopes, back)));
+            if (i != j) add(above.coordinate, link.coordinate, ratio * dot(jet_.body[i].axis, moved));
         }
     }
 
@@ -366,8 +368,7 @@ class ForwardDynamics {
     std::optional<ArticulatedBodies> articulated_;  // in place of M
     std::vector<double> momentum_;                  // (n) with articulated bodies only
     std::vector<double> ldl_;                       // (n, n) factors of M
-    std::vector<Slopes> slopes_;                    // (n, n) of inverse dynamics
-    std::vector<double> weights_;                   // (others, b, b) of them, in other stages' accelerations
+    std::vector<double> slopes_;                    // (n, 2n) of inverse dynamics in (q, v), their negatives
 };
 
 }  // namespace varpin

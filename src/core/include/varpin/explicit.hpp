@@ -71,6 +71,7 @@ class ExplicitStepper {
             a_[i].resize(mechanism.dof());
             if (derivatives) slope_[i].resize(blocks_size(mechanism.tree));
         }
+        if (derivatives) row_.resize(SlopeRows::columns(mechanism.dof()));
     }
 
     std::vector<double> q, v;  // the state
@@ -101,18 +102,20 @@ class ExplicitStepper {
     // outside of blocks is zero already.
     void write_derivatives(double h, double* Jx, double* Jf) {
         const int n = mechanism_->dof();
+        const SlopeSum q = ends(h * h, coefficients_.end_q), v = ends(h, coefficients_.end_v);
         int first = 0;
         for (const Block& block : mechanism_->tree.blocks) {
             const int size = block.end - block.begin, columns = SlopeRows::columns(size);
             for (int row = block.begin; row < block.end; ++row, first += columns) {
-                const auto part = [&](int from, double* in_q, double* in_v) {
-                    add_up(h * h, coefficients_.end_q, first + from, size, in_q + block.begin);
-                    add_up(h, coefficients_.end_v, first + from, size, in_v + block.begin);
+                const auto write = [&](const SlopeSum& sum, int to) {
+                    add_slopes(sum, first, columns, row_.data());
+                    double* x = Jx + to * 2 * n + block.begin;
+                    std::copy_n(row_.data(), size, x);
+                    std::copy_n(row_.data() + size, size, x + n);
+                    std::copy_n(row_.data() + 2 * size, size, Jf + to * n + block.begin);
                 };
-                double *q = Jx + row * 2 * n, *v = Jx + (n + row) * 2 * n;
-                part(0, q, v);
-                part(size, q + n, v + n);
-                part(2 * size, Jf + row * n, Jf + (n + row) * n);
+                write(q, row);
+                write(v, n + row);
                 Jx[row * 2 * n + row] += 1.0;
                 Jx[row * 2 * n + n + row] += h;
                 Jx[(n + row) * 2 * n + n + row] += 1.0;
@@ -160,21 +163,15 @@ class ExplicitStepper {
         }
     }
 
-    // scale sum_i weight[i] slope_i, of `size` entries from the `first` on.
-    void add_up(double scale, const double* weight, int first, int size, double* __restrict sum) const {
-        const double* slope[4] = {};
-        double factor[4] = {};
-        int count = 0;
+    // scale sum_i weight[i] slope_i.
+    SlopeSum ends(double scale, const double* weight) const {
+        SlopeSum sum;
         for (int i = 0; i < stages(); ++i) {
             if (weight[i] == 0.0) continue;
-            slope[count] = slope_[i].data() + first;
-            factor[count++] = scale * weight[i];
+            sum.x[sum.count] = slope_[i].data();
+            sum.factor[sum.count++] = scale * weight[i];
         }
-        for (int c = 0; c < size; ++c) {
-            double total = 0.0;
-            for (int k = 0; k < count; ++k) total += factor[k] * slope[k][c];
-            sum[c] = total;
-        }
+        return sum;
     }
 
     const Mechanism* mechanism_;
@@ -183,6 +180,7 @@ class ExplicitStepper {
     std::vector<double> stage_q_, stage_v_;
     std::vector<double> a_[4];      // (n) of each stage
     std::vector<double> slope_[4];  // their derivatives (b, columns) in q, v and force, block after block
+    std::vector<double> row_;       // one row of their sum
 };
 
 // P paths on their way, each from its own state.

@@ -265,9 +265,9 @@ void project_second(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
     }
 }
 
-// The share of what body j carries in M alone: the composite rigid body algorithm.
+// The share of what body j carries in M alone: the composite rigid body algorithm. Returns F.
 template <class T, class Size>
-void project_mass(const Tree& tree, int j, Jet<T, Size>& w) {
+Force<T> project_mass(const Tree& tree, int j, Jet<T, Size>& w) {
     const Body& link = tree.bodies[j];
     const Force<T> F = w.body[j].inertia * w.body[j].axis;
     const Size n = w.dof;
@@ -278,6 +278,7 @@ void project_mass(const Tree& tree, int j, Jet<T, Size>& w) {
         w.M[above.coordinate * n + cj] += mass;
         if (i != j) w.M[cj * n + above.coordinate] += mass;
     }
+    return F;
 }
 
 // Add the subtree of body j to its parent. Joints above an origin are prismatic: only masses and linear momenta count.

@@ -41,8 +41,7 @@ class LinearStep {
         for (int i = 0; i < n; ++i) {
             for (int c = 0; c < x; ++c) rates[c][i] = after[i * x + c];
         }
-        speeds.clear();
-        add_transposed_product(rates, J, x, speeds, n);
+        transposed_product(rates, J, x, speeds, n);
     }
 
     // D, the derivative of (q, v) at a sample.

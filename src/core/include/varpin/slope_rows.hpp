@@ -1,5 +1,5 @@
-// M X = B - sum_k W_k X_k for many columns at once: what derivatives of accelerations ask for, where those of earlier
-// accelerations X_k enter. docs/mathematics.md, "Explicit methods".
+// M X = B + sum_k s_k W_k X_k for many columns at once: what derivatives of accelerations ask for, where those of
+// earlier accelerations X_k enter, and their sums. docs/mathematics.md, "Explicit methods".
 #pragma once
 
 #include "varpin/wide.hpp"
@@ -14,15 +14,26 @@ struct SlopeRows {
 
     // A term of the right-hand side.
     struct Other {
-        const double* weight;  // W (n, n)
+        double scale;          // s
+        const double* weight;  // W (n, n), rows `weight_stride` apart
         const double* x;       // X (n, columns)
     };
 
     int n = 0;
     const double* ldl = nullptr;  // L D L' of M, with rows at distance `ldl_stride`
     int ldl_stride = 0;
+    int weight_stride = 0;
     Other other[most_others] = {};
     int others = 0;
+};
+
+// sum_k factor_k x_k of rows that are as long.
+struct SlopeSum {
+    static constexpr int most = 4;
+
+    double factor[most] = {};
+    const double* x[most] = {};
+    int count = 0;
 };
 
 namespace detail {
@@ -43,9 +54,10 @@ template <int fours>
             for (int c = 0; c < 4; ++c) sum[f][c] = own[4 * f + c];
         }
         for (int o = 0; o < rows.others; ++o) {
-            const double* weight = rows.other[o].weight + i * n;
+            const double scale = -rows.other[o].scale;
+            const double* weight = rows.other[o].weight + i * rows.weight_stride;
             const double* other = rows.other[o].x + first;
-            for (int k = 0; k < n; ++k, other += columns) subtract(weight[k], other);
+            for (int k = 0; k < n; ++k, other += columns) subtract(scale * weight[k], other);
         }
         const double* factor = rows.ldl + i * rows.ldl_stride;
         for (int k = 0; k < i; ++k) subtract(factor[k], x + k * columns + first);
@@ -79,7 +91,25 @@ template <int most>
     if (c < columns) solve_some<1>(rows, columns, x, c);
 }
 
+// Of rows from `first` on, of a multiple of four columns.
+[[gnu::always_inline]] inline void add_fours(const SlopeSum& of, int first, int columns, double* __restrict sum) {
+    for (int c = 0; c < columns; c += 4) {
+        double total[4] = {};
+        for (int k = 0; k < of.count; ++k) {
+            for (int f = 0; f < 4; ++f) total[f] += of.factor[k] * of.x[k][first + c + f];
+        }
+        for (int f = 0; f < 4; ++f) sum[c + f] = total[f];
+    }
+}
+
 #if defined(__x86_64__) && defined(__GNUC__)
+#if !defined(__clang__)
+[[gnu::optimize("no-tree-loop-vectorize")]]
+#endif
+[[gnu::target("avx2")]] inline void add_wide_fours(const SlopeSum& of, int first, int columns, double* sum) {
+    add_fours(of, first, columns, sum);
+}
+
 // GCC would make four sums at once of one row by four others instead, with twice the instructions.
 #if !defined(__clang__)
 [[gnu::optimize("no-tree-loop-vectorize")]]
@@ -100,6 +130,17 @@ inline void solve_slope_rows(const SlopeRows& rows, double* x) {
     if (has_wide()) return detail::solve_wide(rows, x);
 #endif
     detail::solve_all<3>(rows, x);
+}
+
+// The sum of rows from `first` on, of a multiple of four columns.
+#if defined(__GNUC__) && !defined(__clang__)
+[[gnu::optimize("no-tree-loop-vectorize")]]
+#endif
+inline void add_slopes(const SlopeSum& of, int first, int columns, double* sum) {
+#if defined(__x86_64__) && defined(__GNUC__)
+    if (has_wide()) return detail::add_wide_fours(of, first, columns, sum);
+#endif
+    detail::add_fours(of, first, columns, sum);
 }
 
 }  // namespace varpin

@@ -22,9 +22,9 @@ class TiledMatrix {
     int stride() const { return stride_; }
     void clear() { std::fill(values_.begin(), values_.end(), 0.0); }
 
-  private:
     static int padded(int size) { return (size + tile - 1) / tile * tile; }
 
+  private:
     int stride_;
     std::vector<double> values_;
 };
@@ -33,9 +33,10 @@ enum class Part { all, upper };  // upper: the tiles on and above the diagonal
 
 namespace detail {
 
-// One tile of out += a'b, over `depth` rows.
-[[gnu::always_inline]] inline void add_tile(const double* __restrict a, int a_stride, const double* __restrict b,
-                                            int b_stride, int depth, double* __restrict out, int out_stride) {
+// One tile of out = a'b, or of out += a'b, over `depth` rows.
+template <bool adds>
+[[gnu::always_inline]] inline void find_tile(const double* __restrict a, int a_stride, const double* __restrict b,
+                                             int b_stride, int depth, double* __restrict out, int out_stride) {
     double sum[tile][tile] = {};
     for (int l = 0; l < depth; ++l, a += a_stride, b += b_stride) {
         for (int r = 0; r < tile; ++r) {
@@ -43,24 +44,29 @@ namespace detail {
         }
     }
     for (int r = 0; r < tile; ++r) {
-        for (int c = 0; c < tile; ++c) out[r * out_stride + c] += sum[r][c];
+        for (int c = 0; c < tile; ++c) {
+            double& entry = out[r * out_stride + c];
+            entry = adds ? entry + sum[r][c] : sum[r][c];
+        }
     }
 }
 
-[[gnu::always_inline]] inline void add_tiles(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out,
-                                             int rows, Part part) {
+template <bool adds>
+[[gnu::always_inline]] inline void find_tiles(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out,
+                                              int rows, Part part) {
     const int columns = std::min(b.stride(), out.stride());
     for (int i = 0; i < rows; i += tile) {
         for (int j = part == Part::upper ? i : 0; j < columns; j += tile)
-            add_tile(a[0] + i, a.stride(), b[0] + j, b.stride(), depth, out[i] + j, out.stride());
+            find_tile<adds>(a[0] + i, a.stride(), b[0] + j, b.stride(), depth, out[i] + j, out.stride());
     }
 }
 
 #if defined(__x86_64__) && defined(__GNUC__)
 // The same sums four at a time: no other bytes, and half the instructions.
-[[gnu::target("avx2")]] inline void add_wide_tiles(const TiledMatrix& a, const TiledMatrix& b, int depth,
-                                                   TiledMatrix& out, int rows, Part part) {
-    add_tiles(a, b, depth, out, rows, part);
+template <bool adds>
+[[gnu::target("avx2")]] void find_wide_tiles(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out,
+                                             int rows, Part part) {
+    find_tiles<adds>(a, b, depth, out, rows, part);
 }
 #endif
 
@@ -70,9 +76,50 @@ namespace detail {
 inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out, int rows,
                                    Part part = Part::all) {
 #if defined(__x86_64__) && defined(__GNUC__)
-    if (has_wide()) return detail::add_wide_tiles(a, b, depth, out, rows, part);
+    if (has_wide()) return detail::find_wide_tiles<true>(a, b, depth, out, rows, part);
 #endif
-    detail::add_tiles(a, b, depth, out, rows, part);
+    detail::find_tiles<true>(a, b, depth, out, rows, part);
+}
+
+// The same of out = a'b: whatever was there is gone.
+inline void transposed_product(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out, int rows,
+                               Part part = Part::all) {
+#if defined(__x86_64__) && defined(__GNUC__)
+    if (has_wide()) return detail::find_wide_tiles<false>(a, b, depth, out, rows, part);
+#endif
+    detail::find_tiles<false>(a, b, depth, out, rows, part);
+}
+
+namespace detail {
+
+[[gnu::always_inline]] inline void add_some_rows(const double* __restrict factor, const TiledMatrix& a, int rows,
+                                                 double* __restrict out, int columns) {
+    for (int c = 0; c < columns; c += tile) {
+        double sum[tile];
+        for (int k = 0; k < tile; ++k) sum[k] = out[c + k];
+        const double* row = a[0] + c;
+        for (int i = 0; i < rows; ++i, row += a.stride()) {
+            for (int k = 0; k < tile; ++k) sum[k] += factor[i] * row[k];
+        }
+        for (int k = 0; k < tile; ++k) out[c + k] = sum[k];
+    }
+}
+
+#if defined(__x86_64__) && defined(__GNUC__)
+[[gnu::target("avx2")]] inline void add_wide_rows(const double* factor, const TiledMatrix& a, int rows, double* out,
+                                                  int columns) {
+    add_some_rows(factor, a, rows, out, columns);
+}
+#endif
+
+}  // namespace detail
+
+// out += sum_i factor_i a_i over the leading `rows` rows of a, one after another; out has whole tiles.
+inline void add_rows(const double* factor, const TiledMatrix& a, int rows, double* out, int columns) {
+#if defined(__x86_64__) && defined(__GNUC__)
+    if (has_wide()) return detail::add_wide_rows(factor, a, rows, out, columns);
+#endif
+    detail::add_some_rows(factor, a, rows, out, columns);
 }
 
 // Copy the upper triangle to the lower one.
