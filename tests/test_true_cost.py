@@ -111,3 +111,28 @@ def test_the_time_limit_is_for_all_steps() -> None:
     plan = vp.solve(reach(4), true_cost=1e-13, time_limit=0.5, check=False)
     assert not plan.refinement.met
     assert time.perf_counter() - began < 20.0
+
+
+def test_within_constraints():
+    robot = vp.planar_chain(2)
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
+
+    def problem(*constraints):
+        scene = vp.Scene(robot, damping=0.1)
+        return vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.1, steps=12, constraints=constraints)
+
+    limited = problem(vp.WithinVelocityLimits(robot, (-1.2, 1.2)))
+    plan = vp.solve(limited, true_cost=1e-6, check=False)
+    assert plan.refinement.met
+    assert plan.problem.steps > 12
+    assert plan.status.converged
+    assert plan.violation <= 1e-9
+    assert abs(plan.verify().closed_loop_loss) <= 1.1e-6
+    with pytest.raises(vp.InputError, match="either resume or true_cost"):
+        vp.solve(limited, resume=plan, true_cost=0.1)
+    # No finer grid is tried where there is no plan.
+    far = vp.solve(problem(vp.ReachFrame(robot, "tip", position=[1.0, 0.5, -0.5])), true_cost=0.01, check=False)
+    assert far.status is vp.Status.INFEASIBLE
+    assert len(far.refinement.tried) == 1
+    assert "no plan within the constraints" in far.refinement.reason

@@ -27,12 +27,14 @@ from varpin.control.multipliers import FEASIBLE, ConstraintReport, Multipliers, 
 from varpin.control.penalties import PenalizedProblem, flat, penalized
 from varpin.control.polish import deviations, onto_constraints
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.refinement import refine
 from varpin.control.search import checked_time, require_reports
 from varpin.control.solution import Solution
 from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
+from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.soundness import announce
-from varpin.support.checks import count
+from varpin.support.checks import count, positive
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -74,12 +76,33 @@ def within_constraints(search: Callable[P, Solution]) -> Callable[P, Solution]:
         problem = given.arguments.get("problem")
         if not (isinstance(problem, OptimalControlProblem) and problem.constraints):
             return search(*args, **kwargs)
-        if given.arguments.get("true_cost") is not None:
-            raise InputError("true_cost is for problems without constraints: leave it out, and see plan.verify()")
-        options = {name: value for name, value in given.arguments.items() if name != "problem"}
-        return _Rounds(problem, search, options).run()
+        options = {name: value for name, value in given.arguments.items() if name not in ("problem", "true_cost")}
+        wish = given.arguments.get("true_cost")
+        if wish is None:
+            return _Rounds(problem, search, options).run()
+        return _to_true_cost(problem, search, options, positive("true_cost", wish, "1"))
 
     return solve
+
+
+def _to_true_cost(
+    problem: OptimalControlProblem, search: Callable[..., Solution], options: dict[str, Any], wish: float
+) -> Solution:
+    """Rounds on finer and finer grids, each from the plan before, until its true cost is within the wish."""
+    if options.get("resume") is not None:
+        raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
+    deadline = time.perf_counter() + checked_time(options.get("time_limit", np.inf))
+
+    def once(finer: OptimalControlProblem, start: LinearPolicy | None) -> Solution:
+        own = {**options, "check": False}
+        if start is not None:
+            own |= {"controls": start, "states": None}
+        if np.isfinite(deadline):
+            own["time_limit"] = max(deadline - time.perf_counter(), 1e-9)
+        return _Rounds(finer, search, own).run()
+
+    found = refine(problem, once, wish, lambda: deadline - time.perf_counter())
+    return looked_at(found)[0] if options.get("check", True) else found
 
 
 @dataclass

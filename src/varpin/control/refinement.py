@@ -81,6 +81,8 @@ def _ended(
     problem: OptimalControlProblem, solution: Solution, tried: list[Refined], chosen: int, wish: float, left: float
 ) -> str:
     """Why half the step is not tried, if it is not."""
+    if solution.status is Status.INFEASIBLE:
+        return f"with dt = {problem.dt:g} s there is no plan within the constraints: {solution.reason}"
     if left <= 0.0:
         return f"the time limit came after dt = {problem.dt:g} s"
     if len(tried) > _HALVINGS:
