@@ -324,9 +324,7 @@ class Variational(Integrator):
         steps = self._steps(scene, trajectory)
         guess = np.ascontiguousarray(self._guess(trajectory))
         if scene.constraints:
-            cubic = [k for k, rate in enumerate(scene.rates) if rate >= 0]
-            rates = np.zeros((trajectory.steps, len(scene.rates)))
-            rates[:, cubic] = trajectory.u[:, [scene.rates[k] for k in cubic]]
+            rates, cubic = _rates(scene, trajectory)
             Jx, Jf, Jr, outcome, done = constrained_derivatives(
                 **steps, rates=rates, places=self._places(scene), guess=guess, ramp=ramp
             )
@@ -343,11 +341,10 @@ class Variational(Integrator):
         Momenta and forces are scaled by the mass matrix to equal speeds, since heavy and light joints differ by orders
         of magnitude.
         """
-        n, N, cubic = scene.robot.dof, trajectory.steps, [k for k, rate in enumerate(scene.rates) if rate >= 0]
+        n, N = scene.robot.dof, trajectory.steps
+        rates, cubic = _rates(scene, trajectory)
         wide = 3 * n + len(cubic)
         steps, guess = self._steps(scene, trajectory), np.ascontiguousarray(self._guess(trajectory))
-        rates = np.zeros((N, len(scene.rates)))
-        rates[:, cubic] = trajectory.u[:, [scene.rates[k] for k in cubic]]
         M, _ = scene.core.jets(np.ascontiguousarray(trajectory.q[:-1]), np.ascontiguousarray(trajectory.v[:-1]))
         S = np.zeros((N, wide, wide))
         S[:] = np.eye(wide)
@@ -460,6 +457,14 @@ def _constrained(scene: Scene, paths: ConstrainedRollout, i: int, segment: Segme
         label = scene.bound_constraints.labels[paths.weakest(i)]
         failure = replace(failure, reason=f"{failure.reason}: {label}")
     return replace(segment, impulses=paths.impulses(i)[:, scene.constraint_order], failure=failure)
+
+
+def _rates(scene: Scene, trajectory: Trajectory) -> tuple[Floats, list[int]]:
+    """Velocities that inputs have at the ends of steps (N, i), zero for those on lines; and which inputs have one."""
+    cubic = [k for k, rate in enumerate(scene.rates) if rate >= 0]
+    rates = np.zeros((trajectory.steps, len(scene.rates)))
+    rates[:, cubic] = trajectory.u[:, [scene.rates[k] for k in cubic]]
+    return rates, cubic
 
 
 def _along(scene: Scene, q: Floats) -> Floats:
