@@ -239,7 +239,7 @@ def test_halvings_that_cannot_be_counted_are_refused(halvings):
 @pytest.mark.parametrize("level", [0, 63])
 def test_parts_that_no_step_has_are_refused(level):
     given = {**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)}
-    with refused(ValueError, "halved", "62"):
+    with refused(ValueError, "halvings", "62"):
         core.variational_ends(**given)
 
 
