@@ -74,7 +74,7 @@ _WINDOWS, _MARGIN = 16, 8.0
 # The least steps of a window that another method takes; and how many times errors of velocities count after jumps.
 _SHORT, _PASSING = 8, 1.25
 # How many times the error of a window counts for each window that the whole motion is long.
-_ADDS = 8.0
+_ADDS = 4.0
 # Stages of what they are taken again with where dampers are faster than the step.
 _STOPPING = 3
 # Steps from where a joint comes to rest that are taken again with it, and in how many parts each; in more if it fails.
