@@ -23,6 +23,9 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
+# How what is said of it begins.
+SAID = "disturbances grow here"
+
 # Steps that are taken again, the fewest of a motion that is asked of, and the most joints.
 _PLACES, _LEAST, _JOINTS = 6, 40, 60
 # What is spoken of, in units of the way of the joint that goes furthest, and the part of it that is looked after.

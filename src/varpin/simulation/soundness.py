@@ -44,7 +44,7 @@ from varpin.simulation.accuracy import (
 from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.damping import Fast, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
-from varpin.simulation.growth import grown_error
+from varpin.simulation.growth import SAID, grown_error
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import SHOWS as PHASE_SHOWS
 from varpin.simulation.phase import phase_lost
@@ -280,7 +280,7 @@ def _growing(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
     if found is None:
         return ()
     sentence = (
-        f"disturbances grow here: single steps of dt = {trajectory.dt:g} s by {integrator} are off by about "
+        f"{SAID}: single steps of dt = {trajectory.dt:g} s by {integrator} are off by about "
         f"{found.step:.1g} rad or m, and a method of more stages puts joint {trajectory.joint_names[found.joint]!r} "
         f"elsewhere by up to {found.off:.2g} rad or m, {100 * found.share:.2g}% of the longest way of a joint, from "
         f"t = {found.time:.4g} s on; smaller steps or more stages tell the motion for longer"

@@ -19,7 +19,7 @@ from varpin.mechanics.noise import AdditiveNoise
 from varpin.mechanics.scene import EARTH, Scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.model import Robot, load_robot
-from varpin.simulation import limits
+from varpin.simulation import growth, limits
 from varpin.simulation.run import Interrupted, simulate
 from varpin.study.extremes.checks import condition, findings, finite, measures
 from varpin.study.extremes.exact import exact_motion
@@ -199,7 +199,9 @@ def judge(
     trajectory: Trajectory, error: VarpinError | None, wrong: tuple[str, ...]
 ) -> tuple[Kind, tuple[str, ...], tuple[str, ...]]:
     """The kind of a motion that an error may have ended, what varpin said of it, and what the checks found wrong."""
-    warnings = (warning for warning in trajectory.warnings if not warning.startswith(limits.KINDS))
+    # Neither is of the steps near by, which are judged.
+    elsewhere = (*limits.KINDS, growth.SAID)
+    warnings = (warning for warning in trajectory.warnings if not warning.startswith(elsewhere))
     said = (*(() if error is None else (line_of(error),)), *warnings)
     if not finite(trajectory):
         return Kind.WRONG, said, ("the record is not finite", *wrong)
