@@ -20,7 +20,7 @@ from varpin.errors import VarpinError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
 from varpin.simulation.chatter import alternation, restlessness
-from varpin.simulation.run import rollout
+from varpin.simulation.record import rollout
 from varpin.simulation.soundness import Finding, announce, evident, examined
 
 Floats = NDArray[np.float64]

@@ -21,8 +21,10 @@ from varpin.mechanics.inputs import in_parts_of_steps
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.simulation.chatter import alternation
 from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
+from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.loop_stability import examined_in_loop
-from varpin.simulation.run import Interrupted, Progress, StepFailure, noise_forgotten, simulate
+from varpin.simulation.progress import Progress
+from varpin.simulation.run import noise_forgotten, simulate
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen

@@ -1,0 +1,205 @@
+"""Controls that are functions: control laws, and functions of time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core.arrays import Commands
+from varpin.errors import InputError, UnknownJoint
+from varpin.integrators import Integrator
+from varpin.integrators.base import open_loop
+from varpin.integrators.within import changing
+from varpin.mechanics.policy import OpenLoop
+from varpin.mechanics.scene import Scene
+from varpin.simulation.failures import ControlError
+from varpin.simulation.record import Record
+from varpin.simulation.soundness import Finding
+from varpin.support.checks import JointValues, control_values, finite_array, takes
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+ControlLaw = Callable[[float, Floats, Floats], JointValues]
+# Steps at which a function of time is held against steps of half the length, and the share by which it may be off.
+_LOOKS, _ALIKE = 16, 0.05
+# What an error calls a function of time.
+_OF_TIME = "OpenLoop: f(t)"
+
+
+def require_law(law: ControlLaw) -> None:
+    """Refuse a function that cannot be called with (t, q, v)."""
+    if takes(law, 3):
+        return
+    if takes(law, 1):
+        raise InputError(
+            "controls is a function of one argument; a control law takes (t, q, v), and controls that are a function "
+            "of time alone are given as varpin.OpenLoop(f)"
+        )
+    raise InputError("controls must be a function of (t, q, v): it cannot be called with three arguments")
+
+
+def decision(law: ControlLaw, record: Record) -> Floats:
+    """The control (1, m) of the period that begins at the last node."""
+    k = record.steps
+    time = k * record.dt
+    state = record.last.q[-1].copy(), record.last.v[-1].copy()
+    return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
+
+
+def sampled(controls: OpenLoop, record: Record, steps: int) -> Commands:
+    """Controls of the next steps, or of those before the first for which the function fails."""
+    inputs = controls, record.scene, record.integrator, record.dt
+    try:
+        return evaluated(*inputs, range(record.steps, record.steps + steps), record)
+    except ControlError as error:
+        if error.step == record.steps:
+            raise
+        return evaluated(*inputs, range(record.steps, error.step), record)
+
+
+def evaluated(
+    controls: OpenLoop,
+    scene: Scene,
+    integrator: Integrator,
+    dt: float,
+    steps: Iterable[int],
+    record: Record | None = None,
+) -> Commands:
+    """Controls of time at the stages of some steps, or from their middles for a method with one stage."""
+    times, numbers = integrator.stage_times, np.array(steps, dtype=np.int64)
+    at = (numbers[:, None] + np.array(times or (0.5,))) * dt
+    asked = np.ones(at.shape, dtype=np.bool_)
+    if times and times[0] == 0.0 and times[-1] == 1.0:
+        # Where a step begins the one before has ended.
+        asked[1:, 0] = np.diff(numbers) != 1
+    found = np.empty((*at.shape, scene.controls))
+    look = _at_all_times if controls.vectorized else _at_times
+    found[asked] = look(controls.f, scene, at[asked], np.repeat(numbers, asked.sum(axis=1)), record)
+    shared = np.flatnonzero(~asked[:, 0])
+    found[shared, 0] = found[shared - 1, -1]
+    return changing(found, times) if times else open_loop(found[:, 0])
+
+
+def _at_times(
+    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: Record | None
+) -> Floats:
+    """Controls of time (K, m) at some times (K,) [s], which are within ``steps`` (K,).
+
+    Raises:
+        ControlError: The function raised, or returned something else.
+    """
+    found = np.empty((len(times), scene.controls))
+    shape, isfinite = found.shape[1:], math.isfinite
+    for k, at in enumerate(times.tolist()):
+        try:
+            value = f(at)
+        except Exception as error:
+            raise _error_raised(_OF_TIME, error, int(steps[k]), at, record) from error
+        # What is a control at a glance: to look at all that others may be takes longer than many a function.
+        if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == shape:
+            found[k] = value
+            if isfinite(value.dot(value)):
+                continue
+        found[k] = _control(_OF_TIME, value, scene, int(steps[k]), at, record)
+    return found
+
+
+def _at_all_times(
+    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: Record | None
+) -> Floats:
+    """:func:`_at_times` of a function that takes all times at once.
+
+    The first is asked for alone, which tells its rows from its columns however many they are; and each alone where all
+    of them fail, which tells the first that does.
+    """
+    m = scene.controls
+    parts = [part for part in (times[:1], times[1:]) if len(part)]
+    try:
+        values = [finite_array(_OF_TIME, f(part.copy()), (len(part), m)) for part in parts]
+    except Exception as failure:
+        for step, at in zip(steps.tolist(), times.tolist(), strict=True):
+            try:
+                value = f(np.array([at]))
+            except Exception as error:
+                raise _error_raised(_OF_TIME, error, step, at, record) from error
+            try:
+                finite_array(_OF_TIME, value, (1, m))
+            except InputError as error:
+                raise _control_error(step, at, str(error), record) from None
+        raise _control_error(
+            int(steps[0]),
+            float(times[0]),
+            f"{_OF_TIME}, vectorized, fails for {len(times)} times at once, and for none of them alone: {failure}",
+            record,
+        ) from failure
+    return np.concatenate(values) if values else np.zeros((0, m))
+
+
+def undersampled(
+    controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory
+) -> tuple[Finding, ...]:
+    """Says if steps of half the length see another function: a record has its values at the stages alone."""
+    dt, times = trajectory.dt, integrator.stage_times
+    if not trajectory.steps:
+        return ()
+    looks = np.unique(np.linspace(0, trajectory.steps - 1, _LOOKS).astype(np.int64))
+    try:
+        halves = evaluated(controls, scene, integrator, 0.5 * dt, [2 * k + i for k in looks.tolist() for i in (0, 1)])
+    except ControlError:
+        return ()
+    mean = 0.5 * (halves.u[::2] + halves.u[1::2])
+    total, off = (float(np.abs(part).sum()) for part in (mean, mean - trajectory.u[looks]))
+    if not off > _ALIKE * total:
+        return ()
+    stages = f"{len(times)} stages of a step" if times else "middle of a step"
+    return (
+        Finding(
+            "fast controls",
+            f"the controls of OpenLoop change too fast for dt = {dt:g} s: their means over a step, from the {stages}, "
+            f"are off by {100.0 * off / total:.3g}% of those in half the step"
+            if total > 0.0
+            else f"the controls of OpenLoop change too fast for dt = {dt:g} s: half the step sees none of them",
+        ),
+    )
+
+
+def _called(
+    name: str, call: Callable[[], JointValues], scene: Scene, step: int, time: float, record: Record | None
+) -> Floats:
+    """What a function of the user's returns as a control (m,).
+
+    Raises:
+        ControlError: It raised, or returned something else.
+    """
+    try:
+        value = call()
+    except Exception as error:
+        raise _error_raised(name, error, step, time, record) from error
+    return _control(name, value, scene, step, time, record)
+
+
+def _control(name: str, value: JointValues, scene: Scene, step: int, time: float, record: Record | None) -> Floats:
+    """What a function of the user's has returned, as a control (m,).
+
+    Raises:
+        ControlError: It is something else.
+    """
+    try:
+        return control_values(name, value, scene.control_joints, scene.controls)
+    except (InputError, UnknownJoint) as error:
+        raise _control_error(step, time, str(error), record) from None
+
+
+def _error_raised(name: str, error: Exception, step: int, time: float, record: Record | None) -> ControlError:
+    """The error of a function of the user's that raised."""
+    return _control_error(step, time, f"{name} raised {error!r}", record)
+
+
+def _control_error(step: int, time: float, problem: str, record: Record | None) -> ControlError:
+    """The error of a function of the user's, with the motion before it."""
+    return ControlError(step, time, problem, None if record is None else record.trajectory())
