@@ -20,19 +20,20 @@ from varpin.support.checks import JointValues, as_floats, control_array, require
 
 Floats = NDArray[np.float64]
 
-# Controls that are known before the motion, or fed back by the core.
+# All controls but a control law: known before the motion, or fed back by the core.
 Controls = JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None
 
 
 def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps: int, dt: float) -> Commands:
-    """Controls of ``steps`` steps of ``dt`` [s] as the core takes them.
+    """Commands of the core for controls of ``steps`` steps of ``dt`` [s].
 
-    They are None, (steps, m), (m,), by joint name, a function of time, linear between nodes or a policy.
+    The controls are None, (steps, m), (m,), by joint name, a function of time, linear between nodes or a policy.
 
     Raises:
-        UnknownJoint: A name that is no driven joint's.
-        InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for something else; a law.
-        ControlError: The function of an OpenLoop failed; it holds no trajectory.
+        UnknownJoint: A name is not that of a driven joint.
+        InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for another scene or step;
+            the controls are a control law.
+        ControlError: The function of an OpenLoop failed; the error holds no trajectory.
     """
     if isinstance(controls, OpenLoop | FirstOrderHold):
         refuse_inputs(scene, f"a {type(controls).__name__}")
@@ -78,7 +79,7 @@ def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floa
     """Controls as one row a step, (steps, m).
 
     Raises:
-        UnknownJoint: A name that is no driven joint's.
+        UnknownJoint: A name is not that of a driven joint.
         InputError: The array is neither (steps, m) nor (m,), or not finite.
     """
     shape = (steps, scene.controls)
@@ -95,10 +96,10 @@ def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floa
 
 
 def held_rows(scene: Scene, controls: JointValues | None) -> Floats:
-    """Controls that are each held over an equal part of a motion, (R, m).
+    """Rows of controls, each held over an equal part of a motion, (R, m).
 
     Raises:
-        UnknownJoint: A name that is no driven joint's.
+        UnknownJoint: A name is not that of a driven joint.
         InputError: The array is neither (R, m) nor (m,), or not finite.
     """
     m = scene.controls
@@ -115,7 +116,7 @@ def held_rows(scene: Scene, controls: JointValues | None) -> Floats:
 
 
 def _on_lines(u: Floats, times: Times) -> Commands:
-    """Controls (N + 1, m) at nodes, linear between them, for a method with stages at ``times``."""
+    """Commands for controls (N + 1, m) at the nodes, linear between them, with stages at ``times``."""
     before, after = u[:-1, None], u[1:, None]
     if not times:
         return open_loop(0.5 * (before + after)[:, 0])
@@ -124,7 +125,15 @@ def _on_lines(u: Floats, times: Times) -> Commands:
 
 
 def next_block(controls: Controls | ControlLaw, commands: Commands, record: Record, most: int, left: int) -> Commands:
-    """Commands of the steps that come next: about ``most`` of the ``left`` ones, in whole intervals unless it is 1."""
+    """Commands of the next steps.
+
+    Args:
+        controls: Of the motion.
+        commands: All commands, unless the controls are a function.
+        record: The steps so far.
+        most: About how many steps; whole intervals of held controls unless it is 1.
+        left: Steps to the end of the motion.
+    """
     if callable(controls):
         decides = record.steps % commands.hold == 0
         u = decision(controls, record) if decides else record.last.u[-1:]

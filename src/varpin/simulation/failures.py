@@ -1,4 +1,4 @@
-"""Errors of a simulation; each holds the motion before it."""
+"""Errors of a simulation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Interrupted(KeyboardInterrupt):
     """Ctrl-C during a simulation.
 
     Attributes:
-        trajectory: What was computed before it.
+        trajectory: The motion before it.
     """
 
     def __init__(self, trajectory: Trajectory) -> None:
@@ -30,12 +30,12 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StepError(VarpinError, ValueError):
-    """A function of the user's failed in a step.
+    """A user's function failed in a step.
 
     Attributes:
         step: Index of the step.
-        time: When it was called [s].
-        trajectory: What was computed before; None where the function is called before the motion begins.
+        time: Time of the call [s].
+        trajectory: The motion before; None where the function is called before the motion begins.
     """
 
     def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory | None) -> None:
@@ -50,7 +50,7 @@ class StepError(VarpinError, ValueError):
 
 
 def _restored(kind: type[StepError], message: str, values: dict[str, Any]) -> StepError:
-    """An error that comes from another process."""
+    """An unpickled error."""
     error = kind.__new__(kind, message)
     vars(error).update(values)
     return error
@@ -62,7 +62,7 @@ class ControlError(StepError):
     Attributes:
         step: Index of the step it was called for.
         time: The time it was called with [s].
-        trajectory: What was computed before; None from an ensemble, whose controls are evaluated before it begins.
+        trajectory: The motion before; None from an ensemble, which evaluates its controls before it begins.
     """
 
 
@@ -72,7 +72,7 @@ class NoiseError(StepError):
     Attributes:
         step: Index of the step it was called in.
         time: The start of that step [s].
-        trajectory: What was computed before.
+        trajectory: The motion before.
     """
 
 
@@ -82,7 +82,7 @@ class ForceError(StepError):
     Attributes:
         step: Index of the step it was called in.
         time: The start of that step [s].
-        trajectory: What was computed before.
+        trajectory: The motion before.
     """
 
 
@@ -92,7 +92,7 @@ class ConstraintError(StepError):
     Attributes:
         step: Index of the step it was called in.
         time: The start of that step [s].
-        trajectory: What was computed before.
+        trajectory: The motion before.
     """
 
 
@@ -100,9 +100,9 @@ class ToleranceError(VarpinError, RuntimeError):
     """No number of steps that was tried gives an error below 1 rad or m.
 
     Attributes:
-        tolerance: What was asked for [rad or m].
-        error: The best estimate of an error [rad or m]; infinite where there is none.
-        steps: With how many steps.
+        tolerance: The tolerance [rad or m].
+        error: The smallest estimate of the error in q [rad or m]; infinite where there is none.
+        steps: The number of steps of that estimate.
     """
 
     def __init__(self, tolerance: float, duration: float, steps: int, error: float) -> None:
@@ -126,7 +126,7 @@ class StepFailure(VarpinError, RuntimeError):
         q: Configuration at the start of the step (n,) [rad or m].
         v: Velocity there (n,).
         p: Momentum there (n,).
-        trajectory: What was computed before, with a warning if its control loop is unstable.
+        trajectory: The motion before, with a warning if its control loop is unstable.
     """
 
     def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory) -> None:
@@ -136,8 +136,8 @@ class StepFailure(VarpinError, RuntimeError):
         self.reason = failure.reason
         self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
         self.trajectory = trajectory
-        told = [sentence for sentence in trajectory.warnings if not sentence.startswith(limits.KINDS)]
-        advice = told[0] if told else "a smaller dt may go further"
+        causes = [sentence for sentence in trajectory.warnings if not sentence.startswith(limits.KINDS)]
+        advice = causes[0] if causes else "a smaller dt may go further"
         super().__init__(
             f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
             f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
@@ -146,7 +146,7 @@ class StepFailure(VarpinError, RuntimeError):
 
 
 def named(scene: Scene, failure: Failure) -> Failure:
-    """A failure that names the functions of the scene's forces, which may be its reason."""
+    """The failure with the scene's CustomForce functions named as a possible reason."""
     if scene.custom is None:
         return failure
     what = f"CustomForce {scene.custom.names} may be the reason, where it jumps or its derivatives are wrong"
@@ -154,5 +154,5 @@ def named(scene: Scene, failure: Failure) -> Failure:
 
 
 def _row(values: Floats) -> str:
-    """A vector on one line, whatever its length."""
+    """A vector on one line."""
     return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"

@@ -25,9 +25,10 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
-# Steps at which a function of time is held against steps of half the length, and the share by which it may be off.
-_LOOKS, _ALIKE = 16, 0.05
-# What an error calls a function of time.
+# Number of steps in which the mean of a function of time is compared with that of two half steps, and the largest
+# difference without a warning, as a share of the mean.
+_COMPARED, _ALIKE = 16, 0.05
+# Name of a function of time in errors.
 _OF_TIME = "OpenLoop: f(t)"
 
 
@@ -52,7 +53,11 @@ def decision(law: ControlLaw, record: Record) -> Floats:
 
 
 def sampled(controls: OpenLoop, record: Record, steps: int) -> Commands:
-    """Controls of the next steps, or of those before the first for which the function fails."""
+    """Controls of the next steps up to the first for which the function fails.
+
+    Raises:
+        ControlError: It fails for the first of them.
+    """
     inputs = controls, record.scene, record.integrator, record.dt
     try:
         return evaluated(*inputs, range(record.steps, record.steps + steps), record)
@@ -70,17 +75,17 @@ def evaluated(
     steps: Iterable[int],
     record: Record | None = None,
 ) -> Commands:
-    """Controls of time at the stages of some steps, or from their middles for a method with one stage."""
+    """Controls that are a function of time at the stages of some steps, or in their middles for one-stage methods."""
     times, numbers = integrator.stage_times, np.array(steps, dtype=np.int64)
     at = (numbers[:, None] + np.array(times or (0.5,))) * dt
-    asked = np.ones(at.shape, dtype=np.bool_)
+    called = np.ones(at.shape, dtype=np.bool_)
     if times and times[0] == 0.0 and times[-1] == 1.0:
-        # Where a step begins the one before has ended.
-        asked[1:, 0] = np.diff(numbers) != 1
+        # The first stage of a step is the last stage of the step before.
+        called[1:, 0] = np.diff(numbers) != 1
     found = np.empty((*at.shape, scene.controls))
-    look = _at_all_times if controls.vectorized else _at_times
-    found[asked] = look(controls.f, scene, at[asked], np.repeat(numbers, asked.sum(axis=1)), record)
-    shared = np.flatnonzero(~asked[:, 0])
+    values = _at_all_times if controls.vectorized else _at_times
+    found[called] = values(controls.f, scene, at[called], np.repeat(numbers, called.sum(axis=1)), record)
+    shared = np.flatnonzero(~called[:, 0])
     found[shared, 0] = found[shared - 1, -1]
     return changing(found, times) if times else open_loop(found[:, 0])
 
@@ -88,7 +93,7 @@ def evaluated(
 def _at_times(
     f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: Record | None
 ) -> Floats:
-    """Controls of time (K, m) at some times (K,) [s], which are within ``steps`` (K,).
+    """Controls (K, m) from a function of time at times (K,) [s] within ``steps`` (K,).
 
     Raises:
         ControlError: The function raised, or returned something else.
@@ -100,7 +105,7 @@ def _at_times(
             value = f(at)
         except Exception as error:
             raise _error_raised(_OF_TIME, error, int(steps[k]), at, record) from error
-        # What is a control at a glance: to look at all that others may be takes longer than many a function.
+        # The common case, without the checks of _control: these take longer than many functions.
         if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == shape:
             found[k] = value
             if isfinite(value.dot(value)):
@@ -112,10 +117,10 @@ def _at_times(
 def _at_all_times(
     f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: Record | None
 ) -> Floats:
-    """:func:`_at_times` of a function that takes all times at once.
+    """:func:`_at_times` for a vectorized function.
 
-    The first is asked for alone, which tells its rows from its columns however many they are; and each alone where all
-    of them fail, which tells the first that does.
+    The first time is evaluated alone, so that rows and columns cannot be confused. If the call for all others fails,
+    each is evaluated alone to find the first that fails.
     """
     m = scene.controls
     parts = [part for part in (times[:1], times[1:]) if len(part)]
@@ -143,17 +148,20 @@ def _at_all_times(
 def undersampled(
     controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory
 ) -> tuple[Finding, ...]:
-    """Says if steps of half the length see another function: a record has its values at the stages alone."""
+    """A warning if the mean of a function of time over a step differs from that of two half steps.
+
+    A motion has the function's values at its stages alone.
+    """
     dt, times = trajectory.dt, integrator.stage_times
     if not trajectory.steps:
         return ()
-    looks = np.unique(np.linspace(0, trajectory.steps - 1, _LOOKS).astype(np.int64))
+    at = np.unique(np.linspace(0, trajectory.steps - 1, _COMPARED).astype(np.int64))
     try:
-        halves = evaluated(controls, scene, integrator, 0.5 * dt, [2 * k + i for k in looks.tolist() for i in (0, 1)])
+        halves = evaluated(controls, scene, integrator, 0.5 * dt, [2 * k + i for k in at.tolist() for i in (0, 1)])
     except ControlError:
         return ()
     mean = 0.5 * (halves.u[::2] + halves.u[1::2])
-    total, off = (float(np.abs(part).sum()) for part in (mean, mean - trajectory.u[looks]))
+    total, off = (float(np.abs(part).sum()) for part in (mean, mean - trajectory.u[at]))
     if not off > _ALIKE * total:
         return ()
     stages = f"{len(times)} stages of a step" if times else "middle of a step"
@@ -171,10 +179,10 @@ def undersampled(
 def _called(
     name: str, call: Callable[[], JointValues], scene: Scene, step: int, time: float, record: Record | None
 ) -> Floats:
-    """What a function of the user's returns as a control (m,).
+    """The control (m,) that a user's function returns.
 
     Raises:
-        ControlError: It raised, or returned something else.
+        ControlError: The function raised, or returned no control.
     """
     try:
         value = call()
@@ -184,10 +192,10 @@ def _called(
 
 
 def _control(name: str, value: JointValues, scene: Scene, step: int, time: float, record: Record | None) -> Floats:
-    """What a function of the user's has returned, as a control (m,).
+    """The value of a user's function as a control (m,).
 
     Raises:
-        ControlError: It is something else.
+        ControlError: The value is no control.
     """
     try:
         return control_values(name, value, scene.control_joints, scene.controls)
@@ -196,10 +204,10 @@ def _control(name: str, value: JointValues, scene: Scene, step: int, time: float
 
 
 def _error_raised(name: str, error: Exception, step: int, time: float, record: Record | None) -> ControlError:
-    """The error of a function of the user's that raised."""
+    """The error of a user's function that raised."""
     return _control_error(step, time, f"{name} raised {error!r}", record)
 
 
 def _control_error(step: int, time: float, problem: str, record: Record | None) -> ControlError:
-    """The error of a function of the user's, with the motion before it."""
+    """The error of a user's function, with the motion before it."""
     return ControlError(step, time, problem, None if record is None else record.trajectory())

@@ -14,38 +14,38 @@ from varpin.support.checks import told_motion
 from varpin.trajectory import Nodes
 
 Progress = Callable[[int, int], None] | Callable[[int, int, Nodes], None]
-# Who is told the motion is called at least so often [s], where nothing but whole chunks of steps takes longer.
-_LOOK = 1.0 / 60.0
+# Longest time between two calls of a function that gets the motion [s], except within a chunk of steps.
+_LONGEST = 1.0 / 60.0
 
 
 class Reporter:
-    """Who is told how far a motion is, and perhaps what it was since the last time."""
+    """Calls a progress function with the number of steps done and, if it takes them, the new nodes."""
 
     def __init__(self, progress: Progress | None, steps: int, dt: float) -> None:
         self._progress: Any = progress
         self._steps, self._dt = steps, dt
-        self._moving = told_motion("progress", progress, "steps done, steps in all", "nodes")
+        self._takes_nodes = told_motion("progress", progress, "steps done, steps in all", "nodes")
         self._parts: list[Segment] = []
         self._last = time.perf_counter()
 
     def begin(self, node: Segment) -> None:
-        """Take the first node, and tell of it who is told the motion."""
-        if self._moving:
+        """Take the first node, and report it to a function that takes nodes."""
+        if self._takes_nodes:
             self._parts = [node]
-            self._tell(0)
+            self._report(0)
 
     def add(self, segment: Segment, done: int, *, due: bool) -> None:
-        """Take steps, after which so many are ``done``; and tell, if that is due."""
+        """Take steps, ``done`` the number of all so far; report if ``due``, late or at the end."""
         if self._progress is None:
             return
-        if self._moving:
+        if self._takes_nodes:
             self._parts.append(segment)
-            due = due or time.perf_counter() - self._last > _LOOK
+            due = due or time.perf_counter() - self._last > _LONGEST
         if due or done == self._steps:
-            self._tell(done)
+            self._report(done)
 
-    def _tell(self, done: int) -> None:
-        if not self._moving:
+    def _report(self, done: int) -> None:
+        if not self._takes_nodes:
             self._progress(done, self._steps)
             return
         q, v = (np.concatenate([getattr(part, name) for part in self._parts]) for name in ("q", "v"))

@@ -17,16 +17,16 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# Parts of a motion that are kept one by one.
+# Number of segments from which on they are joined into one.
 _PARTS = 256
 
 
 class Record:
-    """The steps done so far; a trajectory can be made of them at any time.
+    """The steps done so far.
 
     Attributes:
-        steps: How many.
-        last: The part that was added last, or the first node.
+        steps: Their number.
+        last: The segment added last, or the first node.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Record:
         self._parts.append(segment)
         if len(within):
             self._within.append(within[: len(segment.q)])
-        # Single steps take many times the room of their numbers.
+        # A segment of one step takes many times the memory of its numbers.
         if len(self._parts) == _PARTS:
             self._joined.append(join(self._parts))
             self._parts = []
@@ -72,9 +72,17 @@ def _trajectory(
     within: Floats | None,
     on: Commands | None = None,
 ) -> Trajectory:
-    """The motion from a first node on over parts that follow each other; no increments stand for zeros.
+    """The motion from a first node through consecutive segments.
 
-    ``on`` are the commands of all of it where its controls are linear between nodes.
+    Args:
+        scene: The scene.
+        integrator: The integrator.
+        dt: Time step [s].
+        first: The first node.
+        parts: The segments.
+        dw: Increments (N, k) [s^0.5]; None for zeros.
+        within: Controls at the stages (N, s, m); None for controls that are constant over each step.
+        on: The commands of the whole motion, where its controls are linear between nodes.
     """
     steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
     N = len(steps.u)
@@ -104,7 +112,7 @@ def _trajectory(
 
 
 def function_error(error: CustomForceError | CustomConstraintError, record: Record, where: str = "") -> StepError:
-    """The error of a function that failed in the step after those of a record."""
+    """The error of a user's function that failed in the step after the record."""
     now = record.trajectory()
     kind = ForceError if isinstance(error, CustomForceError) else ConstraintError
     return kind(now.steps, float(now.t[-1]), f"{where}{error}", now)
@@ -120,9 +128,9 @@ def located(
     error: CustomForceError | CustomConstraintError,
     where: str = "",
 ) -> VarpinError:
-    """The error of a function that failed somewhere in a motion, with its step and the motion before.
+    """The error of a user's function that failed in a motion, with its step and the motion before.
 
-    The motion is made again, step by step, from ``start`` (q0, v0).
+    The motion is repeated step by step from ``start`` (q0, v0) to find the step.
     """
     state, (first,) = integrator.start(scene, start[0][None], start[1][None])
     dw = np.zeros((0, scene.processes)) if increments is None else increments
@@ -137,12 +145,12 @@ def located(
         record.add(segment, block.within)
         if segment.failure is not None:
             break
-    # What it depends on has changed in the meantime.
+    # The function did not fail this time: its result depends on more than its arguments.
     return error
 
 
 def next_command(commands: Commands, record: Record) -> Commands:
-    """The command of the next step alone: a decision, or the control of the last one while it is held."""
+    """The command of the next step alone: a new decision, or the last control while it is held."""
     decision, held = divmod(record.steps, commands.hold)
     if held:
         return open_loop(record.last.u[-1:])
@@ -151,7 +159,7 @@ def next_command(commands: Commands, record: Record) -> Commands:
 
 
 class Motions:
-    """Motions from one state under commands of any kind; they share their work arrays."""
+    """Motions from one state under given commands; they share their work arrays."""
 
     def __init__(self, scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, dt: float) -> None:
         self.scene, self.integrator, self.dt = scene, integrator, dt
@@ -164,7 +172,7 @@ class Motions:
         *,
         increments: Floats | None = None,
     ) -> tuple[Trajectory, Failure | None]:
-        """The motion, and why it stopped early, if it did; nothing is checked.
+        """The motion, and the failure that stopped it early, if any. No argument is checked.
 
         Args:
             commands: For all of its steps.

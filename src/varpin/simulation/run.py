@@ -27,7 +27,7 @@ from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import Record, function_error
 from varpin.simulation.soundness import Finding, announce, evident, with_warnings
 from varpin.simulation.start import on_constraints
-from varpin.simulation.time_steps import duration_of_choice, steps_for_tolerance, time_steps
+from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
 from varpin.support.checks import JointValues, count, joint_array
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 
@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-# Work between two looks at the progress callback and at Ctrl-C, in steps of one joint: some tens of milliseconds.
+# Work between two progress calls and checks for Ctrl-C, in steps of one joint: some tens of milliseconds.
 _CHUNK = 30_000
 
 
@@ -58,50 +58,52 @@ def simulate(
 ) -> Trajectory:
     """Integrate a scene in time.
 
-    Give ``duration`` and ``tolerance``, and the cheapest integrator and step that keep the error in q within it are
-    found out and taken; or give two of ``dt``, ``steps`` and ``duration``.
+    Give ``duration`` and ``tolerance`` to have the cheapest integrator and time step chosen that keep the error in q
+    within the tolerance; or give two of ``dt``, ``steps`` and ``duration``.
 
     Main args:
-        scene: The scene. Where it has constraints, a start that is off them by little is moved onto them, and a
-            warning says how far.
+        scene: The scene. A start that misses its constraints slightly is moved onto them, with a warning that gives
+            the distance.
         q0: Initial configuration, (n,) or by joint name, 0 for those not named [rad or m].
         v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
         steps: N, their number.
         duration: steps * dt [s].
         tolerance: The largest error in q allowed at any node [rad or m], in place of ``dt`` and ``steps``.
-            ``Trajectory.accuracy`` says what was taken, what error that estimates and how many steps finding out took;
-            it is itself a ``tolerance``, of the same scene's next motion, which tries first what it found. Where the
-            tolerance is out of reach a warning says what is reached. Rows of controls, (R, m), are then held over
-            duration / R each, in which joints that are moved by hand go to theirs; the intervals of a FirstOrderHold
-            are as long, a LinearPolicy needs its period in seconds, and noise and control laws are refused.
-        controls: None for none, servos staying where they are at ``q0``; an array (N, m), one row a step; one row
-            (m,) for all steps, by joint name too where each control is the force of a joint, with 0 for joints that
-            are not named; a :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that
-            returns (m,), or numbers by joint name; :class:`varpin.OpenLoop`, a function of time alone; or
+            ``Trajectory.accuracy`` gives the integrator and step taken, the estimated error and the steps of the
+            search. Given as the ``tolerance`` of the same scene's next motion, its integrator and step are tried
+            first. If the tolerance cannot be met, a warning gives the error that is reached. Rows of controls, (R, m),
+            are then held over duration / R each, in which joints with prescribed positions move to theirs; the
+            intervals of a FirstOrderHold are as long; a LinearPolicy needs its period in seconds; noise and control
+            laws are refused.
+        controls: None for none, with servos holding ``q0``; an array (N, m), one row a step; one row (m,) for all
+            steps, also by joint name where each control is the force of a joint, with 0 for joints that are not named;
+            a :class:`varpin.LinearPolicy`; a control law, a function of (t [s], q (n,), v (n,)) that returns (m,) or
+            numbers by joint name; :class:`varpin.OpenLoop`, a function of time alone; or
             :class:`varpin.FirstOrderHold`, linear in time between nodes. All but the last two are constant over each
-            step. A law is a digital controller: it is called once where each of its periods begins, with the time and
-            the state of that node, and what it returns is held over the period.
+            step. A law is a digital controller: it is called once at the start of each of its periods, with the time
+            and state of that node, and its value is held over the period.
         period: Of a control law, in steps.
-        integrator: If left out, ``Gauss(stages=2)``; where, at the start, springs turn a mode by more than 0.4 rad in a
-            step, ``Gauss(stages=4)``; where dampers, dry friction or servos are more than twice as fast as the step
-            there, ``Radau(stages=4)``, unless the scene has constraints. Where that shows only later in the motion,
-            in a stop that a joint runs into, say, the motion is made anew, and ``Trajectory.integrator`` says by what;
-            that of a law, which is called once a period, is not, but is ready for all stops. A CustomForce is not
-            asked for either. ``Midpoint()`` where noise is drawn; with a tolerance, the cheapest that there is.
+        integrator: If left out, it is chosen by the rates at the start: ``Radau(stages=4)`` where dampers, dry
+            friction or servos are more than twice as fast as the step and the scene has no constraints;
+            ``Gauss(stages=4)`` where springs turn a mode by more than 0.4 rad in a step; else ``Gauss(stages=2)``.
+            If such rates occur only later in the motion, in a joint stop for example, the motion is repeated with the
+            other integrator, which ``Trajectory.integrator`` names. The motion of a law is not repeated, for the law
+            is called once a period; its integrator is chosen for all stops from the start. A CustomForce has no part
+            in the choice. ``Midpoint()`` where noise is drawn; with a tolerance, the cheapest of all.
 
     Other Args:
-        rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, and a
-            noisy scene has a warning of it; so has an ``rng`` where nothing is random.
+        rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, with a
+            warning if the scene has noise. An ``rng`` for a scene without noise gives a warning, too.
         increments: The increments themselves, (N, k) [s^0.5], to replay or refine a path, see
-            :mod:`varpin.mechanics.wiener`. 0 asks for the motion without noise.
-        check: Look at the finished motion, whether the balance of its energy closes, its steps resolve it and its
-            control loop is stable, for ``Trajectory.warnings`` and the log. It takes about half as long as the
-            motion, and 0.1 ms (0.4 ms from 40 steps on); some times as long as the motion where its steps are coarse,
-            and twice as long where small disturbances may grow.
-        progress: Called now and then with (steps done, steps in all). A function that needs three arguments gets the
-            motion, too: a :class:`varpin.Nodes` with the nodes from the last call on, the one it ended with first; as
-            :class:`varpin.LiveView` does.
+            :mod:`varpin.mechanics.wiener`. 0 gives the motion without noise and without the warning.
+        check: Examine the finished motion for ``Trajectory.warnings`` and the log: does its energy balance close, do
+            its steps resolve it, is its control loop stable? The check takes about half as long as the motion, and
+            0.1 ms (0.4 ms from 40 steps on); several times as long as the motion where its steps are coarse, and twice
+            as long where small disturbances may grow.
+        progress: Called now and then with (steps done, steps in all). A function with three required arguments, such
+            as :class:`varpin.LiveView`, also gets a :class:`varpin.Nodes` with the nodes since the last call, whose
+            last node comes first again.
 
     Returns:
         The trajectory, frozen.
@@ -109,18 +111,18 @@ def simulate(
     Raises:
         InputError: Wrong shapes, values that are not finite, dt <= 0, steps < 0, a law of other arguments than
             (t, q, v), a period without a law; dt or steps, noise or a law beside a tolerance.
-        ToleranceError: No step brings the error below 1 rad or m; a chaotic motion over a long time, say.
+        ToleranceError: No step brings the error below 1 rad or m, as in a chaotic motion over a long time.
         UnknownJoint: ``q0`` or ``v0`` names a joint that is no coordinate of the robot, or ``controls`` one that no
             control drives.
-        ControlError: The control function returned something unusable; holds the trajectory so far.
-        NoiseError: A function of a CustomNoise did; holds the trajectory so far.
-        ForceError: A function of a CustomForce did; holds the trajectory so far.
-        ConstraintError: A function of a CustomConstraint did; holds the trajectory so far.
+        ControlError: The control function failed; holds the trajectory so far.
+        NoiseError: A function of a CustomNoise failed; holds the trajectory so far.
+        ForceError: A function of a CustomForce failed; holds the trajectory so far.
+        ConstraintError: A function of a CustomConstraint failed; holds the trajectory so far.
         StepFailure: A step has no trustworthy solution; holds the trajectory so far.
         SingularMassMatrix: M(q0) is not positive definite.
-        AssemblyError: The scene's constraints cannot be kept next to q0.
-        Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt; while a tolerance looks for its
-            integrator, a plain one.
+        AssemblyError: The scene's constraints cannot be kept near q0.
+        Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt; during the search of a tolerance
+            a plain one is raised.
     """
     joints = require_scene(scene).robot.joint_names
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
@@ -129,14 +131,14 @@ def simulate(
     if controls is None and (scene.servo_joints or scene.inputs):
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
-    wished: tuple[Finding, ...] = ()
+    early: tuple[Finding, ...] = ()
     if scene.constraints:
-        q0, v0, wished = on_constraints(scene, q0, v0)
+        q0, v0, early = on_constraints(scene, q0, v0)
     if tolerance is not None:
-        span = duration_of_choice(dt, steps, duration)
+        span = duration_for_tolerance(dt, steps, duration)
         chosen = steps_for_tolerance(scene, q0, v0, span, tolerance, controls, integrator)
         integrator, steps, controls, accuracy, unmet = chosen
-        wished = (*wished, *unmet)
+        early = (*early, *unmet)
         dt = span / steps
     else:
         dt, steps = time_steps(dt, steps, duration)
@@ -154,25 +156,25 @@ def simulate(
             f"period = {period} is of a control law, a function of (t, q, v); rows are given one a step, "
             "and a LinearPolicy has a hold of its own"
         )
-    # A law may remember what it was called with: its motion is made once.
-    again = integrator is None and law is None and not len(dw) and changes_along(scene)
+    # A law may depend on its earlier calls: its motion is integrated once.
+    replaceable = integrator is None and law is None and not len(dw) and changes_along(scene)
     if integrator is None:
         integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0, ahead=law is not None)
-    asked = _Asked(scene, q0, v0, controls, period, dt, steps, dw, check)
-    record, hold, other, interrupted = _made(asked, integrator, reporter, again=again)
+    task = _Task(scene, q0, v0, controls, period, dt, steps, dw, check)
+    record, hold, other, interrupted = _integrated(task, integrator, reporter, replaceable=replaceable)
     while other is not None:
         integrator = other
-        record, hold, other, interrupted = _made(asked, integrator, reporter, again=again)
+        record, hold, other, interrupted = _integrated(task, integrator, reporter, replaceable=replaceable)
     try:
         try:
-            trajectory, found = _told(scene, integrator, record.trajectory(), hold, check=check)
+            trajectory, found = _checked(scene, integrator, record.trajectory(), hold, check=check)
         except (CustomForceError, CustomConstraintError) as error:
-            # Steps that the check takes again may go where the function is not defined. The motion stands.
+            # Steps that the check repeats may go where the function is not defined. The motion itself is valid.
             sentence = f"the motion was not checked: {error}"
             trajectory, found = record.trajectory(), (Finding("check", sentence),)
         if check and isinstance(controls, OpenLoop):
             found = (*found, *undersampled(controls, scene, integrator, trajectory))
-        found = (*noise_forgotten(scene, rng, increments), *wished, *found)
+        found = (*noise_forgotten(scene, rng, increments), *early, *found)
         trajectory = with_warnings(trajectory, found)
         if accuracy is not None:
             trajectory = trajectory.changed(accuracy=accuracy)
@@ -184,8 +186,8 @@ def simulate(
     return trajectory
 
 
-class _Asked(NamedTuple):
-    """A motion that is to be made, but for its integrator; ``period`` is that of a law in steps."""
+class _Task(NamedTuple):
+    """A motion to integrate, without its integrator; ``period`` is that of a law in steps."""
 
     scene: Scene
     q0: Floats
@@ -198,30 +200,31 @@ class _Asked(NamedTuple):
     check: bool
 
 
-def _made(
-    asked: _Asked, integrator: Integrator, reporter: Reporter, *, again: bool
+def _integrated(
+    task: _Task, integrator: Integrator, reporter: Reporter, *, replaceable: bool
 ) -> tuple[Record, int | None, Integrator | None, bool]:
-    """The steps of a motion, and the period of its feedback in steps, None for none.
+    """Integrate a motion.
 
-    ``again`` asks whether another integrator should take them, which comes next; the steps so far are then to be left.
-    Last comes whether Ctrl-C has ended them.
+    Returns:
+        The steps; the period of the feedback in steps, None for none; if ``replaceable``, another integrator that the
+        motion needs, with which it has to be repeated, else None; and whether Ctrl-C ended the motion.
     """
-    scene, controls, dt, steps = asked.scene, asked.controls, asked.dt, asked.steps
+    scene, controls, dt, steps = task.scene, task.controls, task.dt, task.steps
     if callable(controls) or isinstance(controls, OpenLoop):
-        commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=asked.period)
+        commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=task.period)
     else:
         commands = commands_of(scene, integrator, controls, steps, dt)
-    hold = asked.period if callable(controls) else commands.hold if isinstance(controls, LinearPolicy) else None
-    state, (start,) = integrator.start(scene, asked.q0[None], asked.v0[None])
+    hold = task.period if callable(controls) else commands.hold if isinstance(controls, LinearPolicy) else None
+    state, (start,) = integrator.start(scene, task.q0[None], task.v0[None])
     linear = bool(len(commands.places))
     if linear:
-        # Gains of a held control are looked at by the loop's check; those of lines are not.
+        # The loop's check is for held controls.
         hold = None
-    record = Record(scene, integrator, dt, asked.dw, start, commands if linear else None)
-    # A sweep takes as long as the robot has joints, an elimination as their cube.
+    record = Record(scene, integrator, dt, task.dw, start, commands if linear else None)
+    # The cost of a sweep is linear in the number of joints, that of an elimination cubic.
     n = scene.robot.dof
     chunk = max(1, _CHUNK // (n + n**3 // 100))
-    # One step at a time where noise or forces call Python functions: what came before one that fails is recorded.
+    # One step at a time where noise or forces call Python functions, to record the steps before one that fails.
     stepwise = scene.noise.diffusion is None or scene.custom is not None or bool(scene.bound_constraints.rows.customs)
     try:
         reporter.begin(start)
@@ -229,21 +232,21 @@ def _made(
             done = record.steps
             block = next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
             segment = _rolled_out(record, state, block)
-            if again and (other := _better(record, segment, block)) is not None:
+            if replaceable and (other := _better_integrator(record, segment, block)) is not None:
                 return record, hold, other, False
             record.add(segment, block.within)
             if segment.failure is not None:
-                # What a law has just decided is in no step yet.
+                # The last decision of a law is in no step of the record yet.
                 decided = (done, block.u) if callable(controls) else None
-                raise _step_failure(record, segment.failure, hold if asked.check else None, decided)
+                raise _step_failure(record, segment.failure, hold if task.check else None, decided)
             reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
     except KeyboardInterrupt:
         return record, hold, None, True
     return record, hold, None, False
 
 
-def _better(record: Record, segment: Segment, block: Commands) -> Integrator | None:
-    """What should have taken the steps of a segment that follows a record, if that is another integrator."""
+def _better_integrator(record: Record, segment: Segment, block: Commands) -> Integrator | None:
+    """The integrator that the steps of a segment after a record need, if it is not the record's."""
     q, v = (np.concatenate([getattr(record.last, name)[-1:], getattr(segment, name)]) for name in ("q", "v"))
     u = segment.u if len(segment.u) else block.u[:1]
     other = integrator_along(record.scene, record.integrator, q, v, u, record.dt)
@@ -251,7 +254,11 @@ def _better(record: Record, segment: Segment, block: Commands) -> Integrator | N
 
 
 def _rolled_out(record: Record, state: object, block: Commands) -> Segment:
-    """The steps of a block; an error of a user's force or noise has the motion so far."""
+    """The steps of a block.
+
+    Raises:
+        StepError: A user's function failed; the error has the motion so far.
+    """
     dw, scene = record.dw, record.scene
     drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
     try:
@@ -272,7 +279,7 @@ def _step_failure(
     Args:
         record: The motion so far.
         failure: Of the step.
-        hold: Steps between two decisions of the loop; None where no loop is to be looked at.
+        hold: Steps between two decisions of the control loop; None to leave the loop unchecked.
         decided: Of a law the step of its last decision, and that decision (1, m).
     """
     node = record.trajectory()
@@ -283,10 +290,10 @@ def _step_failure(
     return StepFailure(node.steps, node.t[-1], named(record.scene, failure), node)
 
 
-def _told(
+def _checked(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, *, check: bool
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """A whole motion with what is to be said of it; ``hold`` is the period of its feedback in steps, None for none."""
+    """A motion with its warnings; ``hold`` is the period of its feedback in steps, None for none."""
     if check:
         return examined_in_loop(scene, integrator, trajectory, hold)
     found = evident(scene, integrator, trajectory)
@@ -296,7 +303,7 @@ def _told(
 def noise_forgotten(
     scene: Scene, rng: np.random.Generator | int | None, increments: ArrayLike | None = None
 ) -> tuple[Finding, ...]:
-    """Says if a noisy scene is given nothing to draw its noise from, or a seed is given to a scene without noise."""
+    """Warnings: the scene has noise, but neither seed nor increments; or there is a seed, but no noise."""
     if scene.processes and rng is None and increments is None:
         sentence = (
             "the scene has noise, and none was drawn: this is the motion without it. rng=0, or any other seed, draws "
@@ -310,7 +317,7 @@ def noise_forgotten(
 
 
 def _require_memory(scene: Scene, steps: int) -> None:
-    """Refuse a number of steps whose record cannot be held, before anything runs."""
+    """Refuse a number of steps whose record does not fit into memory."""
     columns = 3 * scene.robot.dof + 2 * scene.controls + len(STEP_NUMBERS) + 2
     try:
         np.empty((steps + 1, columns))

@@ -12,16 +12,16 @@ from varpin.simulation.soundness import Finding
 
 Floats = NDArray[np.float64]
 
-# What a start may be moved by onto constraints without a word [rad or m].
-_UNSAID = 1e-9
+# Shift of a start onto its constraints up to which no warning is given [rad or m]: rounding.
+_ROUNDING = 1e-9
 
 
 def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats, tuple[Finding, ...]]:
-    """The nearest state that keeps the constraints, and by how much it is another, if that is to be said.
+    """The nearest state that keeps the constraints, with a warning if it differs from (q0, v0).
 
     Raises:
-        InputError: q0 misses them by more than is corrected unasked.
-        AssemblyError: They cannot be kept next to q0.
+        InputError: q0 misses the constraints by more than ``CORRECTED``.
+        AssemblyError: The constraints cannot be kept near q0.
     """
     label, miss = missed(scene, q0)
     if miss > CORRECTED:
@@ -34,11 +34,11 @@ def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats
         raise InputError(f"{twice} moves a joint that the other constraints and inputs move already at q0")
     v = along_constraints(scene, q, v0)
     shift, turned = float(np.abs(q - q0).max()), float(np.abs(v - v0).max())
-    words = []
-    if shift > _UNSAID:
-        words.append(
+    changes = []
+    if shift > _ROUNDING:
+        changes.append(
             f"q0 was moved by up to {shift:.3g} rad or m onto the constraints (it missed {label} by {miss:.3g})"
         )
-    if turned > _UNSAID * max(1.0, float(np.abs(v0).max())):
-        words.append(f"v0 was changed by up to {turned:.3g} rad/s or m/s, to what the constraints allow")
-    return q, v, (Finding("start off the constraints", "; ".join(words)),) if words else ()
+    if turned > _ROUNDING * max(1.0, float(np.abs(v0).max())):
+        changes.append(f"v0 was changed by up to {turned:.3g} rad/s or m/s, to what the constraints allow")
+    return q, v, (Finding("start off the constraints", "; ".join(changes)),) if changes else ()

@@ -28,12 +28,12 @@ from varpin.trajectory import Accuracy
 
 Floats = NDArray[np.float64]
 
-# Steps in one of a run in which a function failed, for where it does.
-_FINELY = 16
+# Factor on the number of steps of a run whose user's function failed, when the failing step is looked for.
+_REFINED = 16
 
 
 def time_steps(dt: float | None, steps: int | None, duration: float | None) -> tuple[float, int]:
-    """Dt [s] and the number of steps, from two of the three."""
+    """The time step [s] and the number of steps, from two of the three arguments."""
     given = {name: value for name, value in (("dt", dt), ("steps", steps), ("duration", duration)) if value is not None}
     if len(given) != 2:
         got = " and ".join(given) or "none of them"
@@ -54,8 +54,8 @@ def time_steps(dt: float | None, steps: int | None, duration: float | None) -> t
     return dt, steps
 
 
-def duration_of_choice(dt: float | None, steps: int | None, duration: float | None) -> float:
-    """The duration of a motion with a tolerance [s]."""
+def duration_for_tolerance(dt: float | None, steps: int | None, duration: float | None) -> float:
+    """The duration of a motion with a tolerance [s]; refuses a given dt or number of steps."""
     for name, value in (("dt", dt), ("steps", steps)):
         if value is not None:
             raise InputError(
@@ -68,10 +68,10 @@ def duration_of_choice(dt: float | None, steps: int | None, duration: float | No
 
 
 def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: Integrator | None) -> Controls:
-    """The controls; refuses what no tolerance chooses steps for.
+    """The controls, if a tolerance can choose steps for them.
 
     Raises:
-        InputError: Noise, a control law, or an integrator that chooses its own steps.
+        InputError: The scene has noise, the controls are a law, or the integrator chooses its own steps.
     """
     if scene.processes:
         raise InputError(
@@ -89,7 +89,7 @@ def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: I
 
 
 def _intervals(policy: LinearPolicy, duration: float) -> int:
-    """How many intervals a policy has over a motion, whose steps a tolerance chooses."""
+    """The number of a policy's intervals over a motion whose steps a tolerance chooses."""
     if policy.linear:
         raise InputError("tolerance chooses dt, and a policy whose controls are linear between nodes takes it: dt=")
     if policy.period is None:
@@ -104,7 +104,7 @@ def _intervals(policy: LinearPolicy, duration: float) -> int:
 
 
 def _unmet(record: Accuracy, floor: float) -> Finding:
-    """Says that a tolerance is not met, and why."""
+    """The warning that a tolerance is not met, with the cause."""
     cause = (
         f"rounding leaves {floor:.1e}"
         if record.tolerance < floor
@@ -123,13 +123,28 @@ def steps_for_tolerance(
     v0: Floats,
     duration: float,
     tolerance: float | Accuracy,
-    asked: Controls | ControlLaw,
+    wanted: Controls | ControlLaw,
     integrator: Integrator | None,
 ) -> tuple[Integrator, int, Controls, Accuracy, tuple[Finding, ...]]:
-    """Integrator, steps and controls for a tolerance, with the estimate and what is to be said of it."""
+    """Integrator, number of steps and controls for a tolerance, with the estimated accuracy and warnings.
+
+    Args:
+        scene: The scene, without noise.
+        q0: Initial configuration (n,) [rad or m].
+        v0: Initial velocity (n,) [rad/s or m/s].
+        duration: Of the motion [s].
+        tolerance: The largest error in q [rad or m], or the accuracy of an earlier motion.
+        wanted: The controls.
+        integrator: The only one to consider; None for all.
+
+    Raises:
+        InputError: The scene, the controls or the integrator are none that a tolerance can choose steps for.
+        ToleranceError: No number of steps gives an error below 1 rad or m.
+        VarpinError: A user's function fails, or no integrator gets to the end.
+    """
     earlier = tolerance if isinstance(tolerance, Accuracy) else None
     wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
-    controls = _require_choice(scene, asked, integrator)
+    controls = _require_choice(scene, wanted, integrator)
     members = tolerance_candidates(scene, q0, v0, duration) if integrator is None else (integrator,)
     parts = 1
     given: Callable[[Integrator, int], Commands]
@@ -168,14 +183,14 @@ def steps_for_tolerance(
     first = None
     if earlier is not None:
         known = integrator_of(earlier.integrator)
-        # The user's own guard and tolerance, where the integrator is given.
+        # A given integrator keeps its own guard and solver tolerance.
         same = known if integrator is None else next((member for member in members if member.same_map(known)), None)
         if same is not None:
             first = same, earlier.dt
 
-    def finely(run: Raised) -> VarpinError:
-        """Where the function fails in small steps, and where it did if it does not there."""
-        for steps in (_FINELY * run.steps, run.steps):
+    def failure_of(run: Raised) -> VarpinError:
+        """The error with its failing step, found in smaller steps or, failing that, in those of the run."""
+        for steps in (_REFINED * run.steps, run.steps):
             commands = given(run.integrator, steps)
             found = located(scene, run.integrator, (q0, v0), commands, duration / steps, None, run.error)
             if found is not run.error:
@@ -185,7 +200,7 @@ def steps_for_tolerance(
     try:
         choice = choose(motion, members, wish, first)
     except Raised as run:
-        raise finely(run) from run.error
+        raise failure_of(run) from run.error
     record = Accuracy(
         wish,
         choice.error,
@@ -196,7 +211,7 @@ def steps_for_tolerance(
     )
     if not choice.error < SENSIBLE:
         if choice.raised is not None:
-            raise finely(choice.raised) from choice.raised.error
+            raise failure_of(choice.raised) from choice.raised.error
         raise ToleranceError(wish, duration, choice.steps, choice.error)
     found = () if record.met else (_unmet(record, choice.floor),)
     if isinstance(controls, FirstOrderHold):
