@@ -25,7 +25,7 @@ from varpin.simulation.functions import ControlLaw, require_law, undersampled
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
 from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import Record, function_error
-from varpin.simulation.soundness import Finding, announce, evident, with_warnings
+from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
 from varpin.simulation.start import on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
 from varpin.support.checks import JointValues, count, joint_array
@@ -296,7 +296,7 @@ def _checked(
     """A motion with its warnings; ``hold`` is the period of its feedback in steps, None for none."""
     if check:
         return examined_in_loop(scene, integrator, trajectory, hold)
-    found = evident(scene, integrator, trajectory)
+    found = findings_from_record(scene, integrator, trajectory)
     return with_warnings(trajectory, found), found
 
 
