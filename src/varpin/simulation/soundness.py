@@ -593,7 +593,7 @@ def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
         seen = np.zeros(steps, dtype=np.bool_)
         for begin in begins.tolist():
             seen[begin : begin + length] = True
-        begins = np.union1d(begins, blows(v, length, seen)[:1])
+        begins = np.union1d(begins, np.array(blows(v, length, seen)[:1], dtype=np.int64))
     return begins, length
 
 
