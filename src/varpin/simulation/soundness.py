@@ -542,7 +542,8 @@ def looked_again(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         if better.parts != 1:
             return Seen(False)
         other, times = better.method, 1
-    begins, length = _windows(trajectory, every=times == 2)
+    # What rings after a start or a jump may do so for long.
+    begins, length = _windows(trajectory, every=times == 2 or not (pulled or integrator.l_stable))
     commands, drift = open_loop(u[:length:times]), np.zeros((0, 0, scene.robot.dof))
     if not steady:
         # Commands are the same for all paths; their forces need not be.
