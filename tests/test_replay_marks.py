@@ -487,7 +487,7 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
     no("targets['a'][2]", "inf", targets={"a": [0.0, 0.0, np.inf]})
     no("targets['a']", "pose", targets={"a": 2.0 * np.eye(4)})
     no("targets['a']", "pose", targets={"a": np.diag([1.0, 1.0, -1.0, 1.0])})
-    no("targets['a']", "2 rows", motion=sweep[:1], targets={"a": np.zeros((2, 3))})
+    no("targets['a']", "2", motion=sweep[:1], targets={"a": np.zeros((2, 3))})
     no("torques=True", torques=True)
     no("torques", "(N, 6)", "(20, 5)", torques=np.zeros((20, 5)))
     no("torque_limit", "torques", torque_limit=1.0)
