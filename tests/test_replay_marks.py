@@ -499,7 +499,7 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
     no("ghost", "2", robot=both, motion=None, ghost=sweep)
     no("torques", "robots", robot=both, motion=None, torques=[np.ones((20, 6))])
     no("torque_limit", "torques", robot=both, motion=None, torques=False, torque_limit=1.0)
-    no("ahead", "MpcRun", ahead=0.1)
+    no("ahead", "Mpc", ahead=0.1)
     no("motion 2", "(N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
     no("motion", motion=None)
     scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"])
