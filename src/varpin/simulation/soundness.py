@@ -544,7 +544,8 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         if better.parts != 1:
             return Resolution(False)
         other, times = better.method, 1
-    begins, length = _windows(trajectory, every=times == 2)
+    # Ringing after the start or a jump may last long: windows all over the motion.
+    begins, length = _windows(trajectory, every=times == 2 or not (pulled or integrator.l_stable))
     commands, drift = open_loop(u[:length:times]), np.zeros((0, 0, scene.robot.dof))
     if not steady:
         # All paths have the same commands; their forces may differ.
@@ -595,7 +596,7 @@ def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
         seen = np.zeros(steps, dtype=np.bool_)
         for begin in begins.tolist():
             seen[begin : begin + length] = True
-        begins = np.union1d(begins, blows(v, length, seen)[:1])
+        begins = np.union1d(begins, np.array(blows(v, length, seen)[:1], dtype=np.int64))
     return begins, length
 
 
