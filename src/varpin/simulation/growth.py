@@ -1,8 +1,8 @@
-"""What errors of single steps, too small to speak of, grow to over a whole motion.
+"""Growth of small errors of single steps over a whole motion.
 
-Where a disturbance grows a thousandfold, steps that are right to five digits make a motion that is right to two. Some
-steps taken again tell what they are off by, and the fastest modes of the motion linearized at these places by how much
-that may grow. Only if both together come to something is the whole motion made again by a method of more stages.
+Where a disturbance grows a thousandfold, steps that are right to five digits make a motion that is right to two. The
+errors of some steps are estimated by repeating them, and their growth by the fastest modes of the motion linearized
+there. Only if both together give a large error is the whole motion repeated by a method of more stages.
 """
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# How what is said of it begins.
+# First words of the warning.
 SAID = "disturbances grow here"
 
-# Steps that are taken again, the fewest of a motion that is asked of, and the most joints.
+# Number of repeated steps, and the fewest steps of a motion and most joints of a robot that are examined.
 _PLACES, _LEAST, _JOINTS = 6, 40, 60
-# What is spoken of, in units of the way of the joint that goes furthest, and the part of it that is looked after.
-_SHOWS, _NEAR = 0.02, 0.3
-# The part of the fastest mode's exponent that a disturbance grows by, at most half in 60 motions of arms and chains, as
-# modes turn; and an exponent that stands for all beyond.
+# Error from which on a warning is given, as a share of the way of the joint that goes furthest; and the part of it from
+# which on the motion is repeated.
+_WARNED, _NEAR = 0.02, 0.3
+# Exponent of growth as a share of the fastest mode's: at most half in 60 motions of arms and chains, for the directions
+# of modes turn; and the largest exponent.
 _ALIGNED, _MOST = 0.5, 60.0
 
 
 class Growth(NamedTuple):
-    """What a motion is off by after errors of its steps have grown.
+    """The error of a motion after errors of its steps have grown.
 
     Attributes:
-        joint: The coordinate that is off most.
-        off: By how much [rad or m].
+        joint: The coordinate with the largest error.
+        off: The error [rad or m].
         share: The same, in units of the way of the joint that goes furthest.
-        time: From when on it is off by so much that it is spoken of [s].
-        step: What single steps are off by, at worst [rad or m].
+        time: Time from which on the error exceeds the threshold of the warning [s].
+        step: The largest error of a single step [rad or m].
     """
 
     joint: int
@@ -54,9 +55,9 @@ class Growth(NamedTuple):
 
 
 def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Growth | None:
-    """What errors of single steps grow to, if that is worth a word.
+    """The error of a motion after errors of single steps have grown, if it exceeds the threshold of the warning.
 
-    None, too, under noise and constraints, with forces in Python, and of an integrator that chooses its own steps.
+    None, too, under noise and constraints, with forces in Python, and for an integrator that chooses its own steps.
     """
     steps, n = trajectory.steps, scene.robot.dof
     hidden = scene.custom is not None or scene.constraints or trajectory.dw.any()
@@ -70,13 +71,13 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     once = other.method.motions(scene, q[at], v[at], nothing, forces[:, None], trajectory.dt)
     if once is None:
         return None
-    # Controls that change within a step do so for both, nearly.
+    # The means of controls that change within a step serve: they do nearly the same in both methods.
     in_q, in_v = np.abs(once[0][:, 0] - q[at + 1]), np.abs(once[1][:, 0] - v[at + 1])
     way = largest_of_its_kind(scene, np.ptp(q, axis=0))
     least = ROUNDING * (1.0 + np.abs(q).max())
     begins = (in_q + in_v * trajectory.dt) / np.maximum(way, least)
     length = float(trajectory.t[-1] - trajectory.t[0])
-    small = _NEAR * _SHOWS / max(steps * float(begins.max()), 1e-300)
+    small = _NEAR * _WARNED / max(steps * float(begins.max()), 1e-300)
     if small > np.exp(_MOST):
         return None
     try:
@@ -87,7 +88,7 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     fastest = np.sqrt(np.abs(aq).sum(axis=2).max(axis=1)) + np.abs(av).sum(axis=2).max(axis=1)
     if small > np.exp(min(_ALIGNED * float(np.median(fastest)) * length, _MOST)):
         return None
-    # Eigenvalues take longer than all else: at half of the places.
+    # Eigenvalues, the most expensive part, at half of the places.
     J = np.zeros((_PLACES // 2, 2 * n, 2 * n))
     J[:, range(n), range(n, 2 * n)] = 1.0
     J[:, n:, :n], J[:, n:, n:] = aq[::2], av[::2]
@@ -101,7 +102,7 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     shares = off / np.maximum(way, least)
     joint = int(shares.max(axis=0).argmax())
     share = float(shares[:, joint].max())
-    if share <= _SHOWS:
+    if share <= _WARNED:
         return None
-    first = float(trajectory.t[(shares[:, joint] > _SHOWS).argmax()])
+    first = float(trajectory.t[(shares[:, joint] > _WARNED).argmax()])
     return Growth(joint, float(off[:, joint].max()), share, first, float(in_q.max()))

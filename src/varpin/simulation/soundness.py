@@ -46,7 +46,7 @@ from varpin.simulation.damping import Fast, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.growth import SAID, grown_error
 from varpin.simulation.limits import left as limits_left
-from varpin.simulation.phase import SHOWS as PHASE_SHOWS
+from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.simulation.phase import phase_lost
 from varpin.simulation.retaking import Again, Finer, finer, stopping, taken_again
 from varpin.simulation.saturation import bent
@@ -572,7 +572,7 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     if not agree(less / _MARGIN, of_velocity):
         return Resolution(False)
     # Errors of oscillations may add up from window to window over the whole motion.
-    return Resolution(True, agree(less * PHASE_SHOWS / WRONG_MOTION * length / (_ADDS * steps), of_velocity))
+    return Resolution(True, agree(less * PHASE_WARNED / WRONG_MOTION * length / (_ADDS * steps), of_velocity))
 
 
 def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
