@@ -22,8 +22,8 @@ Floats = NDArray[np.float64]
 
 # Number of steps of the first piece; each further piece doubles the number of all steps.
 _FIRST = 32
-# Parts of a repeated step under constraints where dampers are faster than the step. With an odd number Gauss's factor on
-# modes that are far faster, 1 or -1, is that of one step.
+# Parts of a repeated step under constraints where dampers are faster than the step. With an odd number Gauss's factor
+# on modes that are far faster, 1 or -1, is that of one step.
 _DAMPED_PARTS = 7
 
 
