@@ -4,8 +4,8 @@ There are two methods. By theory: where the motion determines the law, u = K (q,
 torque if needed, the loop is linearized at the equilibrium next to the motion. With the plant's exact step under a held
 control, x' = A x + B u (Franklin, Powell and Workman 1998, section 4.3), it is stable if the spectral radius of A + B K
 is below one. By the record, for any other law: the controls do work and grow steadily, by orders of magnitude, or by
-less if they alternate or oscillate within some periods. Growth that the law would have in continuous time too, as in a
-pendulum that falls, is no warning.
+less if they oscillate within some periods. Growth that the law would have in continuous time too, as in a pendulum that
+falls, gives no warning.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ _FLIPS = "flipping controls"
 _GREW, _GROWS = 1e2, 2.0
 # Number of nodes for the fit of a law: this many with the largest changes, and as many spread over the motion.
 _NODES = 32
-# Largest error of a fit: in units of rounding, times the condition of the state (32) and in all (1e5); and in units of
-# the error with which squares of the state are fitted: on a smooth curve any function of the state can be fitted.
+# Largest error of a fit. In units of rounding: 32 times the condition of the state, at most 1e5. In units of the error
+# with which squares of the state are fitted, too: on a smooth curve any function of the state can be fitted.
 _EXACT, _TELLING = (32.0, 1e5), 1e-6
 # Least motion of the state in a direction, as a share of the largest, for the law to be known in it: over the whole
 # record, and in its last changes.
@@ -56,7 +56,7 @@ _SATURATED = 2
 # last intervals between them that are compared, and the ratio of the means of their halves below which the motion
 # calms down.
 _CYCLES, _LATE, _INTERVALS, _KEEPS = 6, 2, 8, 0.9
-# Share of positive work in a control's work, in absolute values, from which on the law pumps energy in on purpose.
+# Net work of a control, as a share of its work in absolute values, above which the law pumps energy in on purpose.
 _PUMPS = 0.7
 # Number of nodes for the fit of a clipped law.
 _CLIPPED_NODES = 400
@@ -401,11 +401,10 @@ def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Findi
         loop = _linearized(scene, law, law.near)[0]
     multiplier = loop.multiplier(period)
     growth = float(np.abs(multiplier))
-    if not (
-        growth > 1.0 + _ABOVE_ONE and len(u) * np.log(growth) > np.log(_GREW_IN_ALL) and loop.grows_by_period(period)
-    ):
+    grows = growth > 1.0 + _ABOVE_ONE and len(u) * np.log(growth) > np.log(_GREW_IN_ALL)
+    if not (grows and loop.grows_by_period(period)):
         return ()
-    # Away from an equilibrium only fast or oscillating growth, which no slow motion has.
+    # Away from an equilibrium only fast, oscillating growth: slow growth may be part of the motion.
     if not rests and (np.abs(np.angle(multiplier)) < _TURNS or growth < _FAST):
         return ()
     where = "its equilibrium q" if rests else "q"
