@@ -274,6 +274,12 @@ def test_a_spring_faster_than_the_step_needs_no_other_look_where_it_is_followed(
     assert not seen.stays or np.abs(motion.q[:, 0] - exact).max() < 0.01
 
 
+@pytest.mark.parametrize("steps", [2, 3, 8, 9])
+def test_a_motion_that_one_window_has_all_of_is_looked_at(steps):
+    scene, motion = oscillator(1.2, vp.Gauss(4), steps=steps)
+    assert looked_again(scene, vp.Gauss(4), motion).resolved
+
+
 @pytest.mark.parametrize("frozen", [{"stiffness": 3e7}, {"damping": 1e7}, {"gravity": [0.0, 0.0, -1e8]}])
 def test_what_stands_still_in_any_step_is_not_taken_for_resolved(frozen):
     """Modes far faster than the step hardly move with an even number of stages, in two steps or in one."""

@@ -29,7 +29,7 @@ SAID = "disturbances grow here"
 # Steps that are taken again, the fewest of a motion that is asked of, and the most joints.
 _PLACES, _LEAST, _JOINTS = 6, 40, 60
 # What is spoken of, in units of the way of the joint that goes furthest, and the part of it that is looked after.
-_SHOWS, _NEAR = 0.02, 0.3
+WARNED, NEAR = 0.02, 0.3
 # The part of the fastest mode's exponent that a disturbance grows by, at most half in 60 motions of arms and chains, as
 # modes turn; and an exponent that stands for all beyond.
 _ALIGNED, _MOST = 0.5, 60.0
@@ -53,17 +53,31 @@ class Growth(NamedTuple):
     step: float
 
 
+def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
+    """An estimate of the factor by which a disturbance grows over a motion, at most.
+
+    It takes the fastest mode at two places: more take longer than many a motion. 1 where :func:`grown_error` is None
+    for every motion; infinity where the linearization fails.
+    """
+    if _unexamined(scene, trajectory):
+        return 1.0
+    try:
+        slopes = _slopes(scene, trajectory, np.array([trajectory.steps // 3, 2 * trajectory.steps // 3]))
+    except LinearizationError:
+        return np.inf
+    return _factor(float(_modes(*slopes).max()), trajectory)
+
+
 def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Growth | None:
     """What errors of single steps grow to, if that is worth a word.
 
     None, too, under noise and constraints, with forces in Python, and of an integrator that chooses its own steps.
     """
-    steps, n = trajectory.steps, scene.robot.dof
-    hidden = scene.custom is not None or scene.constraints or trajectory.dw.any()
-    if hidden or isinstance(integrator, Reference) or n > _JOINTS or steps < _LEAST:
+    if isinstance(integrator, Reference) or _unexamined(scene, trajectory):
         return None
+    steps = trajectory.steps
     other = finer(integrator, trajectory, damped=False, pulled=False)
-    at = np.linspace(0, steps - 1, _PLACES + 2).astype(np.int64)[1:-1]
+    at = _places(trajectory)
     q, v = trajectory.q, trajectory.v
     forces = np.ascontiguousarray(trajectory.u[at] @ scene.actuation.T)
     nothing = open_loop(np.zeros((1, scene.controls)))
@@ -75,24 +89,18 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     way = largest_of_its_kind(scene, np.ptp(q, axis=0))
     least = ROUNDING * (1.0 + np.abs(q).max())
     begins = (in_q + in_v * trajectory.dt) / np.maximum(way, least)
-    length = float(trajectory.t[-1] - trajectory.t[0])
-    small = _NEAR * _SHOWS / max(steps * float(begins.max()), 1e-300)
+    small = NEAR * WARNED / max(steps * float(begins.max()), 1e-300)
     if small > np.exp(_MOST):
         return None
     try:
-        _, aq, av, _ = accelerations(scene, q[at], v[at], forces)
+        slopes = _slopes(scene, trajectory, at)
     except LinearizationError:
         return None
-    # No mode is faster than this.
-    fastest = np.sqrt(np.abs(aq).sum(axis=2).max(axis=1)) + np.abs(av).sum(axis=2).max(axis=1)
-    if small > np.exp(min(_ALIGNED * float(np.median(fastest)) * length, _MOST)):
-        return None
     # Eigenvalues take longer than all else: at half of the places.
-    J = np.zeros((_PLACES // 2, 2 * n, 2 * n))
-    J[:, range(n), range(n, 2 * n)] = 1.0
-    J[:, n:, :n], J[:, n:, n:] = aq[::2], av[::2]
-    rate = float(np.median(np.linalg.eigvals(J).real.max(axis=1)))
-    if small > np.exp(min(_ALIGNED * rate * length, _MOST)):
+    aq, av = slopes
+    if small > _factor(_largest_rate(aq, av), trajectory):
+        return None
+    if small > _factor(float(np.median(_modes(aq[::2], av[::2]))), trajectory):
         return None
     again = taken_again(scene, other.method, trajectory, integrator.stage_times, 0, steps, other.parts)
     if again is None:
@@ -101,7 +109,51 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     shares = off / np.maximum(way, least)
     joint = int(shares.max(axis=0).argmax())
     share = float(shares[:, joint].max())
-    if share <= _SHOWS:
+    if share <= WARNED:
         return None
-    first = float(trajectory.t[(shares[:, joint] > _SHOWS).argmax()])
+    first = float(trajectory.t[(shares[:, joint] > WARNED).argmax()])
     return Growth(joint, float(off[:, joint].max()), share, first, float(in_q.max()))
+
+
+def _unexamined(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether growth is not examined: under noise, constraints or Python forces, and for few steps or many joints."""
+    hidden = scene.custom is not None or scene.constraints or trajectory.dw.any()
+    return bool(hidden or scene.robot.dof > _JOINTS or trajectory.steps < _LEAST)
+
+
+def _places(trajectory: Trajectory) -> NDArray[np.int64]:
+    """Nodes of the motion at which it is linearized."""
+    return np.linspace(0, trajectory.steps - 1, _PLACES + 2).astype(np.int64)[1:-1]
+
+
+def _slopes(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Derivatives of the accelerations in q and in v (K, n, n).
+
+    Raises:
+        LinearizationError: There are none.
+    """
+    forces = np.ascontiguousarray(trajectory.u[at] @ scene.actuation.T)
+    _, aq, av, _ = accelerations(scene, trajectory.q[at], trajectory.v[at], forces)
+    return aq, av
+
+
+def _largest_rate(aq: Floats, av: Floats) -> float:
+    """A bound of the rates of all modes [1/s], from norms of the linearized accelerations."""
+    by_q, by_v = (np.abs(slope).sum(axis=2).max(axis=1) for slope in (aq, av))
+    return float(np.median(np.sqrt(by_q) + by_v))
+
+
+def _modes(aq: Floats, av: Floats) -> Floats:
+    """The rate at which the fastest mode of the linearized accelerations grows at each place (K,) [1/s]."""
+    n = aq.shape[1]
+    J = np.zeros((len(aq), 2 * n, 2 * n))
+    J[:, range(n), range(n, 2 * n)] = 1.0
+    J[:, n:, :n], J[:, n:, n:] = aq, av
+    rates: Floats = np.linalg.eigvals(J).real.max(axis=1)
+    return rates
+
+
+def _factor(rate: float, trajectory: Trajectory) -> float:
+    """The factor by which a disturbance grows over a motion whose fastest mode has this rate [1/s]."""
+    length = float(trajectory.t[-1] - trajectory.t[0])
+    return float(np.exp(min(_ALIGNED * rate * length, _MOST)))

@@ -44,7 +44,8 @@ from varpin.simulation.accuracy import (
 from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.damping import Fast, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
-from varpin.simulation.growth import SAID, grown_error
+from varpin.simulation.growth import NEAR, SAID, grown_error, growth_bound
+from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import SHOWS as PHASE_SHOWS
 from varpin.simulation.phase import phase_lost
@@ -227,7 +228,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     unsettled = _unsettled(scene, integrator, trajectory)
     seen = looked_again(scene, integrator, trajectory)
     if seen.resolved:
-        more = () if found else _adding_up(scene, integrator, trajectory, stays=seen.stays)
+        more = () if found else _adding_up(scene, integrator, trajectory, seen)
         return (*found, *more, *unsettled)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and spoken_of(error):
@@ -255,7 +256,7 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     if scene.constraints and not found:
         found.extend(_not_told(scene, integrator, trajectory))
     if not found:
-        found.extend(_adding_up(scene, integrator, trajectory, stays=False))
+        found.extend(_adding_up(scene, integrator, trajectory, Seen(False)))
     return (*found, *(finding for finding in unsettled if finding.kind not in {other.kind for other in found}))
 
 
@@ -267,11 +268,11 @@ def _not_told(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> t
     return (_ringing(scene, fast, trajectory.dt),) if trajectory.dt * fast.rate > resolves else ()
 
 
-def _adding_up(scene: Scene, integrator: Integrator, trajectory: Trajectory, *, stays: bool) -> tuple[Finding, ...]:
-    """Says what adds up over a motion that steps resolve from period to period; oscillations whose phase ``stays``."""
-    phase = () if stays else _out_of_phase(scene, integrator, trajectory)
+def _adding_up(scene: Scene, integrator: Integrator, trajectory: Trajectory, seen: Seen) -> tuple[Finding, ...]:
+    """Warnings about errors that add up or grow over a motion whose steps resolve each period."""
+    phase = () if seen.stays else _out_of_phase(scene, integrator, trajectory)
     found = (*phase, *_at_limits_of_drives(scene, integrator, trajectory))
-    return found or _growing(scene, integrator, trajectory)
+    return found or (() if seen.predictable else _growing(scene, integrator, trajectory))
 
 
 def _growing(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -498,10 +499,12 @@ class Seen(NamedTuple):
         resolved: Whether even steps of twice the length, or those of a better method, make the same motion, so that
             there is nothing more to look for over a period.
         stays: Whether errors are so small that over the whole motion, too, they do not add up to a word.
+        predictable: Whether they stay below the threshold of a warning even if they grow as the fastest mode does.
     """
 
     resolved: bool
     stays: bool = False
+    predictable: bool = False
 
 
 def looked_again(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Seen:
@@ -537,7 +540,8 @@ def looked_again(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         if better.parts != 1:
             return Seen(False)
         other, times = better.method, 1
-    begins, length = _windows(trajectory, every=times == 2)
+    # What rings after a start or a jump may do so for long.
+    begins, length = _windows(trajectory, every=times == 2 or not (pulled or integrator.l_stable))
     commands, drift = open_loop(u[:length:times]), np.zeros((0, 0, scene.robot.dof))
     if not steady:
         # Commands are the same for all paths; their forces need not be.
@@ -564,7 +568,11 @@ def looked_again(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     if not agree(less / _MARGIN, of_velocity):
         return Seen(False)
     # A whole motion is so many windows long, and errors of oscillations may add up from each to the next.
-    return Seen(True, agree(less * PHASE_SHOWS / WRONG_MOTION * length / (_ADDS * steps), of_velocity))
+    windows = length / steps
+    stays = agree(less * PHASE_SHOWS / WRONG_MOTION * windows / _ADDS, of_velocity)
+    most = less * NEAR * GROWTH_WARNED / WRONG_MOTION * windows
+    predictable = stays and agree(most / growth_bound(scene, trajectory), of_velocity)
+    return Seen(True, stays, predictable)
 
 
 def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
@@ -588,7 +596,7 @@ def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
         seen = np.zeros(steps, dtype=np.bool_)
         for begin in begins.tolist():
             seen[begin : begin + length] = True
-        begins = np.union1d(begins, blows(v, length, seen)[:1])
+        begins = np.union1d(begins, np.array(blows(v, length, seen)[:1], dtype=np.int64))
     return begins, length
 
 
