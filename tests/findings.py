@@ -16,7 +16,7 @@ MARKS = {
     "restless plan": "goes up and down",
     "unstable loop": "control loop",
     "period too long": "too fast for its period",
-    "replay": "cannot be played again",
+    "replay": "cannot be replayed",
     "between nodes": "between nodes",
     "noise left out": "least cost without noise",
 }

@@ -177,7 +177,7 @@ def test_a_cost_that_fails_off_the_plan_is_told():
     cost = vp.CustomCost(picky) + vp.ControlCost(0.1)
     problem = vp.OptimalControlProblem(vp.Scene(vp.planar_chain(1)), cost, [0.1], [0.0], dt=0.01, steps=20)
     plan = vp.solve(problem, max_iterations=2)
-    assert any("cannot be played again" in sentence and "too many" in sentence for sentence in plan.warnings)
+    assert any("cannot be replayed" in sentence and "too many" in sentence for sentence in plan.warnings)
 
 
 def test_ctrl_c_ends_the_look_and_not_the_plan(monkeypatch):
@@ -187,7 +187,7 @@ def test_ctrl_c_ends_the_look_and_not_the_plan(monkeypatch):
     monkeypatch.setattr("varpin.control.examination.replayed", stop)
     plan = vp.solve(reach(vp.planar_chain(2), 3, steps=10, dt=0.05))
     assert plan.status.converged
-    assert "interrupted before the plan was played again" in plan.warnings[0]
+    assert "interrupted before the plan was replayed" in plan.warnings[0]
 
 
 def test_warnings_go_through_files(tmp_path, load):

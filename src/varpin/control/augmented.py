@@ -1,7 +1,7 @@
-"""Hard constraints around S-DDP: the augmented Lagrangian, round by round, and a last step onto the constraints.
+"""Hard constraints by rounds of an augmented Lagrangian around S-DDP, and a last step onto the constraints.
 
-Equations (P1) and (P3) of docs/plan-constraints.md: the multipliers' update is :meth:`Penalty.updated`, which
-:meth:`_Rounds._kept` calls, and that of the penalties' weights is in :meth:`_Rounds._ended_or_next`.
+Equations (P1) and (P3) of docs/plan-constraints.md: :meth:`Penalty.updated`, called by :meth:`_Rounds._kept`, updates
+the multipliers, and :meth:`_Rounds._ended_or_next` the penalties' weights.
 
 After Howell, Jackson and Manchester, "ALTRO: a fast solver for constrained trajectory optimization" (2019).
 """
@@ -42,31 +42,31 @@ P = ParamSpec("P")
 
 logger = logging.getLogger(__name__)
 
-# Of all rounds together, where it is left to the solver.
+# Default number of iterations over all rounds.
 _MOST_ITERATIONS = 5 * ITERATIONS
-# Of a round; the next one has better multipliers.
+# Greatest number of iterations in a round, and of rounds.
 _OF_ROUND = 40
 _ROUNDS = 40
-# Tolerance of the search in the first round, and what each round leaves of it.
+# Tolerance of the search in the first round, and its factor from round to round.
 _LOOSE, _TIGHTER = 1e-3, 0.1
-# Of the tolerance, what the last round takes, and what a round may take that has nothing else to go by.
+# Tolerance of the last round, relative to the given one, and the least tolerance of a round whose search did nothing.
 _FINAL, _FINEST = 1e-2, 1e-7
-# A penalty grows by this factor after a round that leaves more than this part of its constraint's violation.
+# A penalty's weight grows by _GROWTH after a round that leaves more than _ENOUGH of its constraint's violation.
 _GROWTH, _ENOUGH = 10.0, 0.2
-# Beyond this part of its first weight a penalty drowns the cost in rounding.
+# Greatest weight of a penalty, relative to its first one: rounding errors of a heavier penalty exceed the cost.
 _HEAVIEST = 1e9
-# Rounds in which margins follow the plan, and the part of a margin that may still change when they rest.
+# Rounds in which margins are updated, and the relative change below which they have settled.
 _MOVING, _SETTLED = 12, 1e-3
-# A violation that so many rounds in a row leave at more than this part of itself, while penalties grow, will stay.
+# A plan is infeasible when _STUCK rounds in a row have left more than _LOWERED of the worst violation.
 _STUCK, _LOWERED = 3, 0.9
-# What penalties are to bring the violation to; the last step does the rest.
+# Violation at which penalties stop growing; the last step removes the rest.
 _AIM = 1e-8
 
 
 def within_constraints(search: Callable[P, Solution]) -> Callable[P, Solution]:
-    """``search``, which solves problems without constraints, made to solve those with them, too.
+    """Extend ``search``, which solves problems without constraints, to problems with constraints.
 
-    It keeps its signature: its first argument is the problem, and its others are options of each round.
+    The signature stays: the first argument is the problem, and the others are options of each round.
     """
     signature = inspect.signature(search)
 
@@ -88,7 +88,7 @@ def within_constraints(search: Callable[P, Solution]) -> Callable[P, Solution]:
 def _to_true_cost(
     problem: OptimalControlProblem, search: Callable[..., Solution], options: dict[str, Any], wish: float
 ) -> Solution:
-    """Rounds on finer and finer grids, each from the plan before, until its true cost is within the wish."""
+    """Rounds on finer and finer grids, each from the plan before, until the true cost is accurate to ``wish``."""
     if options.get("resume") is not None:
         raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
     deadline = time.perf_counter() + checked_time(options.get("time_limit", np.inf))
@@ -107,7 +107,7 @@ def _to_true_cost(
 
 @dataclass
 class _State:
-    """Where the rounds stand before one of them; as :class:`Multipliers`."""
+    """The state before a round; see :class:`Multipliers` for its attributes."""
 
     multipliers: list[Floats]
     weights: Floats
@@ -143,10 +143,10 @@ class _Rounds:
 
     def run(self) -> Solution:
         began = time.perf_counter()
-        # Options are looked at, and the first motion made, by a search that does nothing more.
+        # A search without iterations checks the options and makes the first motion.
         first = self._first()
         if self.check:
-            # Now, as the search of a plan that there may not be takes long.
+            # Before the search, which takes long where there is no plan.
             announce(logger, self.problem.scene, self.problem.dt, foreseen(self.problem))
         last = len(self.history) + self.most
         found, resume = first, self._resumed_search()
@@ -211,7 +211,7 @@ class _Rounds:
         return first
 
     def _take_up(self, resumed: object) -> Solution:
-        """Stand where a solution was made."""
+        """Continue from the state of a solution."""
         if not isinstance(resumed, Solution):
             raise InputError(f"resume must be a Solution, got {type(resumed).__name__}")
         if self.controls is not None:
@@ -238,7 +238,7 @@ class _Rounds:
         return resumed
 
     def _resumed_search(self) -> Solution | None:
-        """The solution that the round goes on from, its history that of the round alone."""
+        """The resumed solution, with the history of its last round only."""
         resumed = self.resumed
         if resumed is None or resumed.search is None or resumed.multipliers is None:
             return None
@@ -253,7 +253,7 @@ class _Rounds:
             self.progress(min(item.index + 1, last), last)
 
     def _kept(self, found: Solution, problem: PenalizedProblem, begun: _State, known: int) -> Solution:
-        """What a round has found, as a solution of the problem with its constraints."""
+        """The result of a round as a solution of the constrained problem, with updated multipliers."""
         motion = found.trajectory
         values = [
             part.updated(item.value(motion.q, motion.v, motion.u))
@@ -288,7 +288,7 @@ class _Rounds:
         )
 
     def _ended_or_next(self, kept: Solution, begun: _State, found: Solution, last: int) -> tuple[Status | None, str]:
-        """How the rounds end, if they do; else the next one gets its multipliers and penalties, (P3)."""
+        """Status and reason if the rounds end; else update multipliers and weights for the next round, (P3)."""
         known = kept.multipliers
         assert known is not None
         told = reports(self.problem, kept.trajectory, known)
@@ -314,7 +314,7 @@ class _Rounds:
         if out:
             return Status.MAX_ITERATIONS, f"{found.reason}; {state}"
         if found.iterations == 0 and begun.round > 0 and not feasible and begun.tolerance > _FINEST * self.tolerance:
-            # What is left to gain is below the tolerance of the search: a motion that stays teaches nothing.
+            # The search has not moved, so the multipliers would not improve: repeat the round with a smaller tolerance.
             self.state = replace(begun, tolerance=_TIGHTER * begun.tolerance, round=begun.round + 1, backoff=backoff)
             return None, ""
         stays = worst.violation > max(FEASIBLE, _LOWERED * float(begun.worst.max()))
@@ -332,7 +332,7 @@ class _Rounds:
             first_weights=begun.first_weights,
             backoff=backoff,
             worst=violation,
-            # While a violation stays, whether it falls at all is to be found out, and not the optimum to many digits.
+            # An accurate optimum is of no use while the violation does not decrease.
             tolerance=begun.tolerance if exact or stays else max(_FINAL * self.tolerance, _TIGHTER * begun.tolerance),
             round=begun.round + 1,
             stuck=stuck,
@@ -340,7 +340,7 @@ class _Rounds:
         return None, ""
 
     def _polished(self, kept: Solution, problem: PenalizedProblem) -> tuple[Solution, str]:
-        """The plan brought onto its constraints, with the gains that belong to it, and what is left in words."""
+        """The plan moved onto its constraints, with matching gains, and the remaining violation in words."""
         known = kept.multipliers
         assert known is not None
         motion = onto_constraints(self.problem, kept, split(self.bound, known.values), split(self.bound, known.backoff))
@@ -348,7 +348,7 @@ class _Rounds:
         return plan, f"constraints hold to {plan.violation:.1e}"
 
     def _along(self, kept: Solution, motion: Trajectory, problem: PenalizedProblem) -> Solution:
-        """The plan with another motion, next to its own, and what a backward pass finds there."""
+        """The plan with a neighbouring motion and the results of a backward pass along it."""
         moved = replace(kept, trajectory=motion, cost=self.problem.cost_of(motion))
         try:
             found = backward(problem, motion, 0.0)
@@ -367,10 +367,10 @@ class _Rounds:
         )
 
     def _steady(self, kept: Solution) -> Solution:
-        """The plan with the feedback that it has under noise: that of its cost and of its goals alone.
+        """Under noise, the plan with the feedback of its cost and of its equality constraints only.
 
-        Penalties of bounds would make it as stiff at them as in the last round, and not at all beside them; the margin
-        stands in their place.
+        The penalty of an inequality would make the feedback stiff at its bound and leave it soft elsewhere. The margin
+        takes its place.
         """
         if not self.problem.scene.processes:
             return kept
@@ -390,7 +390,7 @@ class _Rounds:
         return replace(kept, gains=found.feedback, previous_gains=found.previous, noise_cost=found.noise)
 
     def _backoff(self, kept: Solution) -> list[Floats]:
-        """What margins come to around a plan."""
+        """The margins of all constraints around a plan, in their units."""
         return [
             item.source.margin * deviations(self.problem, kept, item)
             if item.source.margin > 0.0

@@ -1,4 +1,4 @@
-"""Costs as descent sees them: their differences, digit by digit, and how much of them is at stake.
+"""Rounding errors of cost differences, and the cost at stake, for the stopping criteria.
 
 Equation (O9) of docs/mathematics.md.
 """
@@ -17,21 +17,21 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
-# Rounding errors of costs and states, in units of the last digit: functions are evaluated and steps solved with some.
+# Rounding errors of costs and states, in units of the last digit.
 _ROUNDED = 16.0
 
 
 def rounding(
     problem: OptimalControlProblem, trajectory: Trajectory, here: Floats, there: Floats, model: Model
 ) -> float:
-    """What rounding alone may do to the difference between the cost of a motion and that of one next to it.
+    """Rounding error of the difference between the costs of two neighbouring motions.
 
     Args:
         problem: The problem.
-        trajectory: The motion.
+        trajectory: The first motion.
         here: Its shares.
-        there: The other's.
-        model: The quadratic model of the cost along the motion.
+        there: The shares of the other motion.
+        model: The quadratic model of the cost along the first motion.
     """
     moved = here != there
     values = np.abs(here[moved]).sum() + np.abs(there[moved]).sum()
@@ -47,8 +47,8 @@ class Model:
     """The quadratic model of a cost along a motion.
 
     Attributes:
-        running: At its samples, in (q, v, u).
-        terminal: At its end, in (q, v).
+        running: Expansion at the samples, in (q, v, u).
+        terminal: Expansion at the end, in (q, v).
     """
 
     running: Expansion
@@ -57,13 +57,13 @@ class Model:
 
 @dataclass(frozen=True)
 class Stake:
-    """How much of a cost is at stake, whatever constants there are in it.
+    """The cost at stake along a motion, without constants.
 
     Attributes:
-        free: What the cost would lose by its quadratic models along the motion if each state and control were free;
-            infinite where a model has no minimum. Zero where nothing can be better.
-        moved: The same, but from each model no more than it changes by over the motion's own displacement: states far
-            beyond what moves at all do not count. A tolerance is relative to it.
+        free: Decrease of the cost's quadratic models along the motion if each state and control were free; infinite
+            where a model has no minimum, zero where the cost is least.
+        moved: The same, with each model's decrease bounded by its change over the motion's displacement, so that
+            unreachable states do not count. Tolerances are relative to it.
     """
 
     free: float
@@ -71,10 +71,9 @@ class Stake:
 
 
 def at_stake(problem: OptimalControlProblem, trajectory: Trajectory, model: Model) -> Stake:
-    """How much of the cost of a motion is at stake.
+    """The cost at stake along a motion, (O9).
 
-    A squared distance is all at stake, as long as motion can change it: the stake of bundled costs is about their
-    value. A constant is not; nor is what noise adds.
+    For squared distances that the motion can change it is about their value. Constants and the noise cost do not count.
     """
     weight = problem.dt * float(problem.rule[0, 0])
     along, end = _variables(problem, trajectory)
@@ -106,9 +105,9 @@ def _forms(hessian: Floats, z: Floats) -> Floats:
 
 
 def _falls(expansion: Expansion) -> Floats:
-    """What the quadratic model of each point falls by along its steepest descent, in units of its own curvatures.
+    """Decrease of each point's quadratic model along its steepest descent, scaled by the diagonal of its Hessian.
 
-    That is all where no two variables are coupled. Infinite where the model falls without end.
+    It is the total decrease where no variables are coupled, and infinite where the model is unbounded below.
     """
     gradient, hessian = expansion.gradient, expansion.hessian
     diagonal = np.diagonal(hessian, axis1=1, axis2=2)

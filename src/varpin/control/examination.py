@@ -1,4 +1,4 @@
-"""The look that is taken at a finished plan: does the robot do, at finer steps, what the plan promises?"""
+"""Checks of a finished plan: its cost in finer steps, its velocities and its constraints between nodes."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-# Parts of a step in which a plan is played again.
+# Parts of a step in which a plan is replayed.
 PARTS = 4
-# Of a plan's cost, what a robot may pay above it, and below it, without a word.
+# Greatest relative excess of the replay's cost over the plan's, and shortfall, without a warning.
 LOSS, GAIN = 1e-3, 1e-2
-# Findings about single steps; what they come to over a whole plan, playing it again tells.
+# Kinds of findings about single steps; their effect on the whole plan is measured by the replay.
 _OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
-# Of its cost, what a search that stalls may still promise without a word.
+# Greatest expected decrease of a stalled search, relative to its cost, without a warning.
 _LITTLE = 1e-3
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What a plan costs beyond its promise when its steps are taken in parts, relative to its cost.
+    """Excess cost of a plan replayed in parts of its steps, relative to its cost.
 
-    NaN where the motion cannot go on, or has no cost.
+    NaN where the motion fails or its cost is not finite.
 
     Attributes:
-        alone: With its controls alone.
-        feedback: With its feedback, at the plan's own rate.
+        alone: With the controls alone.
+        feedback: With feedback at the plan's own rate.
     """
 
     alone: float
@@ -54,26 +54,26 @@ class Replay:
 
     @property
     def holds(self) -> bool:
-        """Whether the plan with its feedback costs what it promises."""
+        """Whether the replay with feedback costs about as much as the plan."""
         return -GAIN <= self.feedback <= LOSS
 
 
 def looked_at(solution: Solution) -> tuple[Solution, tuple[Finding, ...]]:
-    """The solution with its warnings, which the log has once for a scene and a time step; and what was found.
+    """Check a solution: returns it with its warnings, and the findings.
 
-    Ctrl-C ends the look and not the plan.
+    The log has each warning once for a scene and a time step. Ctrl-C ends the checks and keeps the plan.
     """
     try:
         found = findings(solution)
     except KeyboardInterrupt:
-        found = (Finding("interrupted", "interrupted before the plan was played again: what it is worth is not known"),)
+        found = (Finding("interrupted", "interrupted before the plan was replayed: its accuracy is not known"),)
     problem = solution.problem
     announce(logger, problem.scene, problem.dt, found)
     return replace(solution, warnings=tuple(finding.sentence for finding in found)), found
 
 
 def findings(solution: Solution) -> tuple[Finding, ...]:
-    """What is to be said of a plan: its energy, its velocities if they are restless, and what the robot makes of it."""
+    """Findings about a plan: its energy balance, velocities, constraints, convergence and cost in finer steps."""
     problem, motion = solution.problem, solution.trajectory
     _, found = examined(problem.scene, problem.integrator, motion)
     told = [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
@@ -90,39 +90,39 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
         replay = replayed(solution)
     except VarpinError as error:
         steps = f"{1.0 / PARTS:g} dt"
-        return *told, Finding("replay", f"the plan cannot be played again in steps of {steps}: {error}")
+        return *told, Finding("replay", f"the plan cannot be replayed in steps of {steps}: {error}")
     if replay.holds:
         return tuple(told)
     told.append(Finding("replay", _sentence(problem, replay)))
     reasons = [finding for finding in found if finding.kind in _OF_STEPS]
-    # What is no fault of the motion may be one of the plan.
+    # Findings about steps that are negligible for the motion may explain the plan's loss.
     record = findings_from_record(problem.scene, problem.integrator, motion)
     return *told, *(reasons or [finding for finding in record if finding.kind in _OF_STEPS])
 
 
 def replayed(solution: Solution) -> Replay:
-    """Play a plan again, without noise and under the same held controls, in steps of a quarter of its own.
+    """Replay a plan in a quarter of its step, without noise and under the same held controls.
 
-    The integrator is the plan's: what it has wrong at dt it has less wrong at a quarter of that, by its order. Costs
-    are integrated by Simpson's rule. :meth:`Solution.verify` tells the same to many digits, for more time.
+    The integrator is the plan's, whose error decreases with its order. Costs are integrated by Simpson's rule.
+    :meth:`Solution.verify` does the same to many digits, in more time.
 
     Raises:
-        VarpinError: A cost or a noise field of one's own fails off the plan.
+        VarpinError: A custom cost or noise field fails off the plan.
     """
     problem = solution.problem
     first = np.inf if solution.search is None else abs(solution.search.first)
-    # Where the optimum costs nothing, there is nothing to be relative to but where the search began.
+    # Where the optimum costs nothing, the excess is relative to the cost at stake at the beginning.
     base = abs(solution.cost) + (1e-9 * first if np.isfinite(first) else 0.0)
     ways = _in_parts(solution)
     costs = [accurate_cost(problem, commands, PARTS, integrator=problem.integrator)[0] for commands in ways]
-    # What the quarters still have wrong themselves.
+    # Richardson's correction for the error of the quarter steps.
     whole = 1.0 - float(PARTS) ** -problem.integrator.order
     lost = [0.0 if cost == solution.cost else (cost - solution.cost) / (whole * (base or 1.0)) for cost in costs]
     return Replay(*lost)
 
 
 def _in_parts(solution: Solution) -> tuple[Commands, Commands]:
-    """A plan's controls alone, and with its feedback, for parts of its steps."""
+    """Commands in parts of the plan's steps: the controls alone, and with feedback."""
     problem = solution.problem
     variational, times = problem.integrator.variational, problem.integrator.stage_times
     alone = open_line(solution.controls, times) if problem.linear else open_loop(solution.controls)
@@ -147,22 +147,22 @@ def _alternating(solution: Solution) -> list[Finding]:
 
 
 def _unfinished(solution: Solution) -> list[Finding]:
-    """Says if the search ended without a plan that it could call the best."""
+    """A finding if the search ended before it converged."""
     history = solution.history
-    # Who asks for few iterations knows that there were few.
+    # No warning where the user asked for few iterations.
     cut = solution.status is Status.MAX_ITERATIONS and len(history) >= ITERATIONS
     ended = solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE)
     if not (cut or ended) or not history:
         return []
     promised = history[-1].expected_decrease
-    # What promises next to nothing is as good as the best.
+    # With a negligible expected decrease the plan is as good as converged.
     if solution.status is Status.STALLED and promised <= _LITTLE * abs(solution.cost):
         return []
     return [Finding("not converged", f"the search ended before it converged: {solution.reason}")]
 
 
 def _at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
-    """Rows of an inequality of states at the start, which no plan can change; None for other constraints."""
+    """Rows of a state inequality at the fixed start; None for other constraints."""
     if bound.of_controls or bound.source.equality:
         return None
     q, v = (np.tile(state, (problem.steps + 1, 1)) for state in (problem.q0, problem.v0))
@@ -171,12 +171,12 @@ def _at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats 
 
 
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
-    """What is wrong with a problem's constraints before any search."""
+    """Findings about a problem's constraints before any search."""
     return [*starts_outside(problem), *hints(problem)]
 
 
 def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
-    """Says where the start violates a constraint, which the first step is then to make good."""
+    """Findings about constraints that the start violates, so that the first step has to satisfy them."""
     found = []
     for bound in problem.bound_constraints:
         c = _at_start(problem, bound)
@@ -195,9 +195,9 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
 
 
 def _noise_left_out(solution: Solution) -> list[Finding]:
-    """Says if a plan within constraints might have less noise elsewhere, for its search leaves noise out; or has none.
+    """Findings about noise in plans with constraints: a search that leaves it out, or a margin without noise.
 
-    Noise of constant strength adds the same to all.
+    Noise of constant strength adds the same cost to all motions.
     """
     problem = solution.problem
     if not problem.scene.processes:
@@ -206,7 +206,7 @@ def _noise_left_out(solution: Solution) -> list[Finding]:
         return [
             Finding(
                 "margin without noise",
-                "a constraint has a margin=, and the scene no noise that it could keep away from: the margin is zero",
+                "a constraint has a margin=, but the scene has no noise: the margin is zero",
             )
         ]
     if not (problem.constraints and problem.steered.any()):
@@ -214,20 +214,20 @@ def _noise_left_out(solution: Solution) -> list[Finding]:
     return [
         Finding(
             "noise left out",
-            "within constraints the motion is that of least cost without noise. The strength of this noise depends on "
-            f"the motion, and what it adds to the cost, {solution.noise_cost:.4g}, may be less along another one: "
-            "without constraints=, solve lowers it, too",
+            "with constraints the motion is that of least cost without noise. The strength of this noise depends on "
+            f"the motion, and the noise cost, {solution.noise_cost:.4g}, may be less along another one: without "
+            "constraints=, solve lowers it, too",
         )
     ]
 
 
 def _between(solution: Solution) -> list[Finding]:
-    """Says where constraints that hold at the nodes are violated between them, in parts of a step."""
+    """Findings about constraints that hold at the nodes and are violated between them."""
     problem = solution.problem
     if not problem.constraints or solution.violation > FEASIBLE:
         return []
     dt = problem.dt / PARTS
-    # Of an unstable motion the controls alone, in parts of steps, leave the nodes; feedback that is too fast does, too.
+    # In parts of steps the controls alone may leave an unstable motion, and so may a feedback that is too fast.
     kept, least = None, np.inf
     for commands in _in_parts(solution):
         motion, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, dt)
@@ -244,13 +244,13 @@ def _between(solution: Solution) -> list[Finding]:
         if bound.of_controls or bound.source.equality:
             continue
         c = bound.value(motion.q, motion.v, motion.u)
-        # Of what margins add, that of the node before.
+        # The margin is that of the plan's node at the end of the step.
         c = c + (
             record.values - whole.value(solution.trajectory.q, solution.trajectory.v, solution.trajectory.u)
         ).repeat(PARTS, axis=0)
         outside = _at_start(problem, whole)
         if outside is not None:
-            # What begins outside is so until the first node.
+            # A row violated at the start is so until the first node.
             c[: PARTS - 1, outside > 0.0] = -np.inf
         place, row = np.unravel_index(int(np.argmax(c)), c.shape)
         if c[place, row] > TOLD * bound.scale:
@@ -266,9 +266,9 @@ def _between(solution: Solution) -> list[Finding]:
 
 
 def _restless(solution: Solution) -> list[Finding]:
-    """Says if a velocity goes up and down all the time: what costs hardly weigh, an optimum makes use of."""
+    """A finding if a velocity oscillates, as it does at an optimum where the cost hardly weighs it."""
     problem = solution.problem
-    # Between decisions a velocity does what held controls leave it to.
+    # Velocities at the decisions: between them the controls are held.
     decided = solution.trajectory.v[:: problem.hold]
     found = restlessness(decided)
     if found is None:
@@ -277,9 +277,9 @@ def _restless(solution: Solution) -> list[Finding]:
     return [
         Finding(
             _RESTLESS,
-            f"the velocity of {name} goes up and down {found.changes} times in {len(decided) - 1} decisions: where "
-            "the task does not ask for it, the cost hardly weighs it; a running VelocityCost, even a small one, or a "
-            "larger one calms it",
+            f"the velocity of {name} goes up and down {found.changes} times in {len(decided) - 1} decisions: if the "
+            "task does not require that, the cost hardly weighs it; a small running VelocityCost, or a larger one, "
+            "calms it",
             found.joint,
         )
     ]
@@ -290,24 +290,22 @@ def _usual(problem: OptimalControlProblem) -> Integrator:
 
 
 def _sentence(problem: OptimalControlProblem, replay: Replay) -> str:
-    """What a plan loses in finer steps, why, and what to change."""
+    """A plan's loss in finer steps, its reason, and what to change."""
     fed, alone = (percent(part) if np.isfinite(part) else "runs away" for part in (replay.feedback, replay.alone))
     dt = f"{problem.dt / PARTS:g}"
     finer = f"problem.at(dt={dt}, hold={problem.hold * PARTS}) decides as often in finer steps"
     if problem.linear or problem.scene.inputs:
-        # Where joints are moved by hand, decisions are not held over several steps.
+        # Kinematic inputs cannot be held over several steps.
         finer = f"problem.at(dt={dt}) has finer steps"
     if -GAIN <= replay.alone <= LOSS:
         why = f"the feedback is too fast for the step; {finer}, and a greater weight on the controls slows it"
     elif problem.sampling != "gauss":
-        why = (
-            f"costs sampled by the rule {problem.sampling!r} miss what happens within steps; sampling='gauss' does not"
-        )
+        why = f"costs sampled by the rule {problem.sampling!r} miss motion within steps; sampling='gauss' does not"
     elif problem.integrator.order < _usual(problem).order:
         why = f"{problem.integrator} is too coarse; {_usual(problem)}, the default, is closer, and {finer}"
     else:
-        why = f"what is fast here is not resolved; {finer}"
+        why = f"the steps do not resolve fast motion; {finer}"
     return (
-        f"in quarters of dt = {problem.dt:g} s the plan costs other than planned, with feedback {fed}, "
+        f"in quarters of dt = {problem.dt:g} s the plan costs other than planned: with feedback {fed}, "
         f"with its controls alone {alone}: {why}"
     )

@@ -1,4 +1,4 @@
-"""What can be said of a problem's constraints without a search: that no motion meets them, or units are mixed up."""
+"""Findings about a problem's constraints before any search: infeasible ones, and values in wrong units."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from varpin.simulation.soundness import Finding
 
 Floats = NDArray[np.float64]
 
-# Angles beyond two turns [rad], and goals beyond so many times the reach, are taken for other units.
+# Greatest plausible angle [rad], two turns, and distance of a goal in units of the reach: others look like wrong units.
 _TURNS, _AFAR = 4.0 * np.pi, 50.0
-# Postures in which a pair of bodies has to be too close for it to be so in all; and limits [rad or m] that stand for
-# none, in the place of which joints are looked at for a turn, or rails for this way [m], to either side.
-_POSTURES, _ENDLESS, _RAIL = 64, 1e4, 100.0
-# Parts of a millimetre that two places of one frame may be apart.
+# Random postures in which the distance of a pair of bodies is tested.
+_POSTURES = 64
+# A joint limit of at least _ENDLESS [rad or m] is none: postures are then within a turn, or _RAIL [m], to either side.
+_ENDLESS, _RAIL = 1e4, 100.0
+# Tolerance on positions and joint limits [m or rad].
 _SAME = 1e-6
 
 
 def hints(problem: OptimalControlProblem) -> list[Finding]:
-    """Says which constraints of a problem no motion meets, and which look like degrees or millimetres."""
+    """Findings about constraints that no motion satisfies, and about values that look like degrees or millimetres."""
     if not problem.constraints:
         return []
     found = [*_goals(problem), *_limits(problem), *_ends(problem)]
@@ -38,7 +39,7 @@ def hints(problem: OptimalControlProblem) -> list[Finding]:
 
 
 def reach(robot: Robot, frame: FrameKinematics) -> float:
-    """How far a frame gets from its first joint at most [m]: all lengths one after another; infinite on free rails."""
+    """Upper bound on a frame's distance from its first joint [m], the sum of all lengths; infinite on free rails."""
     links = frame.links
     total = float(np.linalg.norm(links.translation[1:], axis=1).sum() + np.linalg.norm(frame.translation))
     lower, upper = robot.position_limits
@@ -49,7 +50,7 @@ def reach(robot: Robot, frame: FrameKinematics) -> float:
 
 
 def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Goals out of reach, two of one frame, and those in a region that the frame is kept out of."""
+    """Goals out of reach, two different goals of one frame, and goals in a region that the frame must not enter."""
     goals = [bound for bound in problem.bound_constraints if isinstance(bound.source, ReachFrame)]
     for bound in goals:
         goal = bound.source
@@ -94,17 +95,17 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
                 yield Finding(
                     "goal outside constraints",
                     f"{name} is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.4g} m at t = "
-                    f"{bound.times[-1]:.4g} s: move the goal, or the bound",
+                    f"{bound.times[-1]:.4g} s: move the goal or the bound",
                 )
 
 
 def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Limits of joints that look like degrees."""
+    """Joint limits that look like degrees."""
     turning = _turning(problem.scene.robot)
     for limits in problem.constraints:
         if not isinstance(limits, WithinJointLimits):
             continue
-        # Those of the robot's description are in radians, however wide.
+        # Limits of the robot's description are in radians, however wide.
         given = np.isfinite(limits.limits) & (limits.limits != np.array(limits.robot.position_limits))
         wide = np.where(given, np.abs(limits.limits), 0.0).max(axis=0) * turning
         joint = int(np.argmax(wide))
@@ -117,7 +118,7 @@ def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 
 def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Configurations that the plan is to end at, and that joint limits forbid or that look like degrees."""
+    """Goal configurations outside the joint limits, or that look like degrees."""
     robot = problem.scene.robot
     turning = _turning(robot)
     for term in _last(problem.cost):
@@ -148,7 +149,7 @@ def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 
 def _overlaps(problem: OptimalControlProblem, bound: BoundConstraint) -> Iterator[Finding]:
-    """Pairs of bodies that are too close in every posture."""
+    """Pairs of bodies that are too close in all random postures."""
     constraint = bound.source
     if not isinstance(constraint, KeepClear):
         return
@@ -163,13 +164,13 @@ def _overlaps(problem: OptimalControlProblem, bound: BoundConstraint) -> Iterato
         yield Finding(
             "pair always too close",
             f"KeepClear: {constraint.pairs[pair]} are too close by {least[pair]:.2g} m or more in each of {_POSTURES} "
-            "postures, so hardly any plan keeps them apart. A link is taken for a capsule, which holds more than the "
+            "postures, so hardly any plan keeps them apart. A link is modelled by a capsule, which is larger than the "
             "link: leave it out with links=, give it a smaller one with capsules=, or move the obstacle",
         )
 
 
 def _range(robot: Robot) -> tuple[Floats, Floats]:
-    """Between what (n,) and (n,) each joint is looked at [rad or m]."""
+    """Lower and upper bounds, (n,) each, of the random postures [rad or m]."""
     room = np.where(_turning(robot) > 0.0, 2.0 * np.pi, _RAIL)
     lower, upper = robot.position_limits
     below, above = np.abs(lower) < _ENDLESS, np.abs(upper) < _ENDLESS
@@ -179,14 +180,14 @@ def _range(robot: Robot) -> tuple[Floats, Floats]:
 
 
 def _turning(robot: Robot) -> Floats:
-    """1 for coordinates that turn joints (n,), 0 for those that slide them."""
+    """1 for coordinates of revolute joints (n,), 0 for those of prismatic joints."""
     turning = np.ones(robot.dof)
     turning[robot.tree.coordinate[np.flatnonzero(robot.tree.prismatic)]] = 0.0
     return turning
 
 
 def _last(cost: Cost) -> Iterator[Cost]:
-    """What a cost has at its end, without factors."""
+    """The terminal costs, without factors."""
     for term in cost.terms:
         inner, at_end = term, False
         while isinstance(inner, Terminal | Scaled):

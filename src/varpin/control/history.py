@@ -1,4 +1,4 @@
-"""How a search went: its iterations, how it ended, and where it can go on."""
+"""The record of a search: its iterations, its status, and the state for resuming it."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from enum import Enum
 
 from varpin.trajectory import Trajectory
 
-# Of a search that is not told how many.
+# Default number of iterations.
 ITERATIONS = 100
 
 
 class Status(Enum):
-    """How a solver ended; its value says what that means and what to do."""
+    """How a solver ended; the value explains it, with advice."""
 
     CONVERGED = "converged"
     MAX_ITERATIONS = (
-        "not converged: more iterations may help; go on from this solution with solve(problem, resume=solution)"
+        "not converged: more iterations may help; continue from this solution with solve(problem, resume=solution)"
     )
     STALLED = (
-        "not converged: no step along the plan lowers the expected cost by more than the tolerance; if what it "
-        "promises is little, that is as far as it goes; else a smaller dt, other first controls, right derivatives of "
-        "a cost of one's own or a cost that weighs the controls more may help"
+        "not converged: no step along the plan lowers the expected cost by more than the tolerance; if the expected "
+        "decrease is small, the plan is close to an optimum; else a smaller dt, other first controls, correct "
+        "derivatives of a custom cost or a higher cost of the controls may help"
     )
     INDEFINITE = (
         "not converged: the model of the cost has no minimum in a control, whatever the regularization; give every "
-        "control a ControlCost"
+        "control a cost (ControlCost)"
     )
     NOT_DIFFERENTIABLE = (
         "not converged: the derivatives of the dynamics or of the cost do not exist along the last motion; the log "
@@ -49,18 +49,18 @@ class Iteration:
     """One iteration of a solver.
 
     Attributes:
-        index: From 0.
-        cost: Of the motion it ended with, without noise.
-        noise_cost: What noise adds to the cost of the motion it began with.
-        expected_decrease: Of the expected cost, by the quadratic model with a full step.
-        decrease: Of the expected cost by the step taken, with the plan's model of the noise; 0 if none was.
-        step: Length of the step taken, in (0, 1]; 0 if none was.
+        index: Number of the iteration, from 0.
+        cost: Cost of the motion after the iteration, without noise.
+        noise_cost: Cost added by noise to the motion before the iteration.
+        expected_decrease: Decrease of the expected cost by the quadratic model with a full step.
+        decrease: Actual decrease of the expected cost, with the plan's model of the noise; 0 without a step.
+        step: Length of the accepted step, in (0, 1]; 0 if there is none.
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
-        backward_passes: How many it took, with other regularizations; looking for the controls that meet their limits,
-            on the same derivatives, does not count.
-        rollouts: Trials of the line search.
-        seconds: It took [s].
+        backward_passes: Number of backward passes with different regularizations. Those that determine the controls at
+            their limits, on the same derivatives, do not count.
+        rollouts: Number of trials of the line search.
+        seconds: Time of the iteration [s].
     """
 
     index: int
@@ -86,23 +86,23 @@ class Iteration:
 
 @dataclass(frozen=True, eq=False)
 class SearchState:
-    """Where a search stood at the start of its last iteration: all that it needs to go on.
+    """The state of a search at the start of its last iteration, from which it can be resumed.
 
     Attributes:
-        trajectory: The motion then.
-        cost: Of it, without noise.
-        above: By how much it costs more than the best one, without noise.
-        first: How much of the cost of the first motion was at stake.
-        best: The motion of the least expected cost so far, if one was rated yet.
-        best_cost: Its cost without noise.
-        best_noise: What noise adds to it; that of constant strength changes no plan, and is left out.
-        gains: By how much each iteration lowered the least expected cost.
+        trajectory: The motion.
+        cost: Its cost without noise.
+        above: Its cost minus that of the best motion, without noise.
+        first: Cost at stake on the first motion.
+        best: The motion of least expected cost so far; None before the first backward pass.
+        best_cost: Cost of the best motion without noise.
+        best_noise: Noise cost of the best motion, without the noise of constant strength, which changes no plan.
+        gains: Decrease of the least expected cost in each iteration.
         regularization: Relative to the diagonal of Quu.
-        growth: Of the regularization.
-        bounded: Whether the line search gives up trials whose steps are cut into many parts.
-        cut: Whether it has given up one.
-        whole: Whether the search has come to the whole gradient of what noise adds.
-        history: Of the iterations before.
+        growth: Last factor of the regularization.
+        bounded: Whether the line search stops trials with many substeps.
+        cut: Whether it has stopped one.
+        whole: Whether the search uses the whole gradient of the noise cost.
+        history: The iterations before.
     """
 
     trajectory: Trajectory

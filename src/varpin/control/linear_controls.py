@@ -1,7 +1,7 @@
-"""Plans whose controls are linear between nodes, as the backward pass sees them: with the control in the state.
+"""Steps with controls that are linear between nodes, for the backward pass: the control is part of the state.
 
-The state of the exact recursion is X = (x, w), w the control at the node, and the decision the control u at the next
-one: X' = (A x + (B - ramp) w + ramp u, u). The first control is a decision of its own, before the first step. Equation
+The state of the recursion is X = (x, w), with w the control at the node, and the decision is the control u at the next
+node: X' = (A x + (B - ramp) w + ramp u, u). The first control is a separate decision before the first step. Equation
 (O11) of docs/mathematics.md.
 """
 
@@ -16,22 +16,22 @@ from varpin.control.problem import OptimalControlProblem
 
 Floats = NDArray[np.float64]
 
-# A cost that is sampled at (X, u) before the step, as it is.
+# The sampling rule of a cost in (X, u) at the beginning of the step.
 RULE: Floats = np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
 RULE.setflags(write=False)
 
 
 class Derivatives(NamedTuple):
-    """Of N steps: in the state, in controls at their start and at their end, and of velocities at nodes."""
+    """Derivatives of N steps in the state and in the controls at both ends, and of velocities at the nodes."""
 
     A: Floats  # (N, 2n, 2n)
     begin: Floats  # (N, 2n, m)
     end: Floats  # (N, 2n, m)
-    velocity: Floats  # dv/dx (N + 1, n, 2n) at nodes; (0, n, 2n) where x holds v, or nobody asks
+    velocity: Floats  # dv/dx (N + 1, n, 2n) at nodes; (0, n, 2n) where x holds v or no cost needs it
 
 
 class LinearSteps(NamedTuple):
-    """N + 1 steps in X and u: the first decides on the first control alone, and takes no time."""
+    """N + 1 steps in X and u: the first only sets the first control, and takes no time."""
 
     A: Floats  # (N + 1, X, X)
     B: Floats  # (N + 1, X, m)
@@ -40,7 +40,7 @@ class LinearSteps(NamedTuple):
 
 
 def size(problem: OptimalControlProblem) -> int:
-    """The number of states X: the core takes pairs, so one of them may be nothing."""
+    """The number of states X, made even for the core by a zero state if necessary."""
     states = 2 * problem.scene.robot.dof + problem.scene.controls
     return states + states % 2
 
@@ -53,10 +53,10 @@ def linear_steps(
     Args:
         problem: The problem.
         found: Derivatives along the motion.
-        gradient: Of the running cost at its samples (N s, 2n + m).
-        hessian: Likewise (N s, 2n + m, 2n + m), or (1, ...) for all.
-        rate: Of what changes of the controls cost, (N + 1, m, m), or (0, m, m) for nothing.
-        pull: Likewise its gradient (N + 1, m).
+        gradient: Gradient of the running cost at its samples (N s, 2n + m).
+        hessian: Its Hessian (N s, 2n + m, 2n + m), or (1, 2n + m, 2n + m) for all samples.
+        rate: Hessian of the cost of control changes (N + 1, m, m), or (0, m, m) without one.
+        pull: Its gradient (N + 1, m).
     """
     n, m, h, N = problem.scene.robot.dof, problem.scene.controls, problem.dt, problem.steps
     X, x = size(problem), 2 * n
@@ -64,7 +64,7 @@ def linear_steps(
     A[0, :x, :x] = np.eye(x)
     A[1:, :x, :x], A[1:, :x, x : x + m], B[1:, :x] = found.A, found.begin, found.end
     B[:, x : x + m] = np.eye(m)
-    # In (x, w, u); X has room between w and u.
+    # In (x, w, u); X may have a zero state between w and u.
     g, H = np.zeros((N + 1, x + 2 * m)), np.zeros((N + 1, x + 2 * m, x + 2 * m))
     samples = len(problem.rule)
     of_sample = hessian.reshape(-1, samples, x + m, x + m) if len(hessian) > 1 else hessian[:, None]
@@ -87,7 +87,7 @@ def linear_steps(
 
 
 def _sampled(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]:
-    """D (N, 2n + m, 2n + 2m) of (q, v, u) at each sample of the steps in (x, w, u)."""
+    """Derivatives (N, 2n + m, 2n + 2m) of (q, v, u) in (x, w, u), for each sample of a step."""
     m, x = problem.scene.controls, 2 * problem.scene.robot.dof
     after = np.concatenate([found.A, found.begin, found.end], axis=2)
     parts = []
@@ -99,15 +99,15 @@ def _sampled(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]
 
 
 def at_samples(rule: Floats, J: Floats, velocity: Floats) -> list[Floats]:
-    """D (N, 2n, y) of (q, v) at each sample of N steps, in the y variables of J (N, 2n, y), the state x the first.
+    """Derivatives (N, 2n, y) of (q, v) at each sample of N steps, in the y variables of J (N, 2n, y), the state first.
 
-    ``velocity`` is dv/dx (N + 1, n, 2n) at nodes, or (0, n, 2n) where x holds v or nobody asks.
+    ``velocity`` is dv/dx (N + 1, n, 2n) at nodes, or (0, n, 2n) where x holds v or no cost needs it.
     """
     N, x, size = J.shape
     n = x // 2
     before = np.zeros((N, x, size))
     before[:, :, :x] = np.eye(x)
-    # Of (q, v) at the nodes before and after a step.
+    # Derivatives of (q, v) at the nodes before and after a step.
     nodes = []
     for end, slopes in enumerate((before, J)):
         nodes += [slopes[:, :n], velocity[end : N + end] @ slopes if len(velocity) else slopes[:, n:]]

@@ -1,9 +1,9 @@
-"""What noise adds to the cost of a motion under feedback, to second order, and its gradient in the motion.
+"""The noise cost of a motion under feedback, to second order, and its gradient in the motion.
 
-With the gains held, the covariance of (x, u) goes forward, the quadratic value W backward, and what noise adds is a sum
-over the steps. The share of a step depends on the state and the control that it begins with alone, through its
-derivatives, the Hessians of its costs and its noise: that is differentiated, by central differences of the linearized
-steps. Equation (O12) of docs/mathematics.md.
+With the gains held, the covariance of (x, u) is propagated forward and the quadratic value function W backward; the
+noise cost is a sum over the steps. The share of a step depends only on the state and the control at its beginning,
+through its derivatives, the Hessians of its costs and its noise. Central differences of the linearized steps give the
+gradient of the shares. Equation (O12) of docs/mathematics.md.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# Of the largest value that a coordinate, a momentum or a control has along the motion.
+# Step of the central differences, relative to the largest value of each variable along the motion.
 _SHIFT = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """Gains (R, m, 2n) on the state, and (R, m, m) on the control before where its change costs something."""
+    """Gains (R, m, 2n) on the state, and (R, m, m) on the previous control where its change has a cost."""
 
     state: Floats
     before: Floats | None
@@ -37,10 +37,10 @@ class _Steps:
     """N linearized steps in (x, u) with their costs to second order."""
 
     J: Floats  # (N, 2n, 2n + m)
-    g: Floats  # (N, 2n, k) what noise does
+    g: Floats  # (N, 2n, k) derivative in the noise
     gz: Floats  # (N, 2n, k, 2n + m) its derivative in (x, u)
     cost: Floats  # (N, 2n + m, 2n + m) Hessian of the running cost
-    kicked: Floats  # (N, 2n, 2n) of the part that is sampled after the kick, in the state there
+    kicked: Floats  # (N, 2n, 2n) Hessian of the part sampled after the noise impulse, in the state there
 
 
 def noise_gradient(
@@ -50,16 +50,16 @@ def noise_gradient(
     rate: Floats,
     processes: NDArray[np.bool_],
 ) -> Floats:
-    """The gradient (N, 2n + m) of what noise adds, in the state and the control that each step begins with.
+    """The gradient (N, 2n + m) of the noise cost in the state and the control at the beginning of each step.
 
-    Without what a backward pass has of it: the part through the strength of the noise alone.
+    It leaves out the part through the strength of the noise, which the backward pass already has.
 
     Args:
         problem: The problem.
         trajectory: The motion.
-        feedback: Of a backward pass along it.
-        rate: Hessian (R, m, m) of what changes of controls cost, or (0, m, m).
-        processes: Which count (k,).
+        feedback: The gains of a backward pass along it.
+        rate: Hessian (R, m, m) of the cost of control changes, or (0, m, m).
+        processes: Mask of the processes that count (k,).
     """
     n, m, N = problem.scene.robot.dof, problem.scene.controls, problem.steps
     here = _steps_of(problem, trajectory, processes)
@@ -77,7 +77,7 @@ def noise_gradient(
         for sign in (1.0, -1.0):
             moved = np.zeros(2 * n + m)
             moved[c] = sign * shift[c]
-            # Every other step begins at a moved state, and the node after it is where that leads.
+            # Every other step begins at a shifted state; the node after it moves accordingly.
             shares = np.empty(N)
             for first in range(min(2, N)):
                 rows = slice(first, N, 2)
@@ -88,7 +88,7 @@ def noise_gradient(
                 shares[rows] = _shares(problem, near, W, C)[rows]
             change.append(shares)
         found[:, c] = (change[0] - change[1]) / (2.0 * shift[c])
-    # The end's own Hessian depends on where it is, too.
+    # The Hessian of the terminal cost depends on the state at the end, too.
     at_end = np.empty(2 * n)
     for c in range(2 * n):
         change = []
@@ -105,7 +105,7 @@ def noise_gradient(
 
 
 def _end_hessian(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
-    """Of the terminal cost in x (2n, 2n)."""
+    """Hessian of the terminal cost in x (2n, 2n)."""
     n = problem.scene.robot.dof
     H: Floats = problem.expand_terminal(trajectory).hessian[0, : 2 * n, : 2 * n]
     if not problem.integrator.variational:
@@ -116,7 +116,7 @@ def _end_hessian(problem: OptimalControlProblem, trajectory: Trajectory) -> Floa
 
 
 def _moved(trajectory: Trajectory, dx: Floats, du: Floats, slopes: Floats, variational: bool) -> Trajectory:
-    """Nodes and controls next to those of a motion: no motion, but each of its steps can be linearized."""
+    """A trajectory with shifted nodes and controls; its steps do not connect, but each can be linearized."""
     n = trajectory.q.shape[1]
     q = trajectory.q + dx[:, :n]
     if not variational:
@@ -153,7 +153,7 @@ def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory, processes:
 
 
 def _hessian(problem: OptimalControlProblem, steps: _Steps, W: Floats, k: int | slice) -> Floats:
-    """Of the cost of step k and what follows in (x, u), with the value W after it."""
+    """Hessian in (x, u) of the cost from step k on, with the value function W after the step."""
     J, gz, x = steps.J[k], steps.gz[k], steps.J.shape[1]
     across = W[..., :x, x:]
     spread = problem.dt * (W[..., :x, :x] + steps.kicked[k])
@@ -167,7 +167,7 @@ def _hessian(problem: OptimalControlProblem, steps: _Steps, W: Floats, k: int | 
 
 
 def _shares(problem: OptimalControlProblem, steps: _Steps, W: Floats, C: Floats) -> Floats:
-    """What noise adds in each step (N,), by the values W after steps and the covariances C before them."""
+    """Noise cost of each step (N,), from the values W after the steps and the covariances C before them."""
     x = steps.J.shape[1]
     spread = problem.dt * (W[1:, :x, :x] + steps.kicked)
     before = np.einsum("Nzy,Nzy->N", C[:-1], _hessian(problem, steps, W[1:], slice(None)))
@@ -176,7 +176,7 @@ def _shares(problem: OptimalControlProblem, steps: _Steps, W: Floats, C: Floats)
 
 
 def _decision(feedback: Feedback, r: int, x: int, m: int) -> Floats:
-    """How (x, u) follow from (x, the control before)."""
+    """The matrix from (x, previous control) to (x, u)."""
     T = np.zeros((x + m, x + m))
     T[:x, :x], T[x:, :x] = np.eye(x), feedback.state[r]
     if feedback.before is not None:
@@ -187,7 +187,7 @@ def _decision(feedback: Feedback, r: int, x: int, m: int) -> Floats:
 def _values(
     problem: OptimalControlProblem, steps: _Steps, feedback: Feedback, terminal: Floats, rate: Floats
 ) -> Floats:
-    """The value's Hessians (N + 1, 2n + m, 2n + m) at nodes in (x, the control before), under the gains."""
+    """Hessians of the value function at the nodes (N + 1, 2n + m, 2n + m) in (x, previous control)."""
     N, x, m = problem.steps, steps.J.shape[1], problem.scene.controls
     W = np.zeros((N + 1, x + m, x + m))
     W[N, :x, :x] = terminal
@@ -205,7 +205,7 @@ def _values(
 
 
 def _covariances(problem: OptimalControlProblem, steps: _Steps, feedback: Feedback) -> Floats:
-    """The covariances (N + 1, 2n + m, 2n + m) of (x, u) with which steps begin, and of the end."""
+    """Covariances of (x, u) at the beginning of each step and at the end (N + 1, 2n + m, 2n + m)."""
     N, x, m = problem.steps, steps.J.shape[1], problem.scene.controls
     C, covariance = np.zeros((N + 1, x + m, x + m)), np.zeros((x + m, x + m))
     for k in range(N):

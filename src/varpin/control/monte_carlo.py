@@ -40,11 +40,11 @@ class MonteCarlo:
 
     Attributes:
         cost: Mean over the paths.
-        standard_error: Of the mean.
-        predicted: By the solver's model.
-        paths: How many were counted.
-        failures: Paths that could not be finished; they are not counted.
-        warnings: What varpin says of the paths, a sentence each, as of those of an :class:`Ensemble`.
+        standard_error: Standard error of the mean.
+        predicted: Expected cost by the solver's model.
+        paths: Number of paths in the mean.
+        failures: Number of paths that failed; they are not in the mean.
+        warnings: Warnings about the paths, one sentence each, as those of an :class:`Ensemble`.
     """
 
     cost: float
@@ -89,7 +89,7 @@ class MonteCarloInterrupted(KeyboardInterrupt):
     """Ctrl-C during :meth:`Solution.monte_carlo`.
 
     Attributes:
-        result: Of the paths done so far; None if there are fewer than two.
+        result: The result of the paths done so far; None if there are fewer than two.
     """
 
     def __init__(self, result: MonteCarlo | None) -> None:
@@ -100,7 +100,7 @@ class MonteCarloInterrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True, eq=False)
 class _Costs(Frozen):
-    """What came of a chunk: costs of its paths (C,), NaN where one failed, and which of them are worth a look."""
+    """Results of a chunk: the costs of its paths (C,), NaN where one failed, and the extreme paths to check."""
 
     values: Floats
     extremes: Extremes
@@ -108,7 +108,7 @@ class _Costs(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class _Chunk(Frozen):
-    """Paths of a problem; ``task`` for those that the core can take."""
+    """A chunk of paths that the core integrates."""
 
     problem: OptimalControlProblem
     task: Task
@@ -116,7 +116,7 @@ class _Chunk(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class _Alone(Frozen):
-    """A path of a problem with noise that only Python can evaluate."""
+    """A path of a problem with noise that only Python evaluates."""
 
     problem: OptimalControlProblem
     policy: LinearPolicy
@@ -135,13 +135,10 @@ def monte_carlo(
     executor: Executor | None,
     progress: Callable[[int, int], None] | None,
 ) -> MonteCarlo:
-    """As :meth:`Solution.monte_carlo` says, of any policy."""
+    """See :meth:`Solution.monte_carlo`; for any policy."""
     paths = count("paths", paths, least=2)
     if problem.linear:
-        raise InputError(
-            "monte_carlo draws noise, and controls that are linear between nodes act in scenes without any: plan with "
-            "controls='held'"
-        )
+        raise InputError("monte_carlo draws noise, which linear controls do not support: plan with controls='held'")
     costs: list[Floats] = []
     found: tuple[Finding, ...] = ()
     extremes: Extremes = {}
@@ -161,7 +158,7 @@ def monte_carlo(
             elif executor is not None:
                 parts = in_order(pool, _alone, (_Alone(sent, policy, seeds, path) for path in range(paths)))
             else:
-                # Functions of the user's need not be made for several threads.
+                # Custom functions need not be thread-safe.
                 parts = (_alone(_Alone(sent, policy, seeds, path)) for path in range(paths))
             with closing(parts):
                 for part in parts:
@@ -181,7 +178,7 @@ def monte_carlo(
             if shared is not None:
                 found = looked_at_here(shared, q0[:done], v0[:done], extremes)
             elif np.isfinite(costs[0]).all():
-                # Nothing after another Ctrl-C.
+                # A second Ctrl-C skips the check.
                 with suppress(KeyboardInterrupt):
                     found = _look_alone(_Alone(sent, policy, seeds, 0))
             raise MonteCarloInterrupted(_warned(so_far, (*_lost(so_far), *found))) from None
@@ -194,7 +191,7 @@ def monte_carlo(
 
 
 def _sent(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem without what no path needs: shapes of the robot, and references that are sampled already."""
+    """The problem without the robot's shapes and the cost's references, which no path needs."""
     sent = copy.copy(problem)
     vars(sent).update(scene=without_geometry(problem.scene), cost=CostSum(()))
     return sent
@@ -222,7 +219,7 @@ def _alone(given: _Alone) -> _Costs:
 
 
 def _look_alone(given: _Alone) -> tuple[Finding, ...]:
-    """What is to be said of the first path."""
+    """Findings about the first path."""
     (child,) = given.seeds.generators(given.path, given.path + 1)
     motion = given.problem.simulate(given.policy, rng=child)
     _, found = examined_in_loop(
@@ -232,7 +229,7 @@ def _look_alone(given: _Alone) -> tuple[Finding, ...]:
 
 
 def _lost(result: MonteCarlo) -> tuple[Finding, ...]:
-    """What is to be said of failures, if there are any."""
+    """A finding about failed paths, if there are any."""
     if not result.failures:
         return ()
     lost = f"{result.failures} of {result.paths + result.failures} paths could not be finished, and are not counted"

@@ -1,4 +1,4 @@
-"""Model predictive control: plan, apply the first decision, look where the robot is, plan again."""
+"""Model predictive control: plan, apply the first decision, measure the state, replan."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-# Part of the ticks that may take longer than the period without a word: other programs get in the way.
+# Share of late or slow ticks without a warning: other programs on the machine cause a few.
 _FEW = 0.05
 
 
 @dataclass(frozen=True)
 class Plant:
-    """The robot that is controlled, simulated in place of the real one.
+    """A simulated robot under control.
 
     Attributes:
-        scene: Its scene, which need not be the one planned with: other masses, friction, noise. It takes the same
-            controls.
-        integrator: Any of varpin's. Left out, each run takes that of :func:`varpin.simulate` at the plant's steps, as
-            the start and the first plan ask for it, ready for all stops of joints; its motion says which that was.
-        substeps: Steps to a decision of the controller.
+        scene: Its scene, with the controls of the planned one; masses, friction and noise may differ.
+        integrator: Any of varpin's. By default each run takes the one that :func:`varpin.simulate` chooses at the
+            plant's step for the start and along the first plan, all joint stops included; ``motion.integrator`` names
+            it.
+        substeps: Steps per decision of the controller.
     """
 
     scene: Scene
@@ -64,21 +64,21 @@ class Plant:
 
 @dataclass(frozen=True, eq=False)
 class MpcRun(Frozen):
-    """What a controller did with a plant.
+    """The result of a controller's run on a plant.
 
     Attributes:
-        motion: Of the plant, at its own steps.
-        plans: The plan of every tick, the one that acted (K,).
-        seconds: What planning took in every tick (K,) [s]; 0 in the first, whose plan is there before.
-        iterations: Of S-DDP in every tick (K,), likewise.
-        late: Ticks whose plan came after its budget (K,); the plan of the tick before acted on.
-        period: Of the ticks [s].
-        budget: For planning in a tick [s]; infinite for any.
-        constraints: How plans and motion kept to each of the problem's constraints.
-        warnings: What looks wrong with the first plan, unless it does with the plant's motion, too; with that motion,
-            as in :attr:`Trajectory.warnings`, and its velocities from tick to tick; and whether planning took longer
-            than the period, or than the budget, in more than one tick of twenty, which depends on the machine. Of
-            constraints, where the plant's motion violated them, and how many ticks found no plan within them.
+        motion: The plant's motion, at the plant's steps.
+        plans: The plan that acted in each tick (K,).
+        seconds: Planning time of each tick (K,) [s]; 0 in the first, whose plan is made before the run.
+        iterations: Iterations of S-DDP in each tick (K,); 0 in the first.
+        late: Ticks whose plan exceeded the budget (K,); the previous plan acted instead.
+        period: Time of a tick [s].
+        budget: Time for planning in a tick [s]; infinite without a budget.
+        constraints: How well plans and motion satisfied each of the problem's constraints.
+        warnings: Warnings about the first plan that do not recur in the plant's motion; about the motion, as in
+            :attr:`Trajectory.warnings`, and its velocities from tick to tick; about planning that took longer than the
+            period, or than the budget, in more than one tick of twenty, which depends on the machine; about constraints
+            that the motion violated; and about ticks without a feasible plan.
     """
 
     motion: Trajectory
@@ -93,17 +93,17 @@ class MpcRun(Frozen):
 
     @property
     def infeasible(self) -> int:
-        """In how many ticks no plan was found that keeps to the constraints."""
+        """Number of ticks without a plan that satisfies the constraints."""
         return sum(plan.status is Status.INFEASIBLE for plan in self.plans)
 
     def planned(self, ahead: float | None = None) -> Floats:
-        """Where the plans mean to be some time later: configurations (K + 1, n) [rad or m].
+        """Planned configurations ``ahead`` seconds later (K + 1, n) [rad or m].
 
-        Row k is what the plan that acts in tick k has for ``ahead`` seconds after the tick's beginning, the last row
-        what the last plan has so long after the run's end.
+        Row k is from the plan that acts in tick k, ``ahead`` seconds after the beginning of the tick. The last row is
+        from the last plan, ``ahead`` seconds after the end of the run.
 
         Args:
-            ahead: [s]; the horizon if left out. Beyond its horizon a plan is taken to stay at its end.
+            ahead: Time ahead [s]; the horizon by default. Beyond its horizon a plan stays at its end.
 
         Raises:
             InputError: ``ahead`` is negative or not finite.
@@ -121,7 +121,7 @@ class MpcRun(Frozen):
 
     @property
     def misses(self) -> int:
-        """How many plans came late."""
+        """Number of late plans."""
         return int(self.late.sum())
 
     def __repr__(self) -> str:
@@ -129,9 +129,9 @@ class MpcRun(Frozen):
 
     @property
     def _planning(self) -> str:
-        """What planning took, but for the first plan, which was there before."""
+        """Planning times in words, without the first plan, which is made before the run."""
         if len(self.seconds) < 2:
-            return "nothing, with the first plan there"
+            return "no time: the first plan was made before the run"
         milliseconds = 1e3 * self.seconds[1:]
         return (
             f"{milliseconds.mean():.2f} ms in the mean, {np.quantile(milliseconds, 0.95):.2f} in 95%, "
@@ -162,30 +162,29 @@ class MpcRun(Frozen):
 
 @dataclass(frozen=True)
 class Mpc:
-    """A controller that solves an optimal control problem anew at every decision, from the state it finds.
+    """A controller that solves an optimal control problem at every decision, from the measured state.
 
-    Each tick's search starts from the last plan, moved on by a decision, with its feedback. Times of references are
-    those of the plant: the horizon recedes. Where changes of controls cost something, each plan goes on from the
-    control that acted last.
+    The search of each tick starts from the last plan, shifted by one decision, with its feedback. References are
+    evaluated at the plant's time: the horizon recedes. Costs and limits of changes of the controls start from the last
+    applied control.
 
-    Constraints of the problem hold along every horizon, with obstacles that move where they will be. Multipliers go on
-    from tick to tick, moved on with the plan, and each iteration of a tick is one of the augmented Lagrangian: a plan
-    keeps to its constraints to the accuracy that so few iterations give, which ``MpcRun.constraints`` has for every
-    tick. A goal (:class:`ReachFrame`) is that of the end of every horizon. Limits of the controls' rate go on from the
-    control that acted last. What a margin comes to is that of the first plan.
+    Constraints hold along every horizon, and moving obstacles are predicted. Multipliers are kept from tick to tick,
+    shifted with the plan. Each iteration of a tick is one of the augmented Lagrangian, so a plan satisfies its
+    constraints to the accuracy of few iterations; ``MpcRun.constraints`` has it for every tick. A goal
+    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan.
 
     Main args:
-        problem: The problem; its horizon, discretization, noise, limits and constraints are those of every tick, its
-            initial state and ``t0`` those of the first.
-        iterations: Of S-DDP in a tick, at most.
+        problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
+            initial state and ``t0`` to the first.
+        iterations: Greatest number of S-DDP iterations in a tick.
 
     Other Args:
-        tolerance: Of S-DDP; see :func:`varpin.solve`.
-        first_iterations: In the first tick, which has no plan to start from.
-        budget: For planning in a tick [s]. No iteration begins that would end after it, if it takes as long as the
-            longest one of the tick. A plan that is late all the same is not used: the plan before acts on, with its
-            feedback, ``MpcRun.late`` marks the tick, and more than one in twenty are a warning. What happens then
-            depends on the machine. Infinite, nothing depends on the clock.
+        tolerance: Tolerance of S-DDP; see :func:`varpin.solve`.
+        first_iterations: Greatest number of iterations in the first tick, which has no plan to start from.
+        budget: Time for planning in a tick [s]. No iteration begins that would exceed it if it took as long as the
+            longest one of the tick. A late plan is discarded: the previous plan acts with its feedback, and
+            ``MpcRun.late`` marks the tick; more than one late tick in twenty gives a warning. Results then depend on
+            the machine. With an infinite budget they do not.
     """
 
     problem: OptimalControlProblem
@@ -198,7 +197,7 @@ class Mpc:
         if not isinstance(self.problem, OptimalControlProblem):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
         if self.problem.linear:
-            raise InputError("Mpc decides on controls that are held: the problem's are linear between nodes")
+            raise InputError("Mpc needs held controls: the problem's are linear between nodes")
         count("iterations", self.iterations, least=1)
         count("first_iterations", self.first_iterations, least=1)
         positive("tolerance", self.tolerance, "1")
@@ -215,7 +214,7 @@ class Mpc:
 
     @property
     def period(self) -> float:
-        """Of the ticks: the time a decision holds [s]."""
+        """Time of a tick: how long a decision is held [s]."""
         return self.problem.dt * self.problem.hold
 
     def plan(
@@ -229,22 +228,20 @@ class Mpc:
     ) -> Solution:
         """The plan at time ``t`` [s] from configuration ``q`` (n,) and velocity ``v`` (n,).
 
-        Where it starts from another, each iteration takes one backward pass, and its gains are those that the last
-        iteration followed.
+        With a ``previous`` plan each iteration takes one backward pass, and the gains are those of the last iteration.
 
         Args:
-            t: Now.
+            t: Present time [s].
             q: (n,) or by joint name [rad or m].
             v: (n,) or by joint name [rad/s or m/s].
             previous: The plan to start from; None in the first tick.
-            decisions: How many decisions ago it was made.
-            before: The control applied last, (m,) or by joint name, where changes of controls cost something or have a
-                limit. Left out,
-                what ``previous`` meant to apply, and in the first tick what the problem says.
+            decisions: Number of decisions since ``previous`` was made.
+            before: The last applied control, (m,) or by joint name, where changes of controls have a cost or a limit.
+                By default the control planned by ``previous``, and in the first tick that of the problem.
 
         Raises:
             InputError: q or v of a wrong shape, or not finite.
-            StepFailure, CostError: The motion to start from cannot be integrated, or has no cost.
+            StepFailure, CostError: The initial motion of the search cannot be integrated, or its cost is not finite.
         """
         deadline = np.inf if self.budget == np.inf else time.perf_counter() + self.budget
         scene = self.problem.scene
@@ -257,7 +254,7 @@ class Mpc:
         problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
         if previous is None:
             return self._first_plan(problem)[0]
-        # A tick has no time for a second look at its plan; the run takes one at what came of them all.
+        # A tick does not check its plan; the run checks the motion that results.
         return replan(
             problem,
             previous,
@@ -268,7 +265,7 @@ class Mpc:
         )
 
     def _first_plan(self, problem: OptimalControlProblem) -> tuple[Solution, tuple[Finding, ...]]:
-        """The plan that a run begins with, and what was found wrong with it."""
+        """The first plan of a run and the findings about it."""
         plan = solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations, check=False)
         return looked_at(plan)
 
@@ -282,23 +279,24 @@ class Mpc:
     ) -> MpcRun:
         """Control a simulated plant from the problem's initial state.
 
-        In each tick the plan's first decision acts, as computed from the state at its beginning. The first plan is
-        there before the clock starts.
+        In each tick the first decision of the plan made from the state at its beginning acts. The first plan is made
+        before the run.
 
         Main args:
             plant: None for the problem's own scene, integrated more finely.
-            duration: Of the run [s]; in whole ticks, one at least, and a warning says so where it is not.
-            rng: Generator or seed of the plant's noise; without it there is none, of which a noisy plant has a warning.
+            duration: Time of the run [s], rounded to whole ticks, at least one; a warning reports rounding.
+            rng: Generator or seed of the plant's noise. Without it the plant has none, and a noisy scene gives a
+                warning.
 
         Other Args:
-            progress: Called with (ticks done, ticks in all). A function that needs three arguments gets the plant's
-                motion in the last tick, too, a :class:`varpin.Nodes`; as :class:`varpin.LiveView` does.
+            progress: Called with (ticks done, ticks in all). A function of three arguments, such as a
+                :class:`varpin.LiveView`, is also given the plant's motion in the last tick, a :class:`varpin.Nodes`.
 
         Raises:
             InputError: A plant with other controls or joints.
-            StepFailure: The plant's motion, or the first motion of a search, cannot be integrated; it holds the plant's
-                motion so far. Of a search its cause is the search's own.
-            CostError: A cost of the user's fails; from the second tick on it holds the plant's motion so far.
+            StepFailure: The plant's motion, or the first motion of a search, cannot be integrated. It holds the plant's
+                motion so far; after a search, its cause is the search's error.
+            CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far.
         """
         problem = self.problem
@@ -318,9 +316,9 @@ class Mpc:
                 f"the plant has servos on {', '.join(plant.scene.servo_joints) or 'no joints'}; the problem on "
                 f"{', '.join(problem.scene.servo_joints) or 'no joints'}"
             )
-        if _moved(plant.scene) != _moved(problem.scene):
-            moved = (", ".join(_moved(scene)) or "no joints" for scene in (plant.scene, problem.scene))
-            raise InputError("the plant has linear KinematicInputs on {}; the problem on {}".format(*moved))
+        if _linear_inputs(plant.scene) != _linear_inputs(problem.scene):
+            inputs = (", ".join(_linear_inputs(scene)) or "no joints" for scene in (plant.scene, problem.scene))
+            raise InputError("the plant has linear KinematicInputs on {}; the problem on {}".format(*inputs))
         ticks = max(1, round(positive("duration", duration, "s") / self.period))
         dt = self.period / plant.substeps
         generator = None if rng is None else np.random.default_rng(rng)
@@ -383,7 +381,7 @@ class Mpc:
 
 
 def _outside(held: Sequence[Kept]) -> tuple[Finding, ...]:
-    """Says where the plant's motion violated a constraint, and in how many ticks there was no plan within them."""
+    """Findings about constraints that the plant's motion violated, and about ticks without a feasible plan."""
     found = []
     for row in held:
         if row.infeasible.any():
@@ -392,8 +390,8 @@ def _outside(held: Sequence[Kept]) -> tuple[Finding, ...]:
                 Finding(
                     "infeasible ticks",
                     f"in {int(row.infeasible.sum())} of {len(row.planned)} ticks no plan was found that keeps to "
-                    f"{row.label}; in tick {tick} it is violated by {row.planned[tick]:.2g} {row.unit}, and the plan "
-                    "acts all the same: a longer horizon, wider limits or more iterations may help",
+                    f"{row.label}; in tick {tick} it is violated by {row.planned[tick]:.2g} {row.unit}. These plans "
+                    "act nevertheless: a longer horizon, wider limits or more iterations may help",
                 )
             )
         if row.worst > row.tolerance:
@@ -402,15 +400,15 @@ def _outside(held: Sequence[Kept]) -> tuple[Finding, ...]:
                 Finding(
                     "motion outside constraints",
                     f"the plant's motion violates {row.label} by {row.worst:.2g} {row.unit} at t = {when:.4g} s: a "
-                    "bound that is as much narrower (of noise, a margin=), a smaller dt, more iterations or a longer "
-                    "horizon keep it inside",
+                    "bound narrower by as much (under noise, a margin=), a smaller dt, more iterations or a longer "
+                    "horizon may keep it inside",
                 )
             )
     return tuple(found)
 
 
 def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, ...]:
-    """Says if a run takes another time than was asked for."""
+    """A finding if the duration of a run was rounded to whole ticks."""
     if abs(ticks * period - duration) <= 1e-9 * duration:
         return ()
     sentence = (
@@ -421,13 +419,13 @@ def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, .
 
 
 def _so_far(plant: Plant, method: Integrator, parts: Sequence[Trajectory]) -> Trajectory:
-    """The plant's motion up to now, with the warnings of its record."""
+    """The plant's motion so far, with its warnings."""
     motion = chained(parts)
     return with_warnings(motion, findings_from_record(plant.scene, method, motion))
 
 
 def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:
-    """Says if planning took longer than the period in more than a few ticks: on a robot that plan would be late."""
+    """A finding if planning took longer than the period in more than a few ticks."""
     planned = seconds[1:]
     slow = int((planned > period).sum())
     if not slow > _FEW * len(planned):
@@ -441,7 +439,7 @@ def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:
 
 
 def _late(late: NDArray[np.bool_], budget: float) -> tuple[Finding, ...]:
-    """Says if more than a few plans came after their budget: the loop then runs on old ones."""
+    """A finding if more than a few plans exceeded their budget."""
     planned, missed = len(late) - 1, int(late[1:].sum())
     if not missed > _FEW * planned:
         return ()
@@ -453,7 +451,7 @@ def _late(late: NDArray[np.bool_], budget: float) -> tuple[Finding, ...]:
 
 
 def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
-    """Says if a plant's velocities alternate from tick to tick: the controller is too fast for its period."""
+    """A finding if the plant's velocities alternate from tick to tick."""
     found = None if motion.dw.any() else alternation(motion.v[::substeps])
     if found is None:
         return ()
@@ -466,22 +464,22 @@ def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
 
 
 def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None = None) -> Floats:
-    """What the plan does at its decision ``age``, with its feedback, at the state (q, v) after a control (m,)."""
+    """Control (m,) of the plan's decision ``age`` with feedback at the state (q, v), after the control ``before``."""
     policy, last = plan.policy_on("velocity"), len(plan.gains) - 1
     if age > last and before is not None and policy.previous is not None:
-        # The last decision is repeated, and expects itself before.
+        # The last decision is repeated, with itself as the previous control.
         before = before - policy.u[last] + policy.previous[last]
     return policy.control(min(age, last), np.concatenate([q, v]), before)
 
 
 def _unplanned(failure: StepFailure, motion: Trajectory) -> StepFailure:
-    """The end of a run whose next plan's first motion fails; it holds the plant's motion so far."""
+    """The failure of a run whose next plan has no first motion; it holds the plant's motion so far."""
     reason = f"no plan can be made from here, as step {failure.step} of its first motion fails: {failure.reason}"
     return StepFailure(motion.steps, motion.t[-1], Failure(reason, failure.residual), motion)
 
 
 def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integrator:
-    """Who takes the plant's steps of ``dt`` [s], where a plan has it go."""
+    """The plant's integrator for steps of ``dt`` [s] along the first plan."""
     if plant.integrator is not None:
         return plant.integrator
     scene = plant.scene
@@ -491,8 +489,8 @@ def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integr
     return integrator_along(scene, chosen, plan.q, plan.v, plan.u, dt)
 
 
-def _moved(scene: Scene) -> tuple[str, ...]:
-    """The joints that are moved by hand on lines, which plans are of."""
+def _linear_inputs(scene: Scene) -> tuple[str, ...]:
+    """Names of the joints with linear kinematic inputs."""
     return tuple(
         scene.robot.joint_names[c] for c, rate in zip(scene.inputs.values(), scene.rates, strict=True) if rate < 0
     )
@@ -508,8 +506,8 @@ def _simulated(
     rng: np.random.Generator | None,
     before: Sequence[Trajectory],
 ) -> Trajectory:
-    """The plant's motion of one tick; what came before is in its failure."""
-    # Joints with kinematic inputs move on lines to their next positions over the tick.
+    """The plant's motion in one tick; a failure holds the motion ``before``, too."""
+    # Joints with kinematic inputs move linearly to their next positions over the tick.
     controls = in_parts_of_steps(plant.scene, u[None], q[None], v[None], dt * plant.substeps, plant.substeps)
     options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": controls, "integrator": method}
     options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}

@@ -1,11 +1,11 @@
-"""A search that starts on given states: forces of their own hold the motion there, and are taken away on the way.
+"""Multiple shooting from given states: auxiliary joint forces hold the first motion on them, then are removed.
 
-Equations (O14) and (O15) of docs/mathematics.md. A motion on given states, which no controls need be able to make, is
-one of the robot with a force of its own on every joint. What the forces of a step do to the state at its end is the gap
-of multiple shooting there. Each iteration first tries the step that closes all gaps, as FDDP does (Mastalli et al.,
-"Crocoddyl", 2020): the backward pass knows that the forces go. Where the motion does not follow the model so far, the
-forces are controls that cost something, more and more. When they are gone the motion is one of the controls alone, and
-single shooting goes on.
+Equations (O14) and (O15) of docs/mathematics.md. The given states need not be feasible: an auxiliary force on every
+joint makes up for what the controls lack. The effect of a step's auxiliary forces on the state at its end is the gap of
+multiple shooting. Each iteration first tries the step that closes all gaps, as FDDP does (Mastalli et al., "Crocoddyl",
+2020); the backward pass includes the removal of the forces. If the motion does not follow the model that far, the
+forces become controls with a quadratic cost, and its weight grows. Without auxiliary forces the motion is feasible, and
+single shooting continues from it.
 """
 
 from __future__ import annotations
@@ -40,27 +40,29 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-# How far the first of the states may be from the problem's [rad or m].
+# Tolerance on the first state against q0, and on position limits [rad or m].
 _SAME = 1e-6
-# The natural frequency of what holds the first motion on the path, times a decision's period.
-_HOLDS = 0.25
-# Of the forces on the joints: less than this part of the largest one is none.
-_NONE = 1e-9
-# What a step must keep of the decrease that the model promises, how many times the rise it may be that the model
-# foresees, and the lengths that are tried.
-_KEEPS, _WORSE = 0.1, 2.0
+# Natural frequency of the feedback that holds the first motion on the path, times the decision period.
+_HOLDING_FREQUENCY = 0.25
+# Auxiliary forces count as zero below this fraction of the total joint forces (2-norms over the motion).
+_NO_FORCE = 1e-9
+# Acceptance of a step: least share of an expected decrease, and greatest multiple of an expected increase.
+_LEAST_DECREASE, _MOST_INCREASE = 0.1, 2.0
+# Step lengths of the line search.
 _LENGTHS = 0.5 ** np.arange(10)
-# What forces cost grows by this factor where the model promises no more than this part of what is paid.
-_DEARER, _SETTLED = 4.0, 0.1
-# The regularization after steps that are shorter than this, and where iterations end.
+# The weight of the auxiliary forces grows by _WEIGHT_GROWTH when the expected decrease is at most this share of the
+# cost, that of the forces included.
+_WEIGHT_GROWTH, _SETTLED = 4.0, 0.1
+# Regularization: it decreases after steps of at least _LONG and increases after shorter ones, by the factor _GROWTH,
+# from _LEAST on; iterations end above _MOST.
 _LONG, _LEAST, _GROWTH, _MOST = 0.25, 1e-6, 10.0, 1e6
-# What a trial may end with.
-_LOST = (StepFailure, CostError, CustomForceError)
+# Errors that reject a trial.
+_TRIAL_ERRORS = (StepFailure, CostError, CustomForceError)
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """States to start from, on a problem's nodes: q (N + 1, n) and v (N + 1, n)."""
+    """States to start from, at the problem's nodes: q (N + 1, n) [rad or m] and v (N + 1, n) [rad/s or m/s]."""
 
     q: Floats
     v: Floats
@@ -68,12 +70,13 @@ class Path:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """A motion with forces on the joints.
+    """A motion with auxiliary joint forces.
 
     Attributes:
-        trajectory: As of the problem, of which it is none.
-        full: As of the scene with forces on the joints.
-        cost: Of it; nothing is paid for these forces.
+        trajectory: The motion with the problem's own controls only. It solves the problem's dynamics only where the
+            auxiliary forces are zero.
+        full: The motion in the scene with auxiliary forces; its controls are (u, forces).
+        cost: The problem's cost, without that of the auxiliary forces.
     """
 
     trajectory: Trajectory
@@ -82,16 +85,16 @@ class _Motion:
 
 
 def path_of(problem: OptimalControlProblem, given: object) -> Path:
-    """The states that a search is to start on, checked.
+    """Check the states that a search starts from.
 
     Raises:
-        InputError: They do not fit the problem, or do not begin where it does.
+        InputError: The states do not fit the problem, or do not begin at its q0.
     """
     if problem.linear:
-        raise InputError("states are for held controls; the problem's are linear between nodes")
+        raise InputError("states need held controls; the problem's are linear between nodes")
     if problem.scene.inputs:
         raise InputError(
-            "states do not go with a KinematicInput, whose control is where its joint is: give controls instead"
+            "states cannot be used with a KinematicInput, whose control is its joint's position: give controls instead"
         )
     n, nodes, names = problem.scene.robot.dof, problem.steps + 1, problem.scene.robot.joint_names
     q: object = given
@@ -99,7 +102,7 @@ def path_of(problem: OptimalControlProblem, given: object) -> Path:
     if isinstance(given, Trajectory):
         if given.joint_names != names:
             raise InputError(
-                f"states: the motion is of joints {', '.join(given.joint_names)}, and the problem of {', '.join(names)}"
+                f"states: the motion is of joints {', '.join(given.joint_names)}, the problem of {', '.join(names)}"
             )
         q, v = given.q, given.v
     elif isinstance(given, tuple):
@@ -131,42 +134,42 @@ def _rows(name: str, given: object, shape: tuple[int, int]) -> Floats:
     if array.ndim == 2 and array.shape[1] == shape[1] and array.shape[0] != shape[0]:
         raise InputError(
             f"{name} must have a row for each of {shape[0]} nodes, the first and the last included, got "
-            f"{array.shape[0]}: numpy.interp makes as many of others"
+            f"{array.shape[0]}: resample them, for example with numpy.interp"
         )
     return finite_array(name, array, shape).copy()
 
 
 class GapClosing:
-    """Iterations on a motion that starts on given states, until the controls alone make it.
+    """Iterations that remove the auxiliary forces of a motion on given states.
 
     Attributes:
-        history: Of the iterations so far.
-        motion: The motion so far.
-        left: Of the forces that the first motion has, the part that is left.
+        history: The iterations so far.
+        motion: The current motion.
+        left: Norm of the auxiliary forces, relative to that of the first motion.
     """
 
     def __init__(self, problem: OptimalControlProblem, path: Path, controls: Floats | None) -> None:
         """Make the first motion.
 
         Args:
-            problem: What to minimize. What its noise adds is left to the search that follows.
+            problem: The problem. Its noise is left to the search that follows.
             path: The states.
-            controls: Those that go with them (R, m); the inverse dynamics' within their limits if left out.
+            controls: Controls along the states (R, m); None for those of the inverse dynamics, clipped to their limits.
 
         Raises:
             StepFailure: The motion cannot be integrated.
-            CostError: Its cost is not finite.
+            CostError: The cost of the motion is not finite.
         """
         scene, own = assisted(problem.scene), quiet(problem.scene)
         self.scene, self.problem = scene, problem.changed(scene=own)
         if isinstance(problem, PenalizedProblem):
-            # The rows of penalties are those of the motion so far, and not of what passes expect of it.
+            # Penalties are linearized at the current motion, without the extra passes at the expected one.
             self.problem = self.problem.changed(passes=0)
         self.history: list[Iteration] = []
         self.left = 1.0
         n, m = own.robot.dof, own.controls
         M = lagrangian_jet(own, problem.q0, np.zeros(n)).Lvv
-        omega = _HOLDS / problem.period
+        omega = _HOLDING_FREQUENCY / problem.period
         hold = -np.hstack([omega**2 * M, 2.0 * omega * (np.eye(n) if problem.integrator.variational else M)])
         self._weight = np.linalg.inv(M)
         self._motions = Motions(scene, problem.integrator, problem.q0, problem.v0, problem.dt)
@@ -179,28 +182,28 @@ class GapClosing:
             at = path.q, np.array([lagrangian_jet(own, q, v).Lv for q, v in zip(*at, strict=True)])
         self.motion = self._rolled(np.hstack([u, force]), gains, np.hstack(at)[: -1 : problem.hold])
         if controls is None:
-            # What held the motion on the path is the controls' as far as they can.
+            # The controls take as much of the holding force as their limits allow.
             force = self.motion.full.u @ scene.actuation.T
             u = np.clip(force @ np.linalg.pinv(own.actuation).T, *problem.control_limits)
             self.motion = self._of(replace(self.motion.full, u=np.hstack([u, force - u @ own.actuation.T])))
         if not np.isfinite(self.motion.cost):
             culprits = " + ".join(map(repr, problem.not_finite(self.motion.trajectory) or problem.cost.terms))
             raise CostError(culprits, f"the cost of the motion along the states is {self.motion.cost}")
-        self._dearest = self._holding_cost()
+        self._cost_bound = self._holding_cost()
         self._first = float(np.linalg.norm(self.motion.full.u[:, m:]))
-        if self._first <= _NONE * np.linalg.norm(self.motion.full.u @ scene.actuation.T):
+        if self._first <= _NO_FORCE * np.linalg.norm(self.motion.full.u @ scene.actuation.T):
             self.left = 0.0
-        # To begin with the forces cost what the motion does.
-        self._price = 1.0
-        self._price = self.motion.cost / (self._bill(self.motion) or 1.0)
+        # The first weight makes the auxiliary forces cost as much as the motion.
+        self._force_weight = 1.0
+        self._force_weight = self.motion.cost / (self._force_cost(self.motion) or 1.0)
 
     @property
     def closed(self) -> bool:
-        """Whether the controls alone make the motion."""
+        """Whether the motion has no auxiliary forces."""
         return self.left == 0.0
 
     def policy(self) -> LinearPolicy:
-        """The controls of the motion, with feedback that keeps next to it."""
+        """The controls of the motion, with feedback that stabilizes it."""
         problem, motion = self.problem, self.motion.trajectory
         limits = problem.control_limits
         return LinearPolicy(
@@ -214,7 +217,7 @@ class GapClosing:
         )
 
     def run(self, iterations: int, deadline: float, report: Callable[[Iteration, Trajectory], None]) -> None:
-        """Take the forces away, in so many iterations at most; it may end with some left."""
+        """Remove the auxiliary forces, in at most ``iterations``; some may remain."""
         regularization = 0.0
         while not self.closed and len(self.history) < iterations and time.perf_counter() <= deadline:
             started = time.perf_counter()
@@ -225,21 +228,21 @@ class GapClosing:
                 break
             item = replace(item, index=len(self.history), seconds=time.perf_counter() - started)
             self.history.append(item)
-            logger.info("states, forces of %.3g of their first size: %s", self.left, item)
+            logger.info("states, auxiliary forces at %.3g of their first norm: %s", self.left, item)
             report(item, self.motion.trajectory)
             if item.step >= _LONG:
                 regularization = regularization / _GROWTH if regularization > _LEAST else 0.0
-                if item.expected_decrease <= _SETTLED * (item.cost + self._bill(self.motion)):
-                    self._price *= _DEARER
+                if item.expected_decrease <= _SETTLED * (item.cost + self._force_cost(self.motion)):
+                    self._force_weight *= _WEIGHT_GROWTH
             else:
                 regularization = max(_LEAST, _GROWTH * item.regularization)
                 if regularization > _MOST:
                     break
         if not self.closed:
-            logger.info("states: forces of %.3g of their first size are left; the search goes on without", self.left)
+            logger.info("states: auxiliary forces at %.3g of their first norm are dropped", self.left)
 
     def _rolled(self, u: Floats, gains: Floats, reference: Floats) -> _Motion:
-        """The motion under controls and forces (R, m + n) with feedback."""
+        """Integrate the motion under controls and auxiliary forces (R, m + n) with feedback."""
         problem = self.problem
         free = np.outer([-np.inf, np.inf], np.ones(problem.scene.robot.dof))
         commands = Commands(
@@ -256,7 +259,7 @@ class GapClosing:
         return self._of(full)
 
     def _own(self, full: Trajectory) -> Trajectory:
-        """A motion of the scene with forces on the joints as one of the problem's, which it is none of."""
+        """The motion with the problem's own controls only; the auxiliary forces are left out."""
         m = self.problem.scene.controls
         return replace(
             full, u=full.u[:, :m].copy(), u_stages=full.u_stages[:, :, :m], scene_values=self.problem.scene.values
@@ -267,18 +270,18 @@ class GapClosing:
         return _Motion(own, full, float(self.problem.shares(own).sum()))
 
     def _holding_cost(self) -> float:
-        """The cost of the motion that a search starts with that is given nothing."""
+        """Cost of the default first motion, under the holding policy; infinite where it fails."""
         problem, own = self.problem, self.problem.integrator
         n, m = problem.scene.robot.dof, problem.scene.controls
         commands = problem.holding_policy().commands(problem.steps, m, n, own.variational, problem.dt, own.stage_times)
         try:
             motion, failure = Motions(problem.scene, own, problem.q0, problem.v0, problem.dt).under(commands)
             return np.inf if failure is not None else float(problem.shares(motion).sum())
-        except _LOST:
+        except _TRIAL_ERRORS:
             return np.inf
 
     def _iterate(self, regularization: float) -> Iteration:
-        """Take all forces away at once, if that leads where the model says; else make them smaller."""
+        """Remove all auxiliary forces at once if the motion follows the model; else reduce them."""
         motion, trials, passes = self.motion, 0, 0
         length = 0.0
         closed = self._closed(regularization)
@@ -302,16 +305,17 @@ class GapClosing:
         )
 
     def _closed(self, regularization: float) -> tuple[float, float] | None:
-        """Try the step of multiple shooting that takes all forces away.
+        """Try the multiple-shooting step that removes all auxiliary forces, (O14).
 
-        The rise of the cost that the model expects of it, and the gradient's largest entry.
+        Returns:
+            The expected increase of the cost and the gradient's largest entry; None where the backward pass fails.
         """
         problem, motion, m = self.problem, self.motion, self.problem.scene.controls
         around = _Around(problem, self.scene, motion)
         plan = backward(problem, motion.trajectory, regularization, along=around)
         if plan is None:
             return None
-        # Where the states go when the forces do, under the plan's feedback; and from there as in any pass.
+        # First the linear response to the removal of the forces under the plan's feedback, then a pass around it.
         x, u = around.responded(plan, np.zeros_like(plan.feedforward), forces=True)
         shifted = around.moved(x, u)
         found = backward(problem, motion.trajectory, regularization, along=shifted)
@@ -326,65 +330,66 @@ class GapClosing:
         gradient = float(np.abs(found.free_gradient(problem, motion.trajectory)).max())
         try:
             trial = self._rolled(commands, gains, at + x[: -1 : problem.hold])
-        except _LOST as error:
+        except _TRIAL_ERRORS as error:
             logger.info("states: without forces: %s", error)
             return rise, gradient
-        promised = _WORSE * rise if rise > 0.0 else _KEEPS * rise
-        if trial.cost - motion.cost <= promised and trial.cost <= max(self._dearest, 2.0 * motion.cost):
+        most = _MOST_INCREASE * rise if rise > 0.0 else _LEAST_DECREASE * rise
+        if trial.cost - motion.cost <= most and trial.cost <= max(self._cost_bound, 2.0 * motion.cost):
             self.motion, self._gains, self.left = trial, found.feedback, 0.0
         return rise, gradient
 
     def _smaller(self, regularization: float) -> tuple[float, float, float, int]:
-        """A step of the search in which the forces are controls that cost something.
+        """One DDP step with the auxiliary forces as controls with a quadratic cost, (O15).
 
-        The length of the step, the rise that the model expects of it, the gradient's largest entry and the trials.
+        Returns:
+            The step length, the expected increase of the cost, the gradient's largest entry and the number of trials.
         """
         problem, motion, n, m = self.problem, self.motion, self.problem.scene.robot.dof, self.problem.scene.controls
         assisted = problem.changed(
             scene=self.scene,
             control_limits=np.hstack([problem.control_limits, np.outer([-np.inf, np.inf], np.ones(n))]),
         )
-        plan = backward(assisted, motion.full, regularization, along=self._priced(assisted))
+        plan = backward(assisted, motion.full, regularization, along=self._weighted(assisted))
         if plan is None:
             return 0.0, np.nan, np.nan, 0
         at, old = states(problem, motion.trajectory)[: -1 : problem.hold], motion.full.u[:: problem.hold]
-        here = motion.cost + self._bill(motion)
+        here = motion.cost + self._force_cost(motion)
         length, trials = 0.0, 0
         for step in _LENGTHS:
             trials += 1
             try:
                 trial = self._rolled(old + step * plan.feedforward, plan.feedback, at)
-            except _LOST as error:
+            except _TRIAL_ERRORS as error:
                 logger.info("states: trial of length %g: %s", step, error)
                 continue
-            if trial.cost + self._bill(trial) - here <= _KEEPS * step * plan.slope:
+            if trial.cost + self._force_cost(trial) - here <= _LEAST_DECREASE * step * plan.slope:
                 self.motion, self._gains = trial, plan.feedback[:, :m]
                 length, self.left = float(step), float(np.linalg.norm(trial.full.u[:, m:])) / self._first
                 break
         gradient = float(np.abs(plan.free_gradient(assisted, motion.full)).max())
         return length, -plan.expected_decrease, gradient, trials
 
-    def _bill(self, motion: _Motion) -> float:
-        """What the forces cost."""
+    def _force_cost(self, motion: _Motion) -> float:
+        """Cost of the auxiliary forces of a motion."""
         force = motion.full.u[:, self.problem.scene.controls :]
-        return 0.5 * self._price * self.problem.dt * float(np.einsum("Na,ab,Nb->", force, self._weight, force))
+        return 0.5 * self._force_weight * self.problem.dt * float(np.einsum("Na,ab,Nb->", force, self._weight, force))
 
-    def _priced(self, assisted: OptimalControlProblem) -> Along:
-        """What passes along the motion are made from in which the forces are controls."""
+    def _weighted(self, assisted: OptimalControlProblem) -> Along:
+        """Expansions for backward passes in which the auxiliary forces are controls with a cost."""
         problem, motion = self.problem, self.motion
         m, samples, x = problem.scene.controls, len(problem.model_rule), 2 * problem.scene.robot.dof
         own = Along(problem, motion.trajectory)
         along = Along(assisted.changed(rate=None), motion.full)
         along.problem = assisted
         size = x + self.scene.controls
-        price = self._price * self._weight
+        weight = self._force_weight * self._weight
         running = own.running
         gradient, hessian = np.zeros((len(running.gradient), size)), np.zeros((len(running.gradient), size, size))
         gradient[:, : x + m], hessian[:, : x + m, : x + m] = running.gradient, running.hessian
-        # Samples of a step weigh the same, and share what forces cost in it.
+        # All samples of a step have the same weight, so each has an equal share of the forces' cost.
         share = 1.0 / (samples * float(problem.rule[0, 0]))
-        gradient[:, x + m :] = share * np.repeat(motion.full.u[:, m:] @ price, samples, axis=0)
-        hessian[:, x + m :, x + m :] = share * price
+        gradient[:, x + m :] = share * np.repeat(motion.full.u[:, m:] @ weight, samples, axis=0)
+        hessian[:, x + m :, x + m :] = share * weight
         along.running, along.terminal = Expansion(gradient, hessian), own.terminal
         if problem.rate is not None:
             R, k = problem.decisions, self.scene.controls
@@ -394,13 +399,13 @@ class GapClosing:
 
 
 class _Around(Along):
-    """What passes along a motion with forces on the joints are made from."""
+    """Expansions for backward passes along a motion with auxiliary forces."""
 
     def __init__(self, problem: OptimalControlProblem, scene: Scene, motion: _Motion) -> None:
         super().__init__(problem, motion.trajectory)
         m, n, q, v = problem.scene.controls, problem.scene.robot.dof, motion.trajectory.q, motion.trajectory.v
         lin = linearize_steps(scene, motion.full, problem.integrator, problem.q0)
-        # What taking the forces away does to the end of each step.
+        # Change of the state at the end of each step when its auxiliary force is removed.
         self.gap = -np.einsum("Nxf,Nf->Nx", lin.B[:, :, m:], motion.full.u[:, m:])
         self.rates = velocity_at_nodes(problem.scene, q, v) if problem.integrator.variational else None
         own = replace(lin, B=np.ascontiguousarray(lin.B[:, :, :m]), Gu=lin.Gu[:, :, :, :m])
@@ -408,9 +413,12 @@ class _Around(Along):
         self.kept = own, np.zeros((0, n, 2 * n)) if self.rates is None else self.rates
 
     def responded(self, plan: Plan, ahead: Floats, *, forces: bool) -> tuple[Floats, Floats]:
-        """Where the linearized motion goes: states (N + 1, 2n) and controls (R, m), less the nominal ones.
+        """Response of the linearized motion: changes of the states (N + 1, 2n) and of the controls (R, m).
 
-        ``ahead`` (R, m) is what controls do beside the plan's feedback; with ``forces`` these go away.
+        Args:
+            plan: The plan whose feedback acts.
+            ahead: Feed-forward change of the controls (R, m).
+            forces: Whether the auxiliary forces are removed.
         """
         problem, (lin, _) = self.problem, self.linearized(0, self.problem.steps)
         x, u = np.zeros((problem.steps + 1, lin.A.shape[1])), np.zeros_like(ahead)
@@ -428,14 +436,17 @@ class _Around(Along):
         return x, u
 
     def _at_samples(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
-        """Changes of (q, v, u) at the samples of the cost and of (q, v) at the end, of those of states and controls."""
+        """Changes of (q, v, u) at the cost's samples and of (q, v) at the end.
+
+        x (N + 1, 2n) and u (R, m) are the changes of the states and the controls.
+        """
         problem, n = self.problem, self.problem.scene.robot.dof
         q, v = x[:, :n], x[:, n:] if self.rates is None else np.einsum("Nvx,Nx->Nv", self.rates, x)
         samples = np.concatenate(problem.model_samples(q, v, np.repeat(u, problem.hold, axis=0)), axis=1)
         return samples, np.concatenate([q[-1], v[-1]])
 
     def moved(self, x: Floats, u: Floats) -> _Around:
-        """The same as it is after changes of states (N + 1, 2n) and controls (R, m), by the quadratic model."""
+        """The expansions shifted by changes of the states (N + 1, 2n) and controls (R, m), to second order."""
         there, (samples, end) = copy(self), self._at_samples(x, u)
         there.added = _products(self.running.hessian, samples)
         final, D = self.terminal, self.terminal.slopes
@@ -447,7 +458,7 @@ class _Around(Along):
         return there
 
     def change(self, x: Floats, u: Floats) -> float:
-        """By how much changes of states (N + 1, 2n) and controls (R, m) make the motion dearer, by the model."""
+        """Change of the cost under the quadratic model, for changes of states (N + 1, 2n) and controls (R, m)."""
         weight, (samples, end) = self.problem.dt * float(self.problem.rule[0, 0]), self._at_samples(x, u)
         final = self.terminal.cost
         slope = weight * float((self.running.gradient * samples).sum()) + float(final.gradient[0] @ end)
@@ -467,13 +478,13 @@ def _products(hessian: Floats, z: Floats) -> Floats:
 
 
 def _inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Floats | None) -> tuple[Floats, Floats]:
-    """The controls (R, m) that come closest to making a motion on the path, and the forces (R, n) that are missing."""
+    """Controls (R, m) closest to the inverse dynamics on the path, and the joint forces (R, n) that are missing."""
     scene, hold = problem.scene, problem.hold
     q, v = 0.5 * (path.q[:-hold:hold] + path.q[hold::hold]), np.diff(path.q[::hold], axis=0) / problem.period
     a = np.diff(path.v[::hold], axis=0) / problem.period
     jets = [lagrangian_jet(scene, *at) for at in zip(q, v, strict=True)]
     needed = np.array([jet.Lvv @ a[k] + jet.Lvq @ v[k] - jet.Lq for k, jet in enumerate(jets)])
-    # Servos that stay where they are pull at nothing.
+    # A servo commanded to its present position exerts no spring force.
     still = np.array([scene.command_at(at) for at in q]) @ scene.actuation.T
     needed += still - scene.core.forces(q, v, still)[0]
     if controls is None:

@@ -1,4 +1,4 @@
-"""What a plan's constraints say of its motion: by how much they are violated, which are active, their multipliers."""
+"""Violations, active rows and multipliers of a plan's constraints."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# What a constraint may be violated by at its places in a plan that is feasible, in its own unit.
+# Greatest violation of a constraint at its places in a feasible plan, in its own unit.
 FEASIBLE = 1e-6
-# Of a tenth of a constraint's range, what is violated beside its places, or by a controller, without a word.
+# Greatest violation between its places, or by a controller, without a warning, relative to a tenth of its range.
 TOLD = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
 class Multipliers(Frozen):
-    """Multipliers of a plan's constraints, and where the rounds of the augmented Lagrangian stood.
+    """Multipliers of a plan's constraints, and the state of the rounds of the augmented Lagrangian.
 
-    Arrays of one number for each place and row have those of all constraints one after another, (M,).
+    Arrays (M,) have one number for each place and row of all constraints, one constraint after another.
 
     Attributes:
-        values: Of the plan's motion (M,) [cost / unit of the constraint].
-        backoff: What ``margin`` standard deviations come to (M,), in the constraint's unit; zero without a margin.
-        begun: Those that the last round began with (M,).
-        weights: Of the penalties in the last round (C,), for each constraint [cost / unit^2].
+        values: Multipliers of the plan's motion (M,) [cost / unit of the constraint].
+        backoff: ``margin`` standard deviations (M,), in the constraint's unit; zero without a margin.
+        begun: Multipliers at the beginning of the last round (M,).
+        weights: Weight of each constraint's penalty in the last round (C,) [cost / unit^2].
         first_weights: The same in the first round (C,).
-        worst: The violation after the round before (C,), for each constraint; infinite in the first round.
-        tolerance: Of the search in the last round.
+        worst: Violation of each constraint after the round before (C,); infinite in the first round.
+        tolerance: Tolerance of the search in the last round.
         round: Number of the last round, from 0.
-        iterations: Of the search in all rounds before.
-        stuck: Rounds in a row that have lowered the worst violation by little.
+        iterations: Iterations of all rounds before.
+        stuck: Number of successive rounds that have hardly lowered the worst violation.
     """
 
     values: Annotated[Floats, Axes("rows", finite=True)]
@@ -59,16 +59,16 @@ class Multipliers(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class ConstraintReport(Frozen):
-    """How a plan keeps to one of its constraints.
+    """How well a plan satisfies one of its constraints.
 
     Attributes:
         label: The constraint.
-        rows: What each row is, in words.
-        unit: Of the values.
+        rows: Description of each row.
+        unit: Unit of the values.
         t: Times of its places (K,) [s].
-        values: c at each place (K, rows), with what the margin adds: at most zero where it holds, zero of equalities.
-        multipliers: (K, rows) [cost / unit]: by how much the least cost falls, per unit, where the bound is moved away.
-        equality: Whether it is c = 0 rather than c <= 0.
+        values: c at each place (K, rows), margin included. The constraint holds where c <= 0, an equality where c = 0.
+        multipliers: (K, rows) [cost / unit]: decrease of the least cost per unit by which the bound is relaxed.
+        equality: Whether the constraint is c = 0 rather than c <= 0.
     """
 
     label: str
@@ -81,23 +81,23 @@ class ConstraintReport(Frozen):
 
     @property
     def excess(self) -> Floats:
-        """What is violated at each place (K, rows), at least zero."""
+        """Violation at each place (K, rows), at least zero."""
         found: Floats = np.abs(self.values) if self.equality else np.maximum(self.values, 0.0)
         return found
 
     @property
     def violation(self) -> float:
-        """The most that is violated."""
+        """The largest violation."""
         return float(self.excess.max(initial=0.0))
 
     @property
     def active(self) -> NDArray[np.bool_]:
-        """Where it holds the motion back (K, rows): its multiplier is not zero."""
+        """Where the constraint is active (K, rows): its multiplier is not zero."""
         return np.asarray(self.multipliers != 0.0)
 
     @property
     def where(self) -> str:
-        """Its worst place in words."""
+        """The row and time of the largest violation in words."""
         k, r = np.unravel_index(int(np.argmax(self.excess)), self.excess.shape)
         return f"{self.rows[r]} at t = {self.t[k]:.4g} s"
 
@@ -120,7 +120,7 @@ def split(bound: tuple[BoundConstraint, ...], flat: Floats) -> list[Floats]:
 def reports(
     problem: OptimalControlProblem, motion: Trajectory, multipliers: Multipliers
 ) -> tuple[ConstraintReport, ...]:
-    """What each constraint of a problem says of a motion on its grid."""
+    """Reports about each constraint of a problem for a motion on its grid."""
     bound = problem.bound_constraints
     found = []
     for item, backoff, values in zip(

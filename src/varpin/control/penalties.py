@@ -1,4 +1,4 @@
-"""The augmented Lagrangian of a problem with constraints: a problem without them, whose cost has their penalties.
+"""The augmented Lagrangian of a constrained problem: an unconstrained one with penalties in its cost.
 
 Equations (P2) and (P3) of docs/plan-constraints.md.
 """
@@ -20,7 +20,7 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Passes that look for the constraints that their motion meets.
+# Greatest number of backward passes that determine the active rows of the penalties.
 _PASSES = 60
 
 
@@ -28,8 +28,8 @@ _PASSES = 60
 class Penalty(Frozen):
     """The penalty (weight / 2) sum s^2 of one constraint, s = c + backoff + multipliers / weight.
 
-    Of c <= 0, what of s is below zero costs nothing. It differs from the augmented Lagrangian's usual form by the
-    constant multipliers^2 / (2 weight), and is never below zero.
+    For c <= 0, negative s costs nothing. The penalty differs from the usual form of the augmented Lagrangian by the
+    constant multipliers^2 / (2 weight), and is never negative.
 
     Attributes:
         bound: The constraint.
@@ -45,41 +45,41 @@ class Penalty(Frozen):
 
     @property
     def equality(self) -> bool:
-        """Whether it is of c = 0."""
+        """Whether the constraint is c = 0."""
         return self.bound.source.equality
 
     def signed(self, c: Floats) -> Floats:
-        """S of values (..., K, rows), not cut."""
+        """The shifted values s = c + backoff + multipliers / weight (..., K, rows)."""
         s: Floats = c + self.backoff + self.multipliers / self.weight
         return s
 
     def held(self, s: Floats) -> Mask:
-        """Which of ``s`` cost something."""
+        """Which rows of ``s`` are active, that is, have a cost."""
         return np.ones(s.shape, dtype=np.bool_) if self.bound.source.equality else s > 0.0
 
     def shifted(self, c: Floats) -> Floats:
-        """S of values (..., K, rows)."""
+        """The shifted values s (..., K, rows), zero where the row is inactive."""
         s = self.signed(c)
         return s if self.bound.source.equality else np.maximum(s, 0.0)
 
     def shares(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """What it costs at each place (K,) of a motion."""
+        """The cost of the penalty at each of its places (K,) on a motion."""
         s = self.shifted(self.bound.value(q, v, u))
         found: Floats = self.weight * 0.5 * (s * s).sum(axis=-1)
         return found
 
     def updated(self, c: Floats) -> Floats:
-        """The next round's multipliers (K, rows), (P3), from the values ``c`` at this one's minimum."""
+        """Multipliers of the next round (K, rows), (P3), from the values ``c`` at the minimum of this one."""
         return self.weight * self.shifted(c)
 
 
 @dataclass(frozen=True, eq=False)
 class PenalizedRate(Frozen):
-    """What changes of the controls cost, the penalties of their limits included; as :class:`ControlRate`.
+    """Cost of changes of the controls plus the penalties of rate limits; with the interface of :class:`ControlRate`.
 
     Attributes:
-        plain: Of the problem's cost; of weight zero where it has none.
-        penalties: Of limits of the rate.
+        plain: The rate cost of the problem; of weight zero where it has none.
+        penalties: The penalties of rate limits.
     """
 
     plain: ControlRate
@@ -87,7 +87,7 @@ class PenalizedRate(Frozen):
 
     @property
     def weight(self) -> Floats:
-        """That of the cost alone (m, m)."""
+        """Weight of the rate cost without penalties (m, m)."""
         return self.plain.weight
 
     @property
@@ -109,7 +109,7 @@ class PenalizedRate(Frozen):
         return total
 
     def expand(self, u: Floats, period: float, held: Sequence[Mask] | None = None) -> tuple[Floats, Floats]:
-        """See :meth:`ControlRate.expand`; of penalties, those of ``held`` rows, which cost something if left out."""
+        """See :meth:`ControlRate.expand`; ``held`` selects the penalty rows, by default the active ones."""
         gradient, hessian = self.plain.expand(u, period)
         for i, penalty in enumerate(self.penalties):
             bound = _rate_of(penalty)
@@ -124,12 +124,12 @@ class PenalizedRate(Frozen):
 
 
 def flat(parts: Sequence[Floats]) -> Floats:
-    """Parts one after another (M,)."""
+    """Concatenate the entries of all parts (M,)."""
     return np.concatenate([np.ravel(part) for part in parts]) if parts else np.zeros(0)
 
 
 def rate_columns(penalty: Penalty) -> NDArray[np.int64]:
-    """Which controls a penalty of the rate limits."""
+    """Indices of the controls that a rate penalty limits."""
     return _rate_of(penalty).limited
 
 
@@ -140,15 +140,15 @@ def _rate_of(penalty: Penalty) -> BoundRate:
 
 
 class PenalizedProblem(OptimalControlProblem):
-    """A problem whose cost has the penalties of its constraints. Made by :func:`penalized`.
+    """A problem with the penalties of its constraints in the cost. Made by :func:`penalized`.
 
-    Those of nodes are taken at the end of each step, beside the samples of the cost.
+    Penalties of states are evaluated at the end of each step, in addition to the samples of the cost.
 
     Attributes:
-        penalties: Of constraints on states.
-        all_penalties: Of all constraints, in the problem's order.
-        quiet: Whether plans leave the scene's noise out. With it, stiff penalties would count as what noise costs.
-        passes: That a backward pass may take to find the rows that its motion meets.
+        penalties: Penalties of constraints on states.
+        all_penalties: Penalties of all constraints, in the problem's order.
+        quiet: Whether plans leave the scene's noise out: otherwise stiff penalties would add to the noise cost.
+        passes: Greatest number of passes that determine the active rows; 0 keeps those of the nominal motion.
     """
 
     penalties: tuple[Penalty, ...]
@@ -169,7 +169,7 @@ class PenalizedProblem(OptimalControlProblem):
     @property
     def model_rule(self) -> Floats:
         """See :attr:`OptimalControlProblem.model_rule`."""
-        # q and v of the node at the end of the step.
+        # Weight, and coefficients that select q and v at the end of the step.
         node = [self.rule[0, 0], 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
         return np.vstack([self.rule, node])
 
@@ -191,7 +191,7 @@ class PenalizedProblem(OptimalControlProblem):
         return np.concatenate([shares, *(penalty.shares(q, v, u) for penalty in self.penalties)])
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
-        """See :meth:`OptimalControlProblem.expand_running`; of penalties, the Hessians of Gauss and Newton."""
+        """See :meth:`OptimalControlProblem.expand_running`; penalties have Gauss-Newton Hessians."""
         q, v, u = trajectory.q, trajectory.v, trajectory.u
         s = [penalty.signed(penalty.bound.value(q, v, u)) for penalty in self.penalties]
         held = [penalty.held(signed) for penalty, signed in zip(self.penalties, s, strict=True)]
@@ -208,9 +208,10 @@ class PenalizedProblem(OptimalControlProblem):
     def with_held(
         self, expansion: Expansion, shifted: Sequence[Floats], jacobians: Sequence[Floats], held: Sequence[Mask]
     ) -> Expansion:
-        """The running costs' expansion with penalties of the rows that are ``held``, each (K, rows).
+        """The running costs' expansion plus the penalties of the rows in ``held``, each (K, rows).
 
-        ``shifted`` are what the penalties are squares of, and ``jacobians`` their derivatives.
+        ``shifted`` are the values whose squares are penalized (:meth:`Penalty.signed`), ``jacobians`` their
+        derivatives.
         """
         N, size, x = self.steps, expansion.gradient.shape[1], 2 * self.scene.robot.dof
         gradient, hessian = np.zeros((N, size)), np.zeros((N, size, size))
@@ -220,7 +221,7 @@ class PenalizedProblem(OptimalControlProblem):
             steps, counted = penalty.bound.places - 1, rows.astype(float)
             gradient[steps, :x] += penalty.weight * np.einsum("kr,krx->kx", s * counted, J)
             hessian[steps, :x, :x] += penalty.weight * (np.swapaxes(J, 1, 2) @ (counted[:, :, None] * J))
-        # Samples of the model all weigh the same.
+        # All samples of the model have the same weight.
         weight = self.dt * float(self.rule[0, 0])
         gradients = np.concatenate([expansion.gradient.reshape(N, -1, size), gradient[:, None] / weight], axis=1)
         there = np.broadcast_to(expansion.hessian, (len(expansion.gradient), size, size)).reshape(N, -1, size, size)
@@ -240,12 +241,12 @@ def penalized(
     """The augmented Lagrangian of a problem.
 
     Args:
-        problem: Its own.
-        multipliers: Of each constraint (K, rows).
-        weights: Of each penalty (C,); of weight zero there is none.
-        backoff: Of each constraint (K, rows).
+        problem: The constrained problem.
+        multipliers: For each constraint (K, rows).
+        weights: One for each constraint (C,); weight zero means no penalty.
+        backoff: For each constraint (K, rows).
         quiet: Leave the scene's noise out.
-        passes: That a backward pass may take at most to find the rows that its motion meets.
+        passes: Greatest number of backward passes that determine the active rows.
     """
     made = object.__new__(PenalizedProblem)
     parts = [
@@ -265,6 +266,6 @@ def penalized(
             m = problem.scene.controls
             rate = ControlRate(np.zeros((m, m)), _rate_of(on_rate[0]).before)
         changes["rate"] = PenalizedRate(rate, on_rate)
-    # Past the dataclass, which refuses assignments.
+    # The dataclass is frozen: attributes are set in its dictionary.
     vars(made).update(vars(problem) | changes)
     return made

@@ -1,7 +1,7 @@
-"""A last step of a plan onto its active constraints, by Newton on the exact linearization of its motion.
+"""The last step of a plan onto its active constraints: Newton's method on the exact linearization of its motion.
 
-Equation (P4) of docs/plan-constraints.md.
-After the projected Newton step of Howell, Jackson and Manchester (2019), with the least change of the controls.
+Equation (P4) of docs/plan-constraints.md. After the projected Newton step of Howell, Jackson and Manchester (2019),
+with the least change of the controls.
 """
 
 from __future__ import annotations
@@ -24,25 +24,26 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+# Greatest number of Newton steps.
 _STEPS = 8
-# Of a step, how often controls that it takes beyond their limits are put there.
+# Greatest number of passes in a step that fix controls at their limits.
 _CLIPS = 6
-# What is left is rounding.
+# Violation that counts as rounding error.
 _DONE = 1e-12
-# Of the diagonal, what rows that depend on each other need.
+# Regularization of the normal equations, relative to their diagonal, for linearly dependent rows.
 _LITTLE = 1e-13
 
 
 def onto_constraints(
     problem: OptimalControlProblem, plan: Solution, multipliers: list[Floats], backoff: list[Floats]
 ) -> Trajectory:
-    """The motion next to a plan's that violates its constraints least, with controls within their limits.
+    """The motion near a plan's with the least violation of its constraints and controls within their limits.
 
     Args:
         problem: The problem with its constraints.
-        plan: A plan that all but keeps to them; its feedback holds the motion on the way.
-        multipliers: Of each constraint (K, rows): where they are not zero the constraint is to hold with equality.
-        backoff: Of each constraint (K, rows).
+        plan: A nearly feasible plan; its feedback stabilizes the motions of the Newton steps.
+        multipliers: For each constraint (K, rows); rows with positive multipliers are active.
+        backoff: For each constraint (K, rows).
     """
     best, worst = plan.trajectory, _worst(problem, plan.trajectory, backoff)
     trials, motion = Trials(problem), plan.trajectory
@@ -54,7 +55,7 @@ def onto_constraints(
         if worst <= _DONE:
             break
         values = [c + b for c, b in zip(_values(problem, motion), backoff, strict=True)]
-        # A row that a step has run into stays: it may be next to one that the plan is held back by.
+        # A row that a step violates becomes active and stays so: it may be next to an active one.
         active = [rows | (c > 0.0) for rows, c in zip(active, values, strict=True)]
         attempt = trials.attempt(_corrected(problem, plan, motion, values, active))
         if not attempt.whole:
@@ -67,7 +68,7 @@ def onto_constraints(
 
 
 def _worst(problem: OptimalControlProblem, motion: Trajectory, backoff: list[Floats]) -> float:
-    """The largest violation, each in its own unit."""
+    """The largest violation over all constraints, each in its own unit."""
     values = [c + b for c, b in zip(_values(problem, motion), backoff, strict=True)]
     parts = [
         np.abs(c).max() if item.source.equality else c.max()
@@ -87,19 +88,19 @@ def _corrected(
     values: list[Floats],
     active: list[Mask],
 ) -> Commands:
-    """The motion's controls with the least change that brings its active rows to their bounds, to first order."""
+    """Commands with the least change of the controls that moves active rows onto their bounds, to first order."""
     R, m = problem.decisions, problem.scene.controls
     u = motion.u[:: problem.hold]
     lower, upper = problem.control_limits
     free = (u > lower) & (u < upper)
-    # Controls of large machines may change more than those of small ones.
+    # Changes are weighed relative to the size of each control.
     size = np.abs(u).max(axis=0)
     size = np.where(size > 0.0, size, max(float(size.max()), 1.0))
     c = np.concatenate([value[rows] for value, rows in zip(values, active, strict=True)])
     linear = linearize_steps(problem.scene, motion, problem.integrator, problem.q0)
     ahead = np.zeros((R, m))
     for _ in range(_CLIPS):
-        # What has met a limit stays there, and the others do its part.
+        # Controls at a limit are fixed there, and the free ones make up for them.
         around = _Around(problem, motion, linear, plan, free)
         G = around.rows(active).reshape(-1, R, m)
         left = c + np.einsum("aRm,Rm->a", G, np.where(free, 0.0, ahead))
@@ -137,17 +138,16 @@ def _least_change(G: Floats, c: Floats) -> Floats:
 
 @dataclass
 class _Around:
-    """The linearization of a motion under a plan's feedback, with what constraints make of it.
+    """The linearization of a motion, and of its constraints, under a plan's feedback.
 
-    With the feedback, what is changed on the way to a bound is brought back behind it as the plan would. Without it
-    the rest of an unstable motion would go astray.
+    The feedback returns the motion to the plan after a correction. Without it an unstable motion would diverge.
 
     Attributes:
         problem: The problem with its constraints.
         motion: The motion.
-        linear: Of its steps.
-        plan: Whose feedback acts.
-        free: Controls (R, m) on which it acts.
+        linear: Linearization of its steps.
+        plan: The plan with the feedback.
+        free: Controls (R, m) on which the feedback acts.
     """
 
     problem: OptimalControlProblem
@@ -162,7 +162,7 @@ class _Around:
         self.previous = np.zeros((*self.free.shape, self.free.shape[1])) if previous is None else previous * acts
 
     def rows(self, active: list[Mask]) -> Floats:
-        """Derivatives (a, R m) of the active rows in what controls do beside the feedback."""
+        """Derivatives (a, R m) of the active rows with respect to the feed-forward controls."""
         problem, motion = self.problem, self.motion
         n, R, m, hold = problem.scene.robot.dof, problem.decisions, problem.scene.controls, problem.hold
         total = sum(int(rows.sum()) for rows in active)
@@ -188,14 +188,14 @@ class _Around:
             G[:, own] += back @ self.linear.B[j]
             back = back @ self.linear.A[j]
             if j % hold == 0:
-                # The control follows the state before it, and the control before.
+                # Through feedback the control depends on the state before it and on the previous control.
                 back += G[:, own] @ self.gains[own]
                 if own > 0:
                     G[:, own - 1] += G[:, own] @ self.previous[own]
         return G.reshape(total, R * m)
 
     def moved(self, ahead: Floats) -> tuple[Floats, Floats]:
-        """What states (N + 1, 2n) and controls (R, m) change by if controls do ``ahead`` (R, m) beside the feedback."""
+        """Changes of the states (N + 1, 2n) and controls (R, m) for feed-forward changes ``ahead`` (R, m)."""
         A, B, hold = self.linear.A, self.linear.B, self.problem.hold
         found, change = np.zeros((len(A) + 1, A.shape[1])), ahead.copy()
         for j in range(len(A)):
@@ -209,7 +209,7 @@ class _Around:
 
 
 def _of_rate(item: BoundRate, k: NDArray[np.int64], r: NDArray[np.int64], R: int, m: int) -> Floats:
-    """Derivatives (a, R, m) of rows of the controls' rate."""
+    """Derivatives (a, R, m) of rows of a rate limit with respect to the controls."""
     rows, limited = np.zeros((len(k), R, m)), item.limited
     signs, columns = np.where(r < len(limited), 1.0, -1.0), limited[r % len(limited)]
     decisions, index = item.places[k], np.arange(len(k))
@@ -229,15 +229,15 @@ def state_slopes(problem: OptimalControlProblem, motion: Trajectory) -> Floats:
 
 
 def deviations(problem: OptimalControlProblem, plan: Solution, bound: BoundConstraint) -> Floats:
-    """Standard deviations (K, rows) of a constraint of states under the plan's feedback and the scene's noise.
+    """Standard deviations (K, rows) of a state constraint under the plan's feedback and the scene's noise.
 
-    The covariance is that of the linearization, P' = Ac P Ac' + dt sum_i E[g_i g_i'] with each control held over its
-    decision, as :func:`varpin.propagate_moments` has it without feedback. Limits of controls are not in it.
+    The covariance is that of the linearization, P' = Ac P Ac' + dt sum_i E[g_i g_i'], with each control held over its
+    decision; :func:`varpin.propagate_moments` is the same without feedback. Control limits are neglected.
     """
     motion, n, m = plan.trajectory, problem.scene.robot.dof, problem.scene.controls
     lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0)
     x = 2 * n
-    # Of the state and the control that holds, together.
+    # Covariance of the state and the held control.
     P, found = np.zeros((x + m, x + m)), np.zeros((problem.steps + 1, x, x))
     for j in range(problem.steps):
         if j % problem.hold == 0:

@@ -1,4 +1,4 @@
-"""An optimal control problem: a scene, a cost, a horizon and how it is discretized.
+"""An optimal control problem: a scene, a cost, a horizon and its discretization.
 
 Equation (O1) of docs/mathematics.md.
 """
@@ -57,7 +57,7 @@ logger = logging.getLogger(__name__)
 Sampling = Literal["midpoint", "gauss", "start"]
 Shape = Literal["held", "linear"]
 
-# Rates of dampers and dry friction, times the step, from which on plans are made with an L-stable method.
+# Greatest rate of dampers and dry friction, times the step, for a method that is not L-stable.
 _STIFF = 200.0
 
 
@@ -65,10 +65,10 @@ _STIFF = 200.0
 class OptimalControlProblem(Frozen):
     """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
 
-    With ``controls="linear"`` they are linear in time between the nodes, and chosen at each node, the first one
-    included. What is smooth in time takes a fraction of the nodes then. Limits are kept at the nodes, so everywhere.
+    With ``controls="linear"`` they are linear in time between the nodes, with one decision at each node, the first one
+    included. Smooth motions then need a fraction of the nodes. Limits hold at the nodes, and so everywhere.
 
-    Running costs are integrals in time, sampled once a step, and references are functions of time: the problem means
+    Running costs are integrals in time, sampled in each step, and references are functions of time, so the problem is
     the same at every ``dt``. Controls stay within their limits, feedback included. Costs add up, and numbers scale
     them:
 
@@ -79,13 +79,13 @@ class OptimalControlProblem(Frozen):
     ``VelocityCost(weight, v_r)`` weight . (v - v_r(t))^2
     ``ControlCost(weight, u_r)``  weight . (u - u_r(t))^2; give every control some
     ``ControlRateCost(weight)``   weight . (du/dt)^2, which keeps controls smooth
-    ``FramePositionCost``         of a frame's place; of its ``FrameOrientationCost``,
+    ``FramePositionCost``         a frame's position; also ``FrameOrientationCost``,
                                   ``FrameVelocityCost``
-    ``CenterOfMassCost``          of the robot's centre of mass
+    ``CenterOfMassCost``          the robot's centre of mass
     ``ManipulabilityCost``        keeps away from singular postures
     ``JointLimitBarrier``         keeps joints within their limits; ``VelocityLimitBarrier``
-    ``CustomCost(function)``      a function of one's own of (t, q, v, u)
-    ``Terminal(cost)``            any of them but the control's, at the end instead of its integral
+    ``CustomCost(function)``      a user's function of (t, q, v, u)
+    ``Terminal(cost)``            any of them but the control's, at the end instead of integrated
     ============================= ================================================================
 
     Attributes:
@@ -93,26 +93,25 @@ class OptimalControlProblem(Frozen):
         cost: Running and terminal costs.
         q0: Initial configuration (n,) [rad or m]; it may be given by joint name. Where the scene has constraints, a
             small miss is corrected, as :func:`varpin.simulate` does.
-        v0: Initial velocity (n,) [rad/s or m/s]; the same.
+        v0: Initial velocity (n,) [rad/s or m/s]; also by joint name, and corrected in the same way.
         dt: Time step [s].
         steps: N.
         integrator: Any of varpin's. If left out, ``Gauss(stages=4)``; ``Radau(stages=4)`` where dry friction or dampers
             are more than 200 times as fast as the step at ``q0`` and rest, and the scene has no constraints.
-        sampling: Where running costs are taken in each step. ``"gauss"``, if left out: at its two Gauss points, the
-            motion between the nodes taken for a cubic, of fourth order. ``"midpoint"``: at
-            ((q + q')/2, (q' - q)/dt, u), of second order; it does not see velocities that alternate from node to node,
-            and the optimal ones often do. ``"start"``: at the node where it begins, a left sum as in the paper, of
-            first order.
+        sampling: Where in each step running costs are sampled. ``"gauss"``, the default: at its two Gauss points, with
+            a cubic motion between the nodes, of fourth order. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of
+            second order; it is blind to velocities that alternate from node to node, as optimal ones often do.
+            ``"start"``: at the step's first node, a left sum as in the paper, of first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
-        t0: When the horizon begins [s]; references that are functions of time see it.
+        t0: Time at the beginning of the horizon [s], for references that are functions of time.
         control_limits: Least and greatest control (2, m) [N m or N per unit of control], infinite where there is none;
             of a :class:`varpin.KinematicInput` its positions at nodes.
         controls: ``"held"``, each constant over ``hold`` steps, or ``"linear"`` in time between nodes.
-        constraints: What the motion has to keep to, whatever it costs (:class:`PlanConstraint`): limits of joints, a
-            frame's goal, regions, clearance. Those of a :class:`Scene` are others: they belong to the mechanism, and
-            forces of their own keep them in every motion.
-        rate: What changes of the controls cost: ``rate.weight`` (m, m) and ``rate.before``, the control before the
-            horizon (m,) or None; None where they cost nothing.
+        constraints: Hard constraints on the motion (:class:`PlanConstraint`): joint limits, a frame's goal, regions,
+            clearance. The constraints of a :class:`Scene` differ: they belong to the mechanism, and constraint forces
+            maintain them in every motion.
+        rate: Cost of changes of the controls: ``rate.weight`` (m, m) and ``rate.before``, the control before the
+            horizon (m,) or None; None where changes cost nothing.
     """
 
     scene: Scene
@@ -151,19 +150,19 @@ class OptimalControlProblem(Frozen):
         controls: Shape = "held",
         constraints: Sequence[PlanConstraint] = (),
     ) -> None:
-        """Describe a problem; the class says what each argument is.
+        """Describe a problem; see the class for the arguments.
 
         ``control_limits`` are (lower, upper), each one number, (m,), or by joint name where each control is the force
-        of a joint; infinite where a control has no limit, and for joints that are not named.
+        of a joint. They are infinite where a control has no limit, and for joints that are not named.
 
         Raises:
-            UnknownJoint: A name that is no joint's, or of controls no driven joint's.
+            UnknownJoint: An unknown joint name, or one of a joint that is not driven, for controls.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
-                reference that does not fit the problem's grid, or limits that leave a control nothing; linear controls
-                with ``hold``, in a scene with noise or with constraints; either with joints that are moved by hand, or
-                a cubic one of these; constraints that are no plan constraints or of another robot.
-            CostError: A reference that is a function fails.
-            AssemblyError: The scene's constraints cannot be kept next to q0.
+                reference that does not fit the problem's grid, or a lower limit above the upper one; linear controls
+                with ``hold``, in a scene with noise or with constraints; ``hold`` or linear controls with a
+                :class:`KinematicInput`, or a cubic one; constraints that are no plan constraints or of another robot.
+            CostError: A reference function fails.
+            AssemblyError: The scene's constraints cannot be satisfied near q0.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
         if not isinstance(cost, Cost):
@@ -177,18 +176,18 @@ class OptimalControlProblem(Frozen):
             raise InputError(f"controls must be 'held' or 'linear', got {controls!r}")
         if scene.inputs and (hold != 1 or controls == "linear"):
             raise InputError(
-                "the control of a KinematicInput is where its joint is at the next node: leave hold and "
-                "controls='linear' out; it moves linearly between nodes"
+                "the control of a KinematicInput is its joint's position at the next node: leave hold and "
+                "controls='linear' out; the joint moves linearly between nodes"
             )
         if max(scene.rates, default=-1) >= 0:
             raise InputError(
-                "plans take no cubic KinematicInput: costs that are sampled in a step do not see what its velocities "
-                "at nodes do between them; plan with interpolation='linear', and keep it smooth by a ControlRateCost"
+                "plans take no cubic KinematicInput: costs sampled within a step miss the effect of its velocities at "
+                "the nodes; plan with interpolation='linear', and keep it smooth by a ControlRateCost"
             )
         if controls == "linear" and hold != 1:
             raise InputError(f"linear controls change at every node: leave hold = {hold} out, or take controls='held'")
         if controls == "linear" and scene.processes:
-            raise InputError("plans with linear controls know no noise: take controls='held', or leave the noise out")
+            raise InputError("plans with linear controls take no noise: use controls='held', or leave the noise out")
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
         if m == 0:
@@ -207,7 +206,7 @@ class OptimalControlProblem(Frozen):
         rate = control_rate(cost, m, scene.control_joints)
         given = _constraints(constraints)
         if given and controls == "linear":
-            raise InputError("plans with linear controls know no constraints: take controls='held'")
+            raise InputError("plans with linear controls take no constraints: use controls='held'")
         values = {
             "scene": scene,
             "cost": cost,
@@ -257,19 +256,19 @@ class OptimalControlProblem(Frozen):
 
     @property
     def remembers(self) -> bool:
-        """Whether the control before the horizon counts: changes of controls cost something or have a limit."""
+        """Whether the control before the horizon matters: changes of controls have a cost or a limit."""
         return self.rate is not None or any(item.of_controls for item in self.bound_constraints)
 
     @property
     def before(self) -> Floats | None:
-        """The control before the horizon (m,); None where it does not count, or nothing is known of it."""
+        """The control before the horizon (m,); None where it does not matter or is unknown."""
         known = None if self.rate is None else self.rate.before
         limits = (item.before for item in self.bound_constraints if isinstance(item, BoundRate))
         return next((before for before in (known, *limits) if before is not None), None)
 
     @property
     def decisions(self) -> int:
-        """R, the number of controls to choose: steps / hold, or steps + 1 where they are linear between nodes."""
+        """R, the number of decisions: steps / hold, or steps + 1 where controls are linear between nodes."""
         return self.steps + 1 if self.linear else self.steps // self.hold
 
     @property
@@ -296,19 +295,19 @@ class OptimalControlProblem(Frozen):
         before: JointValues | None = None,
         controls: Shape | None = None,
     ) -> OptimalControlProblem:
-        """The same problem, discretized otherwise or from another state.
+        """The same problem with another discretization or initial state.
 
         With ``dt`` alone the horizon stays, and the number of steps follows. ``before`` is the control applied before
-        the horizon, one number, (m,) or by joint name, for its :class:`ControlRateCost` and
-        :class:`WithinControlRate`.
+        the horizon, one number, (m,) or by joint name, for :class:`ControlRateCost` and :class:`WithinControlRate`.
 
         Raises:
-            InputError: The horizon is no multiple of ``dt``, or ``before`` is given and changes of controls cost
-                nothing and have no limit; or as for the problem itself.
+            InputError: The horizon is no multiple of ``dt``; ``before`` is given where changes of controls have
+                neither cost nor limit; or as for the problem itself.
         """
         if before is not None and not self.remembers:
             raise InputError(
-                "before is the control that a ControlRateCost or a WithinControlRate begins with, and there is none"
+                "before is the control that a ControlRateCost or a WithinControlRate begins with; the problem has "
+                "neither"
             )
         if dt is not None and steps is None:
             steps = round(self.duration / positive("dt", dt, "s"))
@@ -333,7 +332,7 @@ class OptimalControlProblem(Frozen):
         )
 
     def _after(self, before: JointValues | None) -> tuple[PlanConstraint, ...]:
-        """The constraints on a horizon after another control."""
+        """The constraints with another control before the horizon."""
         if before is None:
             return self.constraints
         control = control_values("before", before, self.scene.control_joints, self.scene.controls)
@@ -342,7 +341,7 @@ class OptimalControlProblem(Frozen):
     def _restarted(
         self, q0: JointValues | None, v0: JointValues | None, t0: float | None, before: JointValues | None
     ) -> OptimalControlProblem:
-        """The problem on the same grid: only what a state or a time can change is made anew."""
+        """The problem on the same grid; only what depends on the state or the time is rebuilt."""
         scene, names = self.scene, self.scene.robot.joint_names
         changed: dict[str, Any] = {}
         for name, given in (("q0", q0), ("v0", v0)):
@@ -368,12 +367,12 @@ class OptimalControlProblem(Frozen):
             constraints = changed.get("constraints", self.constraints)
             changed["bound_constraints"] = _bind_constraints(constraints, scene, *grid, rate)
         problem = object.__new__(type(self))
-        # Past the dataclass, which refuses assignments.
+        # The dataclass is frozen: attributes are set in its dictionary.
         vars(problem).update(vars(self) | changed)
         return problem
 
     def differs(self, other: OptimalControlProblem) -> str:
-        """In words, what of two problems differs that can be told without comparing costs; empty if nothing."""
+        """The first difference between two problems in words, costs aside; empty if there is none."""
         robot, its = self.scene.robot, other.scene.robot
         if robot.joint_names != its.joint_names:
             return f"joints {', '.join(its.joint_names)}, not {', '.join(robot.joint_names)}"
@@ -396,22 +395,22 @@ class OptimalControlProblem(Frozen):
         return next(iter(differences(self.scene, other.scene.values, noise=True)), "")
 
     def constraints_on(self, dt: float, steps: int, hold: int) -> tuple[BoundConstraint, ...]:
-        """Its constraints on another grid."""
+        """The constraints on another grid."""
         return _bind_constraints(self.constraints, self.scene, self.t0, dt, steps, hold, self.rate)
 
     @property
     def described_constraints(self) -> str:
-        """Its constraints in words and numbers, all that tells them from others; empty without any."""
+        """A full description of the constraints, for comparison; empty without any."""
         return "; ".join(map(repr, self.constraints))
 
     @property
     def processes(self) -> int:
-        """How many Wiener processes plans reckon with."""
+        """The number of Wiener processes that plans take into account."""
         return self.scene.processes
 
     @property
     def steered(self) -> NDArray[np.bool_]:
-        """Which processes (k,) change plans: what those of constant strength add to the cost is the same for all."""
+        """Which processes (k,) can change plans; one of constant strength adds the same cost to all motions."""
         fields = self.scene.noise.diffusion
         if fields is None or not self.integrator.variational:
             return np.ones(self.scene.processes, dtype=np.bool_)
@@ -419,7 +418,7 @@ class OptimalControlProblem(Frozen):
 
     @property
     def model_rule(self) -> Floats:
-        """Where in a step the quadratic model of the cost is made, as :attr:`rule`."""
+        """Sample points of the cost's quadratic model in a step, as :attr:`rule`."""
         return self.rule
 
     def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
@@ -432,15 +431,15 @@ class OptimalControlProblem(Frozen):
         return bool(np.isfinite(self.control_limits).any())
 
     def holding_controls(self) -> Floats:
-        """The constant control (m,) that comes closest to holding the robot at q0 at rest, within its limits."""
+        """The constant control (m,), within its limits, that comes closest to holding the robot at rest at q0."""
         u = closest_controls(self.scene, self.q0)
         return np.asarray(np.clip(u, *self.control_limits), dtype=np.float64)
 
     def holding_policy(self) -> LinearPolicy:
-        """Holding controls, with feedback that keeps the robot there where every joint can be driven.
+        """Holding controls, with feedback that stabilizes q0 where every joint can be driven.
 
-        The feedback is M(q0) (omega^2 (q0 - q) - 2 omega v), twice as fast as what falls or swings at q0. Without it
-        rounding alone makes an arm fall over that stands upright.
+        The feedback is M(q0) (omega^2 (q0 - q) - 2 omega v), twice as fast as the fastest natural motion at q0. Without
+        feedback rounding errors alone make an upright arm fall over.
         """
         n, m, R = self.scene.robot.dof, self.scene.controls, self.decisions
         jet = lagrangian_jet(self.scene, self.q0, np.zeros(n))
@@ -472,7 +471,7 @@ class OptimalControlProblem(Frozen):
         )
 
     def decided(self, trajectory: Trajectory) -> Floats:
-        """The controls (R, m) of a motion on the problem's grid, one row for each decision."""
+        """The controls (R, m) of a motion on the problem's grid, one row per decision."""
         return trajectory.u_nodes if self.linear else trajectory.u[:: self.hold]
 
     def control_rows(self, trajectory: Trajectory) -> Floats:
@@ -480,7 +479,7 @@ class OptimalControlProblem(Frozen):
         return trajectory.u_nodes if self.linear else trajectory.u
 
     def _static_curvature(self, Lqq: Floats) -> Floats:
-        """L_qq - y . g_qq, y the constraints' forces where the robot is held at q0 at rest."""
+        """L_qq - y . g_qq, with y the constraint forces where the robot is held at rest at q0."""
         if not self.scene.constraints:
             return Lqq
         scene, q = self.scene, self.q0
@@ -491,7 +490,7 @@ class OptimalControlProblem(Frozen):
         return curvature
 
     def samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
-        """Where running costs are taken, the s samples of a step one after another.
+        """States and controls at the running costs' samples, the s samples of a step one after another.
 
         q and v (..., N s, n) and u (..., N s, m), from q and v at the nodes (..., N + 1, n) and u (..., N, m), or
         (..., N + 1, m) at the nodes where controls are linear between them.
@@ -505,9 +504,9 @@ class OptimalControlProblem(Frozen):
         return at_q, at_v, u if len(self.rule) == 1 else np.repeat(u, len(self.rule), axis=-2)
 
     def costs(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """The cost (...) of motions without their noise terms: q and v (..., N + 1, n), u (..., N, m)."""
+        """The cost (...) of motions without noise terms: q and v (..., N + 1, n), u (..., N, m)."""
         values = self.running.value(*self.samples(q, v, u))
-        # Every rule here weighs its samples alike.
+        # All samples of a rule have the same weight.
         running = values.sum(axis=-1) * (self.dt * self.rule[0, 0])
         end = np.zeros((*u.shape[:-2], 1, u.shape[-1]))
         total: Floats = running + self.terminal.value(q[..., -1:, :], v[..., -1:, :], end)[..., 0]
@@ -517,8 +516,8 @@ class OptimalControlProblem(Frozen):
         """The cost of one motion on the problem's grid.
 
         Raises:
-            InputError: The motion is no trajectory of the problem's robot, or it has another number of steps or
-                controls, or another time step.
+            InputError: The motion is not of the problem's robot, or has another number of steps or controls, or
+                another time step.
         """
         require_motion(self.scene, trajectory)
         if self.linear and not trajectory.u_nodes.shape[1]:
@@ -531,10 +530,10 @@ class OptimalControlProblem(Frozen):
         return float(self.shares(trajectory).sum())
 
     def shares(self, trajectory: Trajectory) -> Floats:
-        """What the cost of a motion is the sum of: one entry for each term at each sample.
+        """The terms that sum to the cost of a motion: one entry for each cost term at each sample.
 
-        Differences of two costs are sums of differences of shares. A constant in a cost leaves them as they are,
-        however large it is.
+        The difference of two costs is summed from differences of shares, so a constant in the cost, however large,
+        causes no rounding error.
         """
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
         return self.shares_along(q, v, u, self.running.compiled.values(*self.samples(q, v, u)))
@@ -556,11 +555,11 @@ class OptimalControlProblem(Frozen):
         return np.concatenate(found)
 
     def not_finite(self, trajectory: Trajectory) -> tuple[Cost, ...]:
-        """The terms of the cost that are not finite on a motion, without those of the controls' rate."""
+        """The cost terms that are not finite on a motion; those of the controls' rate are not tested."""
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
         along, end = self.samples(q, v, u), (q[-1:], v[-1:], np.zeros((1, u.shape[1])))
         terms = [term for term in self.cost.terms if not is_control_rate(term)]
-        # Both sums have their parts in the order of the cost's terms.
+        # The parts of both sums are in the order of the cost's terms.
         found = []
         for total, at, at_end in ((self.running, along, False), (self.terminal, end, True)):
             placed = [term for term in terms if isinstance(term, Terminal) == at_end]
@@ -575,7 +574,7 @@ class OptimalControlProblem(Frozen):
         """The motion from (q0, v0) under controls (N, m), a policy or an OpenLoop; with noise if rng is given.
 
         Raises:
-            StepFailure: The motion cannot go on.
+            StepFailure: A step cannot be integrated.
             InputError: As :func:`varpin.simulate`.
         """
         return simulate(
@@ -600,7 +599,7 @@ class OptimalControlProblem(Frozen):
 
     @property
     def places(self) -> Floats:
-        """Where in a step of unit length running costs are sampled (s,)."""
+        """Sample points of running costs in a step of unit length (s,)."""
         return _rule(self.sampling, self.dt)[0]
 
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
@@ -609,20 +608,20 @@ class OptimalControlProblem(Frozen):
 
 
 def default_integrator() -> Gauss:
-    """The integrator of plans where none is given and nothing is stiff, in Python and in scene files.
+    """The default integrator of plans without stiff friction, in Python and in scene files.
 
-    Two stages are of the cost's order. Light joints of an arm with friction need more: their velocities settle within a
-    fraction of a step. Four stages follow that where friction is up to ten times as fast as the step, for a third more
-    time than two.
+    Two stages match the cost's order. Light joints with friction need more, as their velocities settle within a
+    fraction of a step. Four stages resolve friction up to ten times as fast as the step, for a third more time than
+    two.
     """
     return Gauss(stages=4)
 
 
 def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
-    """The integrator of a problem where none is given: the default, or the L-stable one of as many stages.
+    """The integrator of a problem that gives none: the default, or the L-stable one of as many stages.
 
-    Of what is z times as fast as the step, Gauss(4) leaves 1 - 40 / z after each: next to nothing goes from 200 on.
-    Under constraints of the scene it is the default all the same, for Radau's methods do not keep them.
+    A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4): for z above 200 hardly at
+    all. With constraints of the scene it is always the default, since Radau's methods do not support them.
     """
     stages = default_integrator().stages
     if scene.constraints or not dt * rate_at_rest(scene, q0) > _STIFF:
@@ -633,7 +632,7 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
 def _control_limits(given: tuple[JointValues, JointValues] | None, scene: Scene) -> Floats:
     if isinstance(given, str):
         raise InputError(
-            "control_limits must be a pair (lower, upper), for those of a robot that is driven in every joint "
+            "control_limits must be a pair (lower, upper), for a robot with every joint driven "
             f"(-robot.effort_limit, robot.effort_limit); got {given!r}"
         )
     return named_limits("control_limits", given, scene.control_joints, scene.controls)
@@ -660,7 +659,7 @@ def _bind_constraints(
     hold: int,
     rate: ControlRate | None,
 ) -> tuple[BoundConstraint, ...]:
-    """Constraints on a grid."""
+    """Bind constraints to a grid."""
     if not constraints:
         return ()
     times = t0 + np.arange(steps + 1, dtype=np.float64) * dt
@@ -670,9 +669,9 @@ def _bind_constraints(
 
 
 def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:
-    """Where in a step its samples are, (s,), and how they are made (s, 9).
+    """Sample points in a step of unit length (s,), and the coefficients of the samples (s, 9).
 
-    A row is (weight, q from q0, v0, q1, v1, v from q0, v0, q1, v1).
+    A row has the weight, then the coefficients of (q0, v0, q1, v1) for q, then those for v.
     """
     if sampling == "start":
         return np.zeros(1), np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
@@ -688,7 +687,7 @@ def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:
 
 
 def _times(places: Floats, steps: int, dt: float) -> Floats:
-    """Of all samples since the horizon began (N s,) [s], which are at ``places`` in each step."""
+    """Times of all samples since the beginning of the horizon (N s,) [s], at ``places`` in each step."""
     times: Floats = ((np.arange(steps, dtype=np.float64)[:, None] + places) * dt).reshape(-1)
     return times
 
@@ -696,9 +695,9 @@ def _times(places: Floats, steps: int, dt: float) -> Floats:
 def bind_cost(
     cost: Cost, times: Floats, horizon: Points, known: tuple[BoundSum, BoundSum] | None = None
 ) -> tuple[BoundSum, BoundSum]:
-    """The running costs at ``times`` (N,) of a horizon, and the terminal ones at its end.
+    """The running costs at ``times`` (N,) of a horizon, and the terminal costs at its end.
 
-    ``known`` are those of another horizon on the same grid.
+    ``known`` are the bound costs of another horizon on the same grid; parts that do not depend on time are reused.
     """
     at, end = (replace(horizon, t=t) for t in (times, np.array([horizon.t0 + horizon.duration])))
     terms = [term for term in cost.terms if not is_control_rate(term)]

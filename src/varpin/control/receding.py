@@ -1,6 +1,6 @@
-"""A controller's ticks within hard constraints: multipliers go on from tick to tick, and few rounds are made in each.
+"""Replanning with hard constraints: multipliers are kept from tick to tick, with few rounds in each.
 
-Safeguarded multipliers are those of Andreani, Birgin, Martinez and Schuverdt, "On augmented Lagrangian methods with
+The multipliers are safeguarded after Andreani, Birgin, Martinez and Schuverdt, "On augmented Lagrangian methods with
 general lower-level constraints" (2007).
 """
 
@@ -24,16 +24,16 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# A penalty grows by this factor after a tick that leaves more than this part of its constraint's violation, up to this
-# part of its first weight: stiffer ones take more iterations than a tick has.
+# A penalty's weight grows by _GROWTH after a tick that leaves more than _ENOUGH of its constraint's violation, up to
+# _HEAVIEST times its first weight: stiffer penalties take more iterations than a tick has.
 _GROWTH, _ENOUGH, _HEAVIEST = 10.0, 0.5, 1e4
-# Backward passes that an iteration may take to find the rows that its motion meets: the tick before knows most of them.
+# Greatest number of backward passes that determine an iteration's active rows; most are known from the tick before.
 _PASSES = 8
-# Multipliers beyond this part of the cost over a tenth of a constraint's range only wind up, at what cannot be met.
+# Bound on multipliers, times the first weight and the constraint's scale: those of an infeasible constraint wind up.
 _LARGEST = 1e3
-# Of a violation, what ticks in a row are to take away, or there is no plan to be found; and how many.
+# A tick is infeasible when _STUCK ticks in a row have left more than _LOWERED of a violation.
 _LOWERED, _STUCK = 0.9, 3
-# Of a tenth of a constraint's range, what penalties need not grow for.
+# Violation, relative to a tenth of a constraint's range, below which its penalty does not grow.
 _SMALL = 1e-3
 
 
@@ -48,9 +48,10 @@ def replan(
 ) -> Solution:
     """:func:`varpin.control.search.replan` for problems with or without constraints.
 
-    With them each iteration is one of the augmented Lagrangian, and multipliers follow after it. They are those of the
-    plan before, moved on with the horizon. What margins come to is that of the first plan. A tick is INFEASIBLE where
-    it violates a constraint by more than a hundredth of a tenth of its range, and ticks in a row have not lowered that.
+    With constraints each iteration is one of the augmented Lagrangian, followed by an update of the multipliers. They
+    start from those of the previous plan, shifted with the horizon. Margins are those of the first plan. A tick is
+    INFEASIBLE where it violates a constraint by more than a thousandth of its range and several ticks in a row have not
+    lowered the violation.
     """
     known = previous.multipliers
     if not problem.constraints or known is None:
@@ -113,7 +114,7 @@ def replan(
 
 
 def _moved(old: BoundConstraint, new: BoundConstraint, values: Floats, decisions: int, hold: int) -> Floats:
-    """What a constraint's places had (K, rows), some decisions later: the last of them repeated, the goal's kept."""
+    """Values at a constraint's places (K, rows), shifted by ``decisions``; the last is repeated, a goal's stays."""
     by = decisions if new.of_controls else decisions * hold
     rows = np.minimum(np.searchsorted(old.places, new.places + by), len(old.places) - 1)
     moved: Floats = values[rows]
@@ -121,7 +122,7 @@ def _moved(old: BoundConstraint, new: BoundConstraint, values: Floats, decisions
 
 
 def _judged(plan: Solution, before: Multipliers) -> Solution:
-    """The plan of a tick, with what the next one goes on from, and whether it keeps to its constraints at all."""
+    """The plan of a tick with the penalty weights of the next one; INFEASIBLE where violations persist."""
     known = plan.multipliers
     assert known is not None
     bound, told = plan.problem.bound_constraints, plan.constraints
@@ -144,17 +145,17 @@ def _judged(plan: Solution, before: Multipliers) -> Solution:
 
 @dataclass(frozen=True, eq=False)
 class Kept(Frozen):
-    """How a controller and its plant kept to a constraint.
+    """How well a controller and its plant satisfied a constraint.
 
     Attributes:
         label: The constraint.
-        unit: Of its values.
-        tolerance: What is told of if it is violated by more: a hundredth of a tenth of its range.
-        planned: The largest violation in the plan that acts in each tick (K,), with what the margin adds.
-        moved: The violation by the plant's motion at each of its nodes after the first (T,), without the margin; empty
-            of goals, which each plan has at its own end.
+        unit: Unit of its values.
+        tolerance: Violation above which there is a warning: a thousandth of its range.
+        planned: Largest violation in the plan that acts in each tick (K,), margin included.
+        moved: Violation by the plant's motion at each of its nodes after the first (T,), without the margin; empty for
+            goals, which apply to the end of each plan.
         t: Times of these nodes (T,) [s].
-        infeasible: Ticks in which no plan was found that keeps to it (K,).
+        infeasible: Ticks whose plan is INFEASIBLE and violates this constraint (K,).
     """
 
     label: str
@@ -167,7 +168,7 @@ class Kept(Frozen):
 
     @property
     def worst(self) -> float:
-        """The most that the plant's motion violates it; 0 of goals."""
+        """Largest violation by the plant's motion; 0 for goals."""
         return float(self.moved.max(initial=0.0))
 
     def __str__(self) -> str:
@@ -185,7 +186,7 @@ class Kept(Frozen):
 def kept(
     problem: OptimalControlProblem, plans: tuple[Solution, ...], motion: Trajectory, substeps: int
 ) -> tuple[Kept, ...]:
-    """How the plans of a run, and the plant's motion in ``substeps`` a tick, kept to each constraint of the problem."""
+    """Violations of each constraint by the plans of a run and by the plant's motion in ``substeps`` per tick."""
     if not problem.constraints:
         return ()
     fine = problem.constraints_on(motion.dt, motion.steps, substeps)

@@ -1,4 +1,4 @@
-"""What it took to find a plan that costs on the continuous system what it promises."""
+"""The record of a refinement: the steps tried for a plan of a given true cost."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from varpin.control.history import Status
 
 
 def part(loss: float) -> str:
-    """A loss in percent, small ones too."""
+    """A loss in percent, with two significant digits."""
     return f"{100.0 * loss:+.2g} %"
 
 
 @dataclass(frozen=True)
 class Refined:
-    """One of the steps that a plan of a wished true cost was sought with.
+    """One step size of a refinement.
 
     Attributes:
         dt: The step [s].
         steps: N.
-        cost: Of the plan, as its search has it.
-        true_cost: On the continuous system with the plan's feedback, by :meth:`Solution.verify`; NaN where the motion
-            runs away.
+        cost: The plan's cost.
+        true_cost: Cost on the continuous system with the plan's feedback, by :meth:`Solution.verify`; NaN where the
+            motion diverges.
         open_loop_cost: The same under the plan's controls alone.
-        loss: By how much the true cost differs from the plan's, relative to it.
-        iterations: Of the search.
+        loss: Difference of the true cost from the plan's, relative to the latter.
+        iterations: Iterations of the search.
         status: How the search ended.
-        seconds: Of the search and of the verification [s].
-        share: Of the seconds of all steps tried.
+        seconds: Time of the search and the verification [s].
+        share: Share in the time of all steps tried.
     """
 
     dt: float
@@ -52,13 +52,13 @@ class Refined:
 
 @dataclass(frozen=True)
 class Refinement:
-    """What it took to find a plan that costs on the continuous system what it promises.
+    """The step sizes tried for a plan of a given true cost, and the result.
 
     Attributes:
-        wish: The loss that was allowed, relative to the plan's cost.
-        met: Whether the plan's true cost is known to be within it.
-        tried: The steps tried, from the coarsest on; the plan is that of ``tried[chosen]``.
-        chosen: Which.
+        wish: The greatest allowed loss, relative to the plan's cost.
+        met: Whether the loss of the plan is within it.
+        tried: The steps tried, from the coarsest on.
+        chosen: Index of the plan's step in ``tried``.
         reason: How the refinement ended.
     """
 

@@ -1,4 +1,4 @@
-"""The coarsest plan that costs on the continuous system what it promises."""
+"""The plan of the coarsest step whose cost agrees with the cost on the continuous system."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ Search = Callable[[OptimalControlProblem, LinearPolicy | None], Solution]
 
 logger = logging.getLogger(__name__)
 
-# Of the wish, how well true costs are known.
+# Accuracy of true costs, relative to the allowed loss.
 _KNOWN = 0.1
-# A step is halved no more often.
+# Greatest number of halvings of the step.
 _HALVINGS = 10
-# Halvings of the step that must bring the least loss down, or the wish is out of reach.
+# Number of halvings without a smaller loss after which the refinement ends.
 _PATIENCE = 3
 
 
 def refine(problem: OptimalControlProblem, search: Search, wish: float, time_left: Callable[[], float]) -> Solution:
-    """Plan with the problem's step, then from that plan with half of it, until the loss is within the ``wish``.
+    """Plan with the problem's step, then halve the step, each time from the plan before, until the loss is small.
 
     Args:
-        problem: With the coarsest step.
-        search: Makes a plan from first controls; interrupted, it returns one with that status.
-        wish: On the loss with feedback, which is that of :attr:`Verification.closed_loop_loss`.
-        time_left: For all of it [s].
+        problem: The problem with the coarsest step.
+        search: Makes a plan from first controls; interrupted, it returns one with status INTERRUPTED.
+        wish: Greatest allowed :attr:`Verification.closed_loop_loss`.
+        time_left: Returns the time left [s].
     """
     tried: list[Refined] = []
     best: Solution | None = None
@@ -80,7 +80,7 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
 def _ended(
     problem: OptimalControlProblem, solution: Solution, tried: list[Refined], chosen: int, wish: float, left: float
 ) -> str:
-    """Why half the step is not tried, if it is not."""
+    """Why the refinement ends here; empty if it continues."""
     if solution.status is Status.INFEASIBLE:
         return f"with dt = {problem.dt:g} s there is no plan within the constraints: {solution.reason}"
     if left <= 0.0:
@@ -116,7 +116,7 @@ def _within(row: Refined, wish: float) -> bool:
 def _with(
     solution: Solution, wish: float, tried: list[Refined], chosen: int, reason: str, *, met: bool = False
 ) -> Solution:
-    """The solution with what it took."""
+    """The solution with the record of its refinement."""
     total = sum(row.seconds for row in tried) or 1.0
     rows = tuple(replace(row, share=row.seconds / total) for row in tried)
     if met:
@@ -136,10 +136,10 @@ def _halved(problem: OptimalControlProblem) -> OptimalControlProblem:
 
 
 def start_of(problem: OptimalControlProblem, coarse: Solution) -> LinearPolicy:
-    """First controls of a problem with half the step: those that a coarse plan's policy applies on its grid.
+    """First controls of a problem with half the step: a coarse plan's policy applied on the finer grid.
 
     Raises:
-        InputError: The policy does not get to the end there.
+        InputError: The motion under the policy fails before the end of the horizon.
     """
     integrator, n, m = problem.integrator, problem.scene.robot.dof, problem.scene.controls
     on: Literal["momentum", "velocity"] = "momentum" if integrator.variational else "velocity"
@@ -152,7 +152,7 @@ def start_of(problem: OptimalControlProblem, coarse: Solution) -> LinearPolicy:
         raise InputError(f"the plan before does not get to its end in half the step: {failure.reason}")
     u = problem.decided(motion)
     x = np.hstack([motion.q, motion.p if integrator.variational else motion.v])[: -1 : problem.hold]
-    # Feedback keeps rounding small where motions are unstable; lines change their control too late for that.
+    # Feedback suppresses rounding errors of unstable motions; with linear controls it would act too late.
     gains = np.zeros((len(x), m, 2 * n)) if problem.linear else np.repeat(policy.gains, len(x) // len(policy.gains), 0)
     return LinearPolicy(
         u[1:] if problem.linear else u,

@@ -1,7 +1,7 @@
 """Stochastic differential dynamic programming on the structured linearization of any integrator.
 
-The iterations, their line search, equation (O13) of docs/mathematics.md, and when they end. The backward pass is in
-:mod:`varpin.control.backward`; :mod:`varpin.control.augmented` puts hard constraints around this search.
+The iterations, the line search, equation (O13) of docs/mathematics.md, and the stopping criteria. The backward pass is
+in :mod:`varpin.control.backward`; :mod:`varpin.control.augmented` adds hard constraints.
 """
 
 from __future__ import annotations
@@ -60,34 +60,34 @@ Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
 
-# What a step must keep of the promised slope, and the factor between trials.
+# Least share of the expected decrease that a step must reach (Armijo), and the factor between trials.
 ARMIJO, BACKTRACKING = 1e-5, 0.5
-# A step that keeps less of the slope than this is poor: shorter ones are tried as long as they are better.
+# Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
-# The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it shrinks after
-# long steps and grows after short ones.
+# The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it decreases after
+# long steps and increases after short ones.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
 _LONG, _SHORT = 0.5, 0.01
-# What a cost, a noise field, a force or a step may raise somewhere off the motion that has been found.
-_LOST = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
-# As much as this does not hide how far an optimum is; controls that do nothing need some.
+# Errors that reject a trial.
+_TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
+# Greatest regularization with which a search may converge. Controls without effect or cost need some.
 _LITTLE = 1e-4
-# Of Quu, what rounding may change without a word.
+# Relative rounding error of Quu above which the gains are reported as unreliable.
 _LOSSY = 1e-8
-# Iterations without a decrease worth the name before a search gives up: the cost jumps where guards cut steps.
+# Iterations without significant decrease before the search stalls. The cost is discontinuous where guards cut steps.
 _PATIENCE = 15
-# Where the optimum costs nothing, there is nothing to be relative to but this part of what was at stake at first.
+# Share of the first motion's cost at stake that is added to the current one: an optimum of cost zero has none.
 _NOTHING = 1e-9
-# The shortest step of a line search, about, and its trials at most.
+# Approximate shortest step of a line search, and its greatest number of trials.
 _SHORTEST, _TRIALS = 1e-6, 40
-# A trial is given up where a step wants more halvings than this, or than the motion so far, and where it has taken more
-# parts in all than so many times those of the motion so far. What was given up is tried again with more of both where
-# nothing else has led far, and without a bound where nothing has helped; a search that stalls goes on without bounds.
+# Bounds on the substeps of a trial. A trial stops where a step needs more than _HALVINGS halvings and more than the
+# current motion, or where the total exceeds _PARTS times that of the current motion. If no other trial leads far, the
+# stopped ones are repeated with larger bounds, then with none. A search that stalls continues without bounds.
 _HALVINGS, _MORE_HALVINGS = 2, 3
 _PARTS = 3
-# What is at stake on a first motion that no pass has looked at.
+# Marks a cost at stake that no backward pass has computed yet.
 UNKNOWN = -1.0
-# A trial that costs more than any step may is given up; what rounding does to costs is far below this part of them.
+# Relative margin above the greatest acceptable cost at which a trial stops; well above rounding errors.
 _DEARER = 1e-9
 
 
@@ -113,9 +113,9 @@ def solve(
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
 
-    Each iteration takes the derivatives along the motion, goes back through the quadratic model of the cost to go,
-    noise terms included, and searches along the new controls for a motion of lower expected cost: the cost of the
-    motion itself, and what noise adds to it under the model.
+    Each iteration linearizes along the motion, runs a backward pass through the quadratic model of the cost to go,
+    noise terms included, and searches along the new controls for a motion of lower expected cost. The expected cost is
+    the cost of the motion plus what noise adds to it under the model.
 
         robot = vp.load_robot("ur5")
         cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, -1, 1, 0, 0.5, 0], 1e3) + vp.VelocityCost(10))
@@ -124,76 +124,75 @@ def solve(
         print(plan.table())
         print(plan.verify())
 
-    Ctrl-C ends the search and returns the best motion so far, with ``status`` INTERRUPTED, as long as there is one: the
-    first motion has been integrated. ``solve(problem, plan)`` goes on from there.
+    Ctrl-C ends the search once the first motion has been integrated, and returns the best motion so far with ``status``
+    INTERRUPTED. ``solve(problem, plan)`` continues from there.
 
     Where controls have limits, each decision minimizes the model within them at the state that the linearized motion
     will have then, and a control at a limit has no feedback (after Tassa, Mansard and Todorov, "Control-limited
-    differential dynamic programming", 2014). Limits that the motions on the way do not run into cost no iterations.
-    What noise adds is then that of the linear feedback: that noise may drive a control into its limit is not in the
-    model. ``monte_carlo`` has it.
+    differential dynamic programming", 2014). Inactive limits cost no iterations. The noise cost is that of the linear
+    feedback: the model does not include controls that noise drives into their limits. ``monte_carlo`` does.
 
     Main args:
         problem: What to minimize.
-        controls: To start from: None to hold the robot at q0; an array (R, m) or (m,), R the number of
+        controls: Initial controls: None to hold the robot at q0; an array (R, m) or (m,), R the number of
             decisions; by joint name; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this
-            problem. What leaves the problem's limits is brought within them.
-        tolerance: Stop when the decrease that the quadratic model promises is below this part of the cost at stake:
-            what the cost would lose by its own quadratic models along the motion if each state and control were free,
-            and no more than it changes by over what moves. Of squared distances that is about their value; of
-            constants, whatever their size, and of what noise adds it is nothing.
-        max_iterations: At most; 100 if left out, of a problem with constraints 500 of all rounds together.
+            problem. Controls outside the problem's limits are clipped.
+        tolerance: Stop when the expected decrease is below this fraction of the cost at stake, (O9): the decrease of
+            the cost's own quadratic models along the motion if each state and control were free, and at most their
+            change over the motion's displacement. For squared distances it is about their value. Constants in the cost
+            and the noise cost do not count.
+        max_iterations: Greatest number of iterations; by default 100, and 500 over all rounds for a problem with
+            constraints.
 
     Other Args:
-        second_order: Full differential dynamic programming: second derivatives of the dynamics too, wherever they
-            leave the model convex. Converges quadratically; needs an integrator that has them (:class:`Midpoint`).
+        second_order: Full differential dynamic programming: second derivatives of the dynamics too, wherever the
+            model stays convex. Converges quadratically; needs an integrator that has them (:class:`Midpoint`).
         forward: ``"closed"``: the feedback gains act in the line search. ``"open"``: only the feed-forward part, as in
             the paper; it diverges where the open loop is unstable over the horizon.
-        armijo: The part of the promised slope that a step must keep (the paper's alpha).
+        armijo: Least share of the expected decrease that a step must reach (the paper's alpha).
         backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1).
-        regularization: To begin with, relative to the diagonal of Quu; it grows where needed, and shrinks again.
-        time_limit: No iteration begins when this time has passed since the call [s]. What is found then depends on the
-            machine.
-        callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table` as
-            they come. The log has them too, at level INFO, each after the robot and the horizon that it is of. A
-            function that needs two arguments gets the motion that the iteration ended with, too, a
-            :class:`varpin.Trajectory`; as :class:`varpin.LiveView` does.
+        regularization: Initial value, relative to the diagonal of Quu; it increases and decreases as needed.
+        time_limit: No iteration begins after this time since the call [s]. The result then depends on the machine.
+        callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table`. The
+            log has them at level INFO, preceded by the robot and the horizon. A function of two arguments, such as a
+            :class:`varpin.LiveView`, is also given the motion after the iteration, a :class:`varpin.Trajectory`.
         progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
-        resume: A solution of this very problem, as solve returned it or as read from a file: the search goes on where
+        resume: A solution of the same problem, as solve returned it or as read from a file: the search continues where
             it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
-            as before; ``regularization`` goes on by itself.
-        check: Look at the finished plan, whether it costs in finer steps what it promises and its velocities neither
-            alternate nor go up and down all the time, for ``Solution.warnings`` and the log. It takes as long as some
-            motions of the search.
-        true_cost: How far the cost of the plan with its feedback on the continuous system may be from what the plan
-            says, relative to that: 0.01 for a percent. The problem's step is the coarsest; half of it follows, from
-            the plan before, until :meth:`Solution.verify` says that the wish is met. ``Solution.problem`` has the step
-            of the plan, ``Solution.refinement`` what it took, or why the wish cannot be met, which is a warning, too.
-            Controls that are held over several steps keep their period. ``max_iterations`` is for each step,
-            ``time_limit`` for all; Ctrl-C keeps the best plan so far.
-        noise: Which gradient what noise adds has, where its strength depends on the state or the control. ``"held"``:
-            as in the paper, with the Hessian of the value held; it leaves out what the motion's derivatives change, and
-            ends next to the minimum of the expected cost. ``"whole"``: from there it goes on to that minimum, a local
-            one of the model, for 10 to 50 times the time. With ``second_order`` and within control limits it is held.
-            Problems with constraints are solved for the least cost without noise; it shapes their feedback and margins.
-        states: To start from instead of a motion that the controls make: configurations at the nodes (N + 1, n), the
-            first one q0; a pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of
-            another planner will do, though no controls make it: forces on the joints hold the first motion on it, and
-            the first iterations take them away (multiple shooting). ``controls`` are then those that go with the
-            states; left out, they are the inverse dynamics' within their limits. Single shooting goes on from there.
-            Held controls only, and no :class:`KinematicInput`. A search that ends before the forces are gone is left
-            with the controls alone: resumed, it goes on from these, and not as if it had not been interrupted.
+            as before; ``regularization`` is taken from the solution.
+        check: Check the finished plan: whether its cost in finer steps agrees, and whether its velocities alternate or
+            oscillate. ``Solution.warnings`` and the log have the result. It takes as long as a few motions of the
+            search.
+        true_cost: Greatest difference between the plan's cost and its cost with feedback on the continuous system,
+            relative to the former: 0.01 for a percent. The problem's step is the coarsest; it is halved, each search
+            starting from the plan before, until :meth:`Solution.verify` confirms the accuracy. ``Solution.problem`` has
+            the plan's step. ``Solution.refinement`` lists the steps tried, or why the accuracy cannot be reached; a
+            warning reports that, too. Controls that are held over several steps keep their period. ``max_iterations``
+            is for each step, ``time_limit`` for all; Ctrl-C keeps the best plan so far.
+        noise: Gradient of the noise cost, where the noise's strength depends on the state or the control. ``"held"``:
+            as in the paper, with the Hessian of the value function held; it neglects the derivatives of that Hessian,
+            and ends next to the minimum of the expected cost. ``"whole"``: the search continues from there to that
+            minimum, a local one of the model, for 10 to 50 times the time. With ``second_order`` and within control
+            limits it is held. Problems with constraints are solved for the least cost without noise, which then
+            affects only their feedback and margins.
+        states: Initial states, which need not be feasible: configurations at the nodes (N + 1, n), the first one q0; a
+            pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of another planner
+            will do: auxiliary joint forces hold the first motion on it, and the first iterations remove them (multiple
+            shooting). ``controls`` are then those along the states, by default the inverse dynamics' clipped to their
+            limits. Single shooting continues from there. Held controls only, and no :class:`KinematicInput`. A search
+            that ends with auxiliary forces left drops them: resumed, it continues from the controls alone, not as if it
+            had not been interrupted.
 
     Returns:
-        The best motion found, whatever happened; ``status`` says how it ended, ``reason`` with which numbers, and
-        ``warnings`` what keeps a robot from following it.
+        The best motion found, however the search ended. ``status`` and ``reason`` tell how it ended; ``warnings`` lists
+        what keeps a robot from following the plan.
 
     Raises:
         InputError: Controls of a wrong shape, or options out of their range.
-        NoiseFieldError: A noise field of one's own fails on the first motion.
-        ForceError: A :class:`varpin.CustomForce` fails on the first motion; elsewhere it costs a trial.
-        StepFailure: The first motion cannot be integrated; holds what came before.
-        CostError: The cost of the first motion is not finite, or a cost of one's own fails there.
+        NoiseFieldError: A custom noise field fails on the first motion.
+        ForceError: A :class:`varpin.CustomForce` fails on the first motion; a later failure rejects a trial.
+        StepFailure: The first motion cannot be integrated; the error holds the motion up to there.
+        CostError: The cost of the first motion is not finite, or a custom cost fails there.
     """
     if not isinstance(problem, OptimalControlProblem):
         raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
@@ -220,7 +219,7 @@ def solve(
     def report(item: Iteration, motion: Trajectory) -> None:
         tell(item, motion)
         if progress is not None:
-            # Convergence may take a last look after the last iteration.
+            # A converged search reports once more after its last iteration.
             progress(min(item.index + 1 - known, max_iterations), max_iterations)
 
     if true_cost is not None:
@@ -266,10 +265,10 @@ def solve(
 
 
 def require_reports(callback: Any, progress: object) -> Report:
-    """The callback as a function of an iteration and its motion, whichever of them it takes.
+    """The callback as a function of an iteration and its motion, whether or not it takes the motion.
 
     Raises:
-        InputError: It, or a progress, cannot be called with what it is told.
+        InputError: The callback or ``progress`` has the wrong number of arguments.
     """
     both = told_motion("callback", callback, "iteration", "motion")
     if progress is not None and not (callable(progress) and takes(progress, 2)):
@@ -298,11 +297,11 @@ def replan(
     max_iterations: int,
     deadline: float,
 ) -> Solution:
-    """A plan from the one made some ``decisions`` ago, with one backward pass for each iteration: a controller's tick.
+    """Replan from the plan made ``decisions`` ago, with one backward pass per iteration: a controller's tick.
 
-    Where iterations or time end the search, gains are those that its last step followed, and are not made anew for the
-    motion that came of it. Nobody looks at the finished plan. No iteration begins that would end after ``deadline``, on
-    ``time.perf_counter``, if it took as long as those before. Other arguments, and errors, are those of :func:`solve`.
+    Where iterations or time end the search, the gains are those of its last step, without a further backward pass at
+    the final motion. The finished plan is not checked. No iteration begins that would end after ``deadline`` (of
+    ``time.perf_counter``) if it took as long as the longest before. Other arguments and errors are as in :func:`solve`.
     """
     search = _Search(problem, second_order=False, anew=False)
     search.begin(_shifted_commands(problem, previous, decisions))
@@ -339,11 +338,11 @@ def _first_commands(problem: OptimalControlProblem, controls: JointValues | Line
 
 
 def _controls_along(problem: OptimalControlProblem, controls: object) -> Floats | None:
-    """Controls (R, m) that go with given states, within their limits."""
+    """Controls (R, m) along given states, clipped to their limits."""
     if controls is None:
         return None
     if isinstance(controls, Solution | LinearPolicy):
-        raise InputError("controls that go with states are rows (R, m) or (m,), or by joint name, without feedback")
+        raise InputError("controls beside states must be (R, m), (m,) or by joint name, without feedback")
     u = _rows_of(problem, controls)
     return np.asarray(np.clip(u, *problem.control_limits), dtype=np.float64)
 
@@ -358,7 +357,7 @@ def _rows_of(problem: OptimalControlProblem, controls: Any) -> Floats:
 
 
 def _shifted_commands(problem: OptimalControlProblem, previous: Solution, decisions: int) -> Commands:
-    """Those of :meth:`Solution.shifted` under the problem's limits and after its control before."""
+    """The commands of :meth:`Solution.shifted`, with the problem's limits and its previous control."""
     old, before = previous.problem, None if problem.rate is None else problem.rate.before
     R, m = problem.decisions, problem.scene.controls
     same = (
@@ -374,7 +373,7 @@ def _shifted_commands(problem: OptimalControlProblem, previous: Solution, decisi
         start = None if old.rate is None else old.rate.before
         expected = np.vstack([u[:1] if start is None else start, u[:-1]])[rows[:1]]
         gains = np.concatenate([gains, previous.previous_gains], axis=2)
-        # What is repeated expects itself before.
+        # A repeated control has itself as its previous one.
         reference = np.hstack([reference[rows], np.vstack([expected, u[rows[:-1]]])])
     else:
         reference = reference[rows]
@@ -413,7 +412,7 @@ def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
 
 
 def _onto_limits(u: Floats, limits: Floats) -> Floats:
-    """Controls (R, m) that rounding keeps from a limit brought to it, so that they are known to be there."""
+    """Controls (R, m), moved exactly onto a limit where they differ from it by rounding."""
     room = 8.0 * np.finfo(float).eps * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
     for limit in limits:
         u = np.where(np.abs(u - limit) <= room, limit, u)
@@ -422,14 +421,14 @@ def _onto_limits(u: Floats, limits: Floats) -> Floats:
 
 @functools.lru_cache(maxsize=16)
 def _lengths(backtracking: float) -> tuple[float, ...]:
-    """Of the steps that a line search tries, the longest first."""
+    """Step lengths of a line search, the longest first."""
     shorter = max(1, round(np.log(_SHORTEST) / np.log(backtracking)))
     return tuple(backtracking**i for i in range(min(1 + shorter, _TRIALS)))
 
 
 @functools.lru_cache(maxsize=256)
 def _cut_less(integrator: Variational, halvings: int) -> Variational:
-    """An integrator, a dataclass with a guard, whose steps are halved no more often than this."""
+    """The integrator with at most ``halvings`` halvings of a step; itself where it has no guard."""
     guard = integrator.guard
     if guard is None or not is_dataclass(integrator):
         return integrator
@@ -438,13 +437,12 @@ def _cut_less(integrator: Variational, halvings: int) -> Variational:
 
 @dataclass(frozen=True)
 class _Bounds:
-    """What a trial of the line search may take.
+    """Bounds on the work of a trial of the line search.
 
     Attributes:
-        integrator: With the halvings that a step may take.
-        parts: Of all steps, by those of the motion so far.
-        watched: Whether even a trial of the whole step is looked at on its way. Most searches take it, and looking
-            takes time.
+        integrator: Bounds the halvings of a step.
+        parts: Greatest number of substeps, relative to the current motion.
+        watched: Whether a trial of length 1 is also stopped early. Most searches accept it, and the check takes time.
     """
 
     integrator: Integrator
@@ -454,14 +452,14 @@ class _Bounds:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A motion that the line search tried.
+    """A trial of the line search.
 
     Attributes:
-        motion: None where it was given up, or has no cost.
-        shares: Of its cost.
-        cost: By how much it is dearer without noise.
-        expected: By how much it is dearer with noise.
-        cut: Whether it was given up for being cut into many parts.
+        motion: None where the trial was stopped or has no finite cost.
+        shares: The terms of its cost (:meth:`OptimalControlProblem.shares`).
+        cost: Change of the cost without noise.
+        expected: Change of the expected cost.
+        cut: Whether it was stopped for its number of substeps.
     """
 
     motion: Attempt | None = None
@@ -473,13 +471,13 @@ class _Trial:
 
 @dataclass(frozen=True)
 class _Step:
-    """What a line search did.
+    """Result of a line search.
 
     Attributes:
-        length: Of the step taken; 0 if none was.
-        trials: How many it took.
-        decrease: Of the expected cost.
-        hidden: What rounding may do to a difference of costs; 0 where no trial has a cost.
+        length: Length of the accepted step; 0 if none was.
+        trials: Number of trials.
+        decrease: Decrease of the expected cost.
+        hidden: Rounding error of a difference of costs; 0 if a step was accepted or no trial has a cost.
     """
 
     length: float
@@ -489,7 +487,7 @@ class _Step:
 
 
 class _Search:
-    """The motion so far, and what is known around it."""
+    """The state of a search: the current motion, its plan and the history."""
 
     def __init__(
         self,
@@ -509,29 +507,29 @@ class _Search:
         self.exact = second_order
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
-        self.planned: tuple[Trajectory, float, bool] | None = None  # what it is a plan for, and how it was made
+        self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
         self.trials = Trials(problem)
         self._around: Along | None = None
         self.trajectory: Trajectory
-        self.shares: Floats  # of the cost of the trajectory
+        self.shares: Floats  # the terms of the trajectory's cost
         self.cost = np.inf
-        self.first = 0.0  # what was at stake on the first motion
-        self.state: SearchState | None = None  # at the start of the last iteration, from where it can go on
+        self.first = 0.0  # cost at stake on the first motion
+        self.state: SearchState | None = None  # at the start of the last iteration, for resuming
         self.best: Trajectory | None = None
         self.best_cost = self.best_noise = np.inf
-        self.above = 0.0  # what the trajectory costs more than the best one, without noise
-        self.bounded = True  # whether trials are given up for their parts
-        self.cut = False  # whether one was
-        self.gains: list[float] = []  # by how much each iteration lowered the least expected cost
+        self.above = 0.0  # cost of the trajectory minus that of the best one, without noise
+        self.bounded = True  # whether trials stop at a number of substeps
+        self.cut = False  # whether one did
+        self.gains: list[float] = []  # decrease of the least expected cost in each iteration
         self.reason = ""
-        self.anew = anew  # whether a plan is made for the last motion, too
-        self.followed = 0.0  # the length of the last step, if none was
+        self.anew = anew  # whether the final motion gets a backward pass of its own
+        self.followed = 0.0  # without one, the length of the last step
         self.steered = problem.steered
-        # Whether the whole gradient of what noise adds is to be followed in the end, and whether it is. Within limits
-        # what it adds jumps where a control meets one and loses its gains: there is no gradient to follow.
+        # Whether the search ends with the whole gradient of the noise cost, and whether it has come to that. Within
+        # limits the noise cost is discontinuous where a control meets one and loses its gains, so it has no gradient.
         self.wants_whole = whole_noise and not (second_order or problem.limited) and bool(self.steered.any())
         self.whole = False
-        # Before each line of the log, where searches of several problems and of a controller's ticks may stand.
+        # Prefix of each log line: it tells several problems, and a controller's ticks, apart.
         robot, begin = problem.scene.robot.name, problem.t0
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {begin:g} s"
 
@@ -554,18 +552,18 @@ class _Search:
             raise CostError(culprits, f"the cost of the first motion is {self.cost}")
 
     def close(self, closing: GapClosing, most: int, deadline: float, report: Report) -> None:
-        """Begin with what is found on the way from given states, in so many iterations at most."""
+        """Remove the auxiliary forces of given states, in at most ``most`` iterations, and begin with the result."""
         try:
             closing.run(most, deadline, report)
         finally:
             self.history = list(closing.history)
             self.begin(_first_commands(self.problem, closing.policy()))
-            # What is at stake is that of this motion, however many iterations it took.
+            # The cost at stake is that of this motion, after however many iterations.
             self.first = UNKNOWN
             self.state = self._state()
 
     def resume(self, state: SearchState) -> None:
-        """Stand where ``state`` was taken."""
+        """Continue from ``state``."""
         self.trajectory, self.cost, self.above, self.first = state.trajectory, state.cost, state.above, state.first
         self.shares = self.problem.shares(state.trajectory)
         self.gains, self.history = list(state.gains), list(state.history)
@@ -599,7 +597,7 @@ class _Search:
             started = time.perf_counter()
             try:
                 passes = self._plan()
-            except _LOST as error:
+            except _TRIAL_ERRORS as error:
                 if not self.history:
                     raise
                 logger.warning("%s: %s", self.label, error)
@@ -632,15 +630,15 @@ class _Search:
                 more = self._line_search()
                 step = replace(more, trials=step.trials + more.trials, hidden=max(step.hidden, more.hidden))
             self._note(report, started, passes, step)
-            if step.length == 0.0 and self._keeps_no_promise_above(step.hidden):
-                self.reason = f"{self._promised()}, and rounding hides {step.hidden:.1e} of the cost"
+            if step.length == 0.0 and self._decrease_at_most(step.hidden):
+                self.reason = f"{self._expected()}, and rounding hides {step.hidden:.1e} of the cost"
                 return Status.CONVERGED
-            # A tick's plan has to be there in time: none begins that would be late if it took as long as those before.
+            # A tick's iteration begins only if it will end in time, should it take as long as the longest before.
             longest = max(longest, time.perf_counter() - started)
             ended = self._out_of(last, deadline if self.anew else deadline - longest)
             if not self.anew and step.length > 0.0 and ended is not None:
                 self.followed = step.length
-                self.reason = f"{self._promised()} before the last step"
+                self.reason = f"{self._expected()} before the last step"
                 return ended
             if step.length >= _LONG:
                 self._relax()
@@ -650,31 +648,31 @@ class _Search:
                 return Status.STALLED
 
     def _at_first(self) -> float:
-        """What is at stake on the first motion."""
+        """The cost at stake on the first motion."""
         if not self.anew and self.problem.cost.nonnegative:
-            # Of squares no more is at stake than they cost, and a tick has no time to find out how much.
+            # The value of a sum of squares bounds its cost at stake, and a tick saves the time to compute it.
             return self.cost
         stake = self.along.stake
         return stake.free if np.isfinite(stake.free) else stake.moved
 
     def _turns_whole(self, *, there: bool) -> bool:
-        """Whether the search with held noise is as far as it gets, and goes on with the whole gradient."""
+        """Whether the search with held noise has ended and the one with the whole gradient begins."""
         if not self.wants_whole or self.whole:
             return False
         return there or (len(self.gains) > 1 and self.gains[-1] <= 0.0)
 
     def _take_whole(self) -> None:
-        """Follow the whole gradient of what noise adds from here on, from the best motion so far."""
-        logger.info("%s: from here on with the whole gradient of what noise adds", self.label)
+        """Use the whole gradient of the noise cost from now on, starting at the best motion so far."""
+        logger.info("%s: continues with the whole gradient of the noise cost", self.label)
         if self.best is not None and self.best is not self.trajectory:
             self.trajectory, self.cost = self.best, self.best_cost
             self.shares = self.problem.shares(self.best)
-        # What noise adds is rated otherwise from here on.
+        # Noise costs before and after this switch are not comparable.
         self.whole, self.best, self.best_cost, self.best_noise, self.above = True, None, np.inf, np.inf, 0.0
         self.gains, self._around = [], None
 
     def _differentiate_noise(self, regularization: float) -> int:
-        """Give passes along the motion the whole gradient of what noise adds; how many passes that took."""
+        """Add the whole gradient of the noise cost to passes along the motion; returns the passes that took."""
         if not self.whole or self.along.noise_differentiated:
             return 0
         plan = backward(self.problem, self.trajectory, regularization, along=self.along)
@@ -692,7 +690,7 @@ class _Search:
             self.gains.append(0.0)
 
     def _noise(self, plan: Plan) -> float:
-        """What the noise that plans take into account adds to the cost."""
+        """Noise cost of the processes that change plans."""
         if self.steered.all():
             return plan.noise
         if not self.steered.any():
@@ -701,28 +699,28 @@ class _Search:
 
     @property
     def along(self) -> Along:
-        """What passes along the motion are made from."""
+        """Expansions for backward passes along the current motion."""
         if self._around is None or self._around.trajectory is not self.trajectory:
             self._around = Along(self.problem, self.trajectory)
         return self._around
 
     def _share(self, tolerance: float) -> float:
-        """The tolerance on the promised decrease."""
+        """Tolerance on the expected decrease, in units of the cost."""
         return tolerance * (self.along.stake.moved + _NOTHING * self.first)
 
     def _is_there(self, plan: Plan, tolerance: float) -> bool:
         least = tolerance * _NOTHING * self.first
         if self.problem.cost.nonnegative and plan.expected_decrease > tolerance * self.cost + least:
-            # Of squares no more is at stake than they cost.
+            # The value of a sum of squares bounds its cost at stake.
             return False
         if not self.steered.any() and self.along.stake.free <= least:
-            # No motion at all costs less. Without costs on the controls the model may have no minimum even there.
+            # The cost is at its lower bound. Without costs on the controls the model may have no minimum even there.
             self.plan = self._least_regularized()[0] or plan
             return True
-        return self._keeps_no_promise_above(self._share(tolerance))
+        return self._decrease_at_most(self._share(tolerance))
 
     def _ended(self, tolerance: float, last: int, deadline: float) -> tuple[Status | None, str]:
-        """How a search ends that has not converged, if it does, and the reason."""
+        """The status of a search that ends without convergence and the reason; None if it continues."""
         if len(self.history) >= last:
             return self._out_of(last, deadline), ""
         if len(self.gains) > _PATIENCE:
@@ -732,15 +730,15 @@ class _Search:
         return self._out_of(last, deadline), ""
 
     def _out_of(self, last: int, deadline: float) -> Status | None:
-        """Whether iterations or time end the search."""
+        """The status where iterations or time end the search, else None."""
         if len(self.history) >= last:
             return Status.MAX_ITERATIONS
         return Status.OUT_OF_TIME if time.perf_counter() > deadline else None
 
-    def _keeps_no_promise_above(self, bound: float) -> bool:
-        """Whether the model promises no more than ``bound``; the plan is then one that can be trusted with that.
+    def _decrease_at_most(self, bound: float) -> bool:
+        """Whether the expected decrease is at most ``bound``, with little or no regularization.
 
-        Regularization makes promises smaller; it must not pass for an optimum.
+        Regularization reduces the expected decrease, which must not pass for convergence.
         """
         if self.plan is None or not self.plan.expected_decrease <= bound:
             return False
@@ -751,20 +749,20 @@ class _Search:
             self.plan = plan
         return True
 
-    def _promised(self) -> str:
+    def _expected(self) -> str:
         return f"the model promises a decrease of {np.nan if self.plan is None else self.plan.expected_decrease:.1e}"
 
     def _numbers(self, tolerance: float, *, afresh: bool = False) -> str:
-        """What the status rests on; ``afresh`` with as little regularization as the model needs."""
+        """Expected decrease and tolerance in words; ``afresh`` with as little regularization as the model needs."""
         needed = ""
         if afresh and self.regularization > 0.0:
-            with contextlib.suppress(*_LOST):
+            with contextlib.suppress(*_TRIAL_ERRORS):
                 plan, least = self._least_regularized()
                 if plan is not None:
                     self.plan = plan
                     needed = f" under a regularization of {least:.0e}, without which it has no minimum" if least else ""
         share = np.nan if self.plan is None else self._share(tolerance)
-        return f"{self._promised()}{needed}; the tolerance of {tolerance:g} times the cost at stake is {share:.1e}"
+        return f"{self._expected()}{needed}; the tolerance of {tolerance:g} times the cost at stake is {share:.1e}"
 
     def _note(self, report: Report, started: float, passes: int, step: _Step | None = None) -> None:
         if self.plan is None:
@@ -798,21 +796,19 @@ class _Search:
         return self.regularization <= _MOST
 
     def _lift(self) -> bool:
-        """Go on without bounds on what trials may take, if there were any and one was given up."""
+        """Remove the bounds on the substeps of trials if they stopped one; returns whether they did."""
         if not (self.bounded and self.cut):
             return False
-        logger.info(
-            "%s: no progress with trials of few parts: from here on they may take as many as they need", self.label
-        )
+        logger.info("%s: no progress with bounded substeps: trials from now on have no bound", self.label)
         self.bounded, self.regularization, self.growth = False, 0.0, 1.0
-        # One line search without bounds, before what was gained lately is looked at again.
+        # One line search without bounds before the search can stall again.
         self.gains = self.gains[1 - _PATIENCE :]
         return True
 
     def _plan(self, *, exact: bool | None = None) -> int:
-        """A backward pass, with as much regularization as it takes; returns how many it took.
+        """Backward passes with increasing regularization until one succeeds; returns their number.
 
-        Second derivatives can make the model indefinite far from an optimum; there they are left out.
+        Where second derivatives of the dynamics make the model indefinite, they are left out.
         """
         passes = 0
         self.exact = self.second_order if exact is None else exact
@@ -828,7 +824,7 @@ class _Search:
                 return passes
 
     def _least_regularized(self) -> tuple[Plan | None, float]:
-        """The plan at the motion with as little regularization as leaves a minimum, and how much that is."""
+        """The plan with the least regularization that gives the model a minimum, and that regularization."""
         for regularization in (0.0, *10.0 ** np.arange(-6, 11, 2)):
             self._differentiate_noise(float(regularization))
             for exact in (True, False) if self.second_order and regularization == 0.0 else (False,):
@@ -838,7 +834,7 @@ class _Search:
         return None, np.inf
 
     def _line_search(self) -> _Step:
-        """Move to the first motion along the plan whose expected cost is low enough, (O13)."""
+        """Move to the first trial along the plan with sufficient decrease of the expected cost, (O13)."""
         if self.plan is None:
             return _Step(0.0, 0, 0.0, 0.0)
         added = noise_shares(self.problem, self.trajectory, self.plan)
@@ -875,49 +871,49 @@ class _Search:
         return _Step(length, trials, -taken.expected if length > 0.0 else 0.0, hidden)
 
     def _bounds(self) -> Iterator[_Bounds]:
-        """What trials may take, one after another while nothing else helps."""
+        """Bounds on trials, from tight to none."""
         integrator = self.problem.integrator
         guard = integrator.guard if isinstance(integrator, Variational) else None
         if not (self.bounded and guard is not None and is_dataclass(integrator)):
             yield _Bounds(integrator, np.inf, watched=False)
             return
-        # As many parts as a step of the motion so far has take fewer halvings of halves.
+        # A step cut into s substeps has taken at most s - 1 halvings.
         few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
         for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
             yield _Bounds(_cut_less(integrator, halvings), parts, watched=halvings > _HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
     def _try(self, step: float, feedback: Commands, added: Floats, bounds: _Bounds) -> _Trial:
-        """A motion so far along the plan, given up where it is cut to pieces or too dear already."""
+        """A trial of length ``step`` along the plan, stopped early where its substeps or its cost exceed bounds."""
         problem, plan = self.problem, self.plan
         if plan is None:
             return _Trial()
-        # What is to come of the cost, and what noise adds to it, is known not to be below zero.
+        # Where the rest of the cost and the noise cost cannot be negative, a partial sum bounds the total from below.
         bounded = problem.cost.nonnegative and not (self.exact and problem.processes)
         most = float(self.shares.sum() + added.sum()) + self.armijo * step * plan.slope if bounded else np.inf
         parts = np.inf
         if bounds.parts < np.inf and (bounds.watched or step < 1.0):
-            # Explicit methods count no parts.
+            # Explicit methods have no substeps.
             parts = bounds.parts * max(1, int(self.trajectory.statistics.substeps[: self.trials.third].sum()))
         u = problem.decided(self.trajectory) + step * plan.feedforward
         if problem.limited:
             u = _onto_limits(u, problem.control_limits)
         commands = feedback._replace(u=u)
         if problem.linear:
-            # Nothing is fed back to the first control: its state is given.
+            # The first control has no feedback: its state is given.
             commands = feedback._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
         try:
             attempt = self.trials.attempt(
                 commands, integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
             )
             if not attempt.whole:
-                # Whatever makes a step of few halvings fail, more may mend.
+                # A step that fails with few halvings may succeed with more.
                 few = attempt.failure is not None and bounds.integrator != problem.integrator
                 return _Trial(cut=few or attempt.verdict is Watch.Verdict.cut)
             there = attempt.shares()
             noise = noise_shares(problem, attempt.trajectory(), plan) if problem.processes else added
             more = self._noise_beyond(attempt.trajectory(), plan) if self.whole else 0.0
-        except _LOST as error:
+        except _TRIAL_ERRORS as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
         if not np.isfinite(there).all():
@@ -926,7 +922,7 @@ class _Search:
         return _Trial(attempt, there, cost, cost + float((noise - added).sum()) + more)
 
     def _noise_beyond(self, trial: Trajectory, plan: Plan) -> float:
-        """What noise adds along a trial beyond what it adds where it acts and costs as along the motion so far."""
+        """Noise cost along a trial with the value function there, minus that with the current plan's."""
         found = backward(self.problem, trial, self.regularization)
         if found is None:
             return np.inf
@@ -934,7 +930,7 @@ class _Search:
         return float(shares - held)
 
     def _feedback(self, plan: Plan) -> Commands:
-        """The commands of trials, but for the feed-forward part that theirs is on top of."""
+        """The commands of trials without their feed-forward part."""
         problem, here = self.problem, self.trajectory
         if self.forward == "open":
             return _held(problem.decided(here), problem)
@@ -945,7 +941,7 @@ class _Search:
         elif plan.previous is not None:
             before = here.u[: -problem.hold : problem.hold]
             gains = np.concatenate([gains, plan.previous], axis=2)
-            # The first change is from a control that is given.
+            # The control before the first one is given.
             reference = np.hstack([reference, np.vstack([here.u[:1], before])])
         if problem.linear:
             commands = _held(problem.decided(here), problem)
@@ -964,7 +960,7 @@ class _Search:
             return self.plan
         try:
             return self._least_regularized()[0]
-        except _LOST:
+        except _TRIAL_ERRORS:
             return None
 
     def solution(self, status: Status) -> Solution:
@@ -972,8 +968,8 @@ class _Search:
         if plan is not None and self.followed > 0.0:
             plan = plan.followed(self.followed)
         elif status is not Status.CONVERGED:
-            # With noise the fixed point of the search is not the minimum of the expected cost, and the last motion not
-            # always the best; nor does the last plan belong to it, or hold without its regularization.
+            # With noise the fixed point of the search is not the minimum of the expected cost, so the last motion is
+            # not always the best. The last plan may be of another motion, or have regularization.
             plan = self._last_plan()
             above = np.inf if plan is None else self.above + self._noise(plan) - self.best_noise
             if self.best is not None and self.best is not self.trajectory and not above <= 0.0:

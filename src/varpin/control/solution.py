@@ -1,4 +1,4 @@
-"""What a solver returns, and what there is to be done with it: feedback, verification, Monte Carlo."""
+"""The result of a solver, with its feedback policy, verification and Monte Carlo simulation."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Violations:
-    """How far a motion goes beyond limits, at its nodes: the most for each joint or control, zero where it does not.
+    """Largest violation of limits by a motion's nodes for each joint or control; zero where limits hold.
 
     Attributes:
         position: Beyond the limits of the robot's joints, or of a narrower :class:`varpin.JointLimitBarrier` in the
@@ -49,7 +49,7 @@ class Violations:
 
     @property
     def any(self) -> bool:
-        """Whether there is one at all."""
+        """Whether any limit is violated."""
         return bool(any(part.any() for part in (self.position, self.velocity, self.control)))
 
     def __repr__(self) -> str:
@@ -65,43 +65,43 @@ class Solution(Frozen):
     ``print(plan.table())`` shows a row for each iteration, then how the search ended and why:
 
     ========== =====================================================================================
-    iter       Its number, from 0.
-    cost       Of the motion it ended with, without noise.
-    noise cost What noise adds to the cost of the motion it began with, by the solver's model.
-    expected   The decrease of the expected cost by the quadratic model for a full step.
-    decrease   What the step taken brought; near the expected one where the model is good.
+    iter       Number of the iteration, from 0.
+    cost       Cost of the motion after the iteration, without noise.
+    noise cost Cost added by noise to the motion before the iteration, by the solver's model.
+    expected   Decrease of the expected cost by the quadratic model for a full step.
+    decrease   Actual decrease; near the expected one where the model is good.
     grad       Largest entry of the expected cost's gradient in the controls.
     reg        Regularization, relative to the diagonal of Quu; 0 where the model needs none.
-    step       Length of the step taken, in (0, 1]; 0 where none was, as at the end.
-    rollouts   Motions that the line search tried.
+    step       Length of the accepted step, in (0, 1]; 0 where there is none, as at the end.
+    rollouts   Number of trials of the line search.
     ========== =====================================================================================
 
-    ``print(plan.verify())`` tells what the plan costs on the continuous robot, ``print(plan.monte_carlo(200, rng=0))``
-    what it costs under the scene's noise.
+    ``print(plan.verify())`` shows the plan's cost on the continuous system, ``print(plan.monte_carlo(200, rng=0))`` its
+    cost under the scene's noise.
 
     Attributes:
-        problem: What was solved.
+        problem: The problem that was solved.
         trajectory: The motion without noise.
         gains: Feedback (R, m, 2n) on x = (q, p) or (q, v), for each of R decisions. Where controls are linear between
             nodes, decision k > 0 is the control at node k, and reacts to the state at node k - 1, where its line
             begins; the first has gains on the initial state.
-        previous_gains: Feedback (R, m, m) on the control of the decision before, where its changes cost something
+        previous_gains: Feedback (R, m, m) on the previous control, where its changes have a cost
             (:class:`ControlRateCost`) or controls are linear between nodes:
             u_k + gains_k (x - x_k) + previous_gains_k (u_before - u_(k-1)). Else None.
-        feedforward: The change of the controls (R, m) that the last backward pass asked for; zero at an optimum.
-        gradient: Of the expected cost in the controls (R, m), under the solver's model of the noise. At an optimum it
-            is zero but where it pushes a control against its limit.
-        cost: Of the motion without noise.
-        noise_cost: What noise adds to it, by the solver's model.
+        feedforward: Change of the controls (R, m) by the last backward pass; zero at an optimum.
+        gradient: Gradient of the expected cost in the controls (R, m), under the solver's model of the noise. At an
+            optimum it is zero except where it pushes a control against its limit.
+        cost: Cost of the motion without noise.
+        noise_cost: Cost added by noise, by the solver's model.
         status: How the solver ended.
-        reason: With which numbers.
+        reason: Why it ended, with numbers.
         history: One entry for each iteration.
-        search: From where :func:`varpin.solve` can go on, with ``resume``.
-        warnings: What looks wrong with the plan, in sentences that say what to change: it costs more than planned when
-            its steps are taken in quarters, its velocities alternate or go up and down all the time, its energy balance
-            does not close, a wish for its true cost is not met.
-        refinement: What finding the step took where a true cost was wished for; else None.
-        multipliers: Of the problem's constraints, and where their rounds stood; None without constraints.
+        search: State of the search, from which :func:`varpin.solve` continues with ``resume``.
+        warnings: Warnings about the plan, each with what to change: its cost is higher when its steps are taken in
+            quarters, its velocities alternate or oscillate, its energy balance does not close, the requested true cost
+            is not met.
+        refinement: The steps tried where ``true_cost`` was given; else None.
+        multipliers: Multipliers of the problem's constraints and the state of their rounds; None without constraints.
     """
 
     problem: OptimalControlProblem
@@ -127,22 +127,22 @@ class Solution(Frozen):
 
     @property
     def expected_cost(self) -> float:
-        """Cost of the motion and what noise adds to it, by the solver's model."""
+        """Cost of the motion plus the noise cost, by the solver's model."""
         return self.cost + self.noise_cost
 
     @property
     def controls(self) -> Floats:
-        """One row for each decision (R, m)."""
+        """The controls (R, m), one row per decision."""
         return self.problem.decided(self.trajectory)
 
     @property
     def iterations(self) -> int:
-        """Steps that were taken or tried."""
+        """Number of iterations with a line search."""
         return sum(item.rollouts > 0 for item in self.history)
 
     @property
     def violations(self) -> Violations:
-        """What the motion does beyond the limits of joints, whether the cost knows them or not, and of controls."""
+        """Violations of the joint limits, in the cost or not, and of the control limits."""
         robot, motion, speed = self.problem.scene.robot, self.trajectory, self.problem.scene.robot.velocity_limit
         joints, speeds = barriers_of(self.problem.cost)
         return Violations(
@@ -153,12 +153,12 @@ class Solution(Frozen):
 
     @cached_property
     def constraints(self) -> tuple[ConstraintReport, ...]:
-        """How the motion keeps to each of the problem's constraints, in their order."""
+        """How well the motion satisfies each of the problem's constraints, in their order."""
         return () if self.multipliers is None else reports(self.problem, self.trajectory, self.multipliers)
 
     @property
     def violation(self) -> float:
-        """The most that a constraint is violated, in its own unit; 0 where all hold or there are none."""
+        """The largest violation of a constraint, in its own unit; 0 where all hold or there are none."""
         return max((item.violation for item in self.constraints), default=0.0)
 
     @property
@@ -216,7 +216,7 @@ class Solution(Frozen):
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the solution as a compressed npz file without pickle; returns its path.
 
-        The problem is not in it: :meth:`load` takes it. All that a search needs to go on is.
+        The file has the state of the search, but not the problem: :meth:`load` takes it.
 
         Raises:
             FileError: The path cannot be written.
@@ -236,12 +236,13 @@ class Solution(Frozen):
         return cls(**read(path, problem))
 
     def shifted(self, decisions: int, before: JointValues | None = None) -> LinearPolicy:
-        """The policy from a later decision on, its last row repeated: what to start the next horizon with.
+        """The policy from a later decision on, its last row repeated, to start the next horizon with.
 
-        ``before`` is the control, (m,) or by joint name, that has acted before that decision; left out, the plan's own.
+        ``before`` is the control before that decision, (m,) or by joint name; by default the plan's own.
 
         Raises:
-            InputError: Not from 0 to R - 1, a control of a wrong shape, or controls that are linear between nodes.
+            InputError: ``decisions`` is not from 0 to R - 1, a control has a wrong shape, or controls are linear
+                between nodes.
         """
         if self.problem.linear:
             raise InputError("a plan with linear controls is not shifted; plan with controls='held' for that")
@@ -251,7 +252,7 @@ class Solution(Frozen):
         rows = np.minimum(np.arange(len(self.gains)) + decisions, len(self.gains) - 1)
         u, previous_gains, previous = policy.u[rows], None, None
         if policy.previous_gains is not None and policy.previous is not None:
-            # What is repeated expects itself before.
+            # A repeated control has itself as its previous one.
             previous_gains, previous = policy.previous_gains[rows], np.vstack([policy.previous[rows[:1]], u[:-1]])
         return LinearPolicy(
             u,
@@ -271,9 +272,9 @@ class Solution(Frozen):
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
         """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
 
-        A simulation finds out itself over how many steps of its dt a control is held.
+        A simulation needs no ``substeps``: it derives them from its dt and the policy's period.
 
-        Where x is not that of the problem's integrator, dp = L_vq dq + M dv turns the gains around, to first order.
+        Where x is not that of the problem's integrator, dp = L_vq dq + M dv converts the gains, to first order.
 
         Raises:
             InputError: ``x`` is neither "momentum" nor "velocity".
@@ -284,7 +285,7 @@ class Solution(Frozen):
         rows, n = slice(0, -1, hold), self.problem.scene.robot.dof
         linear, first, previous_gains = self.problem.linear, None, self.previous_gains
         if linear:
-            # The first control is what the lines begin at.
+            # The first control is the value at the beginning of the first line.
             first, gains = self.controls[0], gains[1:]
             previous_gains = None if previous_gains is None else previous_gains[1:]
         if self.problem.integrator.variational != (x == "momentum"):
@@ -320,13 +321,13 @@ class Solution(Frozen):
         """Replay the plan through an accurate integration of the continuous system.
 
         Costs are integrated by Simpson's rule, the motion by the classical Runge-Kutta method, or by ``Radau(3)`` where
-        dampers, dry friction or servos are much faster than the plan's step.
-
-        Under constraints it is ``Gauss(3)``, of order 6, which keeps them.
+        dampers, dry friction or servos are much faster than the plan's step. In scenes with constraints it is
+        ``Gauss(3)``, of order 6, which maintains them.
 
         Main args:
             tolerance: On the relative change of the cost when the substeps are doubled.
-            max_substeps: Of one step of the plan; where they do not reach the tolerance, ``accuracy`` says so.
+            max_substeps: Greatest number of substeps in a step of the plan; ``accuracy`` tells if the tolerance was
+                missed.
 
         Other Args:
             progress: Called before each doubling with (substeps, max_substeps).
@@ -356,24 +357,23 @@ class Solution(Frozen):
     ) -> MonteCarlo:
         """Expected cost of the policy under the scene's noise, with the problem's own integrator and step.
 
-        Path i draws its noise from the i-th child of ``rng``: the same bytes for any number of workers, threads,
-        processes or machines of one kind. Only costs come back from them. Noise that only Python can evaluate
-        (:class:`varpin.CustomNoise`) is simulated path by path, which is slow, and without ``executor`` one after
-        another.
+        Path i draws its noise from the i-th child of ``rng``, so results are the same bytes for any number of workers,
+        threads, processes or machines of one kind. Workers return only costs. Noise that only Python evaluates
+        (:class:`varpin.CustomNoise`) is simulated path by path, which is slow, and serially without ``executor``.
 
         Main args:
-            paths: How many.
+            paths: Number of paths.
             rng: Seed or generator.
-            feedback: Without, the controls alone.
+            feedback: False for the controls alone.
 
         Other Args:
-            workers: Threads; as many as there are cores if left out.
+            workers: Number of threads; by default one per core.
             executor: Any ``concurrent.futures.Executor`` instead of threads; see :func:`varpin.simulate_ensemble`.
-            progress: Called now and then with (paths done, paths in all).
+            progress: Called after each chunk of paths with (paths done, paths in all).
 
         Raises:
             InputError: Wrong arguments.
-            VarpinError: Every path failed, or workers get lost again and again.
+            VarpinError: Fewer than two paths succeeded, or workers were lost repeatedly.
             MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
         """
         policy = self.policy if feedback else self.policy.without_feedback()
@@ -390,7 +390,7 @@ class Solution(Frozen):
 
 
 def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floats:
-    """The most that each column of y (N, k) is outside any of some limits."""
+    """Largest violation of any of the limits by each column of y (N, k)."""
     excess = [np.maximum(y - upper, lower - y).max(axis=0) for lower, upper in limits]
     most: Floats = np.maximum(0.0, np.max(excess, axis=0))
     return most

@@ -1,4 +1,4 @@
-"""Solutions in files: npz without pickle, all that a search needs to go on but the problem."""
+"""Solutions in files: npz without pickle, with the state of the search and without the problem."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _COLUMNS = tuple(item.name for item in fields(Iteration))
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """A :class:`SearchState`; of its motion the prefix of the entries, of its history the length."""
+    """A :class:`SearchState`, with the prefix of its motion's entries and the length of its history."""
 
     motion: str
     cost: float
@@ -54,14 +54,14 @@ class _Search:
 
 @dataclass(frozen=True, eq=False)
 class _Best:
-    """Of the best motion of a search the prefix of the entries."""
+    """The prefix of the entries of a search's best motion."""
 
     motion: str
 
 
 @dataclass(frozen=True, eq=False)
 class _Refinement:
-    """Of a :class:`Refinement` what is no row of the steps tried."""
+    """A :class:`Refinement` without the rows of the steps tried."""
 
     wish: float
     met: int
@@ -91,14 +91,14 @@ class _Plan:
 
 
 def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
-    """Write the fields of a :class:`Solution`, as :meth:`Solution.save` says."""
+    """Write the fields of a :class:`Solution`; see :meth:`Solution.save`."""
     problem: OptimalControlProblem = solution["problem"]
     state: SearchState | None = solution["search"]
     motions: dict[str, Trajectory] = {"": solution["trajectory"]}
     if state is not None:
         motions |= {"search.": state.trajectory} | ({} if state.best is None else {"best.": state.best})
     members: dict[str, Any] = {}
-    # Motions are often one and the same: each is written once, without the scene, which is the problem's.
+    # These motions are often the same object: each is written once, without the scene, which is the problem's.
     prefixes: dict[int, str] = {}
     for prefix, motion in motions.items():
         if prefixes.setdefault(id(motion), prefix) == prefix:
@@ -131,7 +131,7 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
 
 
 def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[str, Any]:
-    """The fields of the :class:`Solution` in a file; errors as :meth:`Solution.load` says."""
+    """Read the fields of a :class:`Solution` from a file; see :meth:`Solution.load` for errors."""
     source = path_like("path", path)
     members = read_npz(source, _FORMAT)
     scene = problem.scene
@@ -140,7 +140,7 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
 
     _require_problem(source, members, problem)
     motions = {"": _motion(source, members, "", problem)}
-    # A motion of another robot says so by its weight.
+    # Only after the motion, whose masses give a clearer message for another robot.
     _require_surroundings(source, members, problem, "scene.")
     plan = record_of(_Plan, members, source, sizes=sizes)
     if plan.status not in Status.__members__:
@@ -166,7 +166,7 @@ def _refinement(source: Path, plan: _Plan) -> Refinement | None:
         return None
     whole, kinds = {"steps", "iterations"}, rows[:, -1]
     if not (np.isin(kinds, np.arange(len(_STATUSES))).all() and 0 <= refinement.chosen <= len(rows)):
-        raise FileError(f"{source}: what a refinement tried does not fit together")
+        raise FileError(f"{source}: the steps of the refinement are inconsistent")
     tried = tuple(
         Refined(
             **{name: int(value) if name in whole else value for name, value in zip(_REFINED, row[:-1], strict=True)},
@@ -185,7 +185,7 @@ def _search(
     history: tuple[Iteration, ...],
     problem: OptimalControlProblem,
 ) -> SearchState | None:
-    """Where the search stood; its motions may be among those that are read already."""
+    """The state of the search; motions that are in ``motions`` already are not read again."""
     state = plan.search
     if state is None:
         return None
@@ -208,7 +208,7 @@ def _search(
 
 
 def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
-    """The motion alone of a solution in a file, for which its problem is not needed.
+    """Read only the motion of a solution, without its problem.
 
     Raises:
         FileError: As :meth:`Trajectory.load`.
@@ -218,7 +218,7 @@ def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None
 
 
 def _motion(source: Path, members: Members, prefix: str, problem: OptimalControlProblem) -> Trajectory:
-    """The motion whose entries begin with ``prefix``, if it is one of the problem."""
+    """The motion whose entries begin with ``prefix``, checked against the problem."""
     motion, scene = Trajectory.of_members(source, members, problem.scene.robot, prefix), problem.scene
     found = motion.steps, motion.u.shape[1], motion.dw.shape[1]
     if found != (problem.steps, scene.controls, scene.processes):
@@ -230,7 +230,7 @@ def _motion(source: Path, members: Members, prefix: str, problem: OptimalControl
 
 
 def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
-    """What of a problem's scene tells it from others; of a noise that only Python can evaluate nothing but its size."""
+    """Arrays that identify a problem's scene; noise that only Python evaluates is identified by its size only."""
     values = problem.scene.values
     arrays = {f"scene.{name}": array for name, array in values.items() if not name.startswith("noise.")}
     fields_of_noise = problem.scene.diffusion._asdict()
@@ -240,7 +240,7 @@ def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
 def _require_problem(source: Path, members: Members, problem: OptimalControlProblem) -> None:
     """Refuse a solution of another problem, by its numbers and its noise."""
     given = {name: getattr(problem, name) for name in (*_PROBLEM, "dt")}
-    # Files without a word of it are older than the choice.
+    # Files without this entry are older than linear controls.
     members = {"controls": np.array("held"), **members}
     for name, value in (given | {"problem.integrator": repr(problem.integrator)}).items():
         if name not in members or not np.array_equal(members[name], value):
@@ -260,7 +260,7 @@ def _require_surroundings(source: Path, members: Members, problem: OptimalContro
 
 
 def _rows(history: tuple[Iteration, ...]) -> Floats:
-    """One row for each iteration, its fields in order."""
+    """One row per iteration, with its fields in order."""
     return np.array([[float(getattr(item, name)) for name in _COLUMNS] for item in history]).reshape(-1, len(_COLUMNS))
 
 

@@ -1,4 +1,4 @@
-"""The verb: S-DDP, within the constraints that a problem may have."""
+"""The function ``solve``: S-DDP for problems with or without constraints."""
 
 from varpin.control import search
 from varpin.control.augmented import within_constraints

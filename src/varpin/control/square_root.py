@@ -1,7 +1,7 @@
-"""Convex quadratic functions as sums of squares, which the backward pass on square roots is made of.
+"""Convex quadratic functions as sums of squares, for the backward pass on square roots.
 
-Where the plain recursion runs out of digits, the value is kept as a sum of squares (1/2) |R x + r|^2 and its Hessian
-R'R never formed: see ``square_root.hpp`` in ``src/core``. Every Hessian must be positive semidefinite.
+Where the plain recursion loses too many digits, the value function is kept as a sum of squares (1/2) |R x + r|^2,
+without its Hessian R'R: see ``square_root.hpp`` in ``src/core``. Every Hessian must be positive semidefinite.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from varpin import core
 
 Floats = NDArray[np.float64]
 
-# Eigenvalues of this size are rounding's in a Hessian with ones on its diagonal.
+# Size of eigenvalues that are rounding errors in a Hessian with unit diagonal.
 _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Squares:
-    """N functions (1/2) |L z + r|^2 + c . z, but for constants."""
+    """N functions (1/2) |L z + r|^2 + c . z, up to constants."""
 
     root: Floats  # L (N, z, z), or (1, z, z) for all
     shift: Floats  # r (N, z)
@@ -31,11 +31,11 @@ class Squares:
         return Squares(self.root if len(self.root) == 1 else self.root[rows], self.shift[rows], self.linear[rows])
 
     def after(self, D: Floats) -> Squares:
-        """As functions of x, where z = D x."""
+        """The functions of x with z = D x."""
         return Squares(self.root @ D, self.shift, self.linear @ D)
 
     def padded(self, rows: int) -> Squares:
-        """With rows of zeros in the roots, ``rows`` in all."""
+        """The same functions, with zero rows added to the roots up to ``rows``."""
         more = rows - self.shift.shape[1]
         return Squares(
             np.pad(self.root, ((0, 0), (0, more), (0, 0))), np.pad(self.shift, ((0, 0), (0, more))), self.linear
@@ -43,14 +43,15 @@ class Squares:
 
     @property
     def core(self) -> core.Squares:
-        """The same for the compiled core."""
+        """The squares as an object of the compiled core."""
         return core.Squares(self.root, self.shift, self.linear)
 
 
 def squares_of(gradient: Floats, hessian: Floats) -> Squares | None:
-    """Of ``gradient`` (N, z) and ``hessian`` (N, z, z) or (1, z, z); None where one is not positive semidefinite.
+    """Squares from ``gradient`` (N, z) and ``hessian`` (N, z, z) or (1, z, z); None if one is not semidefinite.
 
-    Only what the Hessian knows nothing of is left in the linear part: as a sum of squares a gradient keeps its digits.
+    The linear part has only the gradient's component in the Hessian's null space: in squares a gradient keeps its
+    digits.
     """
     size = np.sqrt(np.abs(np.diagonal(hessian, axis1=-2, axis2=-1)))
     unit = np.where(size > 0.0, size, 1.0)

@@ -1,7 +1,7 @@
-"""Motions that a search tries: rolled out with their running cost, and given up where they are not worth going on with.
+"""Trial motions of a search: rollouts with their running cost, stopped early where they cannot be accepted.
 
-One call of the core makes a motion, sums its cost on the way and ends it where it is cut into too many parts or costs
-more than any step of the search would accept.
+One call of the core integrates a motion, sums its cost and stops where it takes too many substeps or costs more than
+any step of the search would accept.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """A motion that was tried.
+    """A trial motion.
 
     Attributes:
-        failure: Why it could not go on, or None.
-        verdict: Why it was given up, if it was.
-        shares: What its cost is the sum of, as :meth:`OptimalControlProblem.shares`; None where it did not end.
+        failure: Why a step failed, or None.
+        verdict: Why the motion was stopped; ``going`` where it was not.
     """
 
     trials: Trials
@@ -44,11 +43,11 @@ class Attempt:
 
     @property
     def whole(self) -> bool:
-        """Whether it went to its end."""
+        """Whether it reached the end of the horizon."""
         return self.failure is None and self.verdict is Watch.Verdict.going
 
     def shares(self) -> Floats:
-        """What its cost is the sum of, one that is whole: as :meth:`OptimalControlProblem.shares`."""
+        """The terms of its cost, as :meth:`OptimalControlProblem.shares`; only for a whole motion."""
         q, v, _, _ = self.nodes
         problem = self.trials.problem
         if self.line is not None:
@@ -57,7 +56,7 @@ class Attempt:
         return problem.shares_along(q, v, self.u, self.values)
 
     def trajectory(self) -> Trajectory:
-        """Its motion, as far as it went."""
+        """The motion up to where it ended."""
         trials, done = self.trials, int(self.written.done[0])
         q, v, p, energy = (nodes[: done + 1] for nodes in self.nodes)
         scene = trials.problem.scene
@@ -95,24 +94,24 @@ class Trials:
         self.masses = scene.robot.tree.mass.copy()
         self.text = str(problem.integrator)
         self._weight = problem.dt * float(problem.rule[0, 0])
-        # Early on a motion says little of its cost.
+        # Early on, the cost so far is a poor bound.
         self._third = problem.decisions // 3 * problem.hold or problem.steps + 1
 
     @property
     def third(self) -> int:
-        """After how many steps a motion is looked at first."""
+        """Number of steps before the first check of a motion."""
         return self._third
 
     def attempt(
         self, commands: Commands, *, integrator: Integrator | None = None, most: float = np.inf, parts: float = np.inf
     ) -> Attempt:
-        """The motion under commands for all of its steps.
+        """Integrate the motion under commands for all steps.
 
         Args:
             commands: The commands.
-            integrator: To make it with: the problem's with other options, and itself if left out.
-            most: What it may cost before its end; looked at from a third of the motion on.
-            parts: What that third may take.
+            integrator: The problem's integrator with other options; by default itself.
+            most: Bound on the running cost, checked from a third of the motion on.
+            parts: Bound on the substeps of that third.
         """
         problem, scene = self.problem, self.problem.scene
         N, n, m = problem.steps, scene.robot.dof, scene.controls
@@ -146,7 +145,7 @@ class Trials:
     def _on_lines(
         self, commands: Commands, integrator: Integrator, into: tuple[Floats, Floats, Floats, Floats], nodes: Nodes
     ) -> Attempt:
-        """The motion under controls that are linear between nodes; nothing ends it early."""
+        """Integrate the motion under controls that are linear between nodes, without early stops."""
         scene = self.problem.scene
         (segment,) = integrator.rollout(scene, integrator.fork(self._state), commands, scene.silence, self.problem.dt)
         done, statistics = len(segment.u), segment.statistics

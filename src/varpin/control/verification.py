@@ -1,4 +1,4 @@
-"""A plan held against an accurate integration of the continuous system."""
+"""Comparison of a plan with an accurate integration of the continuous system."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
-# Above, the costs are not known well enough to say anything of the plan.
+# Relative accuracy of the costs above which nothing can be concluded about the plan.
 _UNTOLD = 0.01
-# What the continuous system is integrated with; and where damping is faster than the plan's step by this factor, or is
-# at one of so many nodes.
+# Integrators of the continuous system, without and with fast damping.
 _USUAL, _FAST = RungeKutta4(), Radau(3)
+# Damping is fast if its rate times the plan's step exceeds _FASTER at one of _NODES nodes.
 _FASTER, _NODES = 8.0, 8
 _READING = (
     "where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse (controls alone "
     "also lose much where a motion is unstable)"
 )
-# Runge-Kutta is stable up to this product of rate and step.
+# Stability limit of the Runge-Kutta method: greatest product of rate and step.
 _STABLE = 2.78
 
 
 @dataclass(frozen=True)
 class ViolationOnRobot:
-    """By how much a constraint is violated at most, in its own unit.
+    """Largest violation of a constraint, in its own unit.
 
     Attributes:
         label: The constraint.
-        unit: Of the values.
-        planned: At its places in the plan.
-        open_loop: Of the continuous system under the plan's controls alone, between nodes, too; of a goal at the end.
-            NaN where that motion runs away.
+        unit: Unit of the values.
+        planned: In the plan, at the constraint's places.
+        open_loop: On the continuous system under the plan's controls alone, also between nodes; for a goal, at the end.
+            NaN where the motion diverges.
         closed_loop: The same with feedback.
-        where: The worst row and time with feedback, in words; empty where nothing is violated or the motion runs away.
+        where: The worst row and time with feedback, in words; empty without violation or where the motion diverges.
     """
 
     label: str
@@ -71,24 +71,24 @@ class ViolationOnRobot:
 
 @dataclass(frozen=True)
 class Verification:
-    """A plan held against an accurate integration of the continuous system.
+    """Comparison of a plan with an accurate integration of the continuous system.
 
-    Costs are integrals over the continuous motion, without noise; NaN where that motion runs away.
+    Costs are integrals over the continuous motion, without noise; NaN where that motion diverges.
 
     Attributes:
-        planned_cost: The solver's own.
-        open_loop_cost: Of the plan's controls alone.
-        closed_loop_cost: With the plan's feedback, at the plan's own rate.
-        open_loop_gap: Distance of the end from the plan's, in q, open loop [rad or m].
+        planned_cost: Cost by the solver.
+        open_loop_cost: Cost under the plan's controls alone.
+        closed_loop_cost: Cost with feedback at the plan's own rate.
+        open_loop_gap: Largest distance of the end from the plan's, in q, under the controls alone [rad or m].
         closed_loop_gap: The same with feedback.
         defect: Largest distance in q of an accurately integrated step from the plan's [rad or m].
-        substeps: Of the accurate integration, in one step of the plan.
+        substeps: Substeps of the accurate integration in one step of the plan.
         accuracy: Relative change over the last doubling of the substeps, of the cost that changed more.
         status: How the search for the plan ended.
-        integrator: Of the accurate integration: ``Radau(stages=3)`` where dampers, friction or servos are much faster
-            than the plan's step.
-        constraints: How the continuous system keeps to each of the problem's constraints, without margins, at the nodes
-            of the accurate integration after the plan's first one. Limits of the controls' rate are those of decisions.
+        integrator: The accurate integrator: ``Radau(stages=3)`` where dampers, friction or servos are much faster than
+            the plan's step.
+        constraints: Violations of the problem's constraints on the continuous system, without margins, at the nodes of
+            the accurate integration from the plan's first one on. Rate limits of controls apply to decisions.
     """
 
     planned_cost: float
@@ -105,20 +105,20 @@ class Verification:
 
     @property
     def violation(self) -> float:
-        """The most that a constraint is violated with feedback on the continuous system, in its own unit.
+        """The largest violation of a constraint with feedback on the continuous system, in its own unit.
 
-        NaN where that motion runs away.
+        NaN where that motion diverges.
         """
         return float(np.max([item.closed_loop for item in self.constraints], initial=0.0))
 
     @property
     def told(self) -> bool:
-        """Whether the costs are known to a percent; if not, they say nothing of the plan."""
+        """Whether the costs are known to a percent; if not, nothing can be concluded about the plan."""
         return not (np.isfinite(self.accuracy) and self.accuracy > _UNTOLD)
 
     @property
     def open_loop_loss(self) -> float:
-        """What the controls alone cost above the plan, relative to the plan's cost; NaN where they run away."""
+        """Excess cost under the controls alone, relative to the plan's cost; NaN where the motion diverges."""
         return excess(self.open_loop_cost, self.planned_cost)
 
     @property
@@ -131,7 +131,7 @@ class Verification:
         return (
             f"these costs say nothing of the plan: with {self.substeps} steps of {self.integrator} in one of the "
             f"plan's they still change by {percent(self.accuracy)}. Springs, dampers, dry friction or stops are too "
-            f"fast for them: give more max_substeps than {self.substeps}, or friction a greater width"
+            f"fast: give max_substeps above {self.substeps}, or friction a greater width"
         )
 
     @property
@@ -172,14 +172,14 @@ class Verification:
 
 
 def excess(cost: float, base: float) -> float:
-    """How far a cost is above another one, relative to it; infinite above nothing."""
+    """Excess of ``cost`` over ``base``, relative to ``base``; infinite where ``base`` is zero."""
     if cost == base:
         return 0.0
     return (cost - base) / abs(base) if base != 0.0 else float(np.copysign(np.inf, cost - base))
 
 
 def percent(part: float) -> str:
-    """A part of something in words: in percent, or as a multiple where it is large."""
+    """A fraction as text: in percent, or as a multiple where it is large."""
     if abs(part) >= 1e4:
         return f"{part:+.1e} x"
     return f"{100.0 * part:+.2f} %" if abs(part) < 1.0 else f"{100.0 * part:+.0f} %"
@@ -196,10 +196,10 @@ def verify(
     max_substeps: int,
     progress: Callable[[int, int], None] | None,
 ) -> Verification:
-    """Hold a plan, and its policy on (q, p) or (q, v) for a number of substeps, against accurate integrations.
+    """Compare a plan, and its policy on (q, p) or (q, v), with accurate integrations.
 
-    The substeps double until neither cost changes by more than ``tolerance`` of itself. Where an explicit method does
-    not get there, for dampers or dry friction are too fast for it, an L-stable one does it again.
+    The substeps double until the relative change of both costs is at most ``tolerance``. Where the explicit method does
+    not reach that because of fast dampers or dry friction, the L-stable one repeats the comparison.
     """
     fast = _fast(problem, plan) or problem.dt * rate_at_rest(problem.scene, problem.q0) >= _STABLE * max_substeps
     members = (accurate(problem),) if problem.scene.constraints else (_FAST,) if fast else (_USUAL, _FAST)
@@ -286,7 +286,7 @@ def _violations(
     substeps: int,
     integrator: Integrator,
 ) -> tuple[ViolationOnRobot, ...]:
-    """What the continuous system makes of each constraint under the controls alone, and with feedback."""
+    """Violations of each constraint on the continuous system, under the controls alone and with feedback."""
     if not problem.constraints:
         return ()
     h = problem.dt / substeps
@@ -303,7 +303,7 @@ def _violations(
                 continue
             excess = _excess(bound, bound.value(motion.q, motion.v, motion.u))
             if not bound.of_controls and not bound.source.equality:
-                # The first node of the plan is the first that it can change.
+                # The plan can change nothing before its first node.
                 excess[: substeps - 1] = 0.0
             place, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
             worst.append(float(excess[place, row]))
@@ -315,13 +315,13 @@ def _violations(
 
 
 def _excess(bound: BoundConstraint, c: Floats) -> Floats:
-    """What of values (K, rows) is violated."""
+    """Violation of a constraint with values ``c`` (K, rows)."""
     found: Floats = np.abs(c) if bound.source.equality else np.maximum(c, 0.0)
     return found
 
 
 def _fast(problem: OptimalControlProblem, plan: Trajectory) -> bool:
-    """Whether dampers or friction are so fast that an explicit method would take many substeps to follow them."""
+    """Whether dampers or friction are so fast that an explicit method would need many substeps."""
     if not problem.scene.dissipates or not plan.steps:
         return False
     at = np.unique(np.linspace(0, plan.steps, _NODES, dtype=np.int64))
@@ -337,7 +337,7 @@ def _fine_costs(problem: OptimalControlProblem, substeps: int) -> tuple[BoundSum
 
 
 def accurate(problem: OptimalControlProblem) -> Integrator:
-    """What a plan is held against: classical Runge-Kutta; under constraints ``Gauss(3)``, which keeps them."""
+    """The integrator of the continuous system: classical Runge-Kutta; with scene constraints ``Gauss(3)``."""
     return Gauss(stages=3) if problem.scene.constraints else RungeKutta4()
 
 
@@ -348,9 +348,9 @@ def accurate_cost(
     costs: tuple[BoundSum, BoundSum] | None = None,
     integrator: Integrator | None = None,
 ) -> tuple[float, Floats]:
-    """True cost under given commands, and the end configuration; NaN where the motion runs away.
+    """True cost under given commands, and the end configuration; NaN where the motion diverges.
 
-    In ``substeps`` steps, an even number, of the integrator, :func:`accurate` if left out, for each of the plan's.
+    Each of the plan's steps has ``substeps`` steps, an even number, of the integrator, by default :func:`accurate`.
     """
     scene, h = problem.scene, problem.dt / substeps
     n, m = scene.robot.dof, scene.controls
@@ -358,7 +358,7 @@ def accurate_cost(
     if failure is not None:
         return np.nan, np.full(n, np.nan)
     running, terminal = _fine_costs(problem, substeps) if costs is None else costs
-    # Simpson's rule within each step of the plan: a held control jumps between steps.
+    # Simpson's rule within each step of the plan, since held controls jump between steps.
     if problem.linear:
         before = after = running.value(motion.q, motion.v, motion.u_nodes)
     else:
@@ -387,7 +387,7 @@ def _defect(problem: OptimalControlProblem, trajectory: Trajectory, substeps: in
             motion, failure = rollout(scene, integrator, trajectory.q[k], trajectory.v[k], line, h)
             off.append(np.nan if failure else float(np.abs(motion.q[-1] - trajectory.q[k + 1]).max()))
         return float(np.max(off))
-    # Every step is a path of its own, with its own control handed over as a force.
+    # Every step is a separate path, with its control given as a force.
     commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=substeps)
     force = trajectory.u @ scene.actuation.T
     forces = np.ascontiguousarray(np.broadcast_to(force[:, None], (trajectory.steps, substeps, n)))

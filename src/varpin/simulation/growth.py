@@ -1,8 +1,8 @@
-"""Growth of small errors of single steps over a whole motion.
+"""Growth of the errors of single steps over a whole motion.
 
-Where a disturbance grows a thousandfold, steps that are right to five digits make a motion that is right to two. The
-errors of some steps are estimated by repeating them, and their growth by the fastest modes of the motion linearized
-there. Only if both together give a large error is the whole motion repeated by a method of more stages.
+Where disturbances grow a thousandfold, steps that are right to five digits make a motion that is right to two. Repeated
+steps give the error of a step, and the fastest modes of the linearized motion bound its growth. Only where the product
+is large, the whole motion is repeated by a method of more stages.
 """
 
 from __future__ import annotations
@@ -23,27 +23,26 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# First words of the warning.
+# Begin of the warning.
 SAID = "disturbances grow here"
 
-# Number of repeated steps, and the fewest steps of a motion and most joints of a robot that are examined.
+# Number of repeated steps; fewest steps and most joints of an examined motion.
 _PLACES, _LEAST, _JOINTS = 6, 40, 60
-# Error from which on a warning is given, as a share of the way of the joint that goes furthest; and the part of it from
-# which on the motion is repeated.
-_WARNED, _NEAR = 0.02, 0.3
-# Exponent of growth as a share of the fastest mode's: at most half in 60 motions of arms and chains, for the directions
-# of modes turn; and the largest exponent.
+# Threshold of the warning, as a share of the largest joint travel; and the part of it from which a motion is repeated.
+WARNED, NEAR = 0.02, 0.3
+# The share of the fastest mode's exponent by which a disturbance grows: at most half in 60 motions of arms and chains,
+# because modes turn. And the largest exponent that is computed.
 _ALIGNED, _MOST = 0.5, 60.0
 
 
 class Growth(NamedTuple):
-    """The error of a motion after errors of its steps have grown.
+    """The error of a motion in which the errors of steps have grown.
 
     Attributes:
         joint: The coordinate with the largest error.
         off: The error [rad or m].
-        share: The same, in units of the way of the joint that goes furthest.
-        time: Time from which on the error exceeds the threshold of the warning [s].
+        share: The error as a share of the largest joint travel.
+        time: When the error reaches the threshold of the warning [s].
         step: The largest error of a single step [rad or m].
     """
 
@@ -54,46 +53,54 @@ class Growth(NamedTuple):
     step: float
 
 
-def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Growth | None:
-    """The error of a motion after errors of single steps have grown, if it exceeds the threshold of the warning.
+def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
+    """An estimate of the largest factor by which a disturbance grows over a motion.
 
-    None, too, under noise and constraints, with forces in Python, and for an integrator that chooses its own steps.
+    It comes from the fastest mode at two nodes; more would take longer than many a motion. It is 1 where
+    :func:`grown_error` is None for every motion, and infinite where the linearization fails.
     """
-    steps, n = trajectory.steps, scene.robot.dof
-    hidden = scene.custom is not None or scene.constraints or trajectory.dw.any()
-    if hidden or isinstance(integrator, Reference) or n > _JOINTS or steps < _LEAST:
+    if _unexamined(scene, trajectory):
+        return 1.0
+    try:
+        slopes = _slopes(scene, trajectory, np.array([trajectory.steps // 3, 2 * trajectory.steps // 3]))
+    except LinearizationError:
+        return np.inf
+    return _factor(float(_modes(*slopes).max()), trajectory)
+
+
+def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Growth | None:
+    """The error of a motion after errors of its steps have grown; None below the threshold of the warning.
+
+    None, too, under noise and constraints, with forces in Python, and of an integrator that chooses its own steps.
+    """
+    if isinstance(integrator, Reference) or _unexamined(scene, trajectory):
         return None
+    steps = trajectory.steps
     other = finer(integrator, trajectory, damped=False, pulled=False)
-    at = np.linspace(0, steps - 1, _PLACES + 2).astype(np.int64)[1:-1]
+    at = _places(trajectory)
     q, v = trajectory.q, trajectory.v
     forces = np.ascontiguousarray(trajectory.u[at] @ scene.actuation.T)
     nothing = open_loop(np.zeros((1, scene.controls)))
     once = other.method.motions(scene, q[at], v[at], nothing, forces[:, None], trajectory.dt)
     if once is None:
         return None
-    # The means of controls that change within a step serve: they do nearly the same in both methods.
+    # Controls that change within a step do so for both, nearly.
     in_q, in_v = np.abs(once[0][:, 0] - q[at + 1]), np.abs(once[1][:, 0] - v[at + 1])
     way = largest_of_its_kind(scene, np.ptp(q, axis=0))
     least = ROUNDING * (1.0 + np.abs(q).max())
     begins = (in_q + in_v * trajectory.dt) / np.maximum(way, least)
-    length = float(trajectory.t[-1] - trajectory.t[0])
-    small = _NEAR * _WARNED / max(steps * float(begins.max()), 1e-300)
+    small = NEAR * WARNED / max(steps * float(begins.max()), 1e-300)
     if small > np.exp(_MOST):
         return None
     try:
-        _, aq, av, _ = accelerations(scene, q[at], v[at], forces)
+        slopes = _slopes(scene, trajectory, at)
     except LinearizationError:
         return None
-    # No mode is faster than this.
-    fastest = np.sqrt(np.abs(aq).sum(axis=2).max(axis=1)) + np.abs(av).sum(axis=2).max(axis=1)
-    if small > np.exp(min(_ALIGNED * float(np.median(fastest)) * length, _MOST)):
+    # Eigenvalues take longer than all else: at half of the places.
+    aq, av = slopes
+    if small > _factor(_largest_rate(aq, av), trajectory):
         return None
-    # Eigenvalues, the most expensive part, at half of the places.
-    J = np.zeros((_PLACES // 2, 2 * n, 2 * n))
-    J[:, range(n), range(n, 2 * n)] = 1.0
-    J[:, n:, :n], J[:, n:, n:] = aq[::2], av[::2]
-    rate = float(np.median(np.linalg.eigvals(J).real.max(axis=1)))
-    if small > np.exp(min(_ALIGNED * rate * length, _MOST)):
+    if small > _factor(float(np.median(_modes(aq[::2], av[::2]))), trajectory):
         return None
     again = taken_again(scene, other.method, trajectory, integrator.stage_times, 0, steps, other.parts)
     if again is None:
@@ -102,7 +109,51 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     shares = off / np.maximum(way, least)
     joint = int(shares.max(axis=0).argmax())
     share = float(shares[:, joint].max())
-    if share <= _WARNED:
+    if share <= WARNED:
         return None
-    first = float(trajectory.t[(shares[:, joint] > _WARNED).argmax()])
+    first = float(trajectory.t[(shares[:, joint] > WARNED).argmax()])
     return Growth(joint, float(off[:, joint].max()), share, first, float(in_q.max()))
+
+
+def _unexamined(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether growth is not examined: under noise, constraints or Python forces, and for few steps or many joints."""
+    hidden = scene.custom is not None or scene.constraints or trajectory.dw.any()
+    return bool(hidden or scene.robot.dof > _JOINTS or trajectory.steps < _LEAST)
+
+
+def _places(trajectory: Trajectory) -> NDArray[np.int64]:
+    """Nodes of the motion at which it is linearized."""
+    return np.linspace(0, trajectory.steps - 1, _PLACES + 2).astype(np.int64)[1:-1]
+
+
+def _slopes(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Derivatives of the accelerations in q and in v (K, n, n).
+
+    Raises:
+        LinearizationError: There are none.
+    """
+    forces = np.ascontiguousarray(trajectory.u[at] @ scene.actuation.T)
+    _, aq, av, _ = accelerations(scene, trajectory.q[at], trajectory.v[at], forces)
+    return aq, av
+
+
+def _largest_rate(aq: Floats, av: Floats) -> float:
+    """A bound of the rates of all modes [1/s], from norms of the linearized accelerations."""
+    by_q, by_v = (np.abs(slope).sum(axis=2).max(axis=1) for slope in (aq, av))
+    return float(np.median(np.sqrt(by_q) + by_v))
+
+
+def _modes(aq: Floats, av: Floats) -> Floats:
+    """The rate at which the fastest mode of the linearized accelerations grows at each place (K,) [1/s]."""
+    n = aq.shape[1]
+    J = np.zeros((len(aq), 2 * n, 2 * n))
+    J[:, range(n), range(n, 2 * n)] = 1.0
+    J[:, n:, :n], J[:, n:, n:] = aq, av
+    rates: Floats = np.linalg.eigvals(J).real.max(axis=1)
+    return rates
+
+
+def _factor(rate: float, trajectory: Trajectory) -> float:
+    """The factor by which a disturbance grows over a motion whose fastest mode has this rate [1/s]."""
+    length = float(trajectory.t[-1] - trajectory.t[0])
+    return float(np.exp(min(_ALIGNED * rate * length, _MOST)))

@@ -46,9 +46,12 @@ def bent(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Bend |
     """The error where drives of servos reach or leave their limits, if it exceeds the threshold of the warning."""
     if isinstance(integrator, Reference) or trajectory.dw.any() or scene.custom is not None or not trajectory.steps:
         return None
+    servos = of_kind(scene.elements, "PositionServo")
+    if not servos:
+        return None
     steps, lasting = trajectory.steps, np.zeros(trajectory.steps)
     force = trajectory.u @ scene.actuation.T
-    for servo in of_kind(scene.elements, "PositionServo"):
+    for servo in servos:
         c, (stiffness, damping, effort) = servo.coordinate, servo.values
         if not np.isfinite(effort):
             continue

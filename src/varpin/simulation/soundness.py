@@ -44,7 +44,8 @@ from varpin.simulation.accuracy import (
 from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.damping import Fast, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
-from varpin.simulation.growth import SAID, grown_error
+from varpin.simulation.growth import NEAR, SAID, grown_error, growth_bound
+from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.simulation.phase import phase_lost
@@ -230,7 +231,7 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     unsettled = _unsettled(scene, integrator, trajectory)
     resolution = resolution_of(scene, integrator, trajectory)
     if resolution.resolved:
-        more = () if found else _accumulated(scene, integrator, trajectory, in_phase=resolution.in_phase)
+        more = () if found else _accumulated(scene, integrator, trajectory, resolution)
         return (*found, *more, *unsettled)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and is_wrong(error):
@@ -258,7 +259,7 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     if scene.constraints and not found:
         found.extend(_unresolved_damping(scene, integrator, trajectory))
     if not found:
-        found.extend(_accumulated(scene, integrator, trajectory, in_phase=False))
+        found.extend(_accumulated(scene, integrator, trajectory, Resolution(False)))
     return (*found, *(finding for finding in unsettled if finding.kind not in {other.kind for other in found}))
 
 
@@ -271,12 +272,12 @@ def _unresolved_damping(scene: Scene, integrator: Integrator, trajectory: Trajec
 
 
 def _accumulated(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, *, in_phase: bool
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, resolution: Resolution
 ) -> tuple[Finding, ...]:
-    """Errors that add up over a motion whose steps resolve each period; ``in_phase`` if its oscillations have none."""
-    phase = () if in_phase else _out_of_phase(scene, integrator, trajectory)
+    """Errors that add up or grow over a motion whose steps resolve each period."""
+    phase = () if resolution.in_phase else _out_of_phase(scene, integrator, trajectory)
     found = (*phase, *_at_limits_of_drives(scene, integrator, trajectory))
-    return found or _growing(scene, integrator, trajectory)
+    return found or (() if resolution.predictable else _growing(scene, integrator, trajectory))
 
 
 def _growing(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -504,10 +505,12 @@ class Resolution(NamedTuple):
         resolved: Whether steps of twice the length, or a better method, make the same motion: the steps resolve it
             over a period.
         in_phase: Whether the errors are so small that they add up to none over the whole motion.
+        predictable: Whether the errors are so small that no warning is due even if they grow as the fastest mode does.
     """
 
     resolved: bool
     in_phase: bool = False
+    predictable: bool = False
 
 
 def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Resolution:
@@ -572,7 +575,11 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     if not agree(less / _MARGIN, of_velocity):
         return Resolution(False)
     # Errors of oscillations may add up from window to window over the whole motion.
-    return Resolution(True, agree(less * PHASE_WARNED / WRONG_MOTION * length / (_ADDS * steps), of_velocity))
+    windows = length / steps
+    in_phase = agree(less * PHASE_WARNED / WRONG_MOTION * windows / _ADDS, of_velocity)
+    most = less * NEAR * GROWTH_WARNED / WRONG_MOTION * windows
+    predictable = in_phase and agree(most / growth_bound(scene, trajectory), of_velocity)
+    return Resolution(True, in_phase, predictable)
 
 
 def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
