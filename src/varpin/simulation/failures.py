@@ -110,8 +110,8 @@ class ToleranceError(VarpinError, RuntimeError):
         known = f"is still {error:.1e} rad or m" if np.isfinite(error) else "is unknown"
         super().__init__(
             f"tolerance = {tolerance:g} cannot be met over {duration:g} s: with {steps} steps the error in q "
-            f"{known}. A chaotic motion has no end that any method gets right, and one whose forces are too stiff or "
-            "jump may need more; ask for a shorter duration, or give dt and steps"
+            f"{known}. No method computes a chaotic motion to its end, and stiff or discontinuous forces may need more "
+            "steps; give a shorter duration, or dt and steps"
         )
 
 

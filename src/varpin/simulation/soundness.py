@@ -504,7 +504,7 @@ class Resolution(NamedTuple):
     Attributes:
         resolved: Whether steps of twice the length, or a better method, make the same motion: the steps resolve it
             over a period.
-        in_phase: Whether the errors are so small that they add up to none over the whole motion.
+        in_phase: Whether the errors are so small that no warning is due even if they add up over the whole motion.
         predictable: Whether the errors are so small that no warning is due even if they grow as the fastest mode does.
     """
 

@@ -50,7 +50,9 @@ def time_steps(dt: float | None, steps: int | None, duration: float | None) -> t
     dt = positive("dt", dt, "s")
     steps = max(1, round(min(duration / dt, 1e15)))
     if abs(steps * dt - duration) > 1e-9 * duration:
-        raise InputError(f"duration = {duration:g} s is no multiple of dt = {dt:g} s: dt = {duration / steps!r} s is")
+        raise InputError(
+            f"duration = {duration:g} s is no multiple of dt = {dt:g} s, but of dt = {duration / steps!r} s"
+        )
     return dt, steps
 
 
