@@ -9,7 +9,7 @@ import varpin as vp
 from varpin.mechanics.assembly import along_constraints
 from varpin.mechanics.inputs import in_parts_of_steps
 from varpin.simulation.retaking import taken_again
-from varpin.simulation.soundness import looked_again, motion_error
+from varpin.simulation.soundness import motion_error, resolution_of
 
 
 def four_bar(**options):
@@ -42,7 +42,7 @@ def test_the_estimate_is_the_error():
 def test_fine_steps_are_known_by_steps_of_twice_the_length():
     scene, q, v = four_bar()
     motion = vp.simulate(scene, q, v, dt=1e-3, steps=400, integrator=vp.Gauss(2))
-    assert looked_again(scene, vp.Gauss(2), motion).resolved
+    assert resolution_of(scene, vp.Gauss(2), motion).resolved
     assert not motion.warnings
 
 

@@ -277,7 +277,7 @@ def test_what_is_wrong_and_unsaid_is_silent_wrong(monkeypatch):
     assert cell.kind is Kind.WRONG
     assert "error" in cell.found[0]
     # The same error, but spoken of.
-    monkeypatch.setattr("varpin.simulation.soundness._looked_for", lambda *_: (Finding("test", "all is not well"),))
+    monkeypatch.setattr("varpin.simulation.soundness._errors_found", lambda *_: (Finding("test", "all is not well"),))
     assert run_one(lie, window=0.5).kind is Kind.DEGRADED
 
 
@@ -591,7 +591,7 @@ def test_nothing_on_robots_and_trees_is_silent_wrong(benchmark, name):
 def test_needless_warnings_are_counted(monkeypatch):
     setup, _ = falling()
     assert run_one(setup, 1e-3).kind is Kind.ACCURATE
-    monkeypatch.setattr("varpin.simulation.soundness._looked_for", lambda *_: (Finding("test", "all is not well"),))
+    monkeypatch.setattr("varpin.simulation.soundness._errors_found", lambda *_: (Finding("test", "all is not well"),))
     cell = run_one(setup, 1e-3)
     assert cell.warned
     assert cell.needless

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import varpin as vp
 from varpin.simulation import limits
 from varpin.simulation.friction import rate_at_rest
-from varpin.simulation.soundness import evident
+from varpin.simulation.soundness import findings_from_record
 
 SAID = "dry friction is faster than the step"
 
@@ -127,7 +127,9 @@ def test_friction_faster_than_the_step_without_a_check():
     motion = vp.simulate(block(1e-4), [0.0], [2.0], dt=1e-2, steps=120, check=False, integrator=vp.Midpoint())
     assert any(sentence.startswith(SAID) for sentence in motion.warnings)
     for integrator in (vp.Radau(2), vp.Radau(3)):
-        assert "fast friction" not in {finding.kind for finding in evident(block(1e-4), integrator, motion)}
+        assert "fast friction" not in {
+            finding.kind for finding in findings_from_record(block(1e-4), integrator, motion)
+        }
         assert own(vp.simulate(block(1e-4), [0.0], [2.0], dt=1e-2, steps=120, integrator=integrator)) == []
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import varpin as vp
 from varpin.simulation import limits
-from varpin.simulation.soundness import evident
+from varpin.simulation.soundness import findings_from_record
 
 LIMIT = '<limit lower="{}" upper="{}" velocity="9" effort="9"/>'
 ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
@@ -90,7 +90,7 @@ def test_the_finding_has_a_kind_of_its_own_and_many_joints_are_counted():
     scene = vp.Scene(robot, gravity=False)
     q = np.full(6, 7.0)
     motion = vp.simulate(scene, q, np.zeros(6), dt=1e-3, steps=3, check=False)
-    (finding,) = evident(scene, vp.Midpoint(), motion)
+    (finding,) = findings_from_record(scene, vp.Midpoint(), motion)
     assert finding.kind == limits.POSITION
     assert finding.sentence in motion.warnings
     assert finding.sentence.count(" rad above ") == 6

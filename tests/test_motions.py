@@ -5,7 +5,7 @@ import pytest
 
 import varpin as vp
 from varpin.integrators.base import open_loop
-from varpin.simulation.run import Motions
+from varpin.simulation.record import Motions
 
 STEPS, DT = 60, 0.01
 

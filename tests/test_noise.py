@@ -7,7 +7,7 @@ from refusals import refused
 import varpin as vp
 from varpin.mechanics.noise import bind
 from varpin.mechanics.wiener import coarsen, wiener_increments
-from varpin.simulation.run import NoiseError
+from varpin.simulation.failures import NoiseError
 
 # Three coordinates, two controls: one joint is not actuated, and a control moves two joints.
 ACTUATION = np.array([[1.0, 0.0], [0.0, 0.0], [0.5, 2.0]])

@@ -13,7 +13,7 @@ from varpin.control.examination import findings, replayed
 from varpin.io.scenefile import scenes
 from varpin.simulation import limits
 from varpin.simulation.chatter import RUN, alternation, restlessness
-from varpin.simulation.soundness import evident
+from varpin.simulation.soundness import findings_from_record
 
 ARMS = {
     "ur5": {},
@@ -142,7 +142,9 @@ def test_fast_dampers_are_looked_for_along_the_motion():
     begin = 0.0 if rates[0].max() == slow else 0.5 * np.pi
     q = np.linspace([0.0, begin], [0.0, 0.5 * np.pi - begin], 20)
     motion = vp.simulate(scene, q[0], [0, 0], dt=dt, steps=19)
-    assert "fast damping" in {finding.kind for finding in evident(scene, vp.Midpoint(), replace(motion, q=q))}
+    assert "fast damping" in {
+        finding.kind for finding in findings_from_record(scene, vp.Midpoint(), replace(motion, q=q))
+    }
 
 
 @pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Gauss(4), vp.RungeKutta4(), vp.SemiImplicitEuler()], ids=str)

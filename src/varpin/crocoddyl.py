@@ -26,7 +26,8 @@ from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import refuse_constraints
-from varpin.simulation.run import StepFailure, rollout
+from varpin.simulation.failures import StepFailure
+from varpin.simulation.record import rollout
 from varpin.trajectory import Trajectory
 
 try:

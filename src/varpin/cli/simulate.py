@@ -31,7 +31,8 @@ from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
 from varpin.errors import InputError
 from varpin.mechanics.scene import Scene
 from varpin.show.replay import frame_names
-from varpin.simulation.run import Interrupted, StepFailure, simulate
+from varpin.simulation.failures import Interrupted, StepFailure
+from varpin.simulation.run import simulate
 from varpin.support.checks import count, positive
 from varpin.support.tables import WIDTH, add_row, facts
 from varpin.trajectory import Trajectory

@@ -20,8 +20,8 @@ from varpin.errors import VarpinError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
 from varpin.simulation.chatter import alternation, restlessness
-from varpin.simulation.run import rollout
-from varpin.simulation.soundness import Finding, announce, evident, examined
+from varpin.simulation.record import rollout
+from varpin.simulation.soundness import Finding, announce, examined, findings_from_record
 
 Floats = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     told.append(Finding("replay", _sentence(problem, replay)))
     reasons = [finding for finding in found if finding.kind in _OF_STEPS]
     # Findings about steps that are negligible for the motion may explain the plan's loss.
-    record = evident(problem.scene, problem.integrator, motion)
+    record = findings_from_record(problem.scene, problem.integrator, motion)
     return *told, *(reasons or [finding for finding in record if finding.kind in _OF_STEPS])
 
 

@@ -20,8 +20,9 @@ from varpin.ensemble.paths import Extremes, Shared, Task, chunks, simulate_paths
 from varpin.errors import InputError, VarpinError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.wiener import Children, children
+from varpin.simulation.commands import commands_of
+from varpin.simulation.failures import NoiseError, StepFailure
 from varpin.simulation.loop_stability import examined_in_loop
-from varpin.simulation.run import NoiseError, StepFailure, commands_of
 from varpin.simulation.soundness import Finding, announce
 from varpin.support.checks import count
 from varpin.support.executors import executing, in_order

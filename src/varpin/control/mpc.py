@@ -21,9 +21,11 @@ from varpin.mechanics.inputs import in_parts_of_steps
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.simulation.chatter import alternation
 from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
+from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.loop_stability import examined_in_loop
-from varpin.simulation.run import Interrupted, Progress, StepFailure, noise_forgotten, simulate
-from varpin.simulation.soundness import Finding, announce, evident, with_warnings
+from varpin.simulation.progress import Progress
+from varpin.simulation.run import noise_forgotten, simulate
+from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
@@ -419,7 +421,7 @@ def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, .
 def _so_far(plant: Plant, method: Integrator, parts: Sequence[Trajectory]) -> Trajectory:
     """The plant's motion so far, with its warnings."""
     motion = chained(parts)
-    return with_warnings(motion, evident(plant.scene, method, motion))
+    return with_warnings(motion, findings_from_record(plant.scene, method, motion))
 
 
 def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:

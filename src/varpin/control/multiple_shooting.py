@@ -31,7 +31,8 @@ from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene, assisted, quiet
-from varpin.simulation.run import Motions, StepFailure, named
+from varpin.simulation.failures import StepFailure, named
+from varpin.simulation.record import Motions
 from varpin.support.checks import as_floats, finite_array
 from varpin.trajectory import Trajectory
 

@@ -33,8 +33,9 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
 from varpin.simulation.friction import rate_at_rest
-from varpin.simulation.run import on_constraints, simulate
+from varpin.simulation.run import simulate
 from varpin.simulation.soundness import announce
+from varpin.simulation.start import on_constraints
 from varpin.support.checks import (
     JointValues,
     control_values,

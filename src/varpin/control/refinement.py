@@ -18,7 +18,7 @@ from varpin.control.solution import Solution
 from varpin.control.verification import Verification
 from varpin.errors import InputError, VarpinError
 from varpin.mechanics.policy import LinearPolicy
-from varpin.simulation.run import rollout
+from varpin.simulation.record import rollout
 
 Floats = NDArray[np.float64]
 Search = Callable[[OptimalControlProblem, LinearPolicy | None], Solution]

@@ -36,7 +36,8 @@ from varpin.integrators.variational import Variational
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.policy import LinearPolicy
-from varpin.simulation.run import StepFailure, located, named
+from varpin.simulation.failures import StepFailure, named
+from varpin.simulation.record import located
 from varpin.support.checks import (
     JointValues,
     as_floats,

@@ -20,7 +20,7 @@ from varpin.integrators import Gauss, Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_line, open_loop
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.friction import rate_at_rest
-from varpin.simulation.run import rollout
+from varpin.simulation.record import rollout
 from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from varpin.ensemble.paths import Extremes, Shared, Task
 from varpin.simulation.loop_stability import examined_in_loop
-from varpin.simulation.run import Motions
+from varpin.simulation.record import Motions
 from varpin.simulation.soundness import Finding
 from varpin.support.executors import in_order
 

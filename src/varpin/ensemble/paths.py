@@ -20,7 +20,7 @@ from varpin.integrators.base import Failure, rows
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import Children
-from varpin.simulation.run import located
+from varpin.simulation.record import located
 from varpin.support.frozen import Frozen
 
 Floats = NDArray[np.float64]

@@ -21,8 +21,10 @@ from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import children
 from varpin.simulation.choice import changes_along, integrator_along, stronger, usual_integrator
-from varpin.simulation.run import commands_of, on_constraints, rollout
+from varpin.simulation.commands import commands_of
+from varpin.simulation.record import rollout
 from varpin.simulation.soundness import Finding, announce
+from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.support.executors import executing, in_order
 

@@ -1,8 +1,8 @@
-"""What errors of single steps, too small to speak of, grow to over a whole motion.
+"""Growth of the errors of single steps over a whole motion.
 
-Where a disturbance grows a thousandfold, steps that are right to five digits make a motion that is right to two. Some
-steps taken again tell what they are off by, and the fastest modes of the motion linearized at these places by how much
-that may grow. Only if both together come to something is the whole motion made again by a method of more stages.
+Where disturbances grow a thousandfold, steps that are right to five digits make a motion that is right to two. Repeated
+steps give the error of a step, and the fastest modes of the linearized motion bound its growth. Only where the product
+is large, the whole motion is repeated by a method of more stages.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# How what is said of it begins.
+# Begin of the warning.
 SAID = "disturbances grow here"
 
-# Steps that are taken again, the fewest of a motion that is asked of, and the most joints.
+# Number of repeated steps; fewest steps and most joints of an examined motion.
 _PLACES, _LEAST, _JOINTS = 6, 40, 60
-# What is spoken of, in units of the way of the joint that goes furthest, and the part of it that is looked after.
+# Threshold of the warning, as a share of the largest joint travel; and the part of it from which a motion is repeated.
 WARNED, NEAR = 0.02, 0.3
-# The part of the fastest mode's exponent that a disturbance grows by, at most half in 60 motions of arms and chains, as
-# modes turn; and an exponent that stands for all beyond.
+# The share of the fastest mode's exponent by which a disturbance grows: at most half in 60 motions of arms and chains,
+# because modes turn. And the largest exponent that is computed.
 _ALIGNED, _MOST = 0.5, 60.0
 
 
 class Growth(NamedTuple):
-    """What a motion is off by after errors of its steps have grown.
+    """The error of a motion in which the errors of steps have grown.
 
     Attributes:
-        joint: The coordinate that is off most.
-        off: By how much [rad or m].
-        share: The same, in units of the way of the joint that goes furthest.
-        time: From when on it is off by so much that it is spoken of [s].
-        step: What single steps are off by, at worst [rad or m].
+        joint: The coordinate with the largest error.
+        off: The error [rad or m].
+        share: The error as a share of the largest joint travel.
+        time: When the error reaches the threshold of the warning [s].
+        step: The largest error of a single step [rad or m].
     """
 
     joint: int
@@ -54,10 +54,10 @@ class Growth(NamedTuple):
 
 
 def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
-    """An estimate of the factor by which a disturbance grows over a motion, at most.
+    """An estimate of the largest factor by which a disturbance grows over a motion.
 
-    It takes the fastest mode at two places: more take longer than many a motion. 1 where :func:`grown_error` is None
-    for every motion; infinity where the linearization fails.
+    It comes from the fastest mode at two nodes; more would take longer than many a motion. It is 1 where
+    :func:`grown_error` is None for every motion, and infinite where the linearization fails.
     """
     if _unexamined(scene, trajectory):
         return 1.0
@@ -69,7 +69,7 @@ def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
 
 
 def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Growth | None:
-    """What errors of single steps grow to, if that is worth a word.
+    """The error of a motion after errors of its steps have grown; None below the threshold of the warning.
 
     None, too, under noise and constraints, with forces in Python, and of an integrator that chooses its own steps.
     """

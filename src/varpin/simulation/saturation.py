@@ -46,9 +46,12 @@ def bent(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Bend |
     """What is missed where drives of servos come to their limits or leave them, if that is worth a word."""
     if isinstance(integrator, Reference) or trajectory.dw.any() or scene.custom is not None or not trajectory.steps:
         return None
+    servos = of_kind(scene.elements, "PositionServo")
+    if not servos:
+        return None
     steps, lasting = trajectory.steps, np.zeros(trajectory.steps)
     force = trajectory.u @ scene.actuation.T
-    for servo in of_kind(scene.elements, "PositionServo"):
+    for servo in servos:
         c, (stiffness, damping, effort) = servo.coordinate, servo.values
         if not np.isfinite(effort):
             continue

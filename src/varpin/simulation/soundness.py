@@ -1,8 +1,8 @@
-"""What a finished motion says of itself: does its energy balance close, and is it the motion of the robot?
+"""The check of a finished motion: does its energy balance close, and do its steps resolve the motion of the robot?
 
-Both are asked of every integrator after the run, from its record and by taking parts of it again in smaller steps; what
-the guards of a step let pass, and integrators without guards, are told of here. Whoever makes a motion that a user sees
-calls :func:`examined`, and :func:`announce` for the log.
+The check is the same for all integrators, with guards and without. It uses the motion's record and repeats parts of the
+motion in smaller steps. Every function that returns a motion to the user calls :func:`examined`, and :func:`announce`
+for the log.
 """
 
 from __future__ import annotations
@@ -56,49 +56,52 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# What is spoken of, as part of what is wrong: estimates are made good to some percent.
+# Errors are in units of the thresholds WRONG_ENERGY, WRONG_POSITION, WRONG_MOTION and WRONG_VELOCITY.
+# Estimated error from which on a warning is given: estimates are accurate to some percent.
 CAUTION = 0.95
-# Estimates from fewer steps than a period has are spoken of from this part of what is wrong on.
+# The same for estimates from fewer steps than a period, which are less accurate.
 _UNSETTLED = 0.7
-# An error below which nothing more is asked of a window, and from which on more places are looked at, in units of what
-# is wrong: from others than those looked at first it may be three times as large.
+# Error below which a window is accepted as it is, and error from which on more windows are examined: the error there
+# may be three times as large as in the first windows.
 _SMALL, _NEAR = 0.2, 0.35
-# How far off a motion is of which no more is needed, in units of its way. Ways that are none [rad or m].
+# Distance from the repeated motion at which the repetition ends, as a share of the travel; travel that counts as no
+# motion [rad or m].
 _FAR, _SHORTEST = 0.3, 1e-8
-# Places so near to each other, and within an eighth of a period, are one.
+# Windows that begin within this many nodes, and within an eighth of a period, are one.
 _NEAR_BY = 4
-# Steps taken for all places at most: so many times the motion's own, parts counted, and so many.
+# Most steps of all repetitions: this multiple of the motion's own steps, their parts counted, plus a constant.
 WORK, LEAST_WORK = 50, 256
-# Windows that are taken again in steps of twice the length, beside those where velocities change most; and how many
-# times the error of a window counts, for over a period it grows.
+# Number of windows repeated in steps of twice the length, beside those where velocities change most; and the factor on
+# the error of a window, which grows over a period.
 _WINDOWS, _MARGIN = 16, 8.0
-# The least steps of a window that another method takes; and how many times errors of velocities count after jumps.
+# Fewest steps of a window repeated by another method; and the factor on errors of velocities after jumps of a control.
 _SHORT, _PASSING = 8, 1.25
-# How many times the error of a window counts for each window that the whole motion is long.
+# Factor on the error of a window for each window length of the whole motion.
 _ADDS = 4.0
-# Stages of what they are taken again with where dampers are faster than the step.
+# Stages of the repeating method where dampers are faster than the step.
 _STOPPING = 3
-# Steps from where a joint comes to rest that are taken again with it, and in how many parts each; in more if it fails.
+# Number of steps repeated from where a joint comes to rest, and the parts of each: the second number if the first
+# fails.
 _SETTLING, _SETTLED = 6, (2, 16)
-# What the velocity may be off by there: over several steps in widths of the friction; in one, of the largest velocity.
-_RUBS, _FELT = 0.1, 1e-3
-# Nodes at which mass matrices, and energies of single groups, are looked at.
+# Largest error of the velocity there without a warning: the median in widths of the friction, and the largest as a
+# share of the joint's largest velocity.
+_MEDIAN_OFF, _MOST_OFF = 0.1, 1e-3
+# Number of nodes at which mass matrices and energies of single groups are evaluated.
 _NODES = 16
-# The window of a motion that has one.
+# First nodes of the windows of a motion that has one.
 _FROM_START = np.zeros(1, dtype=np.int64)
-# Velocities below this count as none [rad/s or m/s]: what rounding leaves of a robot in equilibrium.
+# Velocities below this count as zero [rad/s or m/s]: rounding in a robot in equilibrium.
 _STILL = 1e-9
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to be said about a motion.
+    """A warning about a motion.
 
     Attributes:
-        kind: What it is about, in a word or two.
+        kind: Its subject in a word or two.
         sentence: For the user, with numbers.
-        joint: The coordinate that it names, if it is about one; the log has each kind once for a scene, a time step
-            and a joint.
+        joint: The coordinate it names, None for none; the log has each kind once for a scene, a time step and a joint.
     """
 
     kind: str
@@ -107,13 +110,13 @@ class Finding:
 
 
 def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """A motion with its energy balance, if the integrator keeps none, and its warnings; and what was found."""
+    """The motion with its energy balance, if the integrator keeps none, and its warnings; and the findings."""
     if not integrator.variational:
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
         trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
     found = (
-        *_looked_for(scene, integrator, trajectory),
+        *_errors_found(scene, integrator, trajectory),
         *alternating(scene, integrator, trajectory),
         *_beyond_limits(scene, trajectory),
     )
@@ -121,20 +124,20 @@ def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
 
 
 def alternating(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says if velocities alternate from step to step with neither controls nor noise that make them.
+    """A warning if velocities alternate from step to step, caused neither by controls nor by noise.
 
-    What smaller steps do as well is the robot's own, seen at about two nodes a period.
+    Alternation that half steps show as well is an oscillation of the robot of about two nodes a period: no warning.
     """
     found = None if trajectory.dw.any() else alternation(trajectory.v, trajectory.u)
-    if found is None or _does_so_in_smaller_steps(scene, integrator, trajectory, found):
+    if found is None or _alternates_in_half_steps(scene, integrator, trajectory, found):
         return ()
     seen = found.sentence(scene.robot.joint_names, trajectory.t)
     sentence = f"{seen}: dt = {trajectory.dt:g} s is too long for what is stiff, damped or fed back here"
     return (Finding("alternating velocities", sentence, found.joint),)
 
 
-def _does_so_in_smaller_steps(scene: Scene, integrator: Integrator, trajectory: Trajectory, found: Alternation) -> bool:
-    """Whether a stretch of alternating velocities alternates alike when its first steps are halved."""
+def _alternates_in_half_steps(scene: Scene, integrator: Integrator, trajectory: Trajectory, found: Alternation) -> bool:
+    """Whether a stretch of alternating velocities alternates in the same way when its first steps are halved."""
     first, count = found.first, RUN + 1
     parts = 2 * int(np.maximum(trajectory.statistics.substeps[first : first + count], 1).max())
     if isinstance(integrator, Reference) or count * parts > max(4 * FIRST, int(trajectory.statistics.substeps.sum())):
@@ -147,13 +150,13 @@ def _does_so_in_smaller_steps(scene: Scene, integrator: Integrator, trajectory: 
 
 
 def with_warnings(trajectory: Trajectory, found: Iterable[Finding]) -> Trajectory:
-    """The motion with what was found as its warnings."""
+    """The motion with the findings' sentences as its warnings."""
     sentences = tuple(finding.sentence for finding in found)
     return trajectory.changed(warnings=sentences) if sentences else trajectory
 
 
 def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Finding]) -> None:
-    """Log what was found, each kind once for this scene, time step and joint, whatever its numbers."""
+    """Log findings, each kind once for this scene, time step and joint."""
     for finding in found:
         key = finding.kind, dt, finding.joint
         if key not in scene.announced:
@@ -161,14 +164,14 @@ def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Fi
             logger.warning(finding.sentence)
 
 
-def evident(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """What may be wrong, from the record alone: dampers faster than the step, steps taken in parts, limits left.
+def findings_from_record(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Possible errors from the record alone: dampers faster than the step, steps taken in parts, limits exceeded.
 
-    For whoever does not take steps again; :func:`examined` says what is wrong.
+    Unlike :func:`examined` it repeats no steps.
     """
     found = []
     fast = _fast_damping(scene, trajectory)
-    # With more stages what dampers are faster than a step leaves is less.
+    # Methods of more stages stop faster dampers.
     if not integrator.l_stable and trajectory.dt * fast.rate > 2.0 * getattr(integrator, "stages", 1):
         found.append(_ringing(scene, fast, trajectory.dt))
     if split := _in_parts(trajectory):
@@ -177,12 +180,12 @@ def evident(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tup
 
 
 def _beyond_limits(scene: Scene, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says what of the robot's description the motion leaves, limits and loops; the motion itself may be right."""
+    """Warnings of exceeded joint limits and open loops of the robot's description; the motion may still be right."""
     return tuple(Finding(kind, sentence) for kind, sentence in limits_left(scene, trajectory))
 
 
 def _in_parts(trajectory: Trajectory) -> str:
-    """How many steps were taken in parts, in words; empty if none."""
+    """The number of steps taken in parts, in words; empty if none."""
     split = trajectory.statistics.split_steps
     if not split:
         return ""
@@ -191,7 +194,7 @@ def _in_parts(trajectory: Trajectory) -> str:
 
 
 def _fast_damping(scene: Scene, trajectory: Trajectory) -> Fast:
-    """The fastest of the dampers if a step cannot resolve it."""
+    """The fastest damping, if a step cannot resolve it."""
     return fast_damping(scene, trajectory.q, trajectory.v, trajectory.u, trajectory.dt)
 
 
@@ -201,7 +204,7 @@ def _applied(scene: Scene, trajectory: Trajectory) -> Floats:
 
 
 def _ringing(scene: Scene, fast: Fast, dt: float, off: str = "", joint: int | None = None) -> Finding:
-    """Says that something damps faster than the step, and of what joint."""
+    """The warning that damping or dry friction is faster than the step; ``off`` ends it with the error."""
     times = f"(dt * {fast.rate:.3g}/s = {dt * fast.rate:.3g} > 2)"
     cure = f"dt below {2.0 / fast.rate:.3g} s resolves it"
     if fast.stop is None:
@@ -219,19 +222,19 @@ def _ringing(scene: Scene, fast: Fast, dt: float, off: str = "", joint: int | No
     )
 
 
-def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """What the balance of the energy and steps taken again tell."""
+def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Errors from the energy balance and from repeated steps."""
     if not trajectory.steps:
         return ()
-    # Whatever moves a joint by hand gives and takes energy.
+    # A kinematic input does work that the balance does not have.
     found = [] if scene.inputs else [*_energy(scene, integrator, trajectory)]
     unsettled = _unsettled(scene, integrator, trajectory)
-    seen = looked_again(scene, integrator, trajectory)
-    if seen.resolved:
-        more = () if found else _adding_up(scene, integrator, trajectory, seen)
+    resolution = resolution_of(scene, integrator, trajectory)
+    if resolution.resolved:
+        more = () if found else _accumulated(scene, integrator, trajectory, resolution)
         return (*found, *more, *unsettled)
     error = motion_error(scene, integrator, trajectory)
-    if error is not None and spoken_of(error):
+    if error is not None and is_wrong(error):
         dt, start = trajectory.dt, trajectory.t[error.step]
         off = (
             f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
@@ -249,34 +252,36 @@ def _looked_for(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         and not (integrator.l_stable or isinstance(integrator, Reference))
         and (fast := _fast_damping(scene, trajectory)).rate
     ):
-        # No other method gets through these steps: whether they ring has to be seen in the motion itself.
+        # No other method gets through these steps: ringing is looked for in the motion itself.
         before, after = trajectory.v[:-1], trajectory.v[1:]
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():
             found.append(_ringing(scene, fast, trajectory.dt))
     if scene.constraints and not found:
-        found.extend(_not_told(scene, integrator, trajectory))
+        found.extend(_unresolved_damping(scene, integrator, trajectory))
     if not found:
-        found.extend(_adding_up(scene, integrator, trajectory, Seen(False)))
+        found.extend(_accumulated(scene, integrator, trajectory, Resolution(False)))
     return (*found, *(finding for finding in unsettled if finding.kind not in {other.kind for other in found}))
 
 
-def _not_told(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says if dampers are too fast for the steps that a motion under constraints is taken again in."""
+def _unresolved_damping(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """A warning if dampers are too fast even for the steps in which a motion under constraints is repeated."""
     other = finer(integrator, trajectory, damped=True, pulled=True, constrained=True)
     fast = _fast_damping(scene, trajectory)
     resolves = 2.0 * getattr(other.method, "stages", 1) * other.parts
     return (_ringing(scene, fast, trajectory.dt),) if trajectory.dt * fast.rate > resolves else ()
 
 
-def _adding_up(scene: Scene, integrator: Integrator, trajectory: Trajectory, seen: Seen) -> tuple[Finding, ...]:
-    """Warnings about errors that add up or grow over a motion whose steps resolve each period."""
-    phase = () if seen.stays else _out_of_phase(scene, integrator, trajectory)
+def _accumulated(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, resolution: Resolution
+) -> tuple[Finding, ...]:
+    """Errors that add up or grow over a motion whose steps resolve each period."""
+    phase = () if resolution.in_phase else _out_of_phase(scene, integrator, trajectory)
     found = (*phase, *_at_limits_of_drives(scene, integrator, trajectory))
-    return found or (() if seen.predictable else _growing(scene, integrator, trajectory))
+    return found or (() if resolution.predictable else _growing(scene, integrator, trajectory))
 
 
 def _growing(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says if errors of single steps, small as they are, grow to what shows."""
+    """A warning if small errors of single steps grow to large ones over the motion."""
     found = grown_error(scene, integrator, trajectory)
     if found is None:
         return ()
@@ -284,26 +289,27 @@ def _growing(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
         f"{SAID}: single steps of dt = {trajectory.dt:g} s by {integrator} are off by about "
         f"{found.step:.1g} rad or m, and a method of more stages puts joint {trajectory.joint_names[found.joint]!r} "
         f"elsewhere by up to {found.off:.2g} rad or m, {100 * found.share:.2g}% of the longest way of a joint, from "
-        f"t = {found.time:.4g} s on; smaller steps or more stages tell the motion for longer"
+        f"t = {found.time:.4g} s on; smaller steps or more stages keep the motion right for longer"
     )
     return (Finding("growing errors", sentence, found.joint),)
 
 
 def _at_limits_of_drives(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says if servos come to the limits of their drives, or leave them, in steps that are too long for that."""
+    """A warning if servos reach or leave the limits of their drives in steps that are too long for it."""
     found = bent(scene, integrator, trajectory)
     if found is None:
         return ()
     sentence = (
         f"servos come to the limits of their drives, or leave them, in {found.steps} steps: dt = {trajectory.dt:g} s "
         f"is coarse for {integrator} there, and joint {trajectory.joint_names[found.joint]!r} may be off by "
-        f"{found.off:.2g} rad or m, {100 * found.share:.2g}% of the longest way of a joint; smaller steps mend it"
+        f"{found.off:.2g} rad or m, {100 * found.share:.2g}% of the longest way of a joint; "
+        "smaller steps reduce the error"
     )
     return (Finding("servos at their limits", sentence, found.joint),)
 
 
 def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says if oscillations on springs lose more over the whole motion than can be told from a period."""
+    """A warning if errors in phase and amplitude of oscillations on springs add up over the whole motion."""
     lost = phase_lost(scene, integrator, trajectory)
     if lost is None:
         return ()
@@ -317,10 +323,10 @@ def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
 
 
 def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says if joints do not come to rest as dry friction has it, however little that is of their motion.
+    """A warning if a joint with dry friction does not come to rest correctly, however small the error in its motion.
 
-    Their friction is wrong by itself where a velocity near rest is off by a part of the width over which it turns
-    round.
+    The friction force is wrong where a velocity near rest is wrong by a part of the width over which the force changes
+    sign.
     """
     kicked = trajectory.dw.any() and scene.noise.diffusion is None
     if integrator.l_stable or isinstance(integrator, Reference) or kicked:
@@ -332,18 +338,18 @@ def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
             continue
         off = _off_rest(scene, integrator, trajectory, stop, count)
         if len(off) < _SETTLING // 2:
-            # What nothing gets through cannot be seen to be right.
+            # No method gets through these steps, so nothing shows that they are right.
             return (_ringing(scene, Fast(rate, stop), trajectory.dt),)
         lasting, most = float(np.median(off)), float(off.max())
         speed = float(np.abs(trajectory.v[:, stop.joint]).max())
-        if lasting > _RUBS * stop.width or (most > stop.width and most > _FELT * speed):
+        if lasting > _MEDIAN_OFF * stop.width or (most > stop.width and most > _MOST_OFF * speed):
             since = f"; after t = {trajectory.t[stop.step]:.4g} s it is off by up to {most:.3g} rad/s or m/s"
             return (_ringing(scene, Fast(rate, stop), trajectory.dt, since),)
     return ()
 
 
 def _off_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory, stop: Stop, count: int) -> Floats:
-    """How far a joint's velocity is from the right one in the steps after it stops, as many as are known."""
+    """The error of a joint's velocity after each step from where it stops, as far as the repetition gets."""
     off, method = np.zeros(0), stopping(scene, _STOPPING)
     for parts in _SETTLED[1:] if scene.constraints else _SETTLED:
         again = taken_again(scene, method, trajectory, integrator.stage_times, stop.step, count, parts)
@@ -356,14 +362,14 @@ def _off_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory, stop
 
 
 def _energy(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Says if the energy is off, of the whole robot or of a group of joints that moves by itself."""
+    """A warning if the energy of the whole robot, or of a group of joints without coupling to others, is wrong."""
     worst: tuple[float, int, float, float] | None = None
     for at, defect, scale in _balances(scene, integrator, trajectory):
-        # Dampers take what a coarse step leaves too much of: what is lost to them is no error of the motion.
+        # Coarse steps may take too much energy out through dampers: a loss to them is no error of the motion.
         off = np.maximum(defect, 0.0) if scene.dissipates else np.abs(defect)
         last = int(np.argmax(off))
         rounding = 1e-12 * float(np.abs(trajectory.energy).max())
-        # Written such that what is not finite is spoken of.
+        # The comparison is negated, for values that are not finite.
         if not off[last] <= CAUTION * WRONG_ENERGY * scale + rounding:
             share = float(off[last] / scale) if scale > 0.0 else np.inf
             if worst is None or not share <= worst[0]:
@@ -382,9 +388,9 @@ def _energy(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tup
 
 
 def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> list[tuple[Integers, Floats, float]]:
-    """Nodes, what the energy is off by there [J], and the energy turned over [J]: of all joints, and of each group.
+    """Nodes, energy defects there [J], and the energy turned over [J]: of all joints, and of each group.
 
-    Guards hold the balance of every group in each step of a variational integrator.
+    Groups are left out for variational integrators, whose guards check the balance of each group in each step.
     """
     at = np.arange(1, trajectory.steps + 1)
     found = [(at, trajectory.statistics.energy_defect, energy_scale(scene, trajectory))]
@@ -401,7 +407,7 @@ def _balances(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> l
 
 
 def _defects_of(scene: Scene, integrator: Integrator, trajectory: Trajectory, joints: NDArray[np.bool_]) -> Floats:
-    """What the energy of some joints is off by (N + 1,) [J]; they move by themselves. Zero but at some nodes."""
+    """Energy defect (N + 1,) [J] of joints without coupling to others; zero except at some nodes."""
     kicked, given = _kicks(scene, trajectory)
     work, heat = _works(scene, integrator, trajectory, kicked)
     gained = np.append(0.0, np.cumsum((work - heat + given)[:, joints].sum(axis=1)))
@@ -418,15 +424,16 @@ def _defects_of(scene: Scene, integrator: Integrator, trajectory: Trajectory, jo
 def energy_scale(scene: Scene, trajectory: Trajectory) -> float:
     """The energy that a motion turns over [J]: the kinetic energy that its joints gain or lose, and the controls' work.
 
-    What turns evenly all the time, however fast, turns nothing over.
+    A joint at constant velocity turns nothing over.
     """
     return _turnover(scene, trajectory)[0]
 
 
 def _turnover(scene: Scene, trajectory: Trajectory) -> tuple[float, Floats, Floats]:
-    """:func:`energy_scale`; and of each joint (n,) [J] the energies that it is made of.
+    """:func:`energy_scale`, and for each joint (n,) [J] its two parts.
 
-    The kinetic energy of the largest change of its velocity, for all it has to move; and the controls' work.
+    They are the kinetic energy of the largest change of its velocity, with its diagonal entry of M; and the controls'
+    work.
     """
     kinetic, work, turned, worked = energy_turnover(
         scene.core, trajectory.q, trajectory.v, trajectory.p, trajectory.u, trajectory.dt, even=EVEN, looks=_NODES
@@ -435,10 +442,10 @@ def _turnover(scene: Scene, trajectory: Trajectory) -> tuple[float, Floats, Floa
 
 
 def energy_defects(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Floats:
-    """What the energy is off by after each step (N,) [J], of what no control, damper or kick accounts for.
+    """Energy defect after each step (N,) [J]: the change of energy less work of controls, dampers and kicks.
 
-    From the record alone, for integrators that keep no ledger of their own. For what dampers take, velocities are taken
-    for linear over a step. Zeros with noise that only Python can evaluate.
+    It is computed from the record, for integrators without an energy balance of their own. The energy that dampers take
+    is that of velocities linear over a step. Zeros with noise that only Python can evaluate.
     """
     if scene.noise.diffusion is None:
         return np.zeros(trajectory.steps)
@@ -454,13 +461,12 @@ def energy_defects(scene: Scene, integrator: Integrator, trajectory: Trajectory)
 def _works(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, kicked: Floats | float = 0.0
 ) -> tuple[Floats, Floats]:
-    """Work of the controls, and the least that the dampers can take, at each joint in each step (N, n) [J].
+    """Work of the controls, and the least energy that the dampers take, at each joint in each step (N, n) [J].
 
-    What servos make of their controls counts among what is taken.
-
-    Controls that are constant over a step do the work of its way; of others the rest works on velocities that the cubic
-    through both nodes has. A kick of v (N, n) begins each step. Dampers take
-    least where the velocity is even, and q knows its mean: so does all other friction there.
+    Forces of servos count as dampers. The mean of a control over a step works on the step's displacement; its deviation
+    from the mean, where controls change within steps, on the velocity of the cubic through both nodes. A kick of v
+    (N, n) begins each step. Dampers, and all other friction, take least at constant velocity, which is the displacement
+    over the step.
     """
     h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -482,7 +488,7 @@ def _works(
 
 
 def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats | float]:
-    """What each step's kick does to v and to the energy [J], at each joint (N, n), if it comes all at once before."""
+    """Change of v and of the energy [J] by each step's kick, at each joint (N, n), as if it came before the step."""
     if not trajectory.dw.any():
         return 0.0, 0.0
     q, v = trajectory.q[:-1], trajectory.v[:-1]
@@ -492,45 +498,46 @@ def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats
     return change, impulse * (v + 0.5 * change)
 
 
-class Seen(NamedTuple):
-    """What windows of a motion tell that were taken again.
+class Resolution(NamedTuple):
+    """The result of repeating windows of a motion.
 
     Attributes:
-        resolved: Whether even steps of twice the length, or those of a better method, make the same motion, so that
-            there is nothing more to look for over a period.
-        stays: Whether errors are so small that over the whole motion, too, they do not add up to a word.
-        predictable: Whether they stay below the threshold of a warning even if they grow as the fastest mode does.
+        resolved: Whether steps of twice the length, or a better method, make the same motion: the steps resolve it
+            over a period.
+        in_phase: Whether the errors are so small that they add up to none over the whole motion.
+        predictable: Whether the errors are so small that no warning is due even if they grow as the fastest mode does.
     """
 
     resolved: bool
-    stays: bool = False
+    in_phase: bool = False
     predictable: bool = False
 
 
-def looked_again(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Seen:
-    """Whether even steps of twice the length, or a better method, make the same of a motion.
+def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Resolution:
+    """Whether steps of twice the length, or a better method, make the same motion.
 
-    Windows all over the motion, or some of them, are taken again from their first nodes, all at once, under the kicks
-    that noise gave it. That takes half as long as the motion, or less; a motion of whole steps can pass whose noise
-    the core knows.
+    Windows of the motion are repeated from their first nodes, all at once, with the noise of the motion. That takes
+    at most half as long as the motion. Only motions without divided steps, and without noise in Python, can pass.
     """
     steps, q, v, u = trajectory.steps, trajectory.q, trajectory.v, trajectory.u
     if isinstance(integrator, Reference) or not steps or scene.noise.diffusion is None:
-        return Seen(False)
+        return Resolution(False)
     noisy = bool(trajectory.dw.any())
     fastest, split, steady, pulled = glance(scene.core, q, v, u, trajectory.statistics.substeps, trajectory.dt)
     if not fastest > _STILL:
-        return Seen(True)
+        return Resolution(True)
     if split:
-        return Seen(False)
+        return Resolution(False)
     damped = bool(_fast_damping(scene, trajectory).rate)
-    # Under constraints nothing stops what dampers do in one step; and what a hand does in two is another motion.
+    # No method damps stiff modes in one step under constraints. A kinematic input of two steps is not that of a double
+    # step.
     if scene.inputs or (scene.constraints and damped):
-        return Seen(False)
+        return Resolution(False)
     if steps == 1:
-        return Seen(not (damped or noisy or pulled) and _halves_agree(scene, integrator, trajectory))
-    # Springs and dampers far faster than the step do as little in two, and controls that jump at nodes are others
-    # there, which methods for such dampers follow. A better method is held against that in steps as long as theirs.
+        return Resolution(not (damped or noisy or pulled) and _halves_agree(scene, integrator, trajectory))
+    # Springs and dampers far faster than the step do the same in a double step, which so shows no error of theirs; and
+    # methods for such dampers follow jumps of the controls at nodes, which a double step averages. There the comparison
+    # is with a better method in steps of the same length.
     jumps = not (steady or trajectory.u_stages.shape[1])
     other, times = integrator, 2
     if damped and not (integrator.l_stable or pulled):
@@ -538,13 +545,13 @@ def looked_again(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     elif pulled or (damped and jumps):
         better = finer(integrator, trajectory, damped=damped, pulled=pulled)
         if better.parts != 1:
-            return Seen(False)
+            return Resolution(False)
         other, times = better.method, 1
-    # What rings after a start or a jump may do so for long.
+    # Ringing after the start or a jump may last long: windows all over the motion.
     begins, length = _windows(trajectory, every=times == 2 or not (pulled or integrator.l_stable))
     commands, drift = open_loop(u[:length:times]), np.zeros((0, 0, scene.robot.dof))
     if not steady:
-        # Commands are the same for all paths; their forces need not be.
+        # All paths have the same commands; their forces may differ.
         held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
         commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
     kicks = _kicks_of(scene, integrator, trajectory, begins, length, times) if noisy else None
@@ -553,33 +560,33 @@ def looked_again(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     else:
         again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt, kicks)
     if times == 1 and not (jumps or pulled) and again is not None:
-        # What a start off the slow motion leaves of itself after a single step is not to be held against it.
+        # Every second node alone: after a single step the transient of a start off the slow motion remains.
         again = np.ascontiguousarray(again[0][:, 1::2]), np.ascontiguousarray(again[1][:, 1::2])
     if again is None:
-        return Seen(False)
+        return Resolution(False)
 
     def agree(gain: float, gain_of_velocity: float) -> bool:
         return _agree(scene, (q, v), begins, length, trajectory.dt, again, gain, gain_of_velocity)
 
-    # How much less the error is in steps of half the length; of another method nothing is known. What jumps do to
-    # velocities that are damped is over soon, and does not grow; what lasts moves joints.
+    # Factor between the difference and the motion's error: that of a double step, unknown of another method. Errors in
+    # damped velocities after jumps decay soon; errors that last show in positions.
     less = 1.0 if damped or times == 1 else 2.0**integrator.order - 1.0
     of_velocity = 1.0 / _PASSING if damped and jumps and not pulled else less / _MARGIN
     if not agree(less / _MARGIN, of_velocity):
-        return Seen(False)
-    # A whole motion is so many windows long, and errors of oscillations may add up from each to the next.
+        return Resolution(False)
+    # Errors of oscillations may add up from window to window over the whole motion.
     windows = length / steps
-    stays = agree(less * PHASE_SHOWS / WRONG_MOTION * windows / _ADDS, of_velocity)
+    in_phase = agree(less * PHASE_SHOWS / WRONG_MOTION * windows / _ADDS, of_velocity)
     most = less * NEAR * GROWTH_WARNED / WRONG_MOTION * windows
-    predictable = stays and agree(most / growth_bound(scene, trajectory), of_velocity)
-    return Seen(True, stays, predictable)
+    predictable = in_phase and agree(most / growth_bound(scene, trajectory), of_velocity)
+    return Resolution(True, in_phase, predictable)
 
 
 def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
-    """Where windows of a motion begin (K,), and how many steps each has: of like lengths, which are even.
+    """First nodes of windows (K,) and their number of steps, which is even.
 
-    All over the motion, up to a number of them; or some of it, where it takes longer than half of the motion to take
-    them again.
+    With ``every``, windows cover the motion up to a largest number of them; else a part of it, where the repetition
+    costs more a step.
     """
     steps, v = trajectory.steps, trajectory.v
     if every:
@@ -603,10 +610,10 @@ def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
 def _kicks_of(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, begins: Integers, length: int, times: int
 ) -> Floats:
-    """Impulses of the noise in windows of a motion, before and after each step of ``times`` of its own (P, K, 2, n).
+    """Impulses of the noise before and after each repeated step (P, K, 2, n), of ``times`` steps of the motion.
 
-    In a step of twice the length half of what kicked in its middle comes before it and half after it: its end is then
-    at the same place, with the same momentum, to first order in the step.
+    For a double step half of the kick in its middle comes before and half after it, which gives the same position and
+    momentum at its end to first order in the step.
     """
     diffusion, first = scene.noise.diffusion, trajectory.q[0]
     assert diffusion is not None
@@ -638,9 +645,9 @@ def _agree(
     gain: float,
     gain_of_velocity: float,
 ) -> bool:
-    """Whether windows of q and v are what was made of them ``again``, within so much of what is wrong.
+    """Whether windows of q and v agree with their repetition ``again`` within ``gain`` times the error thresholds.
 
-    That has nodes after each step, or after each second one.
+    The repetition has nodes after each step, or after each second one.
     """
     return windows_agree(
         scene.core,
@@ -658,7 +665,7 @@ def _agree(
 
 
 def _halves_agree(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
-    """:func:`looked_again` of a single step: two of half its length make the same motion."""
+    """:func:`resolution_of` for a single step: two half steps make the same motion."""
     q, v, u, half = trajectory.q, trajectory.v, trajectory.u, 0.5 * trajectory.dt
     commands = open_loop(np.concatenate([u, u]))
     if trajectory.u_stages.shape[1]:
@@ -682,7 +689,7 @@ def _windows_under(
     times: int,
     kicks: Floats | None,
 ) -> tuple[Floats, Floats] | None:
-    """Windows of a motion whose controls change within steps, by another method, or in steps of twice the length."""
+    """Windows of a motion with controls that change within steps, repeated by another method or in double steps."""
     at, mine, found = other.stage_times, integrator.stage_times, []
     for window, begin in enumerate(begins):
         values = trajectory.u_stages[begin : begin + length]
@@ -699,13 +706,13 @@ def _windows_under(
 
 
 def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> MotionError | None:
-    """The error of a motion, by taking parts of it again from their first nodes by a method of more stages.
+    """The largest error of a motion, from windows repeated from their first nodes by a method of more stages.
 
-    The start, the places where velocities change most and some spread over the motion are looked at, over a period of
-    each joint or what can be told of it; more places where errors come close to what is wrong. Each joint is judged in
-    units of its own motion. The first error that is worth a word ends the search, and so does a number of steps in
-    proportion to the motion's own. It says nothing of how errors grow over many periods. None where nothing moves, and
-    for an integrator that chooses its own steps.
+    Windows begin at the start, where velocities change most, and at nodes spread over the motion; more are examined if
+    errors come close to the thresholds. Each covers a period of each joint, or as much as is predictable. Each joint's
+    error is in units of its own motion. The search ends at the first error above its threshold, or after a number of
+    steps in proportion to the motion's own. Growth of errors over many periods is not part of it. None where nothing
+    moves, and for an integrator that chooses its own steps.
     """
     if isinstance(integrator, Reference) or not trajectory.steps:
         return None
@@ -720,7 +727,7 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     # Steps whose error is known to be small.
     small = np.zeros(trajectory.steps, dtype=np.bool_)
     left = LEAST_WORK + WORK * int(np.maximum(substeps, 1).sum())
-    # Nodes beside which one was looked from.
+    # Nodes near the first node of an examined window.
     seen = np.zeros(trajectory.steps + 1, dtype=np.bool_)
     worst = None
     for chosen in (first, between(trajectory.steps, first)):
@@ -730,36 +737,36 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
             window = Window.at(scene, trajectory, step)
             if chosen is first and small[step : step + int(window.judged.max())].all():
                 continue
-            look = _look(scene, integrator, trajectory, window, inertia, other, left)
-            if look is None:
+            estimate = _estimate(scene, integrator, trajectory, window, inertia, other, left)
+            if estimate is None:
                 continue
             near = min(_NEAR_BY, int(window.judged.max()) // 8)
             seen[max(0, step - near) : step + near + 1] = True
-            left -= look.work
-            if worst is None or look.error.worst > worst.worst:
-                worst = look.error
-            if spoken_of(look.error) or left <= 0:
+            left -= estimate.work
+            if worst is None or estimate.error.worst > worst.worst:
+                worst = estimate.error
+            if is_wrong(estimate.error) or left <= 0:
                 return worst
-            if look.error.worst < _SMALL:
-                small[step : step + look.known] = True
+            if estimate.error.worst < _SMALL:
+                small[step : step + estimate.known] = True
         if worst is None or worst.worst < _NEAR:
             break
     return worst
 
 
-def spoken_of(error: MotionError) -> bool:
-    """Whether an error is worth a word."""
+def is_wrong(error: MotionError) -> bool:
+    """Whether an error exceeds its threshold."""
     return not error.worst <= (CAUTION if error.settled else _UNSETTLED)
 
 
 @dataclass(frozen=True)
-class _Look:
-    """An estimate of the error at one window.
+class _Estimate:
+    """An estimate of the error in one window.
 
     Attributes:
         error: The error.
-        known: How many steps can be told.
-        work: Steps taken for it.
+        known: The number of predictable steps.
+        work: Number of steps taken for it.
     """
 
     error: MotionError
@@ -767,7 +774,7 @@ class _Look:
     work: int
 
 
-def _look(
+def _estimate(
     scene: Scene,
     integrator: Integrator,
     trajectory: Trajectory,
@@ -775,25 +782,25 @@ def _look(
     inertia: Floats,
     other: Finer,
     most: int,
-) -> _Look | None:
-    """The error at one window, by so many steps at most; None where none can be told."""
+) -> _Estimate | None:
+    """The error in one window, by at most ``most`` steps; None where it cannot be estimated."""
     times = integrator.stage_times
     judged = int(window.judged.max())
     taken = np.maximum(trajectory.statistics.substeps[window.step : window.step + judged], 1)
-    # Where guards took steps in parts, they are as short as these.
+    # Where guards divided steps, the repeated ones are as short as their parts.
     parts = other.parts * int(2 ** np.ceil(np.log2(taken.mean())))
-    # Twice, for whether that motion can be told takes as many steps again.
+    # Half of them, for the disturbed motion takes as many.
     count = min(judged, max(1, most // (2 * parts)))
     q, v = (values[window.step : window.step + count + 1] for values in (trajectory.q, trajectory.v))
     if scene.noise.diffusion is None and trajectory.dw.any():
-        # Kicks that only Python knows are left out of both.
+        # Noise in Python is left out of both motions.
         plain = taken_again(scene, integrator, trajectory, times, window.step, count, parts // other.parts)
         if plain is None:
             return None
         q, v = plain
     again = Again(scene, other.method, trajectory, times, window.step, count, parts)
     far = _FAR * float(np.ptp(q, axis=0).max())
-    # What is far off is wrong or cannot be told, and no more is needed of it.
+    # A motion that is far off is wrong or unpredictable: the repetition ends.
     while not again.ended and np.abs(again.q[again.done] - q[again.done]).max() <= far:
         again.go_on()
     known, work = again.done, again.done * parts
@@ -801,22 +808,22 @@ def _look(
         return None
     with np.errstate(over="ignore", invalid="ignore"):
         off = [np.abs(a - b) / (1.0 - other.left) for a, b in ((q, again.q), (v, again.v))]
-    # A part of a period stands for the whole only if no steps are left for the rest.
+    # The error of a part of a period is extrapolated to the whole only if the repetition ran out of steps.
     cut = known < count
     error = window.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=cut)
     if not error.worst < _SMALL:
         shift = disturbance(trajectory, window.step, known)
         beside = Again(scene, other.method, trajectory, times, window.step, known, parts, shift)
-        told = 0
-        while not beside.ended and told == beside.done:
+        predictable = 0
+        while not beside.ended and predictable == beside.done:
             beside.go_on()
-            # Constraints may move the start by more.
+            # Constraints may move the disturbed start by more than the disturbance.
             apart = max(shift[0], float(np.abs(beside.q[0] - again.q[0]).max()))
-            told = grown(again.q[: beside.done + 1], beside.q[: beside.done + 1], apart)
+            predictable = grown(again.q[: beside.done + 1], beside.q[: beside.done + 1], apart)
         work += beside.done * parts
-        if told < known:
-            known, cut = max(1, told), True
+        if predictable < known:
+            known, cut = max(1, predictable), True
             error = window.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=True)
     if max(float(np.ptp(x[: known + 1], axis=0).max()) for x in (q, again.q)) < _SHORTEST:
         return None
-    return _Look(replace(error, settled=cut or count == judged), known, work)
+    return _Estimate(replace(error, settled=cut or count == judged), known, work)

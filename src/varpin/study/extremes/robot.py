@@ -20,7 +20,8 @@ from varpin.mechanics.scene import EARTH, Scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.model import Robot, load_robot
 from varpin.simulation import growth, limits
-from varpin.simulation.run import Interrupted, simulate
+from varpin.simulation.failures import Interrupted
+from varpin.simulation.run import simulate
 from varpin.study.extremes.checks import condition, findings, finite, measures
 from varpin.study.extremes.exact import exact_motion
 from varpin.study.extremes.record import LEVELS, Cell, Kind, Record, line_of

@@ -18,9 +18,10 @@ from varpin.integrators import Integrator
 from varpin.integrators.base import Segment, open_loop
 from varpin.mechanics.inputs import held_in_parts
 from varpin.mechanics.scene import OF_CONSTRAINTS, Scene, require_scene
+from varpin.simulation.commands import held_rows
 from varpin.simulation.refinement import candidates
-from varpin.simulation.run import held_rows, on_constraints
 from varpin.simulation.soundness import announce
+from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, joint_array, positive
 from varpin.support.frozen import Frozen
 

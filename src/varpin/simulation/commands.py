@@ -1,0 +1,147 @@
+"""Controls of a motion as commands of the core."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core.arrays import Commands
+from varpin.errors import InputError
+from varpin.integrators import Integrator
+from varpin.integrators.base import open_loop, rows
+from varpin.integrators.within import Times, changing
+from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
+from varpin.mechanics.scene import Scene, refuse_inputs
+from varpin.simulation.functions import ControlLaw, decision, evaluated, sampled
+from varpin.simulation.record import Record, next_command
+from varpin.support.checks import JointValues, as_floats, control_array, require_finite
+
+Floats = NDArray[np.float64]
+
+# All controls but a control law: known before the motion, or fed back by the core.
+Controls = JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None
+
+
+def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps: int, dt: float) -> Commands:
+    """Commands of the core for controls of ``steps`` steps of ``dt`` [s].
+
+    The controls are None, (steps, m), (m,), by joint name, a function of time, linear between nodes or a policy.
+
+    Raises:
+        UnknownJoint: A name is not that of a driven joint.
+        InputError: The array is neither (steps, m) nor (m,), or not finite; the policy is for another scene or step;
+            the controls are a control law.
+        ControlError: The function of an OpenLoop failed; the error holds no trajectory.
+    """
+    if isinstance(controls, OpenLoop | FirstOrderHold):
+        refuse_inputs(scene, f"a {type(controls).__name__}")
+    if isinstance(controls, LinearPolicy) and controls.hold != 1:
+        refuse_inputs(scene, "a LinearPolicy that holds its controls over several steps")
+    if isinstance(controls, LinearPolicy):
+        if controls.joints is not None and controls.joints != scene.control_joints:
+            raise InputError(
+                f"the policy's controls are of joints {', '.join(controls.joints)}; "
+                f"the scene's of {', '.join(scene.control_joints or ('no single joints',))}"
+            )
+        if controls.servos is not None and controls.servos != scene.servo_joints:
+            raise InputError(
+                f"the policy's controls are positions of {', '.join(controls.servos) or 'no joints'} and forces of all "
+                f"others; the scene has servos on {', '.join(scene.servo_joints) or 'no joints'}"
+            )
+        if controls.linear and scene.processes:
+            raise InputError(
+                "a policy whose controls are linear between nodes acts in scenes without noise alone: leave the "
+                "scene's noise out, or plan with held controls"
+            )
+        return controls.commands(
+            steps, scene.controls, scene.robot.dof, integrator.variational, dt, integrator.stage_times
+        )
+    if isinstance(controls, OpenLoop):
+        return evaluated(controls, scene, integrator, dt, range(steps))
+    if isinstance(controls, FirstOrderHold):
+        if controls.u.shape != (steps + 1, scene.controls):
+            raise InputError(
+                f"FirstOrderHold: u must have shape {(steps + 1, scene.controls)}, a row for each node of the motion, "
+                f"got {controls.u.shape}"
+            )
+        return _on_lines(controls.u, integrator.stage_times)
+    if callable(controls):
+        raise InputError(
+            "controls must be rows, a varpin.LinearPolicy, a varpin.OpenLoop or a varpin.FirstOrderHold here; only "
+            "simulate takes a control law"
+        )
+    return open_loop(control_rows(scene, controls, steps))
+
+
+def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floats:
+    """Controls as one row a step, (steps, m).
+
+    Raises:
+        UnknownJoint: A name is not that of a driven joint.
+        InputError: The array is neither (steps, m) nor (m,), or not finite.
+    """
+    shape = (steps, scene.controls)
+    if controls is None:
+        return np.zeros(shape)
+    if isinstance(controls, Mapping):
+        controls = control_array("controls", controls, scene.control_joints)
+    if hasattr(controls, "policy"):
+        raise InputError("controls is a plan: give its law, plan.policy, or its controls, plan.trajectory.u")
+    array = as_floats("controls", controls)
+    if array.shape != shape and array.shape != shape[1:]:
+        raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
+    return np.broadcast_to(require_finite("controls", array), shape).copy()
+
+
+def held_rows(scene: Scene, controls: JointValues | None) -> Floats:
+    """Rows of controls, each held over an equal part of a motion, (R, m).
+
+    Raises:
+        UnknownJoint: A name is not that of a driven joint.
+        InputError: The array is neither (R, m) nor (m,), or not finite.
+    """
+    m = scene.controls
+    if controls is None:
+        return np.zeros((1, m))
+    if isinstance(controls, Mapping):
+        return control_array("controls", controls, scene.control_joints)[None]
+    if hasattr(controls, "policy"):
+        raise InputError("controls is a plan: give its law, plan.policy, or its controls, plan.trajectory.u")
+    held = np.atleast_2d(require_finite("controls", as_floats("controls", controls)))
+    if held.ndim != 2 or held.shape[1] != m or not len(held):
+        raise InputError(f"controls must have shape (R, {m}) or ({m},), got {np.shape(controls)}")
+    return held
+
+
+def _on_lines(u: Floats, times: Times) -> Commands:
+    """Commands for controls (N + 1, m) at the nodes, linear between them, with stages at ``times``."""
+    before, after = u[:-1, None], u[1:, None]
+    if not times:
+        return open_loop(0.5 * (before + after)[:, 0])
+    share = np.array(times)[:, None]
+    return changing((1.0 - share) * before + share * after, times)
+
+
+def next_block(controls: Controls | ControlLaw, commands: Commands, record: Record, most: int, left: int) -> Commands:
+    """Commands of the next steps.
+
+    Args:
+        controls: Of the motion.
+        commands: All commands, unless the controls are a function.
+        record: The steps so far.
+        most: About how many steps; whole intervals of held controls unless it is 1.
+        left: Steps to the end of the motion.
+    """
+    if callable(controls):
+        decides = record.steps % commands.hold == 0
+        u = decision(controls, record) if decides else record.last.u[-1:]
+        return open_loop(u)._replace(hold=min(1 if most == 1 else commands.hold, left))
+    if isinstance(controls, OpenLoop):
+        return sampled(controls, record, min(most, left))
+    if most == 1 and not len(commands.places):
+        return next_command(commands, record)
+    first = record.steps // commands.hold
+    before = record.last.u[None, -1] if record.steps else None
+    return rows(commands, first, first + max(1, most // commands.hold), before)

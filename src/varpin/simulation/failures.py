@@ -1,0 +1,158 @@
+"""Errors of a simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.errors import VarpinError
+from varpin.integrators.base import Failure
+from varpin.mechanics.scene import Scene
+from varpin.simulation import limits
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a simulation.
+
+    Attributes:
+        trajectory: The motion before it.
+    """
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        super().__init__(f"interrupted after {trajectory.steps} steps; they are in .trajectory")
+
+
+class StepError(VarpinError, ValueError):
+    """A user's function failed in a step.
+
+    Attributes:
+        step: Index of the step.
+        time: Time of the call [s].
+        trajectory: The motion before; None where the function is called before the motion begins.
+    """
+
+    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory | None) -> None:
+        self.step = step
+        self.time = time
+        self.trajectory = trajectory
+        before = "" if trajectory is None else "; what came before is in error.trajectory"
+        super().__init__(f"step {step} (t = {time:.6g} s): {problem}{before}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), str(self), vars(self).copy())
+
+
+def _restored(kind: type[StepError], message: str, values: dict[str, Any]) -> StepError:
+    """An unpickled error."""
+    error = kind.__new__(kind, message)
+    vars(error).update(values)
+    return error
+
+
+class ControlError(StepError):
+    """A control law or the function of an OpenLoop raised, or returned something that is no control.
+
+    Attributes:
+        step: Index of the step it was called for.
+        time: The time it was called with [s].
+        trajectory: The motion before; None from an ensemble, which evaluates its controls before it begins.
+    """
+
+
+class NoiseError(StepError):
+    """A function of a custom noise raised, or returned something that is no field.
+
+    Attributes:
+        step: Index of the step it was called in.
+        time: The start of that step [s].
+        trajectory: The motion before.
+    """
+
+
+class ForceError(StepError):
+    """A function of a custom force raised, or returned something that is no force.
+
+    Attributes:
+        step: Index of the step it was called in.
+        time: The start of that step [s].
+        trajectory: The motion before.
+    """
+
+
+class ConstraintError(StepError):
+    """A function of a custom constraint raised, or returned something that is no value of it.
+
+    Attributes:
+        step: Index of the step it was called in.
+        time: The start of that step [s].
+        trajectory: The motion before.
+    """
+
+
+class ToleranceError(VarpinError, RuntimeError):
+    """No number of steps that was tried gives an error below 1 rad or m.
+
+    Attributes:
+        tolerance: The tolerance [rad or m].
+        error: The smallest estimate of the error in q [rad or m]; infinite where there is none.
+        steps: The number of steps of that estimate.
+    """
+
+    def __init__(self, tolerance: float, duration: float, steps: int, error: float) -> None:
+        self.tolerance, self.error, self.steps = tolerance, error, steps
+        known = f"is still {error:.1e} rad or m" if np.isfinite(error) else "is unknown"
+        super().__init__(
+            f"tolerance = {tolerance:g} cannot be met over {duration:g} s: with {steps} steps the error in q "
+            f"{known}. A chaotic motion has no end that any method gets right, and one whose forces are too stiff or "
+            "jump may need more; ask for a shorter duration, or give dt and steps"
+        )
+
+
+class StepFailure(VarpinError, RuntimeError):
+    """The step equation could not be solved on its principal branch.
+
+    Attributes:
+        step: Index of the step that failed.
+        time: Its start [s].
+        residual: The last residual, in units of the rounding error of its terms.
+        reason: What stopped the last attempt.
+        q: Configuration at the start of the step (n,) [rad or m].
+        v: Velocity there (n,).
+        p: Momentum there (n,).
+        trajectory: The motion before, with a warning if its control loop is unstable.
+    """
+
+    def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory) -> None:
+        self.step = step
+        self.time = float(time)
+        self.residual = failure.residual
+        self.reason = failure.reason
+        self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
+        self.trajectory = trajectory
+        causes = [sentence for sentence in trajectory.warnings if not sentence.startswith(limits.KINDS)]
+        advice = causes[0] if causes else "a smaller dt may go further"
+        super().__init__(
+            f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
+            f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
+            f"{advice}"
+        )
+
+
+def named(scene: Scene, failure: Failure) -> Failure:
+    """The failure with the scene's CustomForce functions named as a possible reason."""
+    if scene.custom is None:
+        return failure
+    what = f"CustomForce {scene.custom.names} may be the reason, where it jumps or its derivatives are wrong"
+    return replace(failure, reason=f"{failure.reason} ({what})")
+
+
+def _row(values: Floats) -> str:
+    """A vector on one line."""
+    return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"

@@ -1,0 +1,213 @@
+"""Controls that are functions: control laws, and functions of time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core.arrays import Commands
+from varpin.errors import InputError, UnknownJoint
+from varpin.integrators import Integrator
+from varpin.integrators.base import open_loop
+from varpin.integrators.within import changing
+from varpin.mechanics.policy import OpenLoop
+from varpin.mechanics.scene import Scene
+from varpin.simulation.failures import ControlError
+from varpin.simulation.record import Record
+from varpin.simulation.soundness import Finding
+from varpin.support.checks import JointValues, control_values, finite_array, takes
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+ControlLaw = Callable[[float, Floats, Floats], JointValues]
+# Number of steps in which the mean of a function of time is compared with that of two half steps, and the largest
+# difference without a warning, as a share of the mean.
+_COMPARED, _ALIKE = 16, 0.05
+# Name of a function of time in errors.
+_OF_TIME = "OpenLoop: f(t)"
+
+
+def require_law(law: ControlLaw) -> None:
+    """Refuse a function that cannot be called with (t, q, v)."""
+    if takes(law, 3):
+        return
+    if takes(law, 1):
+        raise InputError(
+            "controls is a function of one argument; a control law takes (t, q, v), and controls that are a function "
+            "of time alone are given as varpin.OpenLoop(f)"
+        )
+    raise InputError("controls must be a function of (t, q, v): it cannot be called with three arguments")
+
+
+def decision(law: ControlLaw, record: Record) -> Floats:
+    """The control (1, m) of the period that begins at the last node."""
+    k = record.steps
+    time = k * record.dt
+    state = record.last.q[-1].copy(), record.last.v[-1].copy()
+    return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
+
+
+def sampled(controls: OpenLoop, record: Record, steps: int) -> Commands:
+    """Controls of the next steps up to the first for which the function fails.
+
+    Raises:
+        ControlError: It fails for the first of them.
+    """
+    inputs = controls, record.scene, record.integrator, record.dt
+    try:
+        return evaluated(*inputs, range(record.steps, record.steps + steps), record)
+    except ControlError as error:
+        if error.step == record.steps:
+            raise
+        return evaluated(*inputs, range(record.steps, error.step), record)
+
+
+def evaluated(
+    controls: OpenLoop,
+    scene: Scene,
+    integrator: Integrator,
+    dt: float,
+    steps: Iterable[int],
+    record: Record | None = None,
+) -> Commands:
+    """Controls that are a function of time at the stages of some steps, or in their middles for one-stage methods."""
+    times, numbers = integrator.stage_times, np.array(steps, dtype=np.int64)
+    at = (numbers[:, None] + np.array(times or (0.5,))) * dt
+    called = np.ones(at.shape, dtype=np.bool_)
+    if times and times[0] == 0.0 and times[-1] == 1.0:
+        # The first stage of a step is the last stage of the step before.
+        called[1:, 0] = np.diff(numbers) != 1
+    found = np.empty((*at.shape, scene.controls))
+    values = _at_all_times if controls.vectorized else _at_times
+    found[called] = values(controls.f, scene, at[called], np.repeat(numbers, called.sum(axis=1)), record)
+    shared = np.flatnonzero(~called[:, 0])
+    found[shared, 0] = found[shared - 1, -1]
+    return changing(found, times) if times else open_loop(found[:, 0])
+
+
+def _at_times(
+    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: Record | None
+) -> Floats:
+    """Controls (K, m) from a function of time at times (K,) [s] within ``steps`` (K,).
+
+    Raises:
+        ControlError: The function raised, or returned something else.
+    """
+    found = np.empty((len(times), scene.controls))
+    shape, isfinite = found.shape[1:], math.isfinite
+    for k, at in enumerate(times.tolist()):
+        try:
+            value = f(at)
+        except Exception as error:
+            raise _error_raised(_OF_TIME, error, int(steps[k]), at, record) from error
+        # The common case, without the checks of _control: these take longer than many functions.
+        if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == shape:
+            found[k] = value
+            if isfinite(value.dot(value)):
+                continue
+        found[k] = _control(_OF_TIME, value, scene, int(steps[k]), at, record)
+    return found
+
+
+def _at_all_times(
+    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: Record | None
+) -> Floats:
+    """:func:`_at_times` for a vectorized function.
+
+    The first time is evaluated alone, so that rows and columns cannot be confused. If the call for all others fails,
+    each is evaluated alone to find the first that fails.
+    """
+    m = scene.controls
+    parts = [part for part in (times[:1], times[1:]) if len(part)]
+    try:
+        values = [finite_array(_OF_TIME, f(part.copy()), (len(part), m)) for part in parts]
+    except Exception as failure:
+        for step, at in zip(steps.tolist(), times.tolist(), strict=True):
+            try:
+                value = f(np.array([at]))
+            except Exception as error:
+                raise _error_raised(_OF_TIME, error, step, at, record) from error
+            try:
+                finite_array(_OF_TIME, value, (1, m))
+            except InputError as error:
+                raise _control_error(step, at, str(error), record) from None
+        raise _control_error(
+            int(steps[0]),
+            float(times[0]),
+            f"{_OF_TIME}, vectorized, fails for {len(times)} times at once, and for none of them alone: {failure}",
+            record,
+        ) from failure
+    return np.concatenate(values) if values else np.zeros((0, m))
+
+
+def undersampled(
+    controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory
+) -> tuple[Finding, ...]:
+    """A warning if the mean of a function of time over a step differs from that of two half steps.
+
+    A motion has the function's values at its stages alone.
+    """
+    dt, times = trajectory.dt, integrator.stage_times
+    if not trajectory.steps:
+        return ()
+    at = np.unique(np.linspace(0, trajectory.steps - 1, _COMPARED).astype(np.int64))
+    try:
+        halves = evaluated(controls, scene, integrator, 0.5 * dt, [2 * k + i for k in at.tolist() for i in (0, 1)])
+    except ControlError:
+        return ()
+    mean = 0.5 * (halves.u[::2] + halves.u[1::2])
+    total, off = (float(np.abs(part).sum()) for part in (mean, mean - trajectory.u[at]))
+    if not off > _ALIKE * total:
+        return ()
+    stages = f"{len(times)} stages of a step" if times else "middle of a step"
+    return (
+        Finding(
+            "fast controls",
+            f"the controls of OpenLoop change too fast for dt = {dt:g} s: their means over a step, from the {stages}, "
+            f"are off by {100.0 * off / total:.3g}% of those in half the step"
+            if total > 0.0
+            else f"the controls of OpenLoop change too fast for dt = {dt:g} s: half the step sees none of them",
+        ),
+    )
+
+
+def _called(
+    name: str, call: Callable[[], JointValues], scene: Scene, step: int, time: float, record: Record | None
+) -> Floats:
+    """The control (m,) that a user's function returns.
+
+    Raises:
+        ControlError: The function raised, or returned no control.
+    """
+    try:
+        value = call()
+    except Exception as error:
+        raise _error_raised(name, error, step, time, record) from error
+    return _control(name, value, scene, step, time, record)
+
+
+def _control(name: str, value: JointValues, scene: Scene, step: int, time: float, record: Record | None) -> Floats:
+    """The value of a user's function as a control (m,).
+
+    Raises:
+        ControlError: The value is no control.
+    """
+    try:
+        return control_values(name, value, scene.control_joints, scene.controls)
+    except (InputError, UnknownJoint) as error:
+        raise _control_error(step, time, str(error), record) from None
+
+
+def _error_raised(name: str, error: Exception, step: int, time: float, record: Record | None) -> ControlError:
+    """The error of a user's function that raised."""
+    return _control_error(step, time, f"{name} raised {error!r}", record)
+
+
+def _control_error(step: int, time: float, problem: str, record: Record | None) -> ControlError:
+    """The error of a user's function, with the motion before it."""
+    return ControlError(step, time, problem, None if record is None else record.trajectory())

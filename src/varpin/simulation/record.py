@@ -1,0 +1,203 @@
+"""The record of a motion, and motions under given commands."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.core.arrays import Commands
+from varpin.errors import VarpinError
+from varpin.integrators import Integrator, Segment
+from varpin.integrators.base import Failure, join, lines, open_loop, rows, steps_of
+from varpin.mechanics.constraints import CustomConstraintError
+from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.scene import Scene
+from varpin.simulation.failures import ConstraintError, ForceError, StepError
+from varpin.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+# Number of segments from which on they are joined into one.
+_PARTS = 256
+
+
+class Record:
+    """The steps done so far.
+
+    Attributes:
+        steps: Their number.
+        last: The segment added last, or the first node.
+    """
+
+    def __init__(
+        self, scene: Scene, integrator: Integrator, dt: float, dw: Floats, first: Segment, line: Commands | None
+    ) -> None:
+        self.scene, self.integrator, self.dt, self.dw = scene, integrator, dt, dw
+        self._line = line  # the commands of controls that are linear between nodes
+        self.steps, self.last = 0, first
+        self._first = first
+        self._joined: list[Segment] = []
+        self._parts: list[Segment] = []
+        self._within: list[Floats] = []
+
+    def add(self, segment: Segment, within: Floats) -> None:
+        """Append steps, with the controls at their stages (N, s, m)."""
+        if not len(segment.q):
+            return
+        self.steps += len(segment.q)
+        self.last = segment
+        self._parts.append(segment)
+        if len(within):
+            self._within.append(within[: len(segment.q)])
+        # A segment of one step takes many times the memory of its numbers.
+        if len(self._parts) == _PARTS:
+            self._joined.append(join(self._parts))
+            self._parts = []
+
+    def trajectory(self) -> Trajectory:
+        """The motion so far."""
+        dw = self.dw[: self.steps] if len(self.dw) else None
+        within = np.concatenate(self._within) if self._within else None
+        parts = [*self._joined, *self._parts]
+        return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw, within, self._line)
+
+
+def _trajectory(
+    scene: Scene,
+    integrator: Integrator,
+    dt: float,
+    first: Segment,
+    parts: list[Segment],
+    dw: Floats | None,
+    within: Floats | None,
+    on: Commands | None = None,
+) -> Trajectory:
+    """The motion from a first node through consecutive segments.
+
+    Args:
+        scene: The scene.
+        integrator: The integrator.
+        dt: Time step [s].
+        first: The first node.
+        parts: The segments.
+        dw: Increments (N, k) [s^0.5]; None for zeros.
+        within: Controls at the stages (N, s, m); None for controls that are constant over each step.
+        on: The commands of the whole motion, where its controls are linear between nodes.
+    """
+    steps = join(parts) if len(parts) > 1 else parts[0] if parts else first.part(0)
+    N = len(steps.u)
+    u, nodes = steps.u, np.zeros((N + 1, 0))
+    if on is not None:
+        u, within, nodes = lines(on, steps.u, integrator.stage_times)
+    return Trajectory(
+        t=np.arange(N + 1, dtype=np.float64) * dt,
+        q=np.concatenate([first.q, steps.q]),
+        v=np.concatenate([first.v, steps.v]),
+        p=np.concatenate([first.p, steps.p]),
+        energy=np.concatenate([first.energy, steps.energy]),
+        u=u,
+        dw=np.zeros((N, scene.processes)) if dw is None else dw,
+        masses=scene.robot.tree.mass.copy(),
+        dt=dt,
+        integrator=str(integrator),
+        robot=scene.robot.name,
+        joint_names=scene.robot.joint_names,
+        statistics=steps.statistics,
+        scene_values=scene.values,
+        constraint_forces=np.zeros((N, len(scene.constraint_order))) if steps.impulses is None else steps.impulses / dt,
+        constraint_labels=scene.constraint_labels,
+        u_stages=np.zeros((N, 0, scene.controls)) if within is None else within,
+        u_nodes=nodes,
+    )
+
+
+def function_error(error: CustomForceError | CustomConstraintError, record: Record, where: str = "") -> StepError:
+    """The error of a user's function that failed in the step after the record."""
+    now = record.trajectory()
+    kind = ForceError if isinstance(error, CustomForceError) else ConstraintError
+    return kind(now.steps, float(now.t[-1]), f"{where}{error}", now)
+
+
+def located(
+    scene: Scene,
+    integrator: Integrator,
+    start: tuple[Floats, Floats],
+    commands: Commands,
+    dt: float,
+    increments: Floats | None,
+    error: CustomForceError | CustomConstraintError,
+    where: str = "",
+) -> VarpinError:
+    """The error of a user's function that failed in a motion, with its step and the motion before.
+
+    The motion is repeated step by step from ``start`` (q0, v0) to find the step.
+    """
+    state, (first,) = integrator.start(scene, start[0][None], start[1][None])
+    dw = np.zeros((0, scene.processes)) if increments is None else increments
+    record = Record(scene, integrator, dt, dw, first, commands if len(commands.places) else None)
+    for _ in range(steps_of(commands)):
+        block = next_command(commands, record)
+        drawn = dw[None, record.steps : record.steps + 1] if len(dw) else dw[None, :0][:0]
+        try:
+            (segment,) = integrator.rollout(scene, state, block, drawn, dt)
+        except (CustomForceError, CustomConstraintError) as found:
+            return function_error(found, record, where)
+        record.add(segment, block.within)
+        if segment.failure is not None:
+            break
+    # The function did not fail this time: its result depends on more than its arguments.
+    return error
+
+
+def next_command(commands: Commands, record: Record) -> Commands:
+    """The command of the next step alone: a new decision, or the last control while it is held."""
+    decision, held = divmod(record.steps, commands.hold)
+    if held:
+        return open_loop(record.last.u[-1:])
+    before = record.last.u[None, -1] if record.steps else None
+    return rows(commands, decision, decision + 1, before)._replace(hold=1)
+
+
+class Motions:
+    """Motions from one state under given commands; they share their work arrays."""
+
+    def __init__(self, scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, dt: float) -> None:
+        self.scene, self.integrator, self.dt = scene, integrator, dt
+        self._start = q0, v0
+        self._state, (self._first,) = integrator.start(scene, q0[None], v0[None])
+
+    def under(
+        self,
+        commands: Commands,
+        *,
+        increments: Floats | None = None,
+    ) -> tuple[Trajectory, Failure | None]:
+        """The motion, and the failure that stopped it early, if any. No argument is checked.
+
+        Args:
+            commands: For all of its steps.
+            increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
+
+        Raises:
+            ForceError: A function of a CustomForce failed.
+        """
+        drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
+        state = self.integrator.fork(self._state)
+        try:
+            (segment,) = self.integrator.rollout(self.scene, state, commands, drawn, self.dt)
+        except CustomForceError as error:
+            given = self.scene, self.integrator, self._start, commands, self.dt, increments
+            raise located(*given, error) from error
+        done = len(segment.u)
+        dw = None if increments is None else increments[:done]
+        within = commands.within[:done] if len(commands.within) else None
+        line = commands if len(commands.places) else None
+        made = _trajectory(self.scene, self.integrator, self.dt, self._first, [segment], dw, within, line)
+        return made, segment.failure
+
+
+def rollout(
+    scene: Scene, integrator: Integrator, q0: Floats, v0: Floats, commands: Commands, dt: float
+) -> tuple[Trajectory, Failure | None]:
+    """One of the :class:`Motions` from (q0, v0)."""
+    return Motions(scene, integrator, q0, v0, dt).under(commands)
