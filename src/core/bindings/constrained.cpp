@@ -50,14 +50,14 @@ class ConstrainedRollout : public Rollout<ConstrainedStepping, ConstrainedState>
                    });
     }
 
-    // Of every step of a path in its last roll (steps, m): what the constraints gave, C' times it.
+    // Impulses of the constraints in every step of a path's last roll (steps, m); C' times them act on the joints.
     Out impulses(std::size_t path) const {
         const auto m = static_cast<std::size_t>(stepping_->m);
         const std::vector<double>& all = state(path).impulses;
         return array_of(all.data(), {all.size() / m, m});
     }
 
-    // The row of the constraints that depended most on the others where a path was last.
+    // The constraint row closest to dependence on the others at a path's last state.
     int weakest(std::size_t path) const { return state(path).weakest; }
 };
 

@@ -1,4 +1,4 @@
-"""The backward pass along a motion: a quadratic model of the cost to go, and how to change the controls by it."""
+"""The backward pass along a motion: a quadratic model of the cost to go, and the change of the controls it gives."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Nodes that are linearized at a time: their derivatives are not kept.
+# Number of nodes that are linearized at a time; longer motions do not keep their derivatives.
 _BLOCK = 2048
 
-# Of the way from one pass to the next.
+# Bisections of the line search between two passes.
 _BISECTIONS = 40
 
-# A pass whose Quu rounding may have changed by more than this part is made anew on square roots.
+# Greatest relative rounding error of Quu; above, the pass is repeated on square roots.
 TRUSTED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a backward pass found: how to change the controls, and what to expect of it."""
+    """The result of a backward pass: gains, feed-forward changes of the controls, and the expected decrease."""
 
     feedforward: Floats  # (R, m)
     feedback: Floats  # (R, m, 2n)
-    previous: Floats | None  # (R, m, m) gains on the control before, where its change costs something or it acts on
+    previous: Floats | None  # (R, m, m) gains on the previous control, with a rate cost or linear controls
     gradient: Floats  # (R, m)
     slope: float
     curvature: float
@@ -56,22 +56,22 @@ class Plan:
     jumps: Floats  # (N, 2n, n), empty without noise
     spread: Floats  # (N, 2n, 2n)
     limited: bool
-    loss: float  # about the part of Quu, or of its root, that rounding may have changed
+    loss: float  # estimated relative rounding error of Quu, or of its root
     model: Model  # of the cost along the motion
 
     @property
     def expected_decrease(self) -> float:
         """Decrease of the expected cost with a full step, by the model."""
-        # Without limits the step is the model's minimum, where the curvature takes back half of what the slope gives.
+        # Without limits the step is the model's minimum, where curvature = -slope.
         return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
 
     def followed(self, length: float) -> Plan:
-        """What is left of it after a step of some length, by the model: its gains, and the rest of the way."""
+        """The plan after a step of the given length, by the model: the same gains and the rest of the step."""
         left = 1.0 - length
         return replace(self, feedforward=left * self.feedforward, gradient=left * self.gradient)
 
     def free_gradient(self, problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
-        """The gradient (R, m) without what pushes controls against limits they are at: zero at an optimum."""
+        """The gradient (R, m), zero where it pushes a control against its active limit; zero at an optimum."""
         if not problem.limited:
             return self.gradient
         u, (lower, upper) = problem.decided(trajectory), problem.control_limits
@@ -88,9 +88,9 @@ def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
 def noise_shares(
     problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, processes: NDArray[np.bool_] | None = None
 ) -> Floats:
-    """What noise adds in each step (N,) to the cost of a motion, if it acts and costs as it did along the plan's own.
+    """Noise cost of each step of a motion (N,), with the noise's effect and value function of the plan's own motion.
 
-    ``processes`` (k,) says which ones count, all if left out. Empty where there is no noise.
+    ``processes`` (k,) selects the processes, by default all. Empty where there is no noise.
     """
     if problem.processes == 0:
         return np.zeros(0)
@@ -102,7 +102,7 @@ def noise_shares(
 
 
 def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floats) -> Floats:
-    """What each Wiener process does to the state after each step of a motion, (N, 2n, k), for given ``jumps``."""
+    """Effect of each Wiener process on the state after each step of a motion (N, 2n, k), for given ``jumps``."""
     scene, n, left = problem.scene, problem.scene.robot.dof, problem.integrator.left
     q, v, u = trajectory.q, trajectory.v, trajectory.u
     jump = scene.noise.fields(q[:-1], v[:-1], u, problem.q0).F
@@ -115,7 +115,7 @@ def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floa
 
 
 def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, costate: Floats) -> Floats:
-    """Second derivatives (N, 2n + m, 2n + m) in (x, u) that dynamics and noise fields add to the cost to go."""
+    """Second-derivative terms of dynamics and noise fields in the cost to go (N, 2n + m, 2n + m), in (x, u)."""
     scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
     N, samples, rule = problem.steps, len(problem.model_rule), problem.model_rule
     gradient = problem.expand_running(trajectory).gradient.reshape(N, samples, -1)
@@ -154,9 +154,9 @@ def backward(
     *,
     along: Along | None = None,
 ) -> Plan | None:
-    """One backward pass along a motion; None where a control has no minimum.
+    """One backward pass along a motion; None where the model has no minimum in a control.
 
-    ``along`` is what other passes along it were made from.
+    ``along`` has the expansions of other passes along the motion.
 
     Raises:
         CostError: An expansion of the cost is not finite.
@@ -173,12 +173,12 @@ def backward(
 
 
 def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
-    """The pass, in which penalties of constraints count where the linearized motion will meet them.
+    """The pass with the penalties that are active on the linearized motion.
 
-    A penalty is zero up to its bound and a parabola beyond. Around the nominal motion alone it pulls back what is
-    beyond, and knows nothing of what the step brings there. So passes are made until the rows that count are those that
-    their linearized motion meets: Newton steps to the minimum of the piecewise quadratic model, each as long as lowers
-    it most. Where they do not settle, the best pass of them is taken, or the place that the steps have come to.
+    A penalty is zero up to its bound and a parabola beyond. A model around the nominal motion has only the rows active
+    there, not those that the step activates. So passes are repeated until their active rows are those of their
+    linearized motion: Newton steps with exact line search to the minimum of the piecewise quadratic model. If these do
+    not converge, the result is the best pass or the last point of the steps.
     """
     problem = along.problem
     if not (isinstance(problem, PenalizedProblem) and problem.passes) or len(along.blocks) > 1:
@@ -208,11 +208,11 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
 
 
 class _Rows:
-    """The rows of all penalties around a motion, on which passes along it differ."""
+    """The rows of all penalties around a motion; passes along it differ in their active rows."""
 
     def __init__(self, along: Along, problem: PenalizedProblem) -> None:
         self.whole, self.problem, motion = along, problem, along.trajectory
-        # Made once, before passes take over what is there.
+        # Linearized once, before the expansions are copied for each pass.
         along.linearized(0, problem.steps)
         q, v, u = motion.q, motion.v, motion.u
         self.of_nodes = problem.penalties
@@ -222,9 +222,9 @@ class _Rows:
         self.signed = [item.signed(item.bound.value(q, v, u)) for item in self.penalties]
         self.begun = [item.held(s) for item, s in zip(self.penalties, self.signed, strict=True)]
         self.jacobians = [item.bound.jacobian(q, v) for item in self.of_nodes]
-        # Where the steps to the model's minimum have come to: the rows there, and the cost without penalties.
+        # The present point of the steps to the model's minimum: its rows, and the change of the cost without penalties.
         self.at, self.cost = self.signed, 0.0
-        # The controls and states there, and the model's slope from its start in that direction.
+        # Changes of controls and states at this point, and the model's slope from its start in that direction.
         self.moves = np.zeros((problem.decisions, u.shape[1]))
         self.states, self.slope = np.zeros((len(q), 2 * q.shape[1])), 0.0
         # d(q, v)/dx at the nodes.
@@ -235,7 +235,7 @@ class _Rows:
         self.by_state = [J @ slopes[item.bound.places] for item, J in zip(self.of_nodes, self.jacobians, strict=True)]
 
     def along(self, held: list[Mask]) -> Along:
-        """What passes are made from in which the rows ``held`` count."""
+        """Expansions for a pass with the active rows ``held``."""
         passing = copy(self.whole)
         vars(passing).pop("model", None)
         count = len(self.of_nodes)
@@ -247,7 +247,7 @@ class _Rows:
         return passing
 
     def ahead(self, passing: Along, plan: Plan) -> list[Floats]:
-        """Where a plan takes what the penalties are squares of, on the linearized motion."""
+        """The penalties' shifted values on the linearized motion under a plan."""
         problem, (lin, _) = self.problem, passing.linearized(0, self.problem.steps)
         N, hold = problem.steps, problem.hold
         slack = passing.slack
@@ -273,9 +273,9 @@ class _Rows:
         return found
 
     def move(self, plan: Plan, held: list[Mask], ahead: list[Floats], along: float) -> None:
-        """Go on towards the minimum ``ahead`` of the model in which ``held`` rows count, as far as lowers it most.
+        """Exact line search towards ``ahead``, the minimum of the model with active rows ``held``.
 
-        ``along`` is the slope of the model at its start towards there.
+        ``along`` is the slope of the model at its start in the direction of ``ahead``.
         """
         at, to = flat(self.at), flat(ahead)
         counts = np.concatenate([rows.ravel() for rows in held])
@@ -308,14 +308,14 @@ class _Rows:
 
     @property
     def lowered(self) -> float:
-        """By what the model has changed where the steps have come to, below zero where it is lower."""
+        """Change of the model at the present point of the steps; negative where it is lower."""
         total = self.cost
         for item, s, now, t in zip(self.penalties, self.signed, self.begun, self.at, strict=True):
             total += 0.5 * item.weight * float((t[item.held(t)] ** 2).sum() - (s[now] ** 2).sum())
         return total
 
     def there(self, plan: Plan) -> Plan:
-        """A plan to where the steps have come to, with the feedback of another."""
+        """A plan that leads to the present point of the steps, with the feedback of ``plan``."""
         at = self.states[: -1 : self.problem.hold]
         ahead = self.moves - np.einsum("kmx,kx->km", plan.feedback, at)
         if plan.previous is not None:
@@ -324,7 +324,7 @@ class _Rows:
         return replace(plan, feedforward=ahead, slope=self.slope, curvature=curvature, limited=True)
 
     def change(self, plan: Plan, held: list[Mask], ahead: list[Floats]) -> tuple[float, float]:
-        """By what the piecewise model changes over a plan's whole step, and its slope at the start."""
+        """Change of the piecewise model over a plan's full step, and its slope at the start."""
         change, slope = -plan.expected_decrease, plan.slope
         for item, s, t, now, rows in zip(self.penalties, self.signed, ahead, self.begun, held, strict=True):
             half = 0.5 * item.weight
@@ -337,11 +337,11 @@ class _Rows:
 
 
 def _within_limits(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
-    """The pass whose controls are kept within their limits where the linearized motion is expected.
+    """The pass with controls within their limits at the states of the linearized motion.
 
-    Around the nominal states alone, late decisions seem to meet their limits: each would have to do by itself what
-    those before it are to do. So the first pass knows no limits. What its motion meets of them the next ones take into
-    account, until they meet no others. Where more and more of that changes, nominal states are what is left.
+    Around the nominal states, late decisions seem to reach their limits because each would have to make up for the
+    earlier ones. So the first pass has no limits, and the next ones take the limits into account that the linearized
+    motion reaches, until these do not change. If ever more of them change, the pass is made around the nominal states.
     """
     if not along.problem.limited:
         return _pass(along, regularization, curvature=curvature)[0]
@@ -356,13 +356,13 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
         if plan is None:
             break
         now = np.logical_not(plan.feedback.any(axis=2))
-        # Where motions run into limits for long, looking ahead may lead nowhere.
+        # Where motions stay at limits for long, these passes may not converge.
         changed = int((now != held).sum())
         if changed >= others:
             plan = None
         held, others = now, changed
     if plan is not None and plan.expected_decrease > 0.0:
-        # Feed-forward parts hold together with the feedback that the others ask for: the slope is that of both.
+        # The feed-forward parts belong together with the feedback, so the slope is that of both.
         slope = float((plan.gradient * _foreseen(along, plan)[1]).sum())
         if slope < 0.0:
             return replace(plan, slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
@@ -371,10 +371,10 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
 
 
 def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
-    """Where the linearized motion goes under a plan whose controls are clipped to their limits.
+    """The linearized motion under a plan whose controls are clipped to their limits.
 
-    The state, and the change of the control before, before each decision (R, 2n + m), and the controls' changes (R, m).
-    Where controls are linear between nodes the state is X of :mod:`varpin.control.linear_controls`.
+    Returns the state and the change of the previous control before each decision (R, 2n + m), and the controls' changes
+    (R, m). Where controls are linear between nodes the state is X of :mod:`varpin.control.linear_controls`.
     """
     problem, (R, m, _), x = along.problem, plan.feedback.shape, along.states
     feedback = plan.feedback
@@ -400,9 +400,9 @@ def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
 
 
 class _Limits(NamedTuple):
-    """What keeps controls within their limits: their ``slack`` (R, 2, m), and the states expected (R, 2n + m).
+    """Control limits for a pass: their ``slack`` (R, 2, m), and the ``expected`` states (R, 2n + m).
 
-    Either may be empty: without limits, and around the nominal states.
+    The slack is empty without limits, the expected states around the nominal ones.
     """
 
     slack: Floats
@@ -410,7 +410,7 @@ class _Limits(NamedTuple):
 
 
 class Along:
-    """What all passes along a motion are made from; the linearization is kept where it is one block."""
+    """Expansions along a motion that all its passes share; the linearization is kept where it is one block."""
 
     def __init__(self, problem: OptimalControlProblem, trajectory: Trajectory) -> None:
         self.problem, self.trajectory = problem, trajectory
@@ -423,12 +423,12 @@ class Along:
             self.slack = problem.control_limits - problem.decided(trajectory)[:, None]
         block = max(1, _BLOCK // problem.hold) * problem.hold
         self.blocks = [(max(0, end - block), end) for end in range(problem.steps, 0, -block)][::-1]
-        # The states of the pass: with a control that acts on among them.
+        # The number of states of the pass; with linear controls the state contains the control.
         self.states = 2 * problem.scene.robot.dof
         if problem.linear:
             self.blocks, self.states = [(0, problem.decisions)], size(problem)
         self.kept: tuple[Linearization, Floats] | None = None
-        # What is added to the cost's gradient at its samples (N s, 2n + m): of the noise, where it is differentiated.
+        # Gradient of the noise cost, added to the cost's gradient at its samples (N s, 2n + m) once it is known.
         self.added: Floats | float = 0.0
         self.noise_differentiated = False
 
@@ -442,7 +442,7 @@ class Along:
         return found
 
     def differentiate_noise(self, plan: Plan, processes: NDArray[np.bool_]) -> None:
-        """Give passes from here on the whole gradient of what ``processes`` (k,) add under the plan's gains."""
+        """Add the whole gradient of the noise cost of ``processes`` (k,) under the plan's gains to later passes."""
         problem, N = self.problem, self.problem.steps
         lin, velocity = self.linearized(0, N)
         feedback = Feedback(plan.feedback, plan.previous)
@@ -458,12 +458,12 @@ class Along:
 
     @property
     def slopes(self) -> Floats:
-        """The gradient of the running cost at its samples, with what is added to it."""
+        """The gradient of the running cost at its samples, with that of the noise cost if it was added."""
         return self.running.gradient + self.added
 
     @cached_property
     def stake(self) -> Stake:
-        """How much of the cost of the motion is at stake."""
+        """The cost at stake along the motion."""
         return at_stake(self.problem, self.trajectory, self.model)
 
     @cached_property
@@ -480,7 +480,7 @@ class Along:
         cost = Expansion(end.gradient[:1, x], end.hessian[:1, x, x])
         g, H, D = cost.gradient[0], cost.hessian[0], np.eye(2 * n)
         if problem.integrator.variational:
-            # A motion of one block is linearized for every pass along it, and that knows its last node, too.
+            # The linearization of a motion of one block is kept, and includes the last node.
             slopes = self.linearized(0, problem.steps)[1] if len(self.blocks) == 1 else D[:0, n:]
             D[n:] = slopes[-1] if len(slopes) else velocity_at_nodes(problem.scene, q, v)[0]
             g, H = D.T @ g, D.T @ H @ D
@@ -500,7 +500,7 @@ class Along:
         if self.kept is not None:
             return self.kept
         problem, part = self.problem, self.trajectory.part(begin, end)
-        # Velocities at nodes are needed where they are sampled and x does not hold them.
+        # dv/dx is needed where the cost samples velocities of nodes and x holds momenta.
         nodes = problem.integrator.variational and bool(problem.model_rule[:, [2, 4, 6, 8]].any())
         lin = _linearize(problem, part, begin)
         n = problem.scene.robot.dof
@@ -510,7 +510,7 @@ class Along:
         return lin, velocity
 
     def steps(self, begin: int, end: int, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
-        """A block of steps as the core takes them."""
+        """The expansions of a block of steps for the core."""
         if self.problem.linear:
             return self._on_lines(limits)
         problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.model_rule)
@@ -563,7 +563,7 @@ def _pass(
     curvature: Floats | None = None,
     limits: _Limits | None = None,
 ) -> tuple[Plan | None, Floats]:
-    """The pass by the plain recursion, or, where that has lost its digits and the model is convex, on square roots."""
+    """The plain recursion, or, where its rounding errors are large and the model is convex, that on square roots."""
     plain = _one_pass(along, regularization, costates, curvature, limits, roots=False)
     if curvature is not None or (plain[0] is not None and plain[0].loss <= TRUSTED):
         return plain
@@ -581,7 +581,7 @@ class _Terminal(NamedTuple):
 
 
 class _ByRoots(NamedTuple):
-    """A pass on square roots, and the costs of samples and of changes of the control as squares."""
+    """A pass on square roots, with the costs of samples and of control changes as squares."""
 
     run: core.RootPass
     running: Squares

@@ -1,4 +1,4 @@
-"""Arrays by name, as the compiled core takes them: a robot's tree, controls, and what a rollout writes."""
+"""Named arrays for the compiled core: a robot's tree, forces, constraints, commands, and the nodes of a rollout."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -19,9 +19,8 @@ _NOWHERE.setflags(write=False)
 class Tree(NamedTuple):
     """A tree of ``b`` bodies, each on one joint about or along the z axis of its own frame.
 
-    Body ``j`` moves with generalized coordinate ``coordinate[j]``: its joint stands at
-    ``ratio[j] * q[coordinate[j]] + offset[j]``. Where every ratio is 1, every offset 0 and b = n, bodies and
-    coordinates are the same thing; mimic joints make the difference.
+    Body ``j`` moves with generalized coordinate ``coordinate[j]``: its joint is at
+    ``ratio[j] * q[coordinate[j]] + offset[j]``. Without mimic joints every ratio is 1, every offset 0 and b = n.
     """
 
     parent: Integers  # (b,) index of the parent body, -1 at a root; parents come first
@@ -34,9 +33,9 @@ class Tree(NamedTuple):
     coordinate: Integers  # (b,)
     ratio: Floats  # (b,)
     offset: Floats  # (b,) [rad or m]
-    origin: Integers  # (b,) 1 where no joint above turns: moments of what it carries are taken about its own joint
-    loads: Integers  # (l,) bodies with which a part begins that is light beside what carries it
-    carried: Integers  # (l, n) 1 where a coordinate belongs to the part
+    origin: Integers  # (b,) 1 below prismatic joints only: moments of its subtree are taken about its own joint
+    loads: Integers  # (l,) first bodies of subtrees that are light compared to their carriers
+    carried: Integers  # (l, n) 1 where a coordinate belongs to the subtree
     periodic: Integers  # (n,) 1 where the Lagrangian without springs is the same after a whole turn
     armature: Floats  # (n,) [kg m^2 or kg]
     group: Integers  # (n,) which of r mechanically independent groups a coordinate belongs to, from 0
@@ -45,50 +44,50 @@ class Tree(NamedTuple):
 
 
 class Element(NamedTuple):
-    """What acts on one coordinate besides inertia and gravity; src/core/include/varpin/forces.hpp has the kinds."""
+    """A force on one coordinate besides gravity; src/core/include/varpin/forces.hpp has the kinds."""
 
     kind: str
     coordinate: int
-    values: tuple[float, ...]  # its numbers, in order
+    values: tuple[float, ...]  # parameters of its kind, in order
 
 
 class Coupling(NamedTuple):
-    """What acts between two points; src/core/include/varpin/couplings.hpp has the kinds."""
+    """A force between two points; src/core/include/varpin/couplings.hpp has the kinds."""
 
     kind: str
-    a: int  # the body that carries the one point, -1 for the world
-    b: int  # that of the other
-    values: tuple[float, ...]  # both places (3,) in their body's axes [m], then its numbers in order
+    a: int  # body of the first point, -1 for the world
+    b: int  # body of the second point
+    values: tuple[float, ...]  # both points (3,) in the axes of their bodies [m], then parameters of its kind
 
 
 class Carried(NamedTuple):
-    """A vector that a body carries."""
+    """A direction or a point that is fixed to a body."""
 
     body: int  # -1 for the world
-    direction: bool  # or a point [m]
+    direction: bool  # a direction; else a point [m]
     place: tuple[float, float, float]  # in the body's axes, from its joint
 
 
 class Product(NamedTuple):
     """The constraint factor X . Y - constant of two vectors, each a sum of carried ones."""
 
-    x: int  # place in the list of vectors
+    x: int  # index in the list of vectors
     y: int
     factor: float
     constant: float
 
 
 class Tied(NamedTuple):
-    """The constraint q_follower - sum_k coefficients_k q_leader^k; a joint alone, without any, is moved by hand."""
+    """The constraint q_follower - sum_k coefficients_k q_leader^k; without coefficients, a kinematic input."""
 
     follower: int
     leader: int
     coefficients: tuple[float, ...]
-    rate: int = -1  # of a joint moved by hand on a cubic: the control that is its rate at the end; else -1
+    rate: int = -1  # of a cubic kinematic input: index of the control that is its rate at the end; else -1
 
 
 class CustomRows(NamedTuple):
-    """Constraints by functions."""
+    """Constraints defined by Python functions."""
 
     rows: int  # r
     value: Callable[[Floats], tuple[Floats, Floats]]  # g (r,) and C (r, n) of q (n,)
@@ -119,25 +118,25 @@ class Diffusion(NamedTuple):
 class Commands(NamedTuple):
     """R controls, each held over ``hold`` steps: u, or u + gains (x - reference) with x = (q, p) or (q, v).
 
-    Where gains have 2n + m columns, the control before belongs to x: (q, p, u_before). What comes out is brought
-    within the limits.
+    Where gains have 2n + m columns, x contains the previous control: (q, p, u_before). The result is clipped to the
+    limits.
     """
 
     u: Floats  # (R, m)
     gains: Floats  # (R, m, 2n) or (R, m, 2n + m), or (0, m, 2n) for none
     reference: Floats  # (R, 2n) or (R, 2n + m), or (0, 2n)
-    hold: int  # steps between two looks at the state
+    hold: int  # steps per decision
     limits: Floats  # (2, m) least and greatest control, infinite where there is none
-    before: Floats  # (P, m) the control before the first of each path; (0, m) for what the reference has
-    # (N, s, m) at the stages of each step, of which u has the mean, without feedback and hold; empty where held
+    before: Floats  # (P, m) the control before the first of each path; (0, m) for that of the reference
+    # (N, s, m) controls at the stages of each step, with mean u, without feedback and hold; empty for held controls
     within: Floats = _HELD
-    # (s,) of the stages in a step of unit length: controls are then linear in time over each decision's steps, from the
-    # control before to u, which is reached at their end; empty where they are held
+    # (s,) stages in a step of unit length: controls are then linear in time over each decision's steps, from the
+    # previous control to u at their end; empty for held controls
     places: Floats = _NOWHERE
 
 
 class Nodes(NamedTuple):
-    """What a rollout of P paths over N steps writes: the node after each step, and what the step took."""
+    """Output of a rollout of P paths over N steps: the node after each step, and the work of the step."""
 
     q: Floats  # (P, N, n)
     p: Floats  # (P, N, n)
@@ -146,12 +145,12 @@ class Nodes(NamedTuple):
     u: Floats  # (P, N, m) controls applied
     tally: Integers  # (P, N, 4) Newton iterations, jets, first-order sweeps, substeps
     quality: Floats  # (P, N, 3) worst scaled residual, smallest branch margin, energy error so far [J]
-    ended: Integers  # (P,) how
-    done: Integers  # (P,) steps
+    ended: Integers  # (P,) outcome, as in src/core/include/varpin/nodes.hpp
+    done: Integers  # (P,) number of steps done
 
 
 def new_nodes(paths: int, steps: int, dof: int, controls: int) -> Nodes:
-    """Room for the nodes of a rollout."""
+    """Allocate the nodes of a rollout."""
     return Nodes(
         q=np.empty((paths, steps, dof)),
         p=np.empty((paths, steps, dof)),

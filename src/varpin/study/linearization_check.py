@@ -1,4 +1,4 @@
-"""A linearization held against differences of the steps themselves, on a user's own model."""
+"""Comparison of a linearization with differences of the steps, on a user's model."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ Floats = NDArray[np.float64]
 
 # Central differences of eighth order.
 _WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-# Relative errors up to which derivatives are right, and from which on they are wrong.
+# Relative errors up to which derivatives are right, and above which they are wrong.
 _RIGHT, _NEAR = 1e-6, 1e-3
 
 
 @dataclass(frozen=True)
 class LinearizationCheck:
-    """How far the derivatives of one step are from differences of it.
+    """Errors of the derivatives of one step against differences of the step.
 
-    Errors and norms are the largest entries, in units of the variables' own sizes: positions in 1 rad or m, each
-    momentum in what moves its joint alone at 1 rad/s or m/s, 1 / (M^-1)_ii, velocities, controls and increments in 1.
+    Errors and norms are the largest entries, in units of the variables: 1 rad or m for positions, 1 / (M^-1)_ii for the
+    momentum of joint i, which moves it alone at 1 rad/s or m/s, and 1 for velocities, controls and increments.
 
     Attributes:
         A: Error and norm of dx1/dx0.
@@ -54,15 +54,15 @@ class LinearizationCheck:
 
     @property
     def verdict(self) -> str:
-        """What to make of it, in words."""
+        """The result in words, with advice."""
         if self.holds:
             return f"the derivatives are those of the step, to {self.worst:.0e} of their size"
         parts = {"A": self.A, "B": self.B, "G": self.G}
         wrong = ", ".join(name for name, part in parts.items() if not _relative(part) <= _RIGHT)
         if self.worst <= _NEAR:
             return (
-                f"{wrong} and the differences agree to {self.worst:.0e} alone: another step= of the differences tells "
-                "which of them is off, as does a smaller dt"
+                f"{wrong} and the differences agree only to {self.worst:.0e}: another step= of the differences, or a "
+                "smaller dt, shows which of them is wrong"
             )
         return f"{wrong} is not the derivative of the step: it is off by {self.worst:.1e} of its size"
 
@@ -94,8 +94,8 @@ def check_linearization(
         dt: Time step [s].
 
     Other Args:
-        integrator: That of :func:`varpin.simulate` if left out.
-        step: Of the differences, in the units of :class:`LinearizationCheck`.
+        integrator: By default that of :func:`varpin.simulate`.
+        step: Step of the differences, in the units of :class:`LinearizationCheck`.
 
     Raises:
         InputError: Wrong shapes, or values that are not finite.
@@ -104,7 +104,7 @@ def check_linearization(
     refuse_constraints(
         require_scene(scene),
         "check_linearization",
-        "varpin.linearize does; its A and B are slopes along the constraints, so hold them against steps between "
+        "varpin.linearize does; its A and B are derivatives along the constraints, so compare them with steps between "
         "states that varpin.assemble has brought onto these",
     )
     n, m, k = require_scene(scene).robot.dof, scene.controls, scene.processes
@@ -144,7 +144,7 @@ def _relative(part: tuple[float, float]) -> float:
 def _compare(
     given: Floats, function: Callable[[Floats], Floats], x: Floats, step: float, rows: Floats, columns: Floats
 ) -> tuple[float, float]:
-    """Largest error of a derivative, and largest entry of what it should be, both in the units of rows and columns."""
+    """Largest error of a derivative and largest entry of the differences, in the units of rows and columns."""
     if not x.size:
         return 0.0, 0.0
     derivative = np.zeros_like(given)

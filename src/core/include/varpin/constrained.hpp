@@ -1,13 +1,13 @@
-// Variational steps under holonomic constraints g(q) = 0. docs/constraints.md. Of the discrete action
-// h sum_i b_i L(Q_i, V_i) - sum_k Lam_k . g(Q~_k), with Lobatto points Q~_k = q0 + h sum_j t_kj V_j, t_kj the integral
-// of the j-th Lagrange polynomial on Gauss's points from 0 to the k-th Lobatto point:
+// Variational steps under holonomic constraints g(q) = 0 (docs/constraints.md). The discrete action is
+// h sum_i b_i L(Q_i, V_i) - sum_k Lam_k . g(Q~_k), with Lobatto points Q~_k = q0 + h sum_j t_kj V_j, and t_kj the
+// integral of the j-th Lagrange polynomial on Gauss's points from 0 to the k-th Lobatto point. It gives
 //
 //     L_v(Q_i, V_i) = p0 + h sum_j a_ij (L_q + F)_j - sum_{k<s} w_ik C_k' Lam_k,    w_ik = 1 - t_ki / b_i
 //     g(Q~_k) = 0 for k = 1 .. s
 //     p1 = p0 + h sum_j b_j (L_q + F)_j - sum_{k<=s} C_k' Lam_k,    C(q1) M(q1)^-1 p1 = 0
 //
-// Newton's matrix for all (V, Lam) at once is solved by pivoting. Rows of C that depend on others, in the metric of the
-// kinetic energy at the start of a substep, are left out of it: those that are kept hold them too.
+// Newton's matrix for all (V, Lam) at once is solved with pivoting. Rows of C that depend on others, in the metric of
+// the kinetic energy at the start of a substep, are left out of it: the other rows imply them.
 // Equations (H1) and (H2) of docs/constraints.md.
 #pragma once
 
@@ -26,18 +26,18 @@
 
 namespace varpin {
 
-// C at a node, its rows in the metric of the kinetic energy and in order of what each adds to those before it.
+// C at a node: its independent rows, orthogonalized in the metric of the kinetic energy with pivoting.
 struct ConstraintBasis {
     ConstraintJet jet;
     std::vector<double> ldl;   // (n, n) factors of M
     std::vector<double> root;  // (n) D^-1/2
-    std::vector<double> rows;  // (m, n) D^-1/2 L^-1 C', a row each
-    std::vector<double> Q;     // (r, n) an orthonormal basis of theirs
+    std::vector<double> rows;  // (m, n) rows of C in this metric, D^-1/2 L^-1 C' transposed
+    std::vector<double> Q;     // (r, n) an orthonormal basis of these rows
     std::vector<double> R;     // (r, r) upper triangular: row order[k] = sum_{i<=k} R_ik Q_i
-    std::vector<double> size;  // (m) of the terms that cancel in a row
-    std::vector<int> order;    // (r) of the rows that are kept
+    std::vector<double> size;  // (m) size of the terms that cancel in a row
+    std::vector<int> order;    // (r) the rows that are kept, in pivoting order
     double least = 1.0;        // the smallest diagonal entry of R, in units of its row
-    int weakest = 0;           // its row
+    int weakest = 0;           // the row of this entry
     int rank() const { return static_cast<int>(order.size()); }
 };
 
@@ -55,7 +55,7 @@ inline void exchange(ConstraintBasis& a, ConstraintBasis& b) {
     std::swap(a.weakest, b.weakest);
 }
 
-// Where a constrained path stands besides.
+// State of a constrained path, in addition to PathState.
 struct ConstrainedState {
     ConstrainedState(const Mechanism& mechanism, int stages)
         : path(mechanism, stages),
@@ -66,12 +66,12 @@ struct ConstrainedState {
     PathState path;
     int rank = -1;                     // of the constraints, for the whole rollout
     int weakest = 0;                   // the constraint row that a failed step would name
-    std::vector<double> rate;          // (m) of rows whose joint is moved by hand, at the node; zero of others
-    std::vector<double> impulse;       // (m) of the last step, negative Lam added up [N s or N m s]
+    std::vector<double> rate;          // (m) rates of kinematic inputs at the node; zero for other rows
+    std::vector<double> impulse;       // (m) impulses of the last step, the negative sum of Lam [N s or N m s]
     std::vector<double> past_impulse;  // (s, m) Lam of the last whole step
-    std::vector<double> miss;          // (misses, s, m) of its guess, as PathState's
+    std::vector<double> miss;          // (misses, s, m) errors of its guess, as PathState's
     int trend = 0;                     // rows of `miss` that would have made the best guess
-    std::vector<double> impulses;      // (steps, m) of the last roll
+    std::vector<double> impulses;      // (steps, m) impulses of the last roll
 };
 
 class ConstrainedStepper {
@@ -137,15 +137,15 @@ class ConstrainedStepper {
     int n, m, stages;
     std::vector<double> force;           // (n) constant over the step; (s, n) at its stages, or those of a part of it
     int stride = 0;                      // from one row of `force` to the next
-    Effort effort;                       // of the last step
+    Effort effort;                       // work of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
 
-    // A joint that is moved by hand goes to where its entry of the step's force says that it is at the end: at a
-    // constant rate, or on the cubic from its rate to the one that a control gives. Its row of the constraints is
-    // g = q - (that motion), and no force acts on it but the row's. Where a control is held over several steps, the end
-    // is that of the last of them, `left` from here.
+    // A joint with a kinematic input moves to its goal, its entry of the step's force: at a constant rate, or on the
+    // cubic between the rates at both ends, the second given by a control. Its constraint row is g = q - (this motion),
+    // and no force but the row's acts on it. Where a control is held over several steps, the goal is at the end of the
+    // last of them, `left` steps from here.
 
-    // Put a path at (q, p), p brought onto the tangent space; false where M(q) is not positive definite.
+    // Set a path's state to (q, p), with p projected onto the tangent space; false where M(q) is not positive definite.
     bool begin_at(const double* q, const double* p, ConstrainedState& state, bool project = true) {
         PathState& path = state.path;
         for (int i = 0; i < n; ++i) {
@@ -168,7 +168,7 @@ class ConstrainedStepper {
         return true;
     }
 
-    // Put a path at (q, v).
+    // Set a path's state to (q, v).
     bool begin(const double* q, const double* v, ConstrainedState& state) {
         Jet<double>& jet = equation.stage[0];
         first_order(mechanism, q, v, jet);
@@ -184,7 +184,7 @@ class ConstrainedStepper {
         return true;
     }
 
-    // Add an impulse (n) to the momentum; constraints absorb what is normal to them.
+    // Add an impulse (n) to the momentum; constraints absorb its normal part.
     void kick(const double* push, ConstrainedState& state) {
         PathState& path = state.path;
         for (int i = 0; i < n; ++i) {
@@ -196,8 +196,7 @@ class ConstrainedStepper {
         energy_guard.kicked(unit.data(), path.momentum.data(), path.v.data(), path.energies);
     }
 
-    // The rates at their goals of joints that are moved by hand on cubics, in the order of their rows; of others
-    // unread.
+    // Set the rates of cubic kinematic inputs at their goals, in the order of their rows; others are not read.
     void take_rates(const double* own) { std::copy(own, own + goal_rate.size(), goal_rate.begin()); }
 
     // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`.
@@ -208,7 +207,7 @@ class ConstrainedStepper {
         take_goals();
     }
 
-    // One whole step, in as many substeps as the guards ask for; as VariationalStepper::step.
+    // One whole step, in as many substeps as the guards require; as VariationalStepper::step.
     Outcome step(double h, ConstrainedState& state) {
         effort = {};
         std::fill(state.impulse.begin(), state.impulse.end(), 0.0);
@@ -251,7 +250,7 @@ class ConstrainedStepper {
         return attempt(length_of(h, level), state, true);
     }
 
-    // A whole step from a guess (s, n) next to its root.
+    // A whole step from a guess (s, n) close to its root.
     Outcome from_guess(double h, const double* V, ConstrainedState& state) {
         std::copy(V, V + stages * n, equation.V.begin());
         std::fill(impulse.begin(), impulse.end(), 0.0);
@@ -312,9 +311,9 @@ class ConstrainedStepper {
         }
     }
 
-    // Derivatives of the substep that was solved last, from (q0, p0) under the force f, as a map on all of R^2n: of
-    // (q1, p1) in (q0, p0), Jx (2n, 2n), and in f, Jf (2n, n). At q0 it asks for no g(q0) = 0, and p0's part across the
-    // tangent space is absorbed. In rates at goals, Jr (2n, driven rows), zero of joints on lines.
+    // Derivatives of the last substep, from (q0, p0) under the force f, as a map on all of R^2n: of (q1, p1) in (q0,
+    // p0), Jx (2n, 2n), in f, Jf (2n, n), and in the rates of kinematic inputs at their goals, Jr (2n, driven rows),
+    // zero for linear ones. The map does not require g(q0) = 0, and absorbs the part of p0 normal to the constraints.
     void derivatives(double h, const PathState& path, double* Jx, double* Jf, double* Jr) {
         exchange(here, origin);
         const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
@@ -352,7 +351,7 @@ class ConstrainedStepper {
             }
         }
         end_columns(h, Jx, Jf);
-        // In the rates at both ends of a cubic, in the place of its goal.
+        // For a cubic: derivatives in the rates at both ends, in the column of its goal.
         if (curved_paths) {
             for (int end = 0; end < 2; ++end) {
                 columns.assign(entries(size, w), 0.0);
@@ -384,7 +383,7 @@ class ConstrainedStepper {
             for (int i = 0; i < 2 * n; ++i)
                 Jr[i * driven.size() + d] = driven[d].rate < 0 ? 0.0 : at_end[i * n + driven[d].coordinate];
             if (driven[d].rate < 0) continue;
-            // The rate at the beginning is the momentum's, v = M^-1 p: M dv = dp - L_vq dq.
+            // The rate at the beginning follows from the momentum, v = M^-1 p: M dv = dp - L_vq dq.
             std::fill(y.begin(), y.end(), 0.0);
             y[driven[d].coordinate] = 1.0;
             whiten(origin, y.data(), y.data());
@@ -402,50 +401,50 @@ class ConstrainedStepper {
         }
     }
 
-    ConstraintBasis here;    // where the path stands
-    ConstraintBasis origin;  // where the substep that was solved last began, once the path has moved on
+    ConstraintBasis here;    // at the path's state
+    ConstraintBasis origin;  // at the beginning of the last substep, once the path has moved on
 
   private:
-    ConstraintBasis there;  // where a substep that is tried ends
+    ConstraintBasis there;  // at the end of a trial substep
 
-    // In units of the terms that make up a row: below, it depends on the others. Rounding leaves 1e-15.
+    // Threshold, in units of a row's terms, below which the row depends on the others. Rounding leaves 1e-15.
     static constexpr double dependent = 1e-9;
-    // Below, constraints that are independent are too near to a point where they are not.
+    // Threshold below which independent constraints are too close to a singular point.
     static constexpr double near_toggle = 1e-5;
-    // How far C may turn within a substep, in units of itself, where guards are active.
+    // Greatest relative change of C within a substep, where guards are active.
     static constexpr double most_turn = 0.7;
     static constexpr double stagnation = 100.0;
     static constexpr double sure = 10.0;  // as Collocation's
     static constexpr int most_corrections = 12;
 
-    int left = 1;                                 // steps to the goal of joints that are moved by hand
-    double share = 1.0;                           // of what is left to it, that the next part is
-    std::vector<double> goal;                     // of each joint that is moved by hand, where it is to be
-    std::vector<double> goal_rate, begun;         // the rates there and where the part begins
-    bool curved_paths = false;                    // whether any goes on a cubic
-    std::vector<double> from_q, from_v;           // (n) where the part began, if so
+    int left = 1;                                 // steps to the goal of kinematic inputs
+    double share = 1.0;                           // the next part's share of the time to the goal
+    std::vector<double> goal;                     // goal positions of the kinematic inputs
+    std::vector<double> goal_rate, begun;         // rates at the goal and at the beginning of the part
+    bool curved_paths = false;                    // whether any input is cubic
+    std::vector<double> from_q, from_v;           // (n) state at the beginning of the part, if so
     std::array<std::vector<double>, 2> by_rates;  // (2n, 2n) and (2n, n), derivatives in rates at both ends
-    std::vector<double> given;                    // (s, n) force at the stages of the whole step, where it varies
-    std::vector<double> line;                     // (s, m) controls there, where they are linear
+    std::vector<double> given;                    // (s, n) force at the stages of the whole step, if it varies
+    std::vector<double> line;                     // (s, m) controls at the stages, if they are linear in time
     std::vector<double> at;                       // (s + 1, s) t_kj
     std::vector<double> weight;                   // (s, s) w_ik
     Trial trial;
     std::vector<ConstraintJet> point;  // of Lobatto points 1 .. s
-    std::vector<double> impulse;       // (s, m) Lam_k, zero for rows that are left out
+    std::vector<double> impulse;       // (s, m) Lam_k, zero for omitted rows
     std::vector<double> total;         // (m)
     std::vector<double> last;          // (m) Lam_s
-    std::vector<double> rate;          // (m) of joints that are moved by hand, in the part
+    std::vector<double> rate;          // (m) rates of kinematic inputs in the part
     std::vector<double> Qk, scaled, row_scale, y, bent, pushed, push_size, unit;
     std::vector<double> block, saddle, right, solution;
     std::vector<int> rows;
     std::vector<double> null, reduced_mass, reduced;
-    std::vector<double> foreseen;              // (s, n) stage velocities without what guesses miss
+    std::vector<double> foreseen;              // (s, n) stage velocities extrapolated without the guesses' errors
     std::vector<double> white, along, wanted;  // (n)
     std::vector<double> rest, parts;           // (m, n)
     std::vector<double> product;               // (r, r)
     std::vector<double> mass, curved;          // (n, n)
-    std::vector<double> unspanned;             // (n) squares of what is left of the unit vectors
-    std::vector<char> taken;                   // of rows
+    std::vector<double> unspanned;             // (n) squared norms of the rest of the unit vectors
+    std::vector<char> taken;                   // whether a row is in the basis
 
     std::vector<double> dV, columns, bends;
 
@@ -457,20 +456,20 @@ class ConstrainedStepper {
                                                 &bends[k * n * n]);
     }
 
-    // Of what a joint's course depends on: the goal, or the rates at both ends of a cubic.
+    // Parameters of a kinematic input's motion: the goal, or the rates at both ends of a cubic.
     enum class Goal { position, begin, end };
 
-    // Shares of a joint's position, from where it begins, in the way to its goal; in its rates there and at the goal,
-    // times the time that is left.
+    // Coefficients of a joint's displacement: of the distance to its goal, and of its rates at both ends times the time
+    // to the goal.
     struct Way {
         double ahead, begin, end;
     };
-    // At a share of the time that is left.
+    // The coefficients at a share of the time to the goal.
     Way way_at(int d, double at) const {
         if (mechanism.constraints.driven()[d].rate < 0) return {at, 0.0, 0.0};
         return {at * at * (3.0 - 2.0 * at), at * (1.0 - at) * (1.0 - at), at * at * (at - 1.0)};
     }
-    // The same of its rate: in the mean rate that is left, and in both rates.
+    // The same for its rate: of the mean rate to the goal, and of both rates.
     Way pace_at(int d, double at) const {
         if (mechanism.constraints.driven()[d].rate < 0) return {1.0, 0.0, 0.0};
         return {6.0 * at * (1.0 - at), (1.0 - at) * (1.0 - 3.0 * at), at * (3.0 * at - 2.0)};
@@ -479,7 +478,7 @@ class ConstrainedStepper {
         const Way pace = pace_at(d, at);
         return pace.ahead * share * (goal[d] - from) / h + pace.begin * begun[d] + pace.end * goal_rate[d];
     }
-    // Which of the joints that are moved by hand a row moves, or -1.
+    // Index of the kinematic input of a row, or -1.
     int driven_of(int row) const {
         const std::vector<DrivenRow>& driven = mechanism.constraints.driven();
         for (std::size_t d = 0; d < driven.size(); ++d) {
@@ -488,7 +487,7 @@ class ConstrainedStepper {
         return -1;
     }
 
-    // Derivatives of the end of a substep but for its last impulse, from the right sides in `columns` and the factors
+    // Derivatives of the end of a substep without its last impulse, from the right sides in `columns` and the factors
     // of the bordered matrix.
     void end_columns(double h, double* Jx, double* Jf) {
         const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
@@ -499,7 +498,7 @@ class ConstrainedStepper {
             for (int c = 0; c < w; ++c) dV[i * w + c] = scaled[i % n] * sorted[i * w + c];
         }
         equation.end_derivatives(h, {0, n}, dV, Jx, Jf);
-        // Of the impulses up to the last one: C_k' dLam_k + Lam_k . g_qq dQ~_k.
+        // The impulses up to the last one contribute C_k' dLam_k + Lam_k . g_qq dQ~_k.
         std::vector<double> dQ(n);
         for (int c = 0; c < w; ++c) {
             for (int k = 0; k < stages; ++k) {
@@ -577,8 +576,8 @@ class ConstrainedStepper {
         if (unwinds(i)) path.position[i].unwind();
     }
 
-    // M's factors and C at q, the `rank` rows that are farthest from depending on each other, or, for -1, all that do
-    // not. False where M is not positive definite. C is there already where it has `visited` q.
+    // Compute the factors of M and the basis of C at q, of the `rank` most independent rows, or of all independent ones
+    // for -1. False where M is not positive definite. C is known already where it has `visited` q.
     bool find_basis(const double* q, int rank, ConstraintBasis& basis, bool visited = false) {
         if (!energy_guard.factor(q)) return false;
         basis.ldl = energy_guard.factors();
@@ -587,7 +586,7 @@ class ConstrainedStepper {
         if (!visited) mechanism.constraints.at(q, basis.jet);
         basis.rows.resize(m * n);
         basis.size.assign(m, 0.0);
-        // Of the terms that cancel in a row: their squares times the diagonal of M^-1.
+        // Size of the terms that cancel in a row: their squares times the diagonal of M^-1.
         for (int c = 0; c < n; ++c) {
             double inverse = 0.0;
             for (int i = c; i < n; ++i) {
@@ -603,7 +602,7 @@ class ConstrainedStepper {
             whiten(basis, &basis.jet.C[r * n], &basis.rows[r * n]);
             basis.size[r] = std::sqrt(basis.size[r]);
         }
-        // Gram and Schmidt, twice, the row first that has most left in units of its size.
+        // Gram-Schmidt, twice, with pivoting: next is the row with the largest rest in units of its size.
         std::copy(basis.rows.begin(), basis.rows.end(), rest.begin());
         std::fill(taken.begin(), taken.end(), 0);
         basis.order.clear();
@@ -651,7 +650,7 @@ class ConstrainedStepper {
         for (int k = 0; k < found; ++k) {
             for (int i = 0; i <= k; ++i) basis.R[i * found + k] = parts[basis.order[k] * n + i];
         }
-        // Rows that were dependent are no more: the rollout began where they were by chance.
+        // Dependent rows have become independent: the rollout began at a singular configuration.
         if (rank >= 0 && (next > 1e3 * dependent || found < rank)) basis.least = 0.0;
         return true;
     }
@@ -669,7 +668,7 @@ class ConstrainedStepper {
     }
     double norm(const double* a) const { return std::sqrt(inner(a, a)); }
 
-    // The goals of joints that are moved by hand, out of the step's force.
+    // Read the goals of kinematic inputs from the step's force.
     void take_goals() {
         const std::vector<DrivenRow>& driven = mechanism.constraints.driven();
         goal.resize(driven.size());
@@ -679,14 +678,14 @@ class ConstrainedStepper {
         }
     }
 
-    // How much of the time that is left to its goal has gone at Lobatto point k of the part.
+    // Share of the time to the goal that has passed at Lobatto point k of the part.
     double way_to(int k) const {
         double sum = 0.0;
         for (int j = 0; j < stages; ++j) sum += at[k * stages + j];
         return share * sum;
     }
 
-    // Lam (m) with C M^-1 (p - C' Lam) = rate, of the basis' rows; zero of others.
+    // Solve C M^-1 (p - C' Lam) = rate for Lam (m) of the basis' rows; zero for other rows.
     void find_impulse(const ConstraintBasis& basis, const double* p, const double* rate, double* Lam) {
         const int r = basis.rank();
         whiten(basis, p, white.data());
@@ -704,7 +703,7 @@ class ConstrainedStepper {
         }
     }
 
-    // Take from a momentum what is normal to the constraints at the path's node, whose basis is `here`.
+    // Remove the part of a momentum that is normal to the constraints at the path's node, with the basis `here`.
     void absorb(ConstrainedState& state) {
         PathState& path = state.path;
         for (int again = 0; again < 2; ++again) {
@@ -730,8 +729,8 @@ class ConstrainedStepper {
         std::fill(impulse.begin(), impulse.end(), 0.0);
     }
 
-    // The polynomial through the last step's stage velocities and the velocity at its end, moved by kicks since, and
-    // the last impulses; by how much these miss goes on too, as in VariationalStepper.
+    // Guess of the stages: the polynomial through the last step's stage velocities and the velocity at its end, shifted
+    // by kicks since, and the last impulses. The errors of guesses are extrapolated, too, as in VariationalStepper.
     void extrapolate(const ConstrainedState& state) {
         const PathState& path = state.path;
         const bool steady = mechanism.diffusion.processes == 0;
@@ -754,7 +753,7 @@ class ConstrainedStepper {
         }
     }
 
-    // One substep from where the path stands; moves the path only if it is accepted.
+    // One substep from the path's state; moves the path only if it is accepted.
     Outcome attempt(double h, ConstrainedState& state, bool jets_wanted) {
         PathState& path = state.path;
         state.weakest = here.weakest;
@@ -823,12 +822,12 @@ class ConstrainedStepper {
         return Outcome::solved;
     }
 
-    // Newton's method on the stages and the constraints, as Collocation::solve: factors are kept while they contract,
-    // and a correction that is sure to be the last one is not looked at again unless `jets_wanted`. It then ends with
-    // jets of the root, and with C at all points; else with those of the last iterate.
+    // Newton's method on the stages and the constraints, as Collocation::solve. Factors are kept while they contract.
+    // A correction that is certain to be the last one is not evaluated unless `jets_wanted`. With `jets_wanted` it ends
+    // with the jets and C at the root, else with those of the last iterate.
     Outcome solve(double h, const PathState& path, bool jets_wanted) {
         const Start start{path.position.data(), path.p.data(), force.data(), stride};
-        // In units of these the matrix has entries about 1.
+        // In these units the entries of the matrix are of order 1.
         for (int c = 0; c < n; ++c) scaled[c] = 1.0 / std::sqrt(mass_diagonal(c));
         for (int r = 0; r < m; ++r) row_scale[r] = 1.0 / std::max(norm(&here.rows[r * n]), nothing);
         for (int r = 0; r < m; ++r) {
@@ -858,9 +857,9 @@ class ConstrainedStepper {
                 for (int c = 0; c < n; ++c) equation.delta[i * n + c] = scaled[c] * solution[i * n + c];
             }
             const double moved = equation.kinetic_size(equation.delta.data());
-            // Impulses may have a way to go where velocities have none.
+            // Impulses may be far from the root where velocities are not.
             if (!(moved <= 0.25 * before) && !(worst <= 0.25 * worst_before)) {
-                // The factors may be to blame, if they are of another iterate.
+                // The cause may be factors of an earlier iterate.
                 if (fresh) break;
                 fresh = true;
                 continue;
@@ -874,7 +873,7 @@ class ConstrainedStepper {
                 }
             }
             ++effort.newton_iterations;
-            // With one stage no impulse acts where rows bend, and the bodies alone bend the momenta.
+            // With one stage there is no impulse between the ends, so constraints add no curvature.
             double left = fresh && stages == 1 ? equation.left_by_bending(h, worst) : infinity;
             fresh = false;
             if (before < infinity) {
@@ -900,7 +899,7 @@ class ConstrainedStepper {
         return Outcome::solved;
     }
 
-    // Where the force varies: bring it to the stages of a part of the step.
+    // Interpolate a varying force to the stages of a part of the step.
     void bring_force(double begin, int level) {
         share = length_of(1.0, level) / (left - begin);
         if (stride == 0) return;
@@ -913,7 +912,7 @@ class ConstrainedStepper {
         return sum;
     }
 
-    // What moves a joint by hand does this work: its impulses, the first of which meets the velocity before it, too.
+    // Work of the kinematic inputs' impulses; the first impulse also acts at the velocity before it.
     void add_work(int d, double h, const PathState& path) {
         const DrivenRow& own = mechanism.constraints.driven()[d];
         const double from = path.position[own.coordinate].value.high;
@@ -948,7 +947,7 @@ class ConstrainedStepper {
         }
     }
 
-    // C_k' Lam_k into `pushed`, and the size of its terms.
+    // Write C_k' Lam_k to `pushed`, and the size of its terms.
     void push() {
         std::fill(pushed.begin(), pushed.end(), 0.0);
         std::fill(push_size.begin(), push_size.end(), 0.0);
@@ -966,7 +965,7 @@ class ConstrainedStepper {
         }
     }
 
-    // r of the stages into `right`, -g / h behind it; the largest in rounding units of its terms.
+    // Write the residuals of the stages to `right`, then -g / h; returns the largest in rounding units of its terms.
     double residuals(double h, const Start& start) {
         double worst = 0.0;
         const int r = here.rank();
@@ -1013,7 +1012,7 @@ class ConstrainedStepper {
         for (const double velocity : equation.V) swiftest = std::max(swiftest, std::abs(velocity));
         for (const ConstraintJet& jet : point) {
             for (const int row : here.order) {
-                // Terms may vanish where the row holds; what it may be off by then is the rounding of the stages' way.
+                // Terms may vanish where the row holds; its error is then the rounding of the stages' displacement.
                 double scale = jet.scale[row];
                 for (int c = 0; c < n; ++c) scale += std::abs(jet.C[row * n + c]) * h * swiftest;
                 const double open = std::abs(jet.g[row]),
@@ -1049,7 +1048,7 @@ class ConstrainedStepper {
         }
     }
 
-    // N with what the constraints' impulses between the ends add: w_ik h t_kj Lam_k . g_qq.
+    // Add the terms of the impulses between the ends to N: w_ik h t_kj Lam_k . g_qq.
     void write_stages(double h) {
         const int wide = stages * n;
         block.resize(wide * wide);
@@ -1068,10 +1067,10 @@ class ConstrainedStepper {
         }
     }
 
-    // By how much the rows at `here` have turned on the way to another point: the distance of C0 W C1' (C0 W C0')^-1
-    // from one, W = M^-1 or, where that is less, the squares of what each joint moves at most. While it is below one
-    // for any W, rows stay independent, and a root belongs to the same assembly. Where light joints carry heavy ones, a
-    // small turn of the rows is large in the metric of the kinetic energy.
+    // Change of the rows between `here` and another point: the distance of C0 W C1' (C0 W C0')^-1 from the identity,
+    // with W = M^-1 or, where that gives less, the squared greatest displacement of each joint. While it is below one
+    // for any W, the rows stay independent, and a root belongs to the same assembly. Where light joints carry heavy
+    // ones, a small turn of the rows is large in the metric of the kinetic energy.
     double turn_to(const ConstraintJet& jet) {
         const int r = here.rank();
         for (int a = 0; a < r; ++a) {
@@ -1084,7 +1083,7 @@ class ConstrainedStepper {
 
     double even_turn_to(const ConstraintJet& jet) {
         const int r = here.rank();
-        // Gram and Schmidt on the rows at `here`; R stands where the branch margin puts its own matrices later.
+        // Gram-Schmidt on the rows at `here`; R uses the storage of the branch margin's matrices.
         std::vector<double>&Q = rest, &R = curved;
         for (int c = 0; c < n; ++c) {
             double most = 0.0;
@@ -1109,7 +1108,7 @@ class ConstrainedStepper {
         return from_one(r, R.data());
     }
 
-    // The distance of X from one, X' R = product.
+    // The distance of X from the identity, with X' R = product.
     double from_one(int r, const double* R) {
         for (int k = 0; k < r; ++k) {
             for (int a = 0; a < r; ++a) {
@@ -1128,8 +1127,8 @@ class ConstrainedStepper {
         return std::sqrt(sum);
     }
 
-    // As EnergyGuard's, on the tangent space at the start: with a basis Z of C Z = 0, of Z'(M - h^2 reach / (1 -
-    // margin) (L_qq - Lam . g_qq / h))Z beside Z' M Z.
+    // As EnergyGuard's, on the tangent space at the start: with a basis Z of C Z = 0, it compares Z'(M - h^2 reach / (1
+    // - margin) (L_qq - Lam . g_qq / h))Z with Z' M Z.
     double branch_margin(double h) {
         const int free = n - here.rank();
         if (free == 0) return infinity;
@@ -1155,8 +1154,8 @@ class ConstrainedStepper {
         return least_pivot_ratio(reduced.data(), reduced_mass.data(), free, {0, free});
     }
 
-    // A basis (free, n) of what is orthogonal to all Q in the metric of the kinetic energy: of the unit vectors the one
-    // that has most left of it each time.
+    // A basis (free, n) of the orthogonal complement of Q in the metric of the kinetic energy, by pivoted Gram-Schmidt
+    // on the unit vectors.
     void find_null() {
         const int r = here.rank(), free = n - r;
         null.assign(free * n, 0.0);
@@ -1206,7 +1205,7 @@ class ConstrainedStepper {
         }
     }
 
-    // Where the root takes the path, into `trial`, the impulse at its end apart; and the work on the way.
+    // Write the end of the substep to `trial`, with its last impulse separate, and the work in the substep.
     void advance(double h, const PathState& path) {
         for (int c = 0; c < n; ++c) {
             double move = 0.0, sum = 0.0, across_rows = 0.0;

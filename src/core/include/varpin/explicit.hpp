@@ -27,8 +27,8 @@ enum class ExplicitMethod { euler, semi_implicit, runge_kutta };
 struct Nystroem {
     int stages = 1;
     double reach[4] = {};                           // c
-    int abscissa[4] = {};                           // which of the different c a stage has
-    int abscissae = 1;                              // how many there are
+    int abscissa[4] = {};                           // index of each stage's c among the distinct ones
+    int abscissae = 1;                              // number of distinct c
     double stage_q[4][4] = {}, stage_v[4][4] = {};  // k, l
     double end_q[4] = {}, end_v[4] = {1.0};         // x, y
 };
@@ -54,7 +54,7 @@ constexpr Nystroem nystroem_of(ExplicitMethod method) {
     return of;
 }
 
-// One step after another from any state; with derivatives in (q, v, force), if asked for.
+// Explicit steps from any state, with derivatives in (q, v, force) if `derivatives`.
 class ExplicitStepper {
   public:
     ExplicitStepper(const Mechanism& mechanism, ExplicitMethod method, bool derivatives,
@@ -75,17 +75,17 @@ class ExplicitStepper {
     }
 
     std::vector<double> q, v;  // the state
-    ForwardDynamics dynamics;  // at the state, when a step begins
+    ForwardDynamics dynamics;  // at the state at the beginning of a step
 
-    // Whether derivatives in the force are in one that grows from 0 at the start of the step to it at its end.
+    // Whether derivatives are in the final value of a force that grows linearly from 0 over the step.
     bool ramp = false;
 
     int stages() const { return coefficients_.stages; }
-    // At how many different times of a step its stages are.
+    // Number of distinct times of the stages.
     int abscissae() const { return coefficients_.abscissae; }
 
-    // From the state that `dynamics` is at, under a force (n), or with a `stride` of n one (abscissae, n) for each
-    // time; false where a mass matrix on the way is not positive definite.
+    // One step from the state of `dynamics`, under a force (n), or with a `stride` of n under forces (abscissae, n),
+    // one for each time; false where a mass matrix is not positive definite.
     bool step(double h, const double* force, int stride = 0) {
         for (int i = 0; i < stages(); ++i) {
             move(h, coefficients_.reach[i], coefficients_.stage_q[i], coefficients_.stage_v[i], i, stage_q_.data(),
@@ -98,8 +98,8 @@ class ExplicitStepper {
         return true;
     }
 
-    // The derivatives of the last step in (q, v) and in the force into Jx (2n, 2n) and Jf (2n, n), of which everything
-    // outside of blocks is zero already.
+    // Write the derivatives of the last step in (q, v) and in the force to Jx (2n, 2n) and Jf (2n, n), whose entries
+    // outside of blocks are zero already.
     void write_derivatives(double h, double* Jx, double* Jf) {
         const int n = mechanism_->dof();
         const SlopeSum q = ends(h * h, coefficients_.end_q), v = ends(h, coefficients_.end_v);
@@ -133,7 +133,7 @@ class ExplicitStepper {
         return size;
     }
 
-    // To q + reach h v + h^2 sum_i in_q[i] a_i and v + h sum_i in_v[i] a_i over the first stages.
+    // Set to_q = q + reach h v + h^2 sum_i in_q[i] a_i and to_v = v + h sum_i in_v[i] a_i, with sums over `stages`.
     void move(double h, double reach, const double* in_q, const double* in_v, int stages, double* to_q,
               double* to_v) const {
         for (int r = 0; r < mechanism_->dof(); ++r) {
@@ -147,7 +147,7 @@ class ExplicitStepper {
         }
     }
 
-    // The derivatives of the accelerations at stage i, which `dynamics` is at.
+    // Derivatives of the accelerations at stage i, the state of `dynamics`.
     void differentiate(double h, int i) {
         dynamics.differentiate(stage_v_.data(), a_[i].data());
         ForwardDynamics::Before before[4];
@@ -183,7 +183,7 @@ class ExplicitStepper {
     std::vector<double> row_;       // one row of their sum
 };
 
-// P paths on their way, each from its own state.
+// Rollouts of P paths, each from its own state.
 class ExplicitRollout {
   public:
     ExplicitRollout(const Mechanism& mechanism, ExplicitMethod method, std::int64_t paths, const double* q0,
@@ -200,7 +200,7 @@ class ExplicitRollout {
         for (std::int64_t i = 0; i < paths; ++i) diffusion_centers(mechanism, q0 + i * mechanism.dof(), center(i));
     }
 
-    std::vector<double> q, v;  // (P, n) where the paths stand
+    std::vector<double> q, v;  // (P, n) present states of the paths
 
     std::int64_t paths() const { return paths_; }
     int dof() const { return mechanism_->dof(); }
@@ -216,9 +216,9 @@ class ExplicitRollout {
         return true;
     }
 
-    // All steps, each of length h. Increments (P, N, k), a drift (P, N, n) on top of the controls' force and impulses
-    // on top of the noise's, before and after each step (P, N, 2, n), are null for none. A path alone may be under a
-    // watch, which may end it.
+    // Take all steps, each of length h. Each of these may be null: increments (P, N, k), a drift (P, N, n) added to the
+    // controls' force, and impulses (P, N, 2, n) added to the noise's before and after each step. For a single path a
+    // watch may end the rollout.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
               const Nodes& nodes, Watch* watch = nullptr) {
         for (std::int64_t i = 0; i < paths_; ++i) {
@@ -254,7 +254,7 @@ class ExplicitRollout {
 
     bool at_state() { return stepper_.dynamics.at(stepper_.q.data(), stepper_.v.data()); }
 
-    // One step of a path, with its node; the dynamics are at its state before and after.
+    // One step of a path, with its node. `dynamics` is at the path's state before and after.
     Outcome step(double h, const Commands& commands, const double* dw, const double* drift, const double* kicks,
                  bool regular, const Nodes& nodes, std::int64_t path, std::int64_t s) {
         const int n = dof(), m = mechanism_->controls;
@@ -283,7 +283,7 @@ class ExplicitRollout {
         return regular ? enter_node(nodes, path, s) : Outcome::singular;
     }
 
-    // An impulse (n) at the state, which the dynamics are at.
+    // Apply an impulse (n) at the state, which is that of `dynamics`.
     void kick(const double* impulse) {
         stepper_.dynamics.solve_mass(impulse, jump_.data());
         add_jump();
@@ -294,7 +294,7 @@ class ExplicitRollout {
         for (int r = 0; r < dof(); ++r) stepper_.v[r] += jump_[r];
     }
 
-    // Enter the state as node s of a path; the dynamics are at it then.
+    // Write the state as node s of a path; `dynamics` is at the state afterwards.
     Outcome enter_node(const Nodes& nodes, std::int64_t path, std::int64_t s) {
         const std::int64_t row = path * nodes.steps + s;
         const bool regular = at_state();
