@@ -191,7 +191,7 @@ def test_beyond_rounding_it_says_what_is_reached(caplog):
 
 
 def test_a_chaotic_motion_has_no_end(monkeypatch):
-    monkeypatch.setattr(search, "_PATIENCE", 100_000)
+    monkeypatch.setattr(search, "_MOST_WORK", 100_000)
     with refused(vp.ToleranceError, "1e-06", "200 s"):
         vp.simulate(chain(), REST, REST, duration=200.0, tolerance=1e-6)
 

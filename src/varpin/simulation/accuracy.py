@@ -1,7 +1,6 @@
-"""What is wrong with a motion: from how large an error on, in which units, over how long, and where one looks.
+"""When a motion is wrong: the units of its errors, their thresholds, and the windows in which they are judged.
 
-Definitions alone: :mod:`varpin.simulation.soundness` estimates errors by smaller steps, :mod:`varpin.study.extremes`
-knows them from exact motions.
+:mod:`varpin.simulation.soundness` estimates the errors by smaller steps, :mod:`varpin.study.extremes` by exact motions.
 """
 
 from __future__ import annotations
@@ -18,47 +17,47 @@ from varpin.trajectory import Trajectory
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# What is wrong: error of the energy balance, in units of the energy that was turned over; of a joint's position, in
-# units of its way over a period, and of the way of the joint that goes furthest; of its velocity, in units of its
-# largest one: velocities have peaks, which a small shift in time moves by much.
+# Thresholds of errors. Energy balance: share of the energy turned over. Position: share of the joint's way over a
+# period (the range that q covers), and of the way of the joint that goes furthest. Velocity: share of the joint's
+# largest, with a larger threshold, for a small shift in time changes a peak of the velocity by much.
 WRONG_ENERGY = 0.1
 WRONG_POSITION, WRONG_MOTION, WRONG_VELOCITY = 0.1, 0.05, 0.25
-# Steps looked at from the start, and from each other place.
+# Most steps of the window at the start, and of each other window.
 FIRST, WINDOW = 384, 64
-# Nodes on either side of a place within which a joint's period is looked for.
+# Nodes on either side of a window's first node within which a joint's period is looked for.
 HORIZON = 1024
-# Other places looked at: where velocities change most, and as many spread over the motion.
+# Number of other windows: where velocities change most, and spread over the motion.
 VIOLENT, _SPREAD = 4, 3
-# And where single steps have most of the energy's error.
+# Number of windows at single steps with the largest change of the energy defect.
 _JUMPS = 2
-# An error from which on more places are looked at, in units of what is wrong; and how many.
+# Error from which on more windows are examined, in units of its threshold; and the number of these windows.
 CLOSE, _BETWEEN = 0.4, 15
-# Steps after which a start is judged by its way so far; before that a method of first order is behind by half a step.
+# Steps after which a start is judged by its way so far. Before that a method of first order lags by half a step.
 _SOON = (80, 160)
-# A small disturbance that grows by this is the motion's own doing: from there on no single motion can be told.
+# Growth of a disturbance from which on a motion counts as unpredictable; and the disturbance, relative to q and v.
 PREDICTABLE, DISTURBANCE = 10.0, 1e-7
-# What a joint does that moves this much less than others of its kind, and with this much less speed than would have
-# their energy, is measured in these parts of theirs.
+# Least unit of the errors of a joint that hardly moves: the smaller of LITTLE times the largest way or speed of the
+# joints of its kind, and LIGHT times the speed at which it would have their energy.
 LITTLE, LIGHT = 1e-2, 1e-2
-# Part of a joint's motion so far below which what it does at one place is rest.
+# Least unit of a joint's errors in one window, as a share of its motion up to there.
 _REST = 1e-3
-# Parts of positions and velocities that are no more than what rounding adds up to.
+# Accumulated rounding, relative to positions and velocities.
 ROUNDING = 1e3 * float(np.finfo(np.float64).eps)
-# Part of a speed that counts as changed if nothing changes it: a wheel that turns evenly turns over next to nothing.
+# Least change of a speed, as a share of it, for joints at constant speed.
 EVEN = 1e-3
 
 
 @dataclass(frozen=True)
 class MotionError:
-    """How far a motion is from the right one, at its worst over the joints and the places looked at.
+    """The largest error of a motion over all joints and windows.
 
     Attributes:
-        step: Where the place begins.
-        joint: Which coordinate.
+        step: First node of the window.
+        joint: The coordinate.
         position: Error of q there over a period, in units of the joint's way over it.
         velocity: Error of v, in units of the joint's largest.
         motion: Error of q, in units of the way of the joint that goes furthest.
-        settled: Whether it is good to about a tenth, and not to a factor of two alone.
+        settled: Whether the estimate is accurate to about a tenth; else only to a factor of two.
     """
 
     step: int
@@ -70,21 +69,21 @@ class MotionError:
 
     @property
     def worst(self) -> float:
-        """The largest error, in units of what is wrong; NaN counts as more than anything."""
+        """The largest error, in units of its threshold; infinite where one is NaN."""
         shares = self.position / WRONG_POSITION, self.velocity / WRONG_VELOCITY, self.motion / WRONG_MOTION
         return math.inf if any(map(math.isnan, shares)) else max(shares)
 
 
 @dataclass(frozen=True)
 class Window:
-    """A node of a motion from which on it is judged, and how far.
+    """A part of a motion in which its error is judged.
 
     Attributes:
-        step: The node.
-        span: Over how many steps each joint goes one and a half times to and fro, or right round (n,).
-        whole: Whether it does so; else ``span`` is all the steps there are (n,).
-        judged: Over how many steps errors count (n,): a period.
-        varied: How much v has varied after each step (K, n).
+        step: The first node.
+        span: Number of steps in which each joint oscillates one and a half times, or makes a full turn (n,).
+        whole: Whether it does so; else ``span`` is the number of all steps (n,).
+        judged: Number of steps in which errors count (n,): a period.
+        varied: Total variation of v after each step (K, n).
     """
 
     step: int
@@ -106,11 +105,11 @@ class Window:
     def error(
         self, scene: Scene, trajectory: Trajectory, inertia: Floats, off: tuple[Floats, Floats], *, cut: bool
     ) -> MotionError:
-        """The error from here on, of the distances of q and v from the right motion (K + 1, n), NaN if not known.
+        """The error in this window, from the distances of q and v from the right motion (K + 1, n), NaN if not known.
 
-        ``cut`` says that the right motion cannot be told any further than K steps; else what there is stands for a
-        period, over which errors grow as the motion goes on. What dies out soon is judged by the way that it takes,
-        too.
+        ``cut`` if the right motion is unpredictable beyond K steps; else the error is extrapolated to a period in
+        proportion to the variation of v. At the start of the motion the first steps are judged by themselves as well,
+        for a motion that soon dies out.
         """
         count = len(off[0]) - 1
         soon = [until for until in _SOON if until < count] if self.step == 0 else []
@@ -128,9 +127,9 @@ class Window:
         *,
         cut: bool,
     ) -> MotionError:
-        """:meth:`error` by the first steps."""
+        """:meth:`error` from the first ``until`` steps."""
         here = np.minimum(self.judged, until)
-        # What cannot be told any more is no part of the way.
+        # Unpredictable steps are no part of the way.
         end = np.minimum(self.span, until) if cut else self.span
         way, speed = _units(scene, trajectory, self.step, end, self.whole | (end < self.span), inertia)
         joints = np.arange(len(here))
@@ -141,7 +140,7 @@ class Window:
             growth = np.maximum(np.minimum(growth, self.judged / here), 1.0)
             rounding = ROUNDING * (1.0 + np.abs(trajectory.q[self.step]).max())
             position = np.where(far <= rounding, 0.0, far * (1.0 if cut else growth) / way)
-            # What momenta of joints that move round to goes into the velocities of those at rest.
+            # Rounding of the largest momentum goes into the velocities of joints at rest.
             root = np.sqrt(inertia)
             fastest = np.abs(trajectory.v[self.step : self.step + until + 1]).max(axis=0)
             rounding = np.maximum(rounding / (trajectory.dt * here), ROUNDING * (root * fastest).max() / root)
@@ -153,28 +152,28 @@ class Window:
 
 
 def grown(plain: Floats, disturbed: Floats, disturbance: float) -> int:
-    """Steps, one at least, until two motions' q (K + 1, n), apart by a disturbance at first, are apart out of hand."""
+    """Steps, one at least, until the distance of two motions' q (K + 1, n) is ``PREDICTABLE`` times the disturbance."""
     with np.errstate(over="ignore", invalid="ignore"):
         apart = ~(np.abs(disturbed - plain).max(axis=1) <= PREDICTABLE * disturbance)
     return max(1, int(apart.argmax())) if apart.any() else len(plain) - 1
 
 
 def disturbance(trajectory: Trajectory, step: int, count: int) -> tuple[float, float]:
-    """What is added to q and v at a node to see whether the motion of the steps after it can be told."""
+    """The disturbance of q and of v at a node with which the motion after it is tested for predictability."""
     nodes = trajectory.q[step : step + count + 1]
     shift = DISTURBANCE * max(1.0, float(np.abs(trajectory.q[step]).max()))
-    # In v, by what the same part of the motion has.
+    # In v, relative to the velocities of the same steps.
     way = max(float(np.ptp(nodes, axis=0).max()), shift)
     return shift, DISTURBANCE * float(np.abs(trajectory.v[step : step + count + 1]).max()) / max(1.0, way)
 
 
 def examined_nodes(scene: Scene, trajectory: Trajectory) -> Integers:
-    """The nodes that a motion is looked at from (K,).
+    """First nodes of the windows in which a motion is examined (K,).
 
-    The start, the places where velocities change most, some spread over the motion, and the steps with most of the
-    energy's error.
+    They are the start, the places where velocities change most, some spread over the motion, and the steps with the
+    largest changes of the energy defect.
     """
-    # Where a joint goes to and fro within the first steps, what comes after is to be looked at, too.
+    # The first window covers one period of the fastest joint.
     v, steps = trajectory.v, trajectory.steps
     seen = np.zeros(steps, dtype=bool)
     seen[: min(FIRST, int(Window.at(scene, trajectory, 0).judged.min()))] = True
@@ -182,7 +181,7 @@ def examined_nodes(scene: Scene, trajectory: Trajectory) -> Integers:
     for node in np.linspace(0, max(0, steps - WINDOW), _SPREAD + 1)[1:].astype(np.int64):
         if not seen[node : node + WINDOW].all():
             found.append(int(node))
-    # Single steps that are worse than others, as a whole one is among steps in parts.
+    # Single steps that are worse than others, such as an undivided one among divided ones.
     jumps = np.abs(np.diff(trajectory.statistics.energy_defect, prepend=0.0))
     found += np.argsort(-np.nan_to_num(jumps, nan=np.inf), kind="stable")[:_JUMPS].tolist()
     return np.unique(found)
@@ -218,29 +217,28 @@ def blows(v: Floats, length: int, seen: NDArray[np.bool_] | None = None) -> list
 
 
 def inertias(scene: Scene, q: Floats) -> Floats:
-    """What each joint has to move, its entry on the diagonal of M, at most at some configurations: (n,) of (K, n)."""
+    """The largest diagonal entry of M for each joint (n,), over configurations (K, n)."""
     largest: Floats = np.diagonal(masses(scene, q), axis1=1, axis2=2).max(axis=0)
     return largest
 
 
 def masses(scene: Scene, q: Floats) -> Floats:
-    """M at some configurations (K, n, n)."""
+    """M (K, n, n) at configurations (K, n)."""
     q = np.ascontiguousarray(q)
     return scene.core.jets(q, np.zeros_like(q))[0]
 
 
 def changed(v: Floats) -> Floats:
-    """By how much velocities change over the nodes (K, ...), at most the largest."""
+    """The change of velocities over the nodes (K, ...): the range they cover, at most the largest speed."""
     fastest = np.abs(v).max(axis=0)
     change: Floats = np.clip(np.ptp(v, axis=0), EVEN * fastest, fastest)
     return change
 
 
 def noticed(scene: Scene, way: Floats, speed: Floats, light: Floats, duration: Floats) -> tuple[Floats, Floats]:
-    """Ways and largest velocities (..., n) as units of errors; a joint that hardly moves is measured by the others.
+    """Ways and largest velocities (..., n) as units of errors; those of the other joints bound them from below.
 
-    ``light`` are the velocities that would have little of the others' energy (..., n), ``duration`` how long they are
-    looked at [s].
+    ``light`` are the velocities of :func:`light_speed` (..., n), ``duration`` the time in which they are judged [s].
     """
     least = np.minimum(LITTLE * largest_of_its_kind(scene, speed), light)
     least_way = np.minimum(LITTLE * largest_of_its_kind(scene, way), light * duration)
@@ -248,14 +246,14 @@ def noticed(scene: Scene, way: Floats, speed: Floats, light: Floats, duration: F
 
 
 def light_speed(inertia: Floats, change: Floats) -> Floats:
-    """The velocity of each joint that has little of the energy of what changes most (..., n)."""
+    """``LIGHT`` times the velocity at which each joint has the energy of the largest change (..., n)."""
     root = np.sqrt(inertia)
     light: Floats = LIGHT * (root * change).max(axis=-1, keepdims=True) / root
     return light
 
 
 def largest_of_its_kind(scene: Scene, values: Floats) -> Floats:
-    """For each coordinate (..., n), the largest value of all that turn, or of all that slide: units do not compare."""
+    """For each coordinate (..., n), the largest value of all revolute joints, or of all prismatic ones."""
     sliding = scene.robot.slides
     largest = [values[..., kind].max(axis=-1, initial=0.0, keepdims=True) for kind in (sliding, ~sliding)]
     each: Floats = np.where(sliding, *largest)
@@ -263,10 +261,16 @@ def largest_of_its_kind(scene: Scene, values: Floats) -> Floats:
 
 
 def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.bool_]]:
-    """Over how many steps each joint goes to and fro, or right round (n,), for q and v (K + 1, n).
+    """Number of steps in which each joint oscillates one and a half times, or makes a full turn (n,).
 
-    All of them where it does not, which the second value says. Where a joint turns back the way is as long as there and
-    back, and the velocity small; one and a half ways to and fro, with all that the velocity does, are no such place.
+    The number of all steps where it does neither; the second value is True where it does. One and a half oscillations
+    are three times the range of q and four times the largest speed in total variation, so that a single turning point,
+    where the velocity is small, does not count as one.
+
+    Args:
+        scene: The scene.
+        q: Configurations (K + 1, n).
+        v: Velocities (K + 1, n).
     """
     gone = np.abs(np.diff(q, axis=0)).cumsum(axis=0)
     wide = (np.maximum.accumulate(q, axis=0) - np.minimum.accumulate(q, axis=0))[1:]
@@ -282,17 +286,17 @@ def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.b
 def _units(
     scene: Scene, trajectory: Trajectory, step: int, span: Integers, whole: NDArray[np.bool_], inertia: Floats
 ) -> tuple[Floats, Floats]:
-    """In what each joint's errors of q and v are measured (n,): its way over a period, and its largest velocity."""
+    """Units of each joint's errors of q and v (n,): its way over a period, and its largest velocity."""
     n = len(span)
     before = np.zeros(n, dtype=np.int64)
     if step:
         behind = slice(max(0, step - HORIZON), step + 1)
         before = _periods(scene, trajectory.q[behind][::-1], trajectory.v[behind][::-1])[0]
-    # Where the motion ends within a period, what came before completes it.
+    # Where the motion ends within a period, the steps before complete it.
     begin = step - np.where(whole, 0, before)
     way, speed, change = np.empty(n), np.empty(n), np.empty(n)
     end = step + span + 1
-    # Joints are alike in short motions, which no joint goes to and fro in.
+    # Joints with the same nodes together: all of them in short motions.
     for first, last in set(zip(begin.tolist(), end.tolist(), strict=True)):
         alike = (begin == first) & (end == last)
         q, v = trajectory.q[:last, alike], trajectory.v[:last, alike]

@@ -1,4 +1,4 @@
-"""Velocities that alternate from step to step, which neither the robot nor its controls ask for; and restless ones."""
+"""Velocities that alternate from step to step without a cause in robot or controls; and restless velocities."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ from varpin.core import longest_alternation
 
 Floats = NDArray[np.float64]
 
-# Second differences of the velocity that count, in units of the joint's largest: four times what alternates.
+# Least second difference of a velocity that counts, as a share of the joint's largest velocity: it is four times the
+# alternating part.
 _COUNTS = 2e-3
-# In units of the largest velocity of all joints: what couplings and rounding leave of joints that stand still.
+# The same as a share of the largest velocity of all joints: couplings and rounding in joints at rest.
 _IDLE = 1e-6
-# Changes of sign in a row that are spoken of. An oscillation that the steps resolve has none in a row.
+# Changes of sign in a row from which on a warning is given. An oscillation that the steps resolve has none in a row.
 RUN = 8
-# From a node to the next they change by less than this factor: what a jump at an end of an optimal motion leaves falls
-# to a quarter or two fifths from step to step under held controls, and is gone after a few.
+# Largest factor between second differences in a row. Those after a jump at an end of an optimal motion do not count:
+# under held controls they fall to a quarter or two fifths from step to step.
 _EVEN = 2.0
 
-# Differences of a velocity from node to node that count for restlessness, in units of the joint's largest velocity.
-_SHOWS = 1e-3
-# Changes of their sign that are spoken of: more than so many in a hundred steps, and no fewer than these, for the ends
-# of a motion under held controls have five or six each, however many steps it has.
-RESTLESS, _FEW = 12, 13
+# Least difference of a velocity from node to node that counts as restlessness, as a share of the joint's largest
+# velocity.
+_RESTLESS_CHANGE = 1e-3
+# Changes of sign from which on a warning is given: more than the first number in a hundred steps, and at least the
+# second, for each end of a motion under held controls has five or six, whatever the number of steps.
+RESTLESS, _FEWEST = 12, 13
 
 
 @dataclass(frozen=True)
@@ -44,12 +46,12 @@ class Alternation:
     first: int
 
     def sentence(self, joints: Sequence[str], t: Floats, interval: str = "step") -> str:
-        """What is seen, for a warning to say why: which velocity alternates, how often, and from when on.
+        """The first part of a warning: which velocity alternates, how often, and from when on.
 
         Args:
             joints: Names of the coordinates.
             t: Times of the nodes (N + 1,) [s].
-            interval: What lies between two nodes.
+            interval: Name of the interval between two nodes.
         """
         return (
             f"the velocity of {joints[self.joint]} alternates from {interval} to {interval}, {self.changes} times in a "
@@ -58,12 +60,12 @@ class Alternation:
 
 
 def alternation(v: Floats, u: Floats | None = None) -> Alternation | None:
-    """The longest stretch of alternating velocities, if it is long enough to speak of.
+    """The longest stretch of alternating velocities, if it is long enough for a warning.
 
     Args:
         v: Velocities at the nodes (N + 1, n) [rad/s or m/s].
-        u: Controls of the steps (N, m). Where one of them alternates, the motion has a reason to, and does not count.
-            Left out, everything does.
+        u: Controls of the steps (N, m). Stretches in which one of them alternates do not count. Left out, all
+            stretches count.
     """
     if len(v) < RUN + 3:
         return None
@@ -73,7 +75,7 @@ def alternation(v: Floats, u: Floats | None = None) -> Alternation | None:
 
 @dataclass(frozen=True)
 class Restlessness:
-    """How often the joint that does so most goes from speeding up to slowing down, or back.
+    """The joint whose acceleration changes its sign most often.
 
     Attributes:
         joint: Its coordinate.
@@ -85,17 +87,17 @@ class Restlessness:
 
 
 def restlessness(v: Floats) -> Restlessness | None:
-    """The joint whose velocity goes up and down most often, if that is often enough to speak of.
+    """The joint whose acceleration changes its sign most often, if that is often enough for a warning.
 
     Args:
         v: Velocities at the nodes (N + 1, n) [rad/s or m/s].
     """
     fastest = np.abs(v).max(axis=0, initial=0.0)
     change = np.diff(v, axis=0)
-    shows = np.abs(change) > np.maximum(_SHOWS * fastest, _IDLE * fastest.max(initial=0.0))
-    changes = ((change[1:] * change[:-1] < 0.0) & shows[1:] & shows[:-1]).sum(axis=0)
+    counts = np.abs(change) > np.maximum(_RESTLESS_CHANGE * fastest, _IDLE * fastest.max(initial=0.0))
+    changes = ((change[1:] * change[:-1] < 0.0) & counts[1:] & counts[:-1]).sum(axis=0)
     if not changes.size:
         return None
     joint = int(changes.argmax())
     most = int(changes[joint])
-    return Restlessness(joint, most) if most >= _FEW and 100 * most > RESTLESS * len(change) else None
+    return Restlessness(joint, most) if most >= _FEWEST and 100 * most > RESTLESS * len(change) else None

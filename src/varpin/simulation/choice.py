@@ -1,7 +1,7 @@
 """The integrator of a motion where none is given.
 
-What is known before the motion is its start. Where damping or stops turn out to be faster than the step later on, the
-motion is made anew.
+It is chosen by the rates at the start. Where damping or stops are faster than the step later in the motion, the motion
+is repeated with another integrator.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from varpin.simulation.refinement import candidates, first_steps
 
 Floats = NDArray[np.float64]
 
-# What steps where no integrator is given; and under noise, for more stages do not raise the strong order.
+# The default, and the default under noise, where more stages do not raise the strong order.
 _USUAL, _NOISY = Gauss(2), Midpoint()
-# What steps where something turns by more than this in a step [rad], of which two stages lose 2e-4 rad a period. And
-# where something damps this many times faster than the step: velocities of the others lag and ring, and three stages
-# miss by a tenth what torques that jump do to them.
+# The integrator where a mode turns by more than this in a step [rad]: there two stages lose 2e-4 rad a period.
 _SWINGING, _TURNS = Gauss(4), 0.4
+# The integrator where damping is this many times faster than the step: there velocities of other methods lag and ring,
+# and with three stages the response to jumping torques is wrong by a tenth.
 _STOPPING, _RINGS = Radau(4), 2.0
-# Of more joints than so many nobody asks, for that takes as long as a motion.
-_ASKED = 200
-# Who may be chosen for a tolerance as well, where something damps faster than the coarsest steps by this factor.
+# Most joints of a robot for which rates are computed: for more it takes as long as a motion.
+_MOST_JOINTS = 200
+# Further candidates for a tolerance, where damping is faster than the coarsest steps by this factor.
 _STIFF, _FAR = (Radau(3), Radau(4)), 4.0
 
 
@@ -38,10 +38,10 @@ def usual_integrator(
 ) -> Integrator:
     """The integrator of a motion where none is given; that of a plan is :func:`varpin.control.problem.integrator_for`.
 
-    Under noise it is the midpoint rule: its positions have the right law where damping is faster than the step, and a
-    warning tells of its velocities. Radau's velocities lose nearly all of the noise.
+    Under noise it is the midpoint rule. Where damping is faster than the step, its positions have the right
+    distribution and its velocities a warning; Radau's velocities lose nearly all of the noise.
 
-    ``ahead`` has it ready for all stops that joints may run into, where the motion cannot be made anew.
+    With ``ahead`` the choice covers all stops that joints may run into, for a motion that cannot be repeated.
     """
     if noisy:
         return _NOISY
@@ -52,17 +52,17 @@ def usual_integrator(
 
 
 def changes_along(scene: Scene) -> bool:
-    """Whether a motion without noise may ask for another integrator than its start."""
+    """Whether a motion without noise may need another integrator than its start."""
     if not scene.elements and not scene.couplings:
         return False
     stiffens = scene.couplings or of_kind(scene.elements, "JointStop")
-    return bool((stiffens or scene.dissipates) and scene.custom is None and scene.robot.dof <= _ASKED)
+    return bool((stiffens or scene.dissipates) and scene.custom is None and scene.robot.dof <= _MOST_JOINTS)
 
 
 def integrator_along(scene: Scene, integrator: Integrator, q: Floats, v: Floats, u: Floats, dt: float) -> Integrator:
-    """What should have taken the steps of a motion for which :func:`usual_integrator` has chosen ``integrator``.
+    """The integrator that a motion needs for which :func:`usual_integrator` has chosen ``integrator``.
 
-    q and v (N + 1, n) are those of the nodes, u (N, m) of the steps, of a scene that :func:`changes_along` motions.
+    q and v (N + 1, n) are those of the nodes, u (N, m) of the steps, of a scene for which :func:`changes_along` holds.
     """
     if integrator.same_map(_STOPPING):
         return integrator
@@ -74,16 +74,16 @@ def integrator_along(scene: Scene, integrator: Integrator, q: Floats, v: Floats,
 
 
 def stronger(chosen: Iterable[Integrator]) -> Integrator:
-    """Of integrators that the functions above have chosen, for motions to be made by one, that which is right for all.
+    """The one of some integrators chosen by the functions above that is right for all their motions.
 
-    Where there are none, that of a motion that asks for nothing.
+    The default where there are none.
     """
     ranks = {str(member): rank for rank, member in enumerate((_USUAL, _SWINGING, _STOPPING))}
     return max(chosen, key=lambda own: ranks[str(own)], default=_USUAL)
 
 
 def tolerance_candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) -> tuple[Integrator, ...]:
-    """Integrators to choose from for a tolerance: Radau's, too, where something damps far faster than the arm moves."""
+    """Candidates for a tolerance; with Radau's methods where damping is far faster than the motion."""
     if scene.constraints:
         return candidates(scene)
     moves = first_steps(scene, q0, v0, duration, 1) / duration
@@ -91,11 +91,11 @@ def tolerance_candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) 
 
 
 def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float, *, ahead: bool = False) -> bool:
-    """Whether dampers, dry friction or servos are faster than a rate [1/s] at the start, or would be at rest there."""
-    # Forces of one's own are called by the motion alone, which says where they fail.
-    if not scene.dissipates or scene.custom is not None or len(q0) > _ASKED:
+    """Whether dampers, dry friction or servos are faster than a rate [1/s] at (q0, v0) or at (q0, 0)."""
+    # Custom forces are called in the motion alone, where an error has its step.
+    if not scene.dissipates or scene.custom is not None or len(q0) > _MOST_JOINTS:
         return False
-    # At rest dry friction is fastest; servos do not saturate where they are.
+    # At rest dry friction is steepest, and servos that hold q0 do not saturate.
     q = np.concatenate([np.tile(q0, (2, 1)), stops_ahead(scene, q0)]) if ahead else np.tile(q0, (2, 1))
     v = np.zeros_like(q)
     v[0] = v0
@@ -105,7 +105,7 @@ def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float, *, ahead: b
 
 def _swings_faster(scene: Scene, q0: Floats, rate: float, *, ahead: bool) -> bool:
     """Whether springs, servos or gravity make a mode faster than a rate [rad/s] at rest at the start."""
-    if scene.custom is not None or len(q0) > _ASKED:
+    if scene.custom is not None or len(q0) > _MOST_JOINTS:
         return False
     q = np.concatenate([q0[None], stops_ahead(scene, q0)]) if ahead else q0[None]
     forces = (scene.actuation @ scene.command_at(q0))[None]

@@ -1,9 +1,9 @@
-"""What damps faster than a step can resolve, or turns by too much in one, anywhere along a motion.
+"""Damping that is faster than the step, and modes that turn by too much in one, anywhere along a motion.
 
-Rates change with the inertia, with the levers of dampers between frames, with the velocity where there is dry friction,
-and with every stop that a joint runs into. They are asked for at a few nodes all over the motion and at those that are
-known to matter: where joints with dry friction are slowest, or come to rest within a step, and in the stops of joints
-that reach them, or would within a step.
+Rates change with the inertia, with the lever arms of dampers between frames, with the velocity where there is dry
+friction, and with every stop that a joint runs into. They are evaluated at a few nodes all over the motion, where
+joints with dry friction are slowest or come to rest within a step, and in the stops that joints reach, or would reach
+within a step.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from varpin.simulation.friction import Stop, rate_at_stops, stops
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Nodes that are looked at: one of so many, but so many at least and at most; so many for dry friction, and for stops.
+# Nodes spread over the motion: one of this many, and the least and the largest number.
 _OF, _LEAST, _MOST = 16, 4, 12
+# Most joints with dry friction, and most stops, with nodes of their own.
 _SLOW, _REACHED = 6, 6
 
 
 class Fast(NamedTuple):
-    """What damps faster than a step can resolve.
+    """Damping that is faster than a step can resolve.
 
     Attributes:
-        rate: The fastest [1/s]; 0 for none.
-        stop: Where a joint comes to rest, if it is dry friction that is so fast there.
+        rate: The fastest rate [1/s]; 0 for none.
+        stop: Where a joint comes to rest, if the rate is that of its dry friction; else None.
     """
 
     rate: float
@@ -39,7 +40,7 @@ class Fast(NamedTuple):
 
 
 def fast_damping(scene: Scene, q: Floats, v: Floats, u: Floats, dt: float) -> Fast:
-    """The fastest of all that damps along a motion if steps of ``dt`` [s] cannot resolve it.
+    """The fastest damping along a motion, if steps of ``dt`` [s] cannot resolve it.
 
     q and v (N + 1, n) are those of the nodes, u (N, m) of the steps.
     """
@@ -61,7 +62,7 @@ def fast_damping(scene: Scene, q: Floats, v: Floats, u: Floats, dt: float) -> Fa
 def turns_fast(scene: Scene, q: Floats, v: Floats, u: Floats, h: float) -> bool:
     """Whether stops and springs between frames turn a mode by more than a radian over h [s] along a motion.
 
-    Rates of all other springs are those of the start, but for what the inertia changes.
+    Rates of all other springs are those at the start, except for changes of the inertia.
     """
     if not len(u):
         return False
@@ -75,7 +76,7 @@ def turns_fast(scene: Scene, q: Floats, v: Floats, u: Floats, h: float) -> bool:
 
 
 def stops_ahead(scene: Scene, q: Floats) -> Floats:
-    """Configurations (K, n) that are ``q`` (n,) but for one joint each, which is at a stop with all of its strength."""
+    """Configurations (K, n): ``q`` (n,) with one joint each in a stop, deep enough for the stop's full stiffness."""
     rows = []
     for own in of_kind(scene.elements, "JointStop"):
         lower, upper, *_, width = own.values
@@ -87,26 +88,26 @@ def stops_ahead(scene: Scene, q: Floats) -> Floats:
 
 
 def _spread(steps: int) -> Integers:
-    """Nodes all over a motion, its ends among them."""
+    """Nodes spread over a motion, with its ends."""
     count = min(max(steps // _OF, _LEAST), _MOST, steps + 1)
     nodes: Integers = np.linspace(0, steps, count).astype(np.int64)
     return nodes
 
 
 def _slowest(scene: Scene, v: Floats) -> Integers:
-    """Nodes at which joints with dry friction are slowest, which is where it is steepest."""
+    """Nodes at which joints with dry friction are slowest: there it is steepest."""
     joints = [own.coordinate for own in of_kind(scene.elements, "CoulombFriction")][:_SLOW]
     slowest: Integers = np.abs(v[:, joints]).argmin(axis=0).astype(np.int64)
     return slowest
 
 
 def _in_stops(scene: Scene, q: Floats, v: Floats, h: float) -> tuple[Integers, Floats]:
-    """Nodes at which joints are deepest in their stops, or get there within h [s]; q (K, n) with that joint in it."""
+    """Nodes at which joints are deepest in their stops, or reach them within h [s]; q (K, n) with that joint in it."""
     found = []
     for own in of_kind(scene.elements, "JointStop"):
         c, (lower, upper, *_, width) = own.coordinate, own.values
         for end, side in ((lower, -1.0), (upper, 1.0)):
-            # Between two nodes it may come and go.
+            # A joint may enter and leave its stop between two nodes.
             depth = side * (q[:, c] - end)
             reach = depth + np.abs(v[:, c]) * h
             node = int(reach.argmax())

@@ -1,7 +1,7 @@
-"""Dry friction that is faster than the step: where joints come to rest or turn back, and how fast it is there.
+"""Dry friction that is faster than the step: where joints come to rest or turn back, and its rate there.
 
-Friction -g(v) tanh(v / width) is steep only near v = 0. The nodes of a motion hardly ever lie there, however many of
-its joints come to rest, and derivatives at nodes say nothing of it.
+Friction -g(v) tanh(v / width) is steep only near v = 0. Nodes of a motion rarely lie there even if joints come to rest,
+so its derivatives at nodes do not show the rate.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from varpin.mechanics.scene import Scene
 
 Floats = NDArray[np.float64]
 
-# Places of a motion at which friction is looked at: so many of each joint, and in all.
+# Most steps in which friction is examined: of each joint, and in all.
 _OF_A_JOINT, _MOST = 2, 6
-# Rates below count as none [1/s].
+# Rates below count as zero [1/s].
 _SLOWEST = 1e-6
 
 
@@ -27,9 +27,9 @@ class Stop(NamedTuple):
     """A step in which a joint with dry friction comes to rest or turns back.
 
     Attributes:
-        step: Its number.
-        joint: Which coordinate.
-        width: Velocity at which the joint's friction turns round [rad/s or m/s].
+        step: Its index.
+        joint: The coordinate.
+        width: The width of the joint's friction [rad/s or m/s].
     """
 
     step: int
@@ -52,12 +52,12 @@ def stops(scene: Scene, velocities: Floats) -> list[Stop]:
         at = np.flatnonzero(slows & (np.abs(before) > width))
         chosen = at[np.unique(np.linspace(0, len(at) - 1, _OF_A_JOINT).astype(np.int64))] if len(at) else at
         found += [Stop(step, c, width) for step in chosen.tolist()]
-    # The narrowest first, for what they come to is looked for at a few alone.
+    # The narrowest first: there friction is steepest.
     return sorted(found, key=lambda stop: (stop.width, stop.step))[:_MOST]
 
 
 def rate_at_stops(scene: Scene, q: Floats, v: Floats, u: Floats, at: list[Stop], least: float) -> float:
-    """The fastest rate of all that damps [1/s] where joints come to rest, or 0 where none is faster than ``least``.
+    """The fastest rate of damping [1/s] where joints come to rest, or 0 where none is faster than ``least``.
 
     q and v (N + 1, n) are those of the nodes, u (N, m) of the steps.
     """
@@ -71,10 +71,7 @@ def rate_at_stops(scene: Scene, q: Floats, v: Floats, u: Floats, at: list[Stop],
 
 
 def rate_at_rest(scene: Scene, q: Floats) -> float:
-    """The fastest rate of all that damps at a configuration (n,), where every joint is at rest [1/s].
-
-    There dry friction is as steep as it gets.
-    """
+    """The fastest rate of damping [1/s] at a configuration (n,) with all joints at rest, where friction is steepest."""
     if not any(map(dissipates, scene.elements)) and not any(map(dissipates, scene.couplings)):
         return 0.0
     still = np.zeros((1, q.size))

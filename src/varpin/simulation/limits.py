@@ -1,7 +1,7 @@
-"""What a motion leaves of the robot's description: limits of joints and of their motors, and loops that are open.
+"""Limits of the robot's description that a motion exceeds, of joints and of motors; and loops that are open.
 
-No motion is stopped by them; as a motion of the robot without end stops, and with motors as strong as it takes, it may
-be right.
+The limits do not act on the motion. It may be right for a robot without end stops and with motors that are strong
+enough.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# How the sentences begin, none of which says anything against the motion as a solution of its equations.
+# First words of the warnings. The motion may still be a correct solution of its equations.
 POSITION = "joints leave their limits"
 VELOCITY = "joints pass their velocity limits"
 EFFORT = "controls pass the joints' effort limits"
 LOOPS = "loops of the robot's description are open"
 KINDS = (POSITION, VELOCITY, EFFORT, LOOPS)
-# Beyond its limit by more than this a joint is spoken of: of position [rad or m], of others as a share of the limit.
+# Excess over a limit from which on a warning is given: of positions [rad or m], of others as a share of the limit.
 _OUTSIDE, _SHARE = 1e-6, 1e-6
-# So many joints are told of with numbers.
+# Most joints that a warning names.
 _NAMED = 6
 
 
 def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
-    """Which kinds of limits a motion leaves, and for each a sentence: which joints, by how much, and when.
+    """The kinds of limits that a motion exceeds, each with a sentence: which joints, by how much, and when.
 
-    And which loops the scene leaves open.
+    Loops that the scene leaves open come first.
     """
     if loops := scene.open_loops:
         (a, b), pairs = loops[0], ", ".join(f"{a!r} on {b!r}" for a, b in loops)
@@ -93,7 +93,7 @@ def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
     for stage in range(trajectory.u_stages.shape[1]):
         at_stage = drive_forces(scene.elements, q, v, trajectory.u_stages[:, stage] @ scene.actuation.T)
         forces = np.where(np.abs(at_stage) > np.abs(forces), at_stage, forces)
-    # Controls of joints that are moved by hand are positions.
+    # Controls of kinematic inputs are positions: their forces are those of the constraints.
     for row, c in scene.inputs.items():
         forces[:, c] = trajectory.constraint_forces[:, int(np.argmax(scene.constraint_order == row))]
     return forces

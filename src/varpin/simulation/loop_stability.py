@@ -1,11 +1,11 @@
-"""Is a digital control loop stable at its period? Asked of a finished motion; the law itself is not called again.
+"""Is a digital control loop stable at its period? The answer comes from a finished motion, without calls of the law.
 
-Two looks. What theory says: where the record determines the law, u = K (q, v) + c, with a share of gravity's torque if
-need be, the loop is linearized at the equilibrium next to the motion. With the plant's exact step under a held control,
-x' = A x + B u (Franklin, Powell and Workman 1998, section 4.3), it is stable if the spectral radius of A + B K is below
-one. And what the record shows of any other law: the controls do work and grow steadily, by orders of magnitude, or by
-less if they turn round from period to period. What a law would do in continuous time is not held against its period: a
-pendulum that falls, falls.
+There are two methods. By theory: where the motion determines the law, u = K (q, v) + c, with a share of gravity's
+torque if needed, the loop is linearized at the equilibrium next to the motion. With the plant's exact step under a held
+control, x' = A x + B u (Franklin, Powell and Workman 1998, section 4.3), it is stable if the spectral radius of A + B K
+is below one. By the record, for any other law: the controls do work and grow steadily, by orders of magnitude, or by
+less if they oscillate within some periods. Growth that the law would have in continuous time too, as in a pendulum that
+falls, gives no warning.
 """
 
 from __future__ import annotations
@@ -31,41 +31,42 @@ Floats = NDArray[np.float64]
 _ADVICE = "take a shorter period or lower gains; where neither helps, look at the signs of the law"
 KIND = "unstable loop"
 _FLIPS = "flipping controls"
-# Growth of the controls from the first quarter of a motion to its end, and over each of the last two quarters, that is
-# spoken of. A steady growth by 1e3 is one by 1e3 ** (3/4) from the end of the first quarter.
+# Least growth of the controls for a warning: from the first quarter of a motion to its end, and over each of the last
+# two quarters. Steady growth by 1e3 is growth by 1e3 ** (3/4) from the end of the first quarter.
 _GREW, _GROWS = 1e2, 2.0
-# Nodes that a law is sought from: so many with the largest changes, and as many spread over the motion.
+# Number of nodes for the fit of a law: this many with the largest changes, and as many spread over the motion.
 _NODES = 32
-# Error of a fit up to which a law is what was fitted, in units of rounding, and in units of how badly squares of the
-# state are fitted: along a smooth motion that stays on a curve, anything can be.
+# Largest error of a fit. In units of rounding: 32 times the condition of the state, at most 1e5. In units of the error
+# with which squares of the state are fitted, too: on a smooth curve any function of the state can be fitted.
 _EXACT, _TELLING = (32.0, 1e5), 1e-6
-# Directions in which the state moves by less than this share of the largest are not known: from the whole of a record,
-# and from its last changes.
+# Least motion of the state in a direction, as a share of the largest, for the law to be known in it: over the whole
+# record, and in its last changes.
 _EXCITED, _CHANGED = 1e-9, 1e-3
-# Growth of the controls' changes over the second half of a motion that is spoken of if they turn round.
-_WANTS = 1.5
-# Angle over a period [rad] from which on they do: goals that move, and plants, take many periods for a turn.
+# Least growth of the controls' changes over the second half of a motion for a warning, if they oscillate.
+_CHANGES_GREW = 1.5
+# Least phase over a period [rad] of an oscillation: moving goals and plants take many periods for a turn.
 _TURNS = np.pi / 6.0
-# Part of its size at first that what alternates has at the end if it does not calm down.
-_CALMS = 0.5
-# Growth of the controls up to a step that fails that is spoken of.
+# Least size of an alternation at its end, as a share of that at its start, for it to count as lasting.
+_LASTS = 0.5
+# Least growth of the controls up to a step that fails for a warning.
 _OUTGROWN = 10.0
-# Nodes at one extreme value from which on a control saturates there.
+# Number of nodes at one extreme value from which on a control counts as saturated there.
 _SATURATED = 2
-# Ways from one limit to the other that are a cycle, and those of them within the last half of a motion. The last
-# stretches between them are compared: of a motion that calms down they are shorter and shorter.
-_CYCLES, _LATE, _STRETCHES, _KEEPS = 6, 2, 8, 0.9
-# Part of what a control does with its joint that is pushing it on: a law that only pushes pumps it up on purpose.
+# Least number of changes from one limit to the other in a cycle, and in the second half of the motion. The number of
+# last intervals between them that are compared, and the ratio of the means of their halves below which the motion
+# calms down.
+_CYCLES, _LATE, _INTERVALS, _KEEPS = 6, 2, 8, 0.9
+# Net work of a control, as a share of its work in absolute values, above which the law pumps energy in on purpose.
 _PUMPS = 0.7
-# Nodes that a clipped law is sought from where it cannot be fitted.
-_SOUGHT = 400
-# Beyond this nothing can be squared.
+# Number of nodes for the fit of a clipped law.
+_CLIPPED_NODES = 400
+# Largest value that is squared.
 _HUGE = 1e120
 # Newton's iterations from one start, and halvings of one of its steps.
 _ITERATIONS, _HALVINGS = 30, 6
-# Growth over the whole motion that is worth a word, of a spectral radius that rounding cannot explain.
-_WORTH, _ABOVE_ONE = 1.01, 1e-6
-# Growth over a period that is spoken of where no equilibrium is found.
+# Least growth over the whole motion for a warning, and least excess of a spectral radius over one, beyond rounding.
+_GREW_IN_ALL, _ABOVE_ONE = 1.01, 1e-6
+# Least growth over a period for a warning where no equilibrium is found.
 _FAST = 1.05
 
 
@@ -89,15 +90,15 @@ class Span:
 
 @dataclass(frozen=True)
 class Law:
-    """What a record tells of a control law: u = Kq q + Kv v + S L_q(q, 0) + c.
+    """A control law from a record: u = Kq q + Kv v + S L_q(q, 0) + c.
 
     Attributes:
         Kq: (m, n).
         Kv: (m, n).
         S: Share of gravity's and the springs' forces (m, n).
         c: (m,).
-        span: What of (q, v) it was seen for.
-        near: The configuration where the motion was slowest to change (n,).
+        span: Directions of (q, v) in which the law is known.
+        near: The configuration where the motion changes most slowly (n,).
     """
 
     Kq: Floats
@@ -116,8 +117,8 @@ class Loop:
         A: Rate of (q, v) by (q, v) (2n, 2n) [1/s].
         B: By u (2n, m).
         K: The law (m, 2n).
-        span: What of (q, v) the law is known for.
-        q: Where it was linearized (n,).
+        span: Directions of (q, v) in which the law is known.
+        q: The configuration of the linearization (n,).
     """
 
     A: Floats
@@ -127,17 +128,17 @@ class Loop:
     q: Floats
 
     def multiplier(self, period: float) -> complex:
-        """By what a period [s] multiplies deviations: of the loop with a zero-order hold the largest eigenvalue."""
+        """The factor of a period [s] on deviations: the largest eigenvalue of the loop with a zero-order hold."""
         size, m = self.B.shape
         held = scipy.linalg.expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
         values = self.span.values(held[:size, :size] + held[:size, size:] @ self.K)
         return complex(values[np.argmax(np.abs(values))])
 
-    def owes(self, period: float) -> bool:
-        """Whether its growth is the period's doing, and not that of the law in continuous time as well.
+    def grows_by_period(self, period: float) -> bool:
+        """Whether the growth is caused by the period: the loop in continuous time grows much less or not at all.
 
-        Directions that the state keeps to from period to period it need not keep to in between: where not all are
-        known, what turns round within some periods is the period's.
+        Within a period the state may leave the directions of the nodes. Where not all directions are known, growth that
+        oscillates within some periods therefore counts as caused by the period.
         """
         multiplier = self.multiplier(period)
         if self.span.directions.shape[1] < len(self.span.unit) and np.abs(np.angle(multiplier)) >= _TURNS:
@@ -152,7 +153,7 @@ class Loop:
 def examined_in_loop(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """:func:`varpin.simulation.soundness.examined`, and the loop too.
+    """:func:`varpin.simulation.soundness.examined`, and the check of the control loop.
 
     ``hold`` is the period of the loop in steps, None without feedback.
     """
@@ -164,9 +165,9 @@ def examined_in_loop(
 
 
 def _flipping(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding, ...]:
-    """Says if a law that may saturate flips from period to period and does not calm down.
+    """A warning if a law, saturated or not, flips from period to period and does not calm down.
 
-    Controls that alternate are no excuse for velocities that do: they are made of them.
+    Alternating controls do not excuse alternating velocities here: the law computes them from the velocities.
     """
     if trajectory.dw.any():
         return ()
@@ -177,7 +178,7 @@ def _flipping(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding,
     found = alternation(v)
     if found is not None:
         size = np.abs(np.diff(v[found.first : found.first + found.changes + 3, found.joint], n=2))
-        if size[-1] >= _CALMS * size[0]:
+        if size[-1] >= _LASTS * size[0]:
             seen = found.sentence(scene.robot.joint_names, trajectory.t[::hold], "period")
             return (Finding(_FLIPS, f"under the control law {seen}: {advice}", found.joint),)
     late = u[len(u) // 2 :]
@@ -195,9 +196,9 @@ def _flipping(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding,
 
 
 def _cycling(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding, ...]:
-    """Says if a law whose goal stands still sends a control from limit to limit again and again.
+    """A warning if a law with a fixed goal sends a control from limit to limit without calming down.
 
-    It is not to calm down. Only of laws that leave too few nodes inside their limits to be told from them.
+    Only for laws that cannot be fitted, with too few nodes inside their limits.
     """
     if trajectory.dw.any():
         return ()
@@ -207,18 +208,18 @@ def _cycling(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding, 
         return ()
     side = _at_limit(u, u.max(axis=0)).astype(np.int64) - _at_limit(u, u.min(axis=0))
     half, v = len(u) // 2, trajectory.v[at] @ scene.actuation
-    ways = {}
+    changes = {}
     for k in range(u.shape[1]):
         arrivals = _arrivals(side[:, k])
         late = int((arrivals >= half).sum())
         if len(arrivals) < _CYCLES or late < _LATE:
             continue
-        before, after = np.array_split(np.diff(arrivals)[-_STRETCHES:], 2)
+        before, after = np.array_split(np.diff(arrivals)[-_INTERVALS:], 2)
         work = side[half:, k] * v[half:, k]
         calms = after.mean() < _KEEPS * before.mean()
         if not calms and work.sum() <= _PUMPS * np.abs(work).sum() and _clips(scene, x, u, side, k, len(arrivals)):
-            ways[k] = late
-    if not ways:
+            changes[k] = late
+    if not changes:
         return ()
     with np.errstate(all="ignore"):
         try:
@@ -227,33 +228,34 @@ def _cycling(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding, 
             known = False
     if known:
         return ()
-    worst = max(ways, key=lambda k: ways[k])
+    worst = max(changes, key=lambda k: changes[k])
     low, high = u[:, worst].min(), u[:, worst].max()
     return (
         Finding(
             KIND,
             f"the control loop seems unstable at its period of {hold * trajectory.dt:g} s: control {worst} goes from "
-            f"one of its limits, {low:.4g} and {high:.4g}, to the other {ways[worst]} times in the last "
+            f"one of its limits, {low:.4g} and {high:.4g}, to the other {changes[worst]} times in the last "
             f"{len(u) - half} periods and does not calm down; {_ADVICE}",
         ),
     )
 
 
 def _arrivals(side: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes at which a control comes to a limit from the other one; ``side`` (P,) is 1, -1 at the limits, 0 inside."""
+    """Nodes at which a control reaches a limit from the other one; ``side`` (P,) is 1, -1 at the limits, 0 inside."""
     visits = np.flatnonzero(side)
     arrivals: NDArray[np.int64] = visits[1:][side[visits[1:]] != side[visits[:-1]]]
     return arrivals
 
 
-def _clips(scene: Scene, x: Floats, u: Floats, side: NDArray[np.int64], k: int, ways: int) -> bool:
+def _clips(scene: Scene, x: Floats, u: Floats, side: NDArray[np.int64], k: int, changes: int) -> bool:
     """Whether control k of u (P, m) is a clipped law of its own joints' state or, failing that, of the whole one.
 
-    Fewer ways than twice the unknowns of a law say nothing: some law would give them by chance (Cover 1965).
+    Fewer ``changes`` of the limit than twice the unknowns of a law do not decide it: some law gives them by chance
+    (Cover 1965).
     """
     driven = np.tile(scene.actuation[:, k] != 0.0, 2)
     return any(
-        ways >= 2 * (columns.sum() + 1) and _clipped_law(x[:, columns], u[:, k], side[:, k])
+        changes >= 2 * (columns.sum() + 1) and _clipped_law(x[:, columns], u[:, k], side[:, k])
         for columns in (driven, np.ones_like(driven))
     )
 
@@ -261,12 +263,12 @@ def _clips(scene: Scene, x: Floats, u: Floats, side: NDArray[np.int64], k: int, 
 def _clipped_law(x: Floats, u: Floats, side: NDArray[np.int64]) -> bool:
     """Whether some k x + c, clipped to its limits, gives u (P,) at x (P, 2n); ``side`` (P,) is 1, -1 at the limits.
 
-    A goal that moves sends a control to its limits at other states each time.
+    With a moving goal there is none: the control reaches its limits at other states each time.
     """
     turns = np.flatnonzero(side[1:] != side[:-1])
     tight = np.unique(np.concatenate([turns, turns + 1]))
-    spread = np.linspace(0, len(x) - 1, _SOUGHT).astype(np.int64)
-    rows = np.unique(np.concatenate([tight[:: 1 + len(tight) // _SOUGHT], spread]))
+    spread = np.linspace(0, len(x) - 1, _CLIPPED_NODES).astype(np.int64)
+    rows = np.unique(np.concatenate([tight[:: 1 + len(tight) // _CLIPPED_NODES], spread]))
     x, u, side = x[rows], u[rows], side[rows]
     weight = np.ones(len(x))
     unit = _spread(x, weight)
@@ -287,9 +289,9 @@ def _clipped_law(x: Floats, u: Floats, side: NDArray[np.int64]) -> bool:
 
 
 def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:
-    """Of a motion that cannot go on: controls (P, m) of its periods [s] that have grown by much, in words.
+    """A warning if the controls (P, m) of a motion that ended at a failing step have grown by much.
 
-    A loop that is fast enough ends a motion before its law can be told.
+    A fast unstable loop ends a motion before there are enough nodes to fit its law. ``period`` is that of the law [s].
     """
     size = np.abs(u).max(axis=1, initial=0.0)
     first = int(np.argmax(size > 0.0)) if size.any() else 0
@@ -307,7 +309,7 @@ def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:
 
 
 def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[Finding, ...]:
-    """What is to be said of the loop of a motion whose controls came of its state every ``hold`` steps, if anything."""
+    """The warning of an unstable control loop with feedback every ``hold`` steps, if it is unstable."""
     period = hold * trajectory.dt
     at = np.arange(0, trajectory.steps, hold)
     x = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1)
@@ -328,7 +330,7 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
 
 
 def _does_work(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether the controls bring energy into a motion, rather than take it out."""
+    """Whether the controls do positive work in a motion."""
     ways, before = np.diff(trajectory.q, axis=0), trajectory.u @ scene.actuation.T
     middle = 0.5 * (trajectory.q[1:] + trajectory.q[:-1])
     force = drive_forces(scene.elements, middle, ways / trajectory.dt, before)
@@ -336,7 +338,7 @@ def _does_work(scene: Scene, trajectory: Trajectory) -> bool:
 
 
 def _by_the_record(u: Floats, period: float) -> tuple[Finding, ...]:
-    """Controls that have grown by orders of magnitude, and still do."""
+    """A warning if controls have grown by orders of magnitude, and still grow."""
     largest = np.maximum.accumulate(np.abs(u), axis=0)
     last = len(u) - 1
     quarter, half, three = (largest[round(share * last)] for share in (0.25, 0.5, 0.75))
@@ -356,14 +358,14 @@ def _by_the_record(u: Floats, period: float) -> tuple[Finding, ...]:
 
 
 def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
-    """Controls whose changes grow, in a motion that turns round within some periods."""
+    """A warning if changes of the controls grow in a motion that oscillates within some periods."""
     n, last = x.shape[1] // 2, len(u) - 1
     window = 3 * n + 8
     if last < 2 * window:
         return ()
     changes = np.abs(np.diff(u, axis=0))
     peaks = np.array([part.max(axis=0) for part in np.array_split(changes[last // 2 :], 4)])
-    growing = (np.diff(peaks, axis=0) > 0.0).all(axis=0) & (peaks[-1] >= _WANTS * peaks[0])
+    growing = (np.diff(peaks, axis=0) > 0.0).all(axis=0) & (peaks[-1] >= _CHANGES_GREW * peaks[0])
     if not growing.any():
         return ()
     # The last changes of the state as a linear map of those before (dynamic mode decomposition, Schmid 2010).
@@ -375,7 +377,7 @@ def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]
     step = np.linalg.lstsq(modes[:-1], modes[1:], rcond=None)[0]
     values = np.linalg.eigvals(step)
     growth = float(np.abs(values[np.abs(np.angle(values)) >= _TURNS]).max(initial=0.0))
-    if not 0.5 * last * np.log(growth) > np.log(_WANTS):
+    if not 0.5 * last * np.log(growth) > np.log(_CHANGES_GREW):
         return ()
     worst = int(np.argmax(np.where(growing, peaks[-1], 0.0)))
     return (
@@ -389,7 +391,7 @@ def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]
 
 
 def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
-    """The spectral radius of the loop, where the record determines the law."""
+    """A warning if the spectral radius of the loop exceeds one, where the record determines the law."""
     law = _law_inside_limits(scene, x, u)
     if law is None:
         return ()
@@ -399,9 +401,10 @@ def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Findi
         loop = _linearized(scene, law, law.near)[0]
     multiplier = loop.multiplier(period)
     growth = float(np.abs(multiplier))
-    if not (growth > 1.0 + _ABOVE_ONE and len(u) * np.log(growth) > np.log(_WORTH) and loop.owes(period)):
+    grows = growth > 1.0 + _ABOVE_ONE and len(u) * np.log(growth) > np.log(_GREW_IN_ALL)
+    if not (grows and loop.grows_by_period(period)):
         return ()
-    # Away from an equilibrium only what a slow motion cannot be taken for.
+    # Away from an equilibrium only fast, oscillating growth: slow growth may be part of the motion.
     if not rests and (np.abs(np.angle(multiplier)) < _TURNS or growth < _FAST):
         return ()
     where = "its equilibrium q" if rests else "q"
@@ -427,10 +430,10 @@ def _law_inside_limits(scene: Scene, x: Floats, u: Floats) -> Law | None:
     law = fitted_law(scene, x[free.all(axis=1)], u[free.all(axis=1)], spare=2)
     if law is not None or u.shape[1] == 1:
         return law
-    # Each control by itself: where one is at its limit another is not.
+    # Each control by itself: its nodes inside the limits may be others.
     laws = [fitted_law(scene, x[rows], u[rows, k : k + 1], spare=2) for k, rows in enumerate(free.T)]
     known = [law for law in laws if law is not None]
-    # Of directions that only some of them know nothing can be said of the loop.
+    # The loop needs all laws in all directions.
     if len(known) < len(laws) or any(law.span.directions.shape[1] < x.shape[1] for law in known):
         return None
     Kq, Kv, S, c = (np.concatenate([getattr(law, name) for law in known]) for name in ("Kq", "Kv", "S", "c"))
@@ -438,7 +441,7 @@ def _law_inside_limits(scene: Scene, x: Floats, u: Floats) -> Law | None:
 
 
 def _unsaturated(u: Floats) -> NDArray[np.bool_]:
-    """Where controls u (P, m) are not at their largest or smallest value, if they are there more than once (P, m)."""
+    """Where controls u (P, m) are not saturated at their largest or smallest value (P, m)."""
     return ~(_at_limit(u, u.max(axis=0)) | _at_limit(u, u.min(axis=0)))
 
 
@@ -449,16 +452,16 @@ def _at_limit(u: Floats, limit: Floats) -> NDArray[np.bool_]:
 
 
 def fitted_law(scene: Scene, x: Floats, u: Floats, spare: int = 4) -> Law | None:
-    """The law that gives u (P, m) at (q, v) = x (P, 2n), if one that is linear but for gravity does, to rounding.
+    """The law, linear except for gravity, that gives u (P, m) at (q, v) = x (P, 2n) to rounding, if there is one.
 
-    There are to be ``spare`` more nodes than directions in which the state moves.
+    It takes at least ``spare`` more nodes than directions in which the state moves.
     """
     n = scene.robot.dof
     sound = (np.abs(x).max(axis=1) < _HUGE) & (np.abs(u).max(axis=1) < _HUGE)
     x, u = x[sound], u[sound]
     if len(x) < 4:
         return None
-    # Each node counts alike, whatever a motion that runs away makes of the last ones.
+    # Weights by the size of the state, for motions that run away.
     weight = 1.0 / np.maximum(1.0, np.abs(x).max(axis=1))
     unit = _spread(x, weight)
     change = (np.abs(np.diff(x, axis=0)) / np.where(unit > 0.0, unit, np.inf)).max(axis=1)
@@ -492,20 +495,20 @@ def _pull(scene: Scene, q: Floats) -> Floats:
 
 
 def _centered(columns: Floats, weight: Floats) -> Floats:
-    """Columns (P, k) times weights (P,), without their part along the weights: what a constant explains."""
+    """Columns (P, k) times weights (P,), without their part along the weights, which is that of a constant."""
     rows: Floats = columns * weight[:, None]
     along: Floats = np.asarray(weight @ rows, dtype=np.float64) / (weight @ weight)
     return rows - weight[:, None] * along
 
 
 def _spread(columns: Floats, weight: Floats) -> Floats:
-    """Root mean square (k,) of centered columns; zero for what rounding leaves of a constant."""
+    """Root mean square (k,) of centered columns; zero for a column that is constant to rounding."""
     size = np.sqrt(np.mean(_centered(columns, weight) ** 2, axis=0))
     return np.where(size > 1e-13 * np.abs(columns * weight[:, None]).max(axis=0), size, 0.0)
 
 
 def _affine(x: Floats, u: Floats, weight: Floats, spare: int) -> tuple[Floats, Floats] | None:
-    """K (m, k) and c (m,) of u = K x + c, if that holds to rounding; K is the least of those that give the same."""
+    """K (m, k) and c (m,) of u = K x + c, if that holds to rounding; K is the least of equal fits."""
     unit = _spread(x, weight)
     moving = np.flatnonzero(unit > 0.0)
     if not len(moving):
@@ -518,7 +521,7 @@ def _affine(x: Floats, u: Floats, weight: Floats, spare: int) -> tuple[Floats, F
         return None
     target = _centered(u, weight)
     scaled = (right[known].T / sizes[known]) @ (left.T @ target)
-    # What rounding leaves where a law has no gain would take the double eigenvalue of a free joint apart.
+    # Gains of rounding would split the double eigenvalue of a free joint: they are zero.
     scaled[np.abs(scaled) < 1e-10 * np.abs(scaled).max(axis=0)] = 0.0
     K = np.zeros((u.shape[1], x.shape[1]))
     K[:, moving] = (scaled / unit[moving, None]).T
@@ -528,16 +531,16 @@ def _affine(x: Floats, u: Floats, weight: Floats, spare: int) -> tuple[Floats, F
     terms = ((np.abs(x) @ np.abs(K.T) + np.abs(c)) * weight[:, None]).max()
     squares = _centered((state / weight[:, None]) ** 2, weight)
     missed = np.abs(squares - left @ (left.T @ squares)).max(axis=0) / np.abs(squares).max(axis=0)
-    # Rounding, which directions that are little excited enlarge.
+    # Rounding grows with the condition of the state.
     rounding = np.finfo(np.float64).eps * min(_EXACT[0] * sizes[0] / sizes[known][-1], _EXACT[1]) * terms
     allowed = min(rounding, _TELLING * np.median(missed) * np.abs(target).max())
     return (K, c) if off <= allowed else None
 
 
 def loop_at_rest(scene: Scene, law: Law) -> Loop | None:
-    """The loop at an equilibrium, which Newton's method finds from ``law.near`` or, failing that, from its goal.
+    """The loop at an equilibrium, by Newton's method from ``law.near`` or, failing that, from the law's goal.
 
-    The goal is where the law asks for no control. None if no equilibrium is found.
+    The goal is where the law gives no control. None if no equilibrium is found.
     """
     n = scene.robot.dof
     goal = law.near - np.linalg.lstsq(law.Kq, law.Kq @ law.near + law.c, rcond=None)[0]
@@ -546,12 +549,12 @@ def loop_at_rest(scene: Scene, law: Law) -> Loop | None:
         for _ in range(_ITERATIONS):
             step = np.linalg.lstsq(loop.A[n:, :n] + loop.B[n:] @ loop.K[:, :n], -a, rcond=None)[0]
             if np.abs(step).max() <= 1e-9 * max(1.0, np.abs(loop.q).max()):
-                # A matrix without an inverse may leave a force that no step takes away.
+                # With a singular matrix a force may remain that no step removes.
                 if np.abs(a).max() > 1e-6 * terms:
                     break
                 return loop
             before, q = np.abs(a).max(), loop.q
-            # Damped while the acceleration does not fall.
+            # Halve the step until the acceleration falls.
             for halved in range(_HALVINGS):
                 loop, a, terms = _linearized(scene, law, q + 0.5**halved * step)
                 if np.abs(a).max() < before:

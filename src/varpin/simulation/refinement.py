@@ -1,8 +1,8 @@
-"""Which integrator and step meet an accuracy: from short runs over the whole horizon and the orders of the methods.
+"""The integrator and step that meet an accuracy, from runs over the whole horizon and the orders of the methods.
 
-Every method is run at a few steps, each half of the one before. They converge to the same motion, each at the rate of
-its order; differences between them give the errors, and the order what a smaller step would give. No reference is
-integrated. A method is taken at its word only where its last halving has shown its order.
+Every method is run at a few steps, each half of the one before. All converge to the same motion, each at the rate of
+its order. Differences between runs give the errors, and the order gives those of smaller steps. No reference is
+integrated. The order of a method is used only where its last halving has shown it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from varpin.mechanics.scene import Scene
 Floats = NDArray[np.float64]
 Run = Callable[[Integrator, int], "Sample"]
 
-# Whom to choose from where nobody is named. A new integrator enters here, and everywhere.
+# The default candidates of every choice.
 INTEGRATORS: tuple[Integrator, ...] = (
     ExplicitEuler(),
     SemiImplicitEuler(),
@@ -32,27 +32,28 @@ INTEGRATORS: tuple[Integrator, ...] = (
 )
 
 
-# Predicted errors stay below the tolerance by this factor.
+# Factor between the tolerance and predicted errors.
 SAFETY = 1.5
-# Errors from which on a motion is not the one that was asked for [rad or m].
+# Error from which on a motion counts as wrong [rad or m].
 SENSIBLE = 1.0
-# A halving shows the order p where it divides the error by 2^(p - slack) at least; and more than 2^(p + slack) is not
-# believed.
+# A halving shows the order p if it divides the error by 2^(p - slack) at least; a larger factor than 2^(p + slack)
+# counts as this one.
 _SLACK = 0.6
-# How far below the smallest step tried the order is trusted.
+# Largest factor between a number of steps and that of the finest run up to which the order is extrapolated.
 REACH = 4.0
-# A difference between two motions is the error of one where the other is known this much better.
+# The difference of two motions is the error of one if the uncertainty of the other is below this share of it.
 _CLEARLY = 0.25
-# What rounding adds up to, relative to q: no method is asked for less, or promises it.
+# Accumulated rounding, relative to q: the smallest error that is aimed at or predicted.
 ROUNDING = 200.0 * float(np.finfo(np.float64).eps)
-# Runs of the final choice, each with a few steps more, until one meets the tolerance.
+# Most runs of the final choice, each with some more steps, until one meets the tolerance.
 CHECKS = 4
-# Halvings that bring nothing, after which rounding is in charge of a method that has shown its order at small errors.
+# Number of halvings without gain after which a method counts as limited by rounding, if it has shown its order at an
+# error below the second number [rad or m].
 _STUCK, _SMALL = 2, 1e-6
 
 
 def candidates(scene: Scene) -> tuple[Integrator, ...]:
-    """Those of :data:`INTEGRATORS` that integrate a scene."""
+    """The members of :data:`INTEGRATORS` that can integrate a scene."""
     return tuple(member for member in INTEGRATORS if member.keeps_constraints or not scene.constraints)
 
 
@@ -65,7 +66,7 @@ class Found:
         steps: Over the horizon.
         error: Predicted, the largest over nodes and joints [rad or m]; infinite where not known.
         cost: Predicted, in the units of the runs.
-        measured: Whether runs of as many steps or more stand behind it; else the method's order does.
+        measured: Whether there are runs of as many steps or more; else the error is extrapolated by the order.
     """
 
     integrator: Integrator
@@ -77,10 +78,10 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One run: configurations (K, n) at K evenly spaced times, the end the last, its cost, and whether it is pure.
+    """One run: configurations (K, n) at K evenly spaced times up to the end, its cost, and whether it is pure.
 
-    It is where the method got there by its own steps alone: a guard that splits the steps of two runs into the same
-    parts makes them the same motion, which shows no error.
+    A pure run has no divided steps and gets to the end. A guard that divides the steps of two runs into the same parts
+    makes them the same motion, whose difference is no error.
     """
 
     steps: int
@@ -90,10 +91,18 @@ class Sample:
 
 
 class Method:
-    """An integrator with its runs so far, at steps that are halved from one to the next."""
+    """An integrator with its runs so far, each at half the step of the one before."""
 
     def __init__(self, run: Run, integrator: Integrator, first: int, rows: int, order: int) -> None:
-        """Nothing is run yet; numbers of steps are multiples of ``rows``, and the ``order`` is what to expect."""
+        """A method without runs.
+
+        Args:
+            run: Runs an integrator with a number of steps.
+            integrator: The integrator.
+            first: Number of steps of the first run.
+            rows: All numbers of steps are multiples of it.
+            order: The expected order of convergence.
+        """
         self.run, self.integrator, self.rows, self.order = run, integrator, rows, order
         self.samples: list[Sample] = []
         self.errors = np.zeros(0)
@@ -110,7 +119,7 @@ class Method:
 
     @property
     def whole(self) -> list[Sample]:
-        """The samples since the last that failed or was split."""
+        """The samples after the last that is not pure."""
         bad = [k for k, sample in enumerate(self.samples) if not sample.pure]
         return self.samples[bad[-1] + 1 :] if bad else self.samples
 
@@ -120,7 +129,7 @@ class Method:
         self._next *= 2
 
     def own_limit(self) -> tuple[Floats, float] | None:
-        """Where the last runs point to, and how far the last is from there; None before they show their order."""
+        """The limit of the last runs, and the distance of the last from it; None before they show their order."""
         whole = self.whole
         if len(whole) < 3:
             return None
@@ -130,7 +139,7 @@ class Method:
         if not after * 2.0 ** (self.order - _SLACK) <= before:
             return None
         uncertainty = max(after, before / (gain * 2.0**_SLACK)) / (gain - 1.0)
-        # Coarse runs that blow up may shrink at any rate.
+        # Differences of coarse runs that blow up may shrink at any rate.
         if not uncertainty < SENSIBLE:
             return None
         shared = math.gcd(len(b), len(c))
@@ -138,10 +147,10 @@ class Method:
         return end + (end - _thinned(b, shared)) / (gain - 1.0), uncertainty
 
     def judge(self, limit: Floats | None, uncertainty: float) -> None:
-        """Errors of :attr:`whole`, against the best known end if that is clearly better, else by its own runs.
+        """Set the errors of :attr:`whole`, from the best known limit if that is clearly better, else from own runs.
 
-        ``bounded`` says which of them are no more than bounds, and ``doubted`` whether the last one looks better than
-        it is taken for: a further run will tell.
+        ``bounded`` marks errors that are upper bounds only. ``doubted`` is set if the last error is raised for caution:
+        a further run decides.
         """
         whole = self.whole
         self.errors, self.bounded = np.full(len(whole), np.nan), np.ones(len(whole), dtype=bool)
@@ -155,11 +164,11 @@ class Method:
         if limit is not None:
             away = np.array([distance(sample.q, limit) for sample in whole])
             clear = away * _CLEARLY >= uncertainty
-            # An end that is known less well still bounds the error.
+            # A less certain limit still bounds the error.
             better = ~clear & ~(self.errors <= away + uncertainty)
             self.errors = np.where(clear, away, np.where(better, away + uncertainty, self.errors))
             self.bounded = better | (self.bounded & ~clear)
-        # Where errors of single joints change sign a run may be right by chance: its neighbours say how right.
+        # Where a joint's error changes sign a run may be right by chance: its neighbours bound its error from below.
         gain = 2.0**self.order
         from_larger = np.append(np.nan, self.errors[:-1]) / (gain * 2.0**_SLACK)
         from_smaller = np.append(self.errors[1:], np.nan) * gain
@@ -169,13 +178,13 @@ class Method:
 
     @property
     def regular(self) -> bool:
-        """Whether the last halving shows the order."""
+        """Whether the last halving has shown the order."""
         if len(self.errors) < 2 or not np.isfinite(self.errors[-2:]).all():
             return False
         return bool(self.errors[-1] * 2.0 ** (self.order - _SLACK) <= self.errors[-2])
 
     def note_stagnation(self) -> None:
-        """Close the method where halving its step has ceased to help after it had shown its order."""
+        """Close the method if halving its step no longer reduces the error after it has shown its order."""
         self._order_seen = self._order_seen or (self.regular and self.errors[-1] < _SMALL)
         known = self._order_seen and len(self.errors) > 1 and not self.bounded[-1]
         slow = known and not self.errors[-1] < 0.7 * self.errors[-2]
@@ -184,7 +193,7 @@ class Method:
             self.open = False
 
     def cost_at(self, steps: float) -> float:
-        """Predicted cost: between runs on a straight line, beyond them on that of the last two."""
+        """Predicted cost: linear between runs, extrapolated from the last two beyond them."""
         counts = np.array([sample.steps for sample in self.samples], dtype=float)
         costs = np.array([sample.cost for sample in self.samples])
         if steps > counts[-1]:
@@ -193,7 +202,7 @@ class Method:
 
     @property
     def cost_a_step(self) -> float:
-        """What one step more costs; noise of a clock must not make it too small."""
+        """The cost of one more step, at least half of the mean: measured times have noise."""
         before, last = self.samples[-2:]
         slope = (last.cost - before.cost) / (last.steps - before.steps)
         mean = last.cost / last.steps
@@ -211,7 +220,7 @@ class Method:
         )
 
     def steps_for(self, error: float) -> int | None:
-        """The fewest steps whose predicted error, and that of all more, is at most ``error``; None if not known."""
+        """The fewest steps from which on the predicted error is at most ``error``; None if not known."""
         counts = [sample.steps for sample in self.whole]
         good = len(counts)
         while good > 0 and self.errors[good - 1] <= error:
@@ -222,27 +231,27 @@ class Method:
             return self.rounded(counts[-1] * (self.errors[-1] / error) ** (1.0 / self.order))
         if good == 0 or not np.isfinite(self.errors[good - 1]):
             return counts[good]
-        # On the straight line between two runs in logarithms.
+        # Linear between two runs in logarithms.
         here, there = np.log(self.errors[good - 1 : good + 1])
         if here - there > (self.order + 1) * math.log(2.0):
-            # A limit of stability lies between them, and nobody knows where.
+            # A stability limit lies somewhere between them.
             return counts[good]
         share = (here - math.log(error)) / (here - there)
         return min(self.rounded(counts[good - 1] * 2.0**share), counts[good])
 
     def rounded(self, steps: float) -> int:
-        """A multiple of R."""
+        """The next multiple of ``rows``."""
         rows = self.rows
         return rows * math.ceil(min(steps, 1e15) / rows)
 
     def more(self, steps: int, error: float, tolerance: float) -> int:
-        """The number of steps to try where so many have missed a tolerance."""
-        # A blow-up says nothing of how many more it takes.
+        """The number of steps to try next after ``steps`` with this error, above the tolerance."""
+        # The error of a run that blows up gives no factor.
         growth = min((error / tolerance) ** (1.0 / self.order), 2.0) if math.isfinite(error) else 2.0
         return self.rounded(1.05 * growth * steps)
 
     def choice(self, steps: int, floor: float) -> Found:
-        """The method at so many steps; no error below ``floor`` is promised."""
+        """The method at a number of steps, with an error of at least ``floor``."""
         return Found(
             integrator=self.integrator,
             steps=steps,
@@ -253,12 +262,12 @@ class Method:
 
 
 class Search:
-    """Refines the methods that may still win.
+    """Refines the methods that may still be the cheapest.
 
     Attributes:
         methods: With their runs.
-        floor: What rounding leaves of every wish [rad or m].
-        limit: The motion that the best method points to, (K, n); None before one does.
+        floor: The smallest error that rounding allows [rad or m].
+        limit: The limit of the best method's runs (K, n); None before one is known.
         uncertainty: Of the limit [rad or m].
     """
 
@@ -268,7 +277,7 @@ class Search:
         Args:
             methods: Without runs.
             late: Whether no further run may begin.
-            cheap: Runs below this cost are worth making to be sure.
+            cheap: Cost below which a choice is checked by further runs.
         """
         self.methods, self.late, self.cheap = tuple(methods), late, cheap
         self.floor = 0.0
@@ -280,11 +289,11 @@ class Search:
         self.judge()
 
     def limits(self) -> list[tuple[Floats, float]]:
-        """Motions that methods point to, each with its uncertainty [rad or m]."""
+        """The limits of the methods' runs, each with its uncertainty [rad or m]."""
         return [limit for limit in (method.own_limit() for method in self.methods) if limit is not None]
 
     def judge(self) -> None:
-        """Errors of all runs, by the best end that is known."""
+        """Set the errors of all runs by the best known limit."""
         limits = self.limits()
         if limits:
             self.limit, self.uncertainty = min(limits, key=lambda limit: limit[1])
@@ -293,15 +302,14 @@ class Search:
             method.judge(self.limit, self.uncertainty)
 
     def refine(self, method: Method) -> None:
-        """Run a method at half its step, and judge all runs anew."""
+        """Run a method at half its step, and update the errors of all runs."""
         method.refine()
         self.judge()
         method.note_stagnation()
 
     def for_tolerance(self, wish: float) -> tuple[list[Found], bool]:
-        """The best of every method for an error [rad or m], the cheapest first, and whether the wish is met."""
+        """The best choice of each method for an error [rad or m], the cheapest first, and whether the error is met."""
         while not self.late():
-            # What rounding puts out of reach is approached as far as it lets.
             target = max(wish, self.floor)
             steps = {method: method.steps_for(target) for method in self.methods}
             near = [m for m in self.methods if reaches(m, steps[m])]
@@ -309,7 +317,7 @@ class Search:
             rivals = [m for m in self.methods if m.open and m not in near and self._least(m, steps[m]) < best]
             if not rivals and near:
                 winner = min(near, key=lambda m: m.cost_at(steps[m] or 0))
-                # Where it costs little the prediction is held against a run at half the step.
+                # Where it costs little the prediction is checked by a run at half the step.
                 beyond = 2 * (steps[winner] or 0) > winner.last.steps
                 rivals = [winner] if winner.open and beyond and 2.0 * best < self.cheap else []
             if not rivals:
@@ -318,14 +326,14 @@ class Search:
         found = {method: method.steps_for(max(wish, self.floor)) for method in self.methods}
         choices = [m.choice(k, self.floor) for m, k in found.items() if k is not None]
         if any(reaches(m, k) for m, k in found.items()):
-            # What no run stands near is an estimate, and gives way to what is known.
+            # Choices far beyond the runs are extrapolated too far: they come last.
             choices.sort(key=lambda c: (not reaches(self._of(c), c.steps), c.cost))
             choices[0] = self.checked(choices[0], SAFETY * max(wish, self.floor))
             return choices, wish >= self.floor
         return sorted(self.as_they_are(), key=lambda c: (c.error, -c.integrator.order)), False
 
     def checked(self, choice: Found, tolerance: float) -> Found:
-        """The choice, run as it is and with more steps where it misses the tolerance, if that costs little."""
+        """The choice after a run of it, with more steps where it misses the tolerance, if that costs little."""
         method, steps = self._of(choice), choice.steps
         for _ in range(CHECKS):
             if self.limit is None or self.uncertainty > 0.5 * tolerance or choice.cost > self.cheap or self.late():
@@ -341,12 +349,12 @@ class Search:
 
     @staticmethod
     def _least(method: Method, steps: int | None) -> float:
-        """A time that the method cannot do without: that of its last run, or half of what its order asks for."""
+        """A lower bound of the method's cost: that of its last run, or half of that predicted."""
         unsure = steps is None or method.doubted
         return method.last.cost if unsure else max(method.last.cost, 0.5 * method.cost_at(steps or 0))
 
     def as_they_are(self) -> list[Found]:
-        """The last whole run of each method, where its error is known to any extent.
+        """The last pure run of each method.
 
         Raises:
             VarpinError: There is none.
@@ -365,12 +373,12 @@ class Search:
 
 
 def reaches(method: Method, steps: int | None) -> bool:
-    """Whether the runs reach far enough to speak of so many steps."""
+    """Whether the runs are fine enough to predict the error of ``steps`` steps."""
     return steps is not None and steps <= REACH * method.last.steps
 
 
 def distance(a: Floats, b: Floats) -> float:
-    """The largest difference of two motions at the times that both have, (K, n) each; the end is one of them."""
+    """The largest difference of two motions (K, n) at their common times, which include the end."""
     shared = math.gcd(len(a), len(b))
     return float(np.abs(_thinned(a, shared) - _thinned(b, shared)).max())
 
@@ -382,7 +390,7 @@ def _thinned(q: Floats, samples: int) -> Floats:
 
 
 def first_steps(scene: Scene, q0: Floats, v0: Floats, duration: float, rows: int) -> int:
-    """So few steps that they are coarse for the fastest direction at the start; a multiple of ``rows``."""
+    """A number of steps that is coarse for the fastest mode at the start; a multiple of ``rows``."""
     jet = lagrangian_jet(scene, q0, np.zeros_like(q0))
     rates = np.abs(np.linalg.eigvals(np.linalg.solve(jet.Lvv, jet.Lqq)))
     rate = math.sqrt(float(rates.max())) + float(np.abs(v0).max())

@@ -1,4 +1,4 @@
-"""Steps of a finished motion that are taken again: from their own first node, by another method or in smaller steps."""
+"""Repetition of some steps of a finished motion, from their own first node, by another method or in smaller steps."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# Steps between two looks at how far a motion has come, at first; twice as many each time.
+# Number of steps of the first piece; each further piece doubles the number of all steps.
 _FIRST = 32
-# Parts in which steps under constraints are taken again where dampers are faster than they: an odd number, for Gauss's
-# methods turn round what is far faster than a step, or leave it where it is.
+# Parts of a repeated step under constraints where dampers are faster than the step. With an odd number Gauss's factor
+# on modes that are far faster, 1 or -1, is that of one step.
 _DAMPED_PARTS = 7
 
 
 @dataclass(frozen=True)
 class Finer:
-    """What parts of a motion are taken again with.
+    """The method with which steps of a motion are repeated.
 
     Attributes:
         method: The integrator.
-        parts: Its steps in one of the motion's.
-        left: The part of the motion's error that is left with it.
+        parts: Number of its steps in one of the motion's.
+        left: The remaining share of the motion's error.
     """
 
     method: Integrator
@@ -43,18 +43,19 @@ class Finer:
 
 
 def stopping(scene: Scene, stages: int) -> Integrator:
-    """A method for steps in which something comes to rest: Radau's; Gauss's, which keep constraints, under them."""
+    """A method for fast damping: Radau's; under constraints, which Radau's do not keep, Gauss's."""
     return Gauss(stages) if scene.constraints else Radau(stages)
 
 
 def finer(
     integrator: Integrator, trajectory: Trajectory, *, damped: bool, pulled: bool, constrained: bool = False
 ) -> Finer:
-    """A method whose error is far below that of a motion's integrator, in steps as long.
+    """A method whose error is far below that of a motion's integrator in steps of the same length.
 
-    One stage more: of modes that are far faster than the step, an odd number of stages turns round what an even one
-    leaves where it is. Radau's points where dampers are faster than the step (``damped``), or parts of it under
-    constraints; an explicit method beside explicit ones of first order where springs are no faster either (``pulled``).
+    It has one stage more, so that modes far faster than the step differ: a step with an odd number of stages multiplies
+    them by -1, one with an even number by 1. Where dampers are faster than the step (``damped``) it has Radau's points
+    or, under constraints, divides the step. Beside explicit methods of first order it is explicit, unless springs are
+    faster than the step (``pulled``).
     """
     stages = int(getattr(integrator, "stages", 1))
     kick = integrator.kick if isinstance(integrator, Variational) else "left"
@@ -73,15 +74,16 @@ def finer(
 
 
 class Again:
-    """``count`` steps of a motion from a node on, taken again piece by piece in parts, under the same forces.
+    """Repetition of ``count`` steps of a motion from node ``step`` on, each in ``parts``, under the same forces.
 
-    ``times`` are the stage times of the motion's own integrator, at which it has controls that change within steps.
+    ``times`` are the stage times of the motion's own integrator, at which the motion has its controls if they change
+    within steps. ``shift`` is added to q and v of the first node.
 
     Attributes:
-        q: Configurations of their nodes (count + 1, n), NaN from where none is known.
+        q: Configurations at the nodes (count + 1, n), NaN where not known.
         v: Velocities.
-        done: Steps that are known.
-        ended: Whether there are no more.
+        done: Number of repeated steps.
+        ended: Whether the repetition is complete or has failed.
     """
 
     def __init__(
@@ -96,7 +98,6 @@ class Again:
         shift: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self.q, self.v = np.full((2, count + 1, scene.robot.dof), np.nan)
-        # ``moved`` is added to q and v at first.
         self.q[0], self.v[0] = trajectory.q[step] + shift[0], trajectory.v[step] + shift[1]
         self.done, self.ended = 0, count == 0
         self._scene, self._method, self._trajectory, self._step = scene, method, trajectory, step
@@ -110,7 +111,7 @@ class Again:
             self.ended = True
 
     def go_on(self, steps: int | None = None) -> None:
-        """Take some more steps; left out, as many as there are already."""
+        """Repeat some more steps; if ``steps`` is left out, as many as there are already."""
         scene, trajectory, method, parts, begin = self._scene, self._trajectory, self._method, self._parts, self.done
         end = min(self._count, begin + (max(begin, _FIRST) if steps is None else steps))
         taken = slice(self._step + begin, self._step + end)
@@ -123,7 +124,7 @@ class Again:
             else:
                 drawn[0, ::parts] += method.left * trajectory.dw[taken]
                 drawn[0, parts - 1 :: parts] += (1.0 - method.left) * trajectory.dw[taken]
-        # Impulses of noise depend on the controls, too.
+        # Impulses of the noise depend on the controls, too.
         given = trajectory.u[taken], trajectory.q[taken], trajectory.v[taken]
         commands = open_loop(in_parts_of_steps(scene, *given, trajectory.dt, parts))
         if trajectory.u_stages.shape[1]:
@@ -141,9 +142,9 @@ class Again:
 def taken_again(
     scene: Scene, method: Integrator, trajectory: Trajectory, times: Times, step: int, count: int, parts: int
 ) -> tuple[Floats, Floats] | None:
-    """``count`` steps from a node on at once, q and v of their nodes (count + 1, n); arguments of :class:`Again`.
+    """Repeated steps: q and v at their nodes (count + 1, n). The arguments are those of :class:`Again`.
 
-    NaN from where they fail; None if the first does.
+    NaN from where a step fails; None if the first does.
     """
     again = Again(scene, method, trajectory, times, step, count, parts)
     if not again.ended:

@@ -1,7 +1,7 @@
-"""Servos that reach the limit of their drives, or leave it, within a step: there forces bend faster than the step.
+"""Servos that reach or leave the limit of their drives within a step.
 
-Collocation of any order misses what a force does that bends within a step. Steps in which it does are taken again in
-many parts; what their velocities are off by goes on for as long as the drive stays at its limit.
+There the force has a kink within the step, which collocation of any order does not resolve. Such steps are repeated in
+many parts. The error of the velocity lasts for as long as the drive stays at its limit.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# Steps that are taken again, of how many, in how many parts each, and with how many stages.
+# Most places with repeated steps, the steps of each, the parts of each step, and the stages of the method.
 _PLACES, _LENGTH, _PARTS, _STAGES = 12, 2, 16, 4
-# What is spoken of, in units of the way of the joint that goes furthest.
-_SHOWS = 0.003
+# Error from which on a warning is given, as a share of the way of the joint that goes furthest.
+_WARNED = 0.003
 
 
 class Bend(NamedTuple):
-    """What the limits of drives do to a motion.
+    """The error of a motion by the limits of drives.
 
     Attributes:
-        joint: The coordinate that is off most.
-        off: About by how much [rad or m].
+        joint: The coordinate with the largest error.
+        off: The estimated error [rad or m].
         share: The same, in units of the way of the joint that goes furthest.
-        steps: In how many steps drives come to their limit or leave it.
+        steps: Number of steps in which drives reach or leave their limit.
     """
 
     joint: int
@@ -43,7 +43,7 @@ class Bend(NamedTuple):
 
 
 def bent(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Bend | None:
-    """What is missed where drives of servos come to their limits or leave them, if that is worth a word."""
+    """The error where drives of servos reach or leave their limits, if it exceeds the threshold of the warning."""
     if isinstance(integrator, Reference) or trajectory.dw.any() or scene.custom is not None or not trajectory.steps:
         return None
     servos = of_kind(scene.elements, "PositionServo")
@@ -59,7 +59,7 @@ def bent(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Bend |
         ends_of_steps = pull[:-1], pull[1:]
         before, after = (np.clip((force[:, c] + part) / effort, -1.0, 1.0) for part in ends_of_steps)
         crossed = np.flatnonzero(np.trunc(before) != np.trunc(after))
-        # At its limit a drive lets errors go on; elsewhere it takes them back.
+        # At the limit of a drive errors of the velocity last; elsewhere the servo corrects them.
         ends = np.append(crossed[1:], steps)
         held = np.where(np.abs(after[crossed]) < 1.0, damping / stiffness, trajectory.dt * (ends - crossed))
         lasting[crossed] = np.maximum(lasting[crossed], np.minimum(held, trajectory.dt * (steps - crossed)))
@@ -81,4 +81,4 @@ def bent(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Bend |
     way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
     shares = off / np.maximum(way, ROUNDING * (1.0 + np.abs(trajectory.q).max()))
     joint = int(shares.argmax())
-    return Bend(joint, float(off[joint]), float(shares[joint]), len(at)) if shares[joint] > _SHOWS else None
+    return Bend(joint, float(off[joint]), float(shares[joint]), len(at)) if shares[joint] > _WARNED else None

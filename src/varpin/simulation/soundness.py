@@ -47,7 +47,7 @@ from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.growth import NEAR, SAID, grown_error, growth_bound
 from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.limits import left as limits_left
-from varpin.simulation.phase import SHOWS as PHASE_SHOWS
+from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.simulation.phase import phase_lost
 from varpin.simulation.retaking import Again, Finer, finer, stopping, taken_again
 from varpin.simulation.saturation import bent
@@ -576,7 +576,7 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         return Resolution(False)
     # Errors of oscillations may add up from window to window over the whole motion.
     windows = length / steps
-    in_phase = agree(less * PHASE_SHOWS / WRONG_MOTION * windows / _ADDS, of_velocity)
+    in_phase = agree(less * PHASE_WARNED / WRONG_MOTION * windows / _ADDS, of_velocity)
     most = less * NEAR * GROWTH_WARNED / WRONG_MOTION * windows
     predictable = in_phase and agree(most / growth_bound(scene, trajectory), of_velocity)
     return Resolution(True, in_phase, predictable)

@@ -1,6 +1,6 @@
-"""The integrator and step that meet a tolerance on a motion, at least cost in evaluations, and the error to expect.
+"""The integrator and step that meet a tolerance on a motion at the lowest cost, with the estimated error.
 
-Costs are counts, so that the same question has the same answer on every machine. Errors are those at all nodes.
+Costs are numbers of evaluations, so that the choice is the same on every machine. Errors are those at all nodes.
 """
 
 from __future__ import annotations
@@ -33,35 +33,37 @@ from varpin.simulation.refinement import (
 
 Floats = NDArray[np.float64]
 
-# Work between two chances for Ctrl-C, in steps of one joint.
+# Work between two checks for Ctrl-C, in steps of one joint.
 _CHUNK = 100_000
-# Nodes of a run that are kept, about.
+# About the number of nodes of a run that are kept.
 _NODES = 4096
-# Evaluations after which no further run is begun, times the number of joints.
-_PATIENCE = 50_000_000
-# A motion whose last differences shrink at least like this is taken to go on so.
+# Number of evaluations, times the number of joints, after which no further run begins.
+_MOST_WORK = 50_000_000
+# Where differences between runs shrink by at least this factor, twice, a limit is extrapolated; its distance from the
+# last run in units of the last difference: 0.75 / (1 - 0.75).
 _SHRINKS, _LEFT = 0.75, 3.0
-# Controls of time are taken at steps of this many times the number, too: a jump lies elsewhere in each of those.
+# Factor on the number of steps of a second run that samples a function of time elsewhere: a jump lies at another place
+# of a step.
 _OTHER = 1.37
-# An integrator that misses the tolerance by this factor is not worth more of its steps.
+# Factor on the tolerance from which on an error ends the trial of the earlier integrator.
 _FAR = 30.0
-# Runs in which a function of the user's fails, after which none is expected to pass.
+# Number of runs with a failing user's function after which the search ends, if no run has passed.
 _RAISES = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What is to be integrated.
+    """The motion to integrate.
 
     Attributes:
         scene: Without noise.
         q0: (n,) [rad or m].
         v0: (n,) [rad/s or m/s].
         duration: [s].
-        parts: A number that goes into all numbers of steps.
-        commands: Those of an integrator for a number of steps.
-        sampled: Whether the commands are samples of a function, which steps and half steps may see alike where it
-            jumps between them.
+        parts: All numbers of steps are multiples of it.
+        commands: The commands for an integrator and a number of steps.
+        sampled: Whether the commands are samples of a function: where it jumps, steps and half steps may have the same
+            samples.
     """
 
     scene: Scene
@@ -88,11 +90,11 @@ class Raised(Exception):
 
 
 class _Runs:
-    """Runs of a motion, and what they took together."""
+    """Runs of a motion, with their total cost."""
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
-        self.most = _PATIENCE / len(motion.q0)
+        self.most = _MOST_WORK / len(motion.q0)
         self.steps = self.evaluations = 0
         self.raised: Raised | None = None
         self._raises, self._passed = 0, False
@@ -110,7 +112,7 @@ class _Runs:
             stride *= 2
         n, dt, nothing = len(given.q0), given.duration / steps, np.zeros((0, 0, 0))
         if steps > self.most:
-            # Runs that end in their first steps cost nothing and are halved without end, until this one is too long.
+            # Too long to run. Its cost is counted, which ends a search whose runs all fail in their first steps.
             self.evaluations += steps
             return Sample(steps, np.full((steps // stride, n), np.nan), math.inf, pure=False)
         commands = given.commands(integrator, steps)
@@ -140,19 +142,19 @@ class _Runs:
         self.steps += done
         self.evaluations += evaluations
         self._passed = self._passed or pure
-        # A run that a guard has split says nothing of the method's order; the rest of it is left out.
+        # A run with divided steps does not show the method's order; it ends there.
         return Sample(steps, q, float(evaluations) * steps / max(done, 1), pure)
 
 
-class _Wish(Search):
-    """A search whose costs are evaluations, and whose choice is held against a run at half its step."""
+class _CheckedSearch(Search):
+    """A search whose costs are evaluations, and whose choice is checked by a run at half its step."""
 
     def __init__(self, methods: Sequence[Method], runs: _Runs) -> None:
         super().__init__(methods, lambda: runs.evaluations > runs.most, math.inf)
         self.sampled = runs.motion.sampled
 
     def limits(self) -> list[tuple[Floats, float]]:
-        """See :meth:`Search.limits`; where no method shows its order, what differences that shrink point to."""
+        """See :meth:`Search.limits`; where no method shows its order, limits of shrinking differences."""
         return super().limits() or [limit for limit in map(_rough_limit, self.methods) if limit is not None]
 
     def checked(self, choice: Found, tolerance: float) -> Found:
@@ -173,7 +175,7 @@ class _Wish(Search):
         return best
 
     def as_they_are(self) -> list[Found]:
-        """See :meth:`Search.as_they_are`; nothing is known of a motion that no method has taken in whole steps."""
+        """See :meth:`Search.as_they_are`; an unknown error where no method has a pure run."""
         if any(method.whole for method in self.methods):
             return super().as_they_are()
         method = self.methods[-1]
@@ -181,7 +183,7 @@ class _Wish(Search):
 
 
 def _rough_limit(method: Method) -> tuple[Floats, float] | None:
-    """The last run, and how far it is from the end, from differences that shrink twice, at whatever rate."""
+    """The last run, and its distance from the limit, from differences that shrink twice, at whatever rate."""
     if len(method.whole) < 4:
         return None
     a, b, c, d = (sample.q for sample in method.whole[-4:])
@@ -192,14 +194,14 @@ def _rough_limit(method: Method) -> tuple[Floats, float] | None:
 
 
 def _error(method: Method, steps: int) -> float:
-    """The error of a run at its nodes, by a run at half the step; NaN where one of them fails."""
+    """The error of a run at its nodes, from a run at half the step; NaN where one of them fails."""
     once, twice = (method.run(method.integrator, k) for k in (steps, 2 * steps))
     gain = 2.0**method.order if len(method.errors) == 0 or method.regular else 2.0
     return distance(once.q, twice.q) * gain / (gain - 1.0)
 
 
 def _error_of_samples(method: Method, steps: int) -> float:
-    """How far the end is from that of a run whose steps lie otherwise; NaN where one of them fails."""
+    """The difference at the end from a run with other sampling times; NaN where one of them fails."""
     other = method.rounded(_OTHER * steps)
     one, two = (method.run(method.integrator, k).q[-1] for k in (steps, other))
     return float(np.abs(one - two).max())
@@ -207,15 +209,15 @@ def _error_of_samples(method: Method, steps: int) -> float:
 
 @dataclass(frozen=True)
 class Choice:
-    """What to take, and what finding it out took.
+    """The chosen integrator and number of steps, with the cost of the search.
 
     Attributes:
         integrator: The method.
-        steps: Of it.
+        steps: Its number of steps.
         error: The estimate, at all nodes [rad or m]; infinite where nothing is known.
         search_steps: Steps of all runs.
         search_evaluations: Evaluations in them.
-        floor: What rounding leaves of every wish [rad or m].
+        floor: The smallest error that rounding allows [rad or m].
         raised: The last run in which a function of a custom force or constraint failed, if one did.
     """
 
@@ -237,14 +239,14 @@ def choose(
         motion: To integrate.
         integrators: To choose from.
         tolerance: At all nodes [rad or m].
-        first: An integrator and a step [s] that are taken if they, or somewhat smaller steps, meet the tolerance.
+        first: An integrator and a step [s] to try first: taken if they, or somewhat smaller steps, meet the tolerance.
 
     Raises:
         SingularMassMatrix: M(q0) is not positive definite.
         VarpinError: No integrator gets to the end.
         Raised: A function of a custom force or constraint fails in all runs.
     """
-    # It refuses states that no motion starts from.
+    # Raises for states from which no motion can start.
     integrators[0].start(motion.scene, motion.q0[None], motion.v0[None])
     runs = _Runs(motion)
 
@@ -267,8 +269,8 @@ def choose(
     coarse = first_steps(motion.scene, motion.q0, motion.v0, motion.duration, motion.parts)
     if coarse > runs.most:
         return Choice(integrators[0], coarse, math.inf, 0, 0, 0.0)
-    # Powers of two, for runs to share as many nodes as they can.
+    # Powers of two, so that runs share as many nodes as possible.
     least = motion.parts * 2 ** math.ceil(math.log2(coarse // motion.parts))
-    search = _Wish([of(member, least) for member in integrators], runs)
+    search = _CheckedSearch([of(member, least) for member in integrators], runs)
     (best, *_), _ = search.for_tolerance(tolerance / SAFETY)
     return Choice(best.integrator, best.steps, best.error, runs.steps, runs.evaluations, search.floor, runs.raised)
