@@ -24,15 +24,15 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Horizon(Frozen):
-    """The grid that constraints are put on.
+    """The time grid of a plan, to which constraints are bound.
 
     Attributes:
         t: Times of the nodes (N + 1,) [s].
-        robot: Whose motion it is.
+        robot: The problem's robot.
         controls: m.
         hold: Steps that share one control.
         control_joints: The joint whose force each control is; None where controls are something else.
-        before: The control before the horizon (m,), or None where nothing is known of it.
+        before: The control before the horizon (m,), or None where it is unknown.
     """
 
     t: Floats
@@ -55,10 +55,10 @@ class BoundConstraint(Frozen, ABC):
     Attributes:
         source: The constraint.
         places: Indices of nodes (K,), or of decisions where ``of_controls``.
-        times: Of the places (K,) [s].
-        rows: What each row of c is, in words.
-        unit: Of c.
-        scale: What of c is about as much as a tenth of the whole, in its unit: where penalties begin.
+        times: Times of the places (K,) [s].
+        rows: Description of each row of c.
+        unit: Unit of c.
+        scale: About a tenth of the range of c, in its unit; it scales the first penalty weights and tolerances.
     """
 
     source: PlanConstraint
@@ -76,27 +76,27 @@ class BoundConstraint(Frozen, ABC):
 
     @property
     def size(self) -> int:
-        """How many numbers c has."""
+        """The number of entries of c."""
         return len(self.places) * len(self.rows)
 
     @abstractmethod
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """C (..., K, rows) of motions, q and v (..., N + 1, n) at their nodes and u (..., N, m)."""
+        """The values c (..., K, rows) on motions, q and v (..., N + 1, n) at the nodes and u (..., N, m)."""
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         """dc/d(q, v) (K, rows, 2n) of one motion, q and v (N + 1, n).
 
         Raises:
-            NotImplementedError: It is one of controls.
+            NotImplementedError: The constraint is on controls.
         """
         raise NotImplementedError
 
 
 class PlanConstraint(Frozen, ABC):
-    """A hard constraint of a plan. Whoever adds one provides ``bind``.
+    """A hard constraint of a plan. A subclass implements ``bind``.
 
     Attributes:
-        margin: How many standard deviations of what noise does to it it stays away from its bound; 0 for none.
+        margin: Distance kept from the bound, in standard deviations of c under the scene's noise; 0 for none.
     """
 
     margin: float = 0.0
@@ -104,23 +104,23 @@ class PlanConstraint(Frozen, ABC):
 
     @abstractmethod
     def bind(self, horizon: Horizon) -> BoundConstraint:
-        """The constraint on a grid.
+        """Bind the constraint to a grid.
 
         Raises:
-            InputError: It is of another robot, or does not fit the controls.
+            InputError: The constraint is for another robot, or does not fit the controls.
         """
 
     def after(self, before: Floats) -> PlanConstraint:  # noqa: ARG002
-        """The constraint on a horizon that begins after another control (m,)."""
+        """The constraint on a horizon with another control before it (m,)."""
         return self
 
     @property
     def label(self) -> str:
-        """What it is called in reports."""
+        """Name in reports."""
         return type(self).__name__
 
     def __repr__(self) -> str:
-        """All that tells it from others of its kind, to the last digit."""
+        """All parameters to the last digit, for comparison with other constraints."""
         values = {name: value for name, value in vars(self).items() if not isinstance(value, Robot) and name[0] != "_"}
         told = (f"{name}={_told(value)}" for name, value in values.items() if name != "kinematics")
         return f"{type(self).__name__}({', '.join(told)})"
@@ -131,7 +131,7 @@ def _told(value: object) -> str:
 
 
 def require_robot(constraint: PlanConstraint, robot: object) -> Robot:
-    """``robot``, or an InputError that says whose argument it is."""
+    """``robot`` if it is a Robot; else an InputError that names the argument's owner."""
     if not isinstance(robot, Robot):
         name = type(constraint).__name__
         raise InputError(f"{name} takes a robot from load_robot, got {type(robot).__name__}")
@@ -139,7 +139,7 @@ def require_robot(constraint: PlanConstraint, robot: object) -> Robot:
 
 
 def require_same(constraint: PlanConstraint, made_for: Robot, horizon: Horizon) -> None:
-    """Refuse a constraint that was made for another robot than the problem's."""
+    """Raise an InputError for a constraint that was made for another robot than the problem's."""
     robot = horizon.robot
     if made_for.joint_names != robot.joint_names or not made_for.built_like(robot):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Links that keep clear of obstacles and of each other."""
+"""Clearance of links from obstacles and from each other, as a hard constraint of a plan."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from varpin.support.checks import finite, path_like
 
 Floats = NDArray[np.float64]
 
-# A tenth of an arm's reach [m].
+# Scale: a tenth of an arm's reach [m].
 _LENGTH = 0.1
 
 
@@ -47,9 +47,9 @@ class _BoundClearance(BoundConstraint):
 class KeepClear(PlanConstraint):
     """distance(q) >= distance for every pair, at every node after the first: links stay clear of obstacles.
 
-    Each link is taken for the smallest capsule around its shapes, which holds more than the link; ``capsules`` gives
-    others. Between capsules and balls distances are exact; of boxes coal tells them. Derivatives are those of the
-    points that are nearest.
+    Each link is modelled by the smallest capsule around its shapes, which is larger than the link; ``capsules`` gives
+    others. Distances between capsules and spheres are exact; coal computes those of boxes. Derivatives are those of the
+    nearest points.
     """
 
     robot: Robot
@@ -73,19 +73,19 @@ class KeepClear(PlanConstraint):
             robot: The robot.
             obstacles: From :meth:`Obstacle.sphere`, :meth:`Obstacle.capsule` and :meth:`Obstacle.box`; they may move
                 (:meth:`Obstacle.moving`).
-            distance: What is to be between the bodies of a pair at least [m].
-            links: Which links; all that joints move and that have shapes or a capsule given if left out.
-            itself: Keep links clear of each other, too, but for neighbours: those on one joint or on two that follow
-                each other, and pairs that overlap at q = 0; ``pairs`` says which are left.
+            distance: Least distance between the bodies of a pair [m].
+            links: Names of the links; by default all moving links with shapes or a given capsule.
+            itself: Keep links clear of each other, too, except for pairs on one joint or on two consecutive joints, and
+                pairs that overlap at q = 0; ``pairs`` lists the rest.
             srdf: An SRDF file, whose ``disable_collisions`` leave out more pairs of links.
             capsules: By the name of a link, or of another frame, (begin (3,), end (3,), radius) in its own axes [m], in
                 place of the fitted one.
-            margin: In standard deviations of what noise does to a distance.
+            margin: In standard deviations of a distance under noise.
 
         Raises:
             RobotError: A mesh is missing or cannot be read, or the file is no SRDF.
-            UnknownFrame: There is no such link.
-            InputError: There is nothing to keep clear of, a link without shapes, or a wrong value.
+            UnknownFrame: The robot has no such link.
+            InputError: There are no pairs, a link has no shapes, or a value is invalid.
         """
         self.robot = require_robot(self, robot)
         if isinstance(obstacles, Obstacle) or not all(isinstance(item, Obstacle) for item in obstacles):
@@ -101,7 +101,7 @@ class KeepClear(PlanConstraint):
         }
 
     def missing(self, q: Floats, t: float) -> Floats:
-        """What each pair is too close by (N, pairs) [m] at configurations (N, n) and one time, below zero if clear."""
+        """Missing distance of each pair (N, pairs) [m] at configurations (N, n) and time t [s]; negative if clear."""
         found: Floats = self.distance - self._of.over(np.array([t])).distances(q)
         return found
 

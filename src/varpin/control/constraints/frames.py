@@ -1,4 +1,4 @@
-"""Where a frame has to be: at a goal in the end, or in or out of a region all the time."""
+"""Hard constraints on a frame: a goal at the end, or a region that it stays in or out of."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from varpin.support.checks import as_floats, checked_limits, finite, finite_arra
 Floats = NDArray[np.float64]
 
 _XYZ = ("x", "y", "z")
-# A tenth of an arm's reach [m] and of a large turn [rad].
+# Scales: a tenth of an arm's reach [m] and of a large rotation [rad].
 _LENGTH, _ANGLE = 0.1, 0.3
 
 
@@ -51,8 +51,8 @@ class _OfFrame(PlanConstraint):
 class ReachFrame(_OfFrame):
     """p(q) = position and log(rotation' R(q)) = 0 at the last node: a frame ends at a goal.
 
-    The rotation's residual is the vector [rad] from goal to frame in the frame's own axes, at most pi long; a goal half
-    a turn away has no direction to turn in.
+    The rotation's residual is the rotation vector from goal to frame in the frame's own axes, at most pi long [rad]. It
+    is not differentiable half a turn away from the goal.
     """
 
     equality = True
@@ -65,12 +65,12 @@ class ReachFrame(_OfFrame):
         Args:
             robot: The robot.
             frame: Name of the frame.
-            position: Of its origin in the world (3,) [m]; any if left out.
-            rotation: From the frame's axes to the world's, a rotation matrix (3, 3); any if left out.
+            position: Goal of its origin in the world (3,) [m]; by default free.
+            rotation: Goal of its rotation matrix, from the frame's axes to the world's (3, 3); by default free.
 
         Raises:
             UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, there is no goal, or it is no place or no rotation.
+            InputError: The frame is fixed to the base, there is no goal, or the goal is no position or no rotation.
         """
         self._take(robot, frame)
         if position is None and rotation is None:
@@ -116,7 +116,7 @@ class _BoundGoal(BoundConstraint):
 
 
 def _log_slope(e: Floats) -> Floats:
-    """D log(R) over the body's own turn at the rotation vector e (3,): the inverse of SO(3)'s right Jacobian."""
+    """The inverse of SO(3)'s right Jacobian at the rotation vector e (3,): d log(R) over the body's rotation."""
     angle = float(np.linalg.norm(e))
     E = np.array([[0.0, -e[2], e[1]], [e[2], 0.0, -e[0]], [-e[1], e[0], 0.0]])
     near = angle < 1e-4
@@ -128,7 +128,7 @@ def _log_slope(e: Floats) -> Floats:
 @dataclass(frozen=True, eq=False)
 class _BoundRegion(BoundConstraint):
     region: _Region
-    shifts: Floats  # of the region at each place (K, 3), or (1, 3) where it stands
+    shifts: Floats  # displacement of the region at each place (K, 3), or (1, 3) where it does not move
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
         at = q[..., self.places, :]
@@ -137,7 +137,7 @@ class _BoundRegion(BoundConstraint):
         return self.region.distances(p).reshape(*at.shape[:-1], len(self.rows))
 
     def outside(self, place: Floats) -> Floats:
-        """C (rows,) of a place (3,) [m] at the last node."""
+        """The values c (rows,) for a position (3,) [m] at the last node."""
         found: Floats = self.region.distances((place - self.shifts[-1])[None])[0]
         return found
 
@@ -153,15 +153,15 @@ class _Region(_OfFrame):
     @property
     @abstractmethod
     def _rows(self) -> tuple[str, ...]:
-        """What each row of c is."""
+        """Description of each row of c."""
 
     @abstractmethod
     def distances(self, p: Floats) -> Floats:
-        """How far places p (N, 3) are outside of what is allowed, (N, rows) [m]."""
+        """Distances of positions p (N, 3) [m] outside of the region's bounds (N, rows) [m]."""
 
     @abstractmethod
     def slopes(self, p: Floats) -> Floats:
-        """Derivatives of that (N, rows, 3)."""
+        """Derivatives of the distances in p (N, rows, 3)."""
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
@@ -170,10 +170,10 @@ class _Region(_OfFrame):
         return _BoundRegion(self, places, times, self._rows, "m", _LENGTH, self, self.shifts(times))
 
     def shifts(self, times: Floats) -> Floats:  # noqa: ARG002
-        """Where the region is at some times (K,) [s], from its own origin (K, 3) or (1, 3) [m].
+        """Displacements of the region at given times (K,) [s]: (K, 3), or (1, 3) where it does not move [m].
 
         Raises:
-            InputError: A function of the user's fails.
+            InputError: A user's function fails.
         """
         return np.zeros((1, 3))
 
@@ -187,9 +187,9 @@ class KeepInHalfSpace(_Region):
         Args:
             robot: The robot.
             frame: Name of the frame.
-            normal: Of the plane (3,), towards the side that is allowed; made of length 1.
-            offset: Of the plane from the world's origin along its normal [m].
-            margin: In standard deviations of what noise does to the distance.
+            normal: Normal of the plane (3,), towards the allowed side; of any length.
+            offset: Distance of the plane from the world's origin along its normal [m].
+            margin: In standard deviations of the distance under noise.
 
         Raises:
             UnknownFrame: The robot has no such frame.
@@ -229,11 +229,11 @@ class KeepInBox(_Region):
             frame: Name of the frame.
             lower: One number or (3,) in the world, infinite where there is no limit [m].
             upper: Likewise.
-            margin: In standard deviations of what noise does to the distance.
+            margin: In standard deviations of the distance under noise.
 
         Raises:
             UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, or the box has no inside or no side.
+            InputError: The frame is fixed to the base, or the box is empty or has no finite side.
         """
         self._take(robot, frame)
         self.limits = checked_limits("KeepInBox", (lower, upper), 3)
@@ -277,13 +277,13 @@ class _OfSphere(_Region):
         Args:
             robot: The robot.
             frame: Name of the frame.
-            center: Of the sphere in the world (3,) [m], or a function of time [s] that returns it.
-            radius: Of the sphere [m].
-            margin: In standard deviations of what noise does to the distance.
+            center: Centre in the world (3,) [m], or a function of time [s] that returns it.
+            radius: Radius [m].
+            margin: In standard deviations of the distance under noise.
 
         Raises:
             UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, or the sphere is none.
+            InputError: The frame is fixed to the base, or centre or radius are invalid.
         """
         self._take(robot, frame)
         name = type(self).__name__
@@ -298,7 +298,7 @@ class _OfSphere(_Region):
         return ("the sphere",)
 
     def shifts(self, times: Floats) -> Floats:
-        """See the base: places are then those from the centre."""
+        """See the base: positions are relative to the centre."""
         if callable(self.center):
             return over_time(f"{type(self).__name__} center", self.center, times, 3)
         return self.center[None]
@@ -311,7 +311,7 @@ class _OfSphere(_Region):
     def slopes(self, p: Floats) -> Floats:
         """See the base."""
         length = np.linalg.norm(p, axis=1, keepdims=True)
-        # At the centre every way leads out; inside, none is needed.
+        # At the centre, where the distance has no gradient: any direction to leave the sphere, none to stay inside.
         fixed = np.array([0.0, 0.0, 1.0 if self.outside else 0.0])
         unit = np.where(length > 0.0, p / np.where(length > 0.0, length, 1.0), fixed)
         found: Floats = (-unit if self.outside else unit)[:, None]

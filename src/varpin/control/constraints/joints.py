@@ -1,4 +1,4 @@
-"""Limits of joints and of what controls change by, as hard constraints of a plan."""
+"""Limits of joint positions, joint velocities and control rates, as hard constraints of a plan."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from varpin.support.checks import JointValues, as_floats, control_array, finite_
 
 Floats = NDArray[np.float64]
 
-# A tenth of what a joint of unknown range may do.
+# Scales of joints without a finite range [rad or m; rad/s or m/s].
 _POSITION, _SPEED = 0.1, 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class _BoundBox(BoundConstraint):
     in_velocity: bool
-    columns: Integers  # which coordinate each row is of
+    columns: Integers  # the coordinate of each row
     signs: Floats  # 1 for upper limits, -1 for lower ones
     bounds: Floats  # signs times the limits
 
@@ -60,12 +60,12 @@ class _WithinLimits(PlanConstraint):
 
         Args:
             robot: The robot.
-            limits: (lower, upper), each one number, (n,) or by joint name, infinite where there is none; the robot's
-                if left out [rad or m; of velocities rad/s or m/s].
-            margin: In standard deviations of what noise does to the joint; see the page on plans within constraints.
+            limits: (lower, upper), each one number, (n,) or by joint name, infinite where there is none; by default the
+                robot's [rad or m; of velocities rad/s or m/s].
+            margin: In standard deviations of the joint under noise; see the page on plans within constraints.
 
         Raises:
-            UnknownJoint: A name that is no joint's.
+            UnknownJoint: An unknown joint name.
             InputError: There is no limit, or an argument has a wrong shape or value.
         """
         self.robot = require_robot(self, robot)
@@ -108,7 +108,7 @@ class _WithinLimits(PlanConstraint):
 
 
 class WithinJointLimits(_WithinLimits):
-    """lower <= q <= upper at every node after the first: joints stay within their limits.
+    """lower <= q <= upper at every node after the first: joints stay within their position limits.
 
     ``JointLimitBarrier`` is its soft counterpart, a cost.
     """
@@ -121,7 +121,7 @@ class WithinJointLimits(_WithinLimits):
 
 
 class WithinVelocityLimits(_WithinLimits):
-    """lower <= v <= upper at every node after the first: joints stay within their limits of speed.
+    """lower <= v <= upper at every node after the first: joints stay within their velocity limits.
 
     ``VelocityLimitBarrier`` is its soft counterpart, a cost.
     """
@@ -135,7 +135,7 @@ class WithinVelocityLimits(_WithinLimits):
 
 @dataclass(frozen=True, eq=False)
 class BoundRate(BoundConstraint):
-    """What changes of the controls may be; rows are those of the greatest changes and then of the least.
+    """Bound limits of the control rate; first the rows of the upper limits, then those of the lower ones.
 
     Attributes:
         period: The time that each control holds [s].
@@ -152,7 +152,7 @@ class BoundRate(BoundConstraint):
 
     @property
     def limited(self) -> Integers:
-        """Which controls have a limit."""
+        """Indices of the controls with a limit."""
         return np.flatnonzero(np.isfinite(self.limit))
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
@@ -160,7 +160,7 @@ class BoundRate(BoundConstraint):
         return self.of_decisions(u[..., :: self.hold, :])
 
     def of_decisions(self, u: Floats) -> Floats:
-        """C (..., K, rows) of decisions u (..., R, m)."""
+        """The values c (..., K, rows) for decisions u (..., R, m)."""
         first = u[..., :1, :] if self.before is None else np.broadcast_to(self.before, (*u.shape[:-2], 1, u.shape[-1]))
         rate = np.diff(u, axis=-2, prepend=first)[..., self.places, :] / self.period
         rates, most = rate[..., self.limited], self.limit[self.limited]
@@ -169,10 +169,10 @@ class BoundRate(BoundConstraint):
 
 
 class WithinControlRate(PlanConstraint):
-    """abs(u_k - u_(k-1)) / T <= limit, T = hold dt: controls change no faster than drives can.
+    """abs(u_k - u_(k-1)) / T <= limit, T = hold dt: controls change no faster than the drives can.
 
-    Controls are held over a decision and jump to the next; the jump over the period is their rate. ``ControlRateCost``
-    is its soft counterpart.
+    Controls are held and jump between decisions; the rate is the jump divided by the period. ``ControlRateCost`` is its
+    soft counterpart.
     """
 
     limit: JointValues
@@ -184,8 +184,8 @@ class WithinControlRate(PlanConstraint):
         Args:
             limit: One number, (m,), or by joint name where each control is the force of a joint; infinite where there
                 is none, and for joints that are not named [control/s].
-            before: The control applied before the horizon, one number, (m,) or by joint name, from which the first
-                change counts. Left out, that of a ``ControlRateCost`` in the cost, and without one the first is free.
+            before: The control before the horizon, for the first change: one number, (m,) or by joint name. By default
+                that of a ``ControlRateCost`` in the cost; without one, the first change is free.
 
         Raises:
             InputError: A limit that is not positive, or NaN.

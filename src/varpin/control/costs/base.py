@@ -1,8 +1,8 @@
 """Costs: integrals over time and terms at the end, which add up.
 
 A running cost l(t, q, v, u) stands for its integral over the motion, whatever the time step; ``Terminal`` makes it a
-term at the final time. All of them are evaluated and expanded over many points at once: varpin's in the core, others
-with NumPy, so that a cost of one's own needs no compiled code.
+term at the final time. Costs are evaluated and expanded at many points at once: varpin's own in the core, custom costs
+with NumPy, without compiled code.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ Reference = ArrayLike | Callable[[float], ArrayLike]
 
 
 class CostError(VarpinError, ValueError):
-    """A cost raised, or returned something that is no cost.
+    """A cost raised an exception or returned an invalid value.
 
     Attributes:
-        cost: Which one, as text.
-        problem: What is wrong with it.
-        trajectory: The plant's motion so far where a controller was at work (:meth:`varpin.Mpc.run`), else None.
+        cost: The cost, as text.
+        problem: Description of the failure.
+        trajectory: In :meth:`varpin.Mpc.run`, the plant's motion so far; else None.
     """
 
     def __init__(self, cost: str, problem: str, trajectory: Trajectory | None = None) -> None:
@@ -48,18 +48,18 @@ class CostError(VarpinError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Points(Frozen):
-    """Where costs are to be evaluated: N points in time on a horizon.
+    """N points in time on a horizon, at which costs are evaluated.
 
     Attributes:
         t: Times (N,) [s].
-        duration: Of the horizon [s].
-        steps: Of the problem's grid.
+        duration: Duration of the horizon [s].
+        steps: Number of steps of the problem's grid.
         dof: n.
         controls: m.
-        t0: When the horizon begins [s].
-        joints: Names of the coordinates, if costs are to find theirs by name.
+        t0: Time at the beginning of the horizon [s].
+        joints: Names of the coordinates, for weights and references by name.
         control_joints: The joint whose force each control is; None where controls are something else.
-        robot: Whose horizon it is, if costs are to be sure that they are of the same.
+        robot: The problem's robot, for costs that check it.
     """
 
     t: Floats
@@ -74,7 +74,7 @@ class Points(Frozen):
 
     @property
     def elapsed(self) -> Floats:
-        """Times since the horizon began (N,) [s]."""
+        """Times since the beginning of the horizon (N,) [s]."""
         return self.t - self.t0
 
     @property
@@ -108,12 +108,12 @@ class BoundCost(Frozen, ABC):
         """Its expansion at q (N, n), v (N, n) and u (N, m)."""
 
     def add_to(self, terms: Terms, factor: float) -> bool:  # noqa: ARG002
-        """Put ``factor`` times the cost among terms that the core evaluates; False if it is none of them."""
+        """Add ``factor`` times the cost to the terms that the core evaluates; False if the core does not know it."""
         return False
 
 
 class CompiledCost(BoundCost):
-    """A cost that the core evaluates; whoever adds one provides ``add_to``."""
+    """A cost that the core evaluates; a subclass implements ``add_to``."""
 
     points: Points
 
@@ -134,35 +134,35 @@ class CompiledCost(BoundCost):
 
 
 class Cost(Frozen, ABC):
-    """A cost. Whoever adds one provides ``bind``; ``CustomCost`` is the shorter way."""
+    """A cost. A subclass implements ``bind``; ``CustomCost`` takes a function instead."""
 
     @abstractmethod
     def bind(self, points: Points) -> BoundCost:
-        """The cost at given points.
+        """Bind the cost to given points.
 
         Raises:
             InputError: Its parameters do not fit the robot or the problem's grid.
-            CostError: A reference that is a function fails.
+            CostError: A reference function fails.
         """
 
     @property
     def terms(self) -> tuple[Cost, ...]:
-        """What it is a sum of."""
+        """The terms of the sum."""
         return (self,)
 
     @property
     def of_controls(self) -> bool:
-        """Whether it is of the controls alone, which do not exist at the final time."""
+        """Whether it depends on the controls alone, which do not exist at the final time."""
         return False
 
     @property
     def nonnegative(self) -> bool:
-        """Whether it is known never to be below zero: a motion that costs nothing is then an optimum."""
+        """Whether it is known to be nonnegative: a motion of cost zero is then an optimum."""
         return False
 
     @property
     def timed(self) -> bool:
-        """Whether what :meth:`bind` makes depends on the points' times, and not on their number alone."""
+        """Whether the result of :meth:`bind` depends on the points' times, not only on their number."""
         return True
 
     def __add__(self, other: Cost) -> CostSum:

@@ -1,4 +1,4 @@
-"""The cost of changing controls: what couples each decision to the one before."""
+"""The cost of control changes, which couples each decision to the previous one."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ Floats = NDArray[np.float64]
 class ControlRateCost(Cost):
     """weight . (du/dt)^2: keep controls smooth.
 
-    Controls are constant over a period T = hold dt and jump between them. The integral of the square of their rate is
-    that of the line through them, the sum over decisions of weight . (u_k - u_(k-1))^2 / T: it means the same at every
-    ``dt`` for controls that are smooth in time, up to a part of the size of T.
+    Controls are constant over a period T = hold dt and jump between periods. The cost is the integral of the squared
+    rate of the line through them, the sum over decisions of weight . (u_k - u_(k-1))^2 / T. For controls that are
+    smooth in time it is the same at every ``dt``, up to an error of order T.
     """
 
     weight: Floats | Mapping[str, float]
@@ -34,8 +34,8 @@ class ControlRateCost(Cost):
         Args:
             weight: One number, (m,), by joint name where each control is the force of a joint, or a matrix (m, m),
                 positive semidefinite [cost s / control^2].
-            before: The control applied before the horizon, one number, (m,) or by joint name, from which the first
-                change counts. Left out, the first control is free.
+            before: The control before the horizon, for the first change: one number, (m,) or by joint name. By default
+                the first control is free.
 
         Raises:
             InputError: A weight that is not finite, indefinite, or neither number, vector nor square matrix; or a
@@ -65,10 +65,10 @@ class ControlRateCost(Cost):
         return True
 
     def bind(self, points: Points) -> BoundCost:  # noqa: ARG002
-        """Refuse: it is nothing at any single point in time, and a problem takes it by :func:`control_rate`.
+        """Raise an error: the cost has no value at single points, and a problem takes it by :func:`control_rate`.
 
         Raises:
-            InputError: It is part of another cost than a sum.
+            InputError: Always: the cost is part of another cost than a sum.
         """
         raise InputError(f"{self!r} must be a term of a problem's cost, scaled or not, and no part of another")
 
@@ -79,7 +79,7 @@ def _plain(values: Floats | Mapping[str, float]) -> object:
 
 @dataclass(frozen=True, eq=False)
 class ControlRate(Frozen):
-    """What changes of the controls cost in all.
+    """The total cost of control changes.
 
     Attributes:
         weight: (m, m).
@@ -90,7 +90,7 @@ class ControlRate(Frozen):
     before: Floats | None
 
     def shares(self, u: Floats, period: float) -> Floats:
-        """What each of N controls (..., N, m) that change every ``period`` [s] costs beside the one before (..., N)."""
+        """Costs (..., N) of the changes to each of N controls (..., N, m) that change every ``period`` [s]."""
         rows = np.ascontiguousarray(u).reshape(-1, *u.shape[-2:])
         return change_values(self.weight / period, self._before, rows).reshape(u.shape[:-1])
 
@@ -100,7 +100,7 @@ class ControlRate(Frozen):
         return total
 
     def expand(self, u: Floats, period: float) -> tuple[Floats, Floats]:
-        """Gradients (N, m) in u_k, with u_(k-1) as it is, of each change of the controls (N, m); Hessians (N, m, m)."""
+        """Gradients (N, m) and Hessians (N, m, m) in u_k of the cost of each change, at controls (N, m)."""
         return expand_changes(self.weight / period, self._before, np.ascontiguousarray(u))
 
     @property
@@ -110,7 +110,7 @@ class ControlRate(Frozen):
 
 
 def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:
-    """All terms on the rate of controls in a cost together, for m controls; None if there is none.
+    """The sum of a cost's terms on the rate of m controls; None if there is none.
 
     Args:
         cost: The cost.
