@@ -178,3 +178,6 @@ def test_refused_beside_states():
     other = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.0], [0.0], dt=0.01, steps=3)
     with pytest.raises(vp.InputError, match="of joints"):
         vp.solve(problem, states=other)
+    slower = vp.simulate(problem.scene, problem.q0, [0.0, 0.0], dt=2.0 * problem.dt, steps=problem.steps)
+    with pytest.raises(vp.InputError, match="dt"):
+        vp.solve(problem, states=slower)

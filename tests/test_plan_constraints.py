@@ -211,6 +211,33 @@ def test_rounds_go_on_where_they_stopped(tmp_path):
         vp.solve(two_links(FAMILIES["velocities"], steps=20), resume=whole)
 
 
+def test_a_round_that_was_cut_is_as_long_as_one_that_was_not(monkeypatch):
+    """A round ends after so many iterations, those before the cut included."""
+    monkeypatch.setattr("varpin.control.augmented._OF_ROUND", 4)
+    problem = two_links(FAMILIES["velocities"], steps=20)
+    whole = vp.solve(problem, max_iterations=9, check=False)
+    part = vp.solve(problem, max_iterations=2, check=False)
+    rest = vp.solve(problem, resume=part, max_iterations=7, check=False)
+    assert rest.trajectory.q.tobytes() == whole.trajectory.q.tobytes()
+
+
+def test_centres_that_move_are_compared_by_where_they_are():
+    """In another process the same function has another address."""
+
+    def problem(speed):
+        ball = vp.Obstacle.sphere([1.5, 0.0, 0.5], 0.1).moving(lambda t: [speed * t, 0.0, 0.0])
+        return two_links(
+            [
+                vp.KeepInSphere(ROBOT, "tip", lambda t: [speed * t, 0.0, 0.0], 5.0),
+                vp.KeepClear(ROBOT, [ball], capsules={"tip": ([-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.05)}),
+            ]
+        )
+
+    assert problem(1.0).described_constraints == problem(1.0).described_constraints
+    assert problem(1.0).described_constraints != problem(1.1).described_constraints
+    assert " at 0x" not in problem(1.0).described_constraints
+
+
 def test_interrupted():
     """Ctrl-C leaves the best motion so far, from which the rounds go on."""
 

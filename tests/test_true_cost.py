@@ -7,6 +7,7 @@ import pytest
 from refusals import refused
 
 import varpin as vp
+from varpin.control.refinement import refine
 
 
 def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
@@ -136,3 +137,23 @@ def test_within_constraints():
     assert far.status is vp.Status.INFEASIBLE
     assert len(far.refinement.tried) == 1
     assert "no plan within the constraints" in far.refinement.reason
+
+
+def test_interrupted_before_a_motion_is_made() -> None:
+    """Ctrl-C ends the call where there is no plan yet, and returns the best plan where there is one."""
+    coarse = vp.solve(reach(3), check=False)
+    for plans in ([], [coarse]):
+        left = list(plans)
+
+        def search(problem: vp.OptimalControlProblem, start: object, left: list = left) -> vp.Solution:
+            if not left:
+                raise KeyboardInterrupt
+            return left.pop()
+
+        if not plans:
+            with pytest.raises(KeyboardInterrupt):
+                refine(reach(3), search, 1e-12, lambda: np.inf)
+            continue
+        found = refine(reach(3), search, 1e-12, lambda: np.inf)
+        assert found.status is vp.Status.INTERRUPTED
+        assert found.cost == coarse.cost

@@ -154,7 +154,7 @@ class _Rounds:
             begun = self.state
             known = len(self.history)
             done = 0 if resume is None or resume.search is None else len(resume.search.history)
-            left = min(last - known, _OF_ROUND) - done
+            left = min(last - known, _OF_ROUND - done)
             problem = penalized(self.problem, begun.multipliers, begun.weights, begun.backoff)
             options: dict[str, Any] = dict(self.options)
             if resume is None:

@@ -104,6 +104,11 @@ def path_of(problem: OptimalControlProblem, given: object) -> Path:
             raise InputError(
                 f"states: the motion is of joints {', '.join(given.joint_names)}, the problem of {', '.join(names)}"
             )
+        if given.steps == problem.steps and not np.isclose(given.dt, problem.dt, rtol=1e-6):
+            raise InputError(
+                f"states: the motion has dt = {given.dt:g} s, the problem {problem.dt:g} s; give states=motion.q to "
+                "follow its path at the problem's pace"
+            )
         q, v = given.q, given.v
     elif isinstance(given, tuple):
         if len(given) != 2:

@@ -6,6 +6,8 @@ Equation (O1) of docs/mathematics.md.
 from __future__ import annotations
 
 import logging
+import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -53,6 +55,9 @@ from varpin.trajectory import Trajectory, require_motion
 Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
+
+# A function in a description, with its address, which differs from process to process.
+_FUNCTION = re.compile(r"<(?:[^<>]|<[^<>]*>)* at 0x[0-9a-f]+>")
 
 Sampling = Literal["midpoint", "gauss", "start"]
 Shape = Literal["held", "linear"]
@@ -400,8 +405,20 @@ class OptimalControlProblem(Frozen):
 
     @property
     def described_constraints(self) -> str:
-        """A full description of the constraints, for comparison; empty without any."""
-        return "; ".join(map(repr, self.constraints))
+        """A full description of the constraints, for comparison; empty without any.
+
+        Functions of time are described by their values at the nodes: their names differ from process to process.
+        """
+        times = self.t0 + self.dt * np.arange(self.steps + 1)
+        words = []
+        for constraint in self.constraints:
+            text = repr(constraint)
+            words.append(_FUNCTION.sub("function", text))
+            if words[-1] != text:
+                moving = (constraint, *getattr(constraint, "obstacles", ()))
+                shifts = [part.shifts(times) for part in moving if hasattr(part, "shifts")]
+                words.append(f"at nodes {[zlib.crc32(shift.round(12).tobytes()) for shift in shifts]}")
+        return "; ".join(words)
 
     @property
     def processes(self) -> int:

@@ -47,10 +47,15 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
     chosen, start = 0, None
     while True:
         began = time.perf_counter()
+        solution: Solution | None = None
         try:
             solution = search(problem, start)
             told = None if solution.status is Status.INTERRUPTED else solution.verify(tolerance=_KNOWN * wish)
         except KeyboardInterrupt:
+            if solution is None:
+                if best is None:
+                    raise
+                solution = best
             solution, told = replace(solution, status=Status.INTERRUPTED), None
         except VarpinError as error:
             if best is None:

@@ -165,7 +165,7 @@ def _refinement(source: Path, plan: _Plan) -> Refinement | None:
     if refinement is None or rows is None:
         return None
     whole, kinds = {"steps", "iterations"}, rows[:, -1]
-    if not (np.isin(kinds, np.arange(len(_STATUSES))).all() and 0 <= refinement.chosen <= len(rows)):
+    if not (np.isin(kinds, np.arange(len(_STATUSES))).all() and 0 <= refinement.chosen < max(len(rows), 1)):
         raise FileError(f"{source}: the steps of the refinement are inconsistent")
     tried = tuple(
         Refined(

@@ -3,6 +3,8 @@
 
 #include <cmath>
 
+#include "varpin/elementary.hpp"
+
 namespace varpin {
 
 struct Dual {
@@ -27,15 +29,17 @@ inline Dual sqrt(Dual a) {
     const double root = std::sqrt(a.value);
     return {root, 0.5 * a.slope / root};
 }
-inline Dual sin(Dual a) { return {std::sin(a.value), a.slope * std::cos(a.value)}; }
+inline elementary::Turn<Dual> turn(Dual a) {
+    const auto [c, s] = elementary::turn(a.value);
+    return {{c, -a.slope * s}, {s, a.slope * c}};
+}
 inline Dual tanh(Dual a) {
-    const double t = std::tanh(a.value);
+    const double t = elementary::tanh(a.value);
     return {t, a.slope * (1.0 - t * t)};
 }
 inline Dual exp(Dual a) {
-    const double e = std::exp(a.value);
+    const double e = elementary::exp(a.value);
     return {e, a.slope * e};
 }
-inline Dual cos(Dual a) { return {std::cos(a.value), -a.slope * std::sin(a.value)}; }
 
 }  // namespace varpin

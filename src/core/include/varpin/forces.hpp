@@ -19,6 +19,7 @@
 #include <vector>
 
 #include "varpin/dual.hpp"
+#include "varpin/elementary.hpp"
 
 namespace varpin {
 
@@ -100,7 +101,7 @@ struct CoulombFriction {
 
     template <class T>
     JointForce<T> force(T, T v) const {
-        using std::tanh, std::exp;
+        using elementary::tanh, elementary::exp;
         const T side = tanh((1.0 / width) * v), turn = (1.0 / width) * (T(1.0) - side * side);
         T g = T(level), slope = T(0.0);
         if (breakaway != level) {

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "varpin/body.hpp"
+#include "varpin/elementary.hpp"
 #include "varpin/spatial.hpp"
 
 namespace varpin {
@@ -66,7 +67,7 @@ class LinkCollector {
 // The placement of every body at q.
 template <class T>
 void forward_kinematics(const Links& links, const T* q, PlacementOf<T>* at) {
-    using std::cos, std::sin;
+    using elementary::turn;
     for (int j = 0; j < links.size(); ++j) {
         const Body& link = links.bodies[j];
         const Mat3<double>& E = link.rotation;
@@ -82,7 +83,7 @@ void forward_kinematics(const Links& links, const T* q, PlacementOf<T>* at) {
         if (link.prismatic) {
             here.position += angle * R.z;
         } else {
-            const T c = cos(angle), s = sin(angle);
+            const auto [c, s] = turn(angle);
             here.rotation = {c * R.x + s * R.y, c * R.y - s * R.x, R.z};
         }
         at[j] = here;
@@ -176,7 +177,7 @@ inline Quaternion quaternion(const Mat3<double>& R) {
 inline Vec3<double> logarithm(const Mat3<double>& E) {
     const Quaternion z = quaternion(E);
     const double sine = std::sqrt(dot(z.vector, z.vector));
-    return (sine > 0.0 ? 2.0 * std::atan2(sine, z.w) / sine : 0.0) * z.vector;
+    return (sine > 0.0 ? 2.0 * elementary::angle_above(sine, z.w) / sine : 0.0) * z.vector;
 }
 
 // The D with dr = D w dt for the logarithm r of a rotation with angular velocity w in its own axes,
@@ -184,7 +185,8 @@ inline Vec3<double> logarithm(const Mat3<double>& E) {
 // (Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, 2011, 10.86).
 inline Mat3<double> logarithm_derivative(const Vec3<double>& r) {
     const double square = dot(r, r), angle = std::sqrt(square), half = 0.5 * angle;
-    const double factor = angle < 1e-3 ? 1.0 / 12.0 + square / 720.0 : (1.0 - half / std::tan(half)) / square;
+    const auto [c, s] = elementary::turn(half);
+    const double factor = angle < 1e-3 ? 1.0 / 12.0 + square / 720.0 : (1.0 - half * (c / s)) / square;
     // [r]^2 = r r' - a^2
     const double diagonal = 1.0 - factor * square;
     const auto column = [&](const Vec3<double>& unit, double along) {

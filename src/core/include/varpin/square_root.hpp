@@ -171,7 +171,12 @@ class RootPass {
             for (int c = 0; c < size; ++c) terms[c] += std::abs(step.J[i][c]) * scale[i];
         }
         if (!held) return;
-        for (int c = x; c < size; ++c) terms[c] = std::hypot(terms[c], scale[c]);
+        for (int c = x; c < size; ++c) {
+            // sqrt(a^2 + b^2) without overflow; what is not a number stays so.
+            const double a = terms[c], b = scale[c], larger = a >= b ? a : b, smaller = a >= b ? b : a;
+            const double share = larger == 0.0 ? 0.0 : smaller / larger;
+            terms[c] = larger * std::sqrt(1.0 + share * share);
+        }
     }
 
     // Rows N with S = N'N for a jump of the state: from the value, then from the samples after the jump.
