@@ -419,3 +419,25 @@ def test_derivatives_of_a_crank_that_starts_from_rest():
     motion = vp.simulate(scene, begin, np.zeros(2), dt=2e-3, steps=3, controls=turn[:, None], integrator=vp.Gauss(2))
     # Both links are as long, so the second turns twice as far the other way.
     np.testing.assert_allclose(vp.linearize(scene, motion).B[:, :2, 0], [[1.0, -2.0]] * 3, atol=1e-8)
+
+
+@pytest.mark.parametrize("stages", [2, 3, 4])
+@pytest.mark.parametrize("joints", [2, 3, 4])
+def test_a_robot_that_is_held_at_rest_with_its_driven_joint_at_zero(joints, stages):
+    """Where q and v of the driven joint are zero, its row has no terms to measure rounding by."""
+    scene = vp.Scene(vp.planar_chain(joints), damping=0.1, constraints=[vp.KinematicInput("joint1")])
+    q0 = np.full(joints, 0.1)
+    q0[0] = 0.0
+    for dt in (0.05, 0.02, 0.01, 0.001):
+        motion = vp.simulate(scene, q0, np.zeros(joints), dt=dt, steps=3, integrator=vp.Gauss(stages))
+        np.testing.assert_allclose(motion.q[:, 0], 0.0, rtol=0.0, atol=1e-15)
+        held = vp.simulate(
+            scene,
+            q0,
+            np.zeros(joints),
+            dt=dt,
+            steps=3,
+            controls=scene.holding_controls(q0),
+            integrator=vp.Gauss(stages),
+        )
+        np.testing.assert_allclose(held.q, np.tile(q0, (4, 1)), rtol=0.0, atol=1e-13)

@@ -74,6 +74,19 @@ def test_a_wish_out_of_reach_says_so() -> None:
     assert "half the step cannot be taken" in stuck.refinement.reason
 
 
+def test_searches_that_do_not_converge_end_the_halving() -> None:
+    """Nobody gets to a goal out of reach, and smaller steps change nothing."""
+    chain = vp.planar_chain(2)
+    goal = vp.ReachFrame(chain, "tip", position=[40.0, 0.0, 0.0])
+    problem = vp.OptimalControlProblem(
+        vp.Scene(chain, damping=0.1), vp.ControlCost(1e-3), [0.3, 0.2], [0.0, 0.0], dt=0.05, steps=8, constraints=[goal]
+    )
+    found = vp.solve(problem, true_cost=0.01, max_iterations=15, check=False).refinement
+    assert not found.met
+    assert len(found.tried) <= 3
+    assert "searches ended MAX_ITERATIONS" in found.reason
+
+
 @pytest.mark.parametrize("after", [1, 12])
 def test_an_interrupt_keeps_the_best(after: int) -> None:
     calls = 0

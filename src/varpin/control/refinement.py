@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 _KNOWN = 0.1
 # Greatest number of halvings of the step.
 _HALVINGS = 10
-# Number of halvings without a smaller loss after which the refinement ends.
+# Number of halvings without a smaller loss, or of searches within it that have not converged, that end the refinement.
 _PATIENCE = 3
 
 
@@ -96,6 +96,8 @@ def _ended(
         return f"the last {_PATIENCE} halvings of the step have not lowered the loss"
     if _within(tried[-1], wish) and solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE):
         return f"the loss is within the wish, but the search ended {solution.status.name}"
+    if len(tried) >= _PATIENCE and all(_within(row, wish) for row in tried[-_PATIENCE:]):
+        return f"losses are within the wish for {_PATIENCE} steps, but the searches ended {solution.status.name}"
     return ""
 
 

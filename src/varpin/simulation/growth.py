@@ -77,19 +77,21 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         return None
     steps = trajectory.steps
     other = finer(integrator, trajectory, damped=False, pulled=False)
-    at = _places(trajectory)
     q, v = trajectory.q, trajectory.v
-    forces = np.ascontiguousarray(trajectory.u[at] @ scene.actuation.T)
+    at = _places(trajectory)
+    # A single violent step may be off by more than all others together.
+    repeated = np.append(at, np.abs(np.diff(v, axis=0)).max(axis=1).argmax())
+    forces = np.ascontiguousarray(trajectory.u[repeated] @ scene.actuation.T)
     nothing = open_loop(np.zeros((1, scene.controls)))
-    once = other.method.motions(scene, q[at], v[at], nothing, forces[:, None], trajectory.dt)
+    once = other.method.motions(scene, q[repeated], v[repeated], nothing, forces[:, None], trajectory.dt)
     if once is None:
         return None
     # Controls that change within a step do so for both, nearly.
-    in_q, in_v = np.abs(once[0][:, 0] - q[at + 1]), np.abs(once[1][:, 0] - v[at + 1])
+    in_q, in_v = np.abs(once[0][:, 0] - q[repeated + 1]), np.abs(once[1][:, 0] - v[repeated + 1])
     way = largest_of_its_kind(scene, np.ptp(q, axis=0))
     least = ROUNDING * (1.0 + np.abs(q).max())
-    begins = (in_q + in_v * trajectory.dt) / np.maximum(way, least)
-    small = NEAR * WARNED / max(steps * float(begins.max()), 1e-300)
+    begins = ((in_q + in_v * trajectory.dt) / np.maximum(way, least)).max(axis=1)
+    small = NEAR * WARNED / max(steps * float(begins[:-1].max()), float(begins[-1]), 1e-300)
     if small > np.exp(_MOST):
         return None
     try:

@@ -434,6 +434,7 @@ class ConstrainedStepper {
     std::vector<double> total;         // (m)
     std::vector<double> last;          // (m) Lam_s
     std::vector<double> rate;          // (m) rates of kinematic inputs in the part
+    double unresolved = 0.0;           // velocity below the rounding of the last residuals
     std::vector<double> Qk, scaled, row_scale, y, bent, pushed, push_size, unit;
     std::vector<double> block, saddle, right, solution;
     std::vector<int> rows;
@@ -972,6 +973,7 @@ class ConstrainedStepper {
         right.assign(stages * (n + r), 0.0);
         solution.resize(right.size());
         push();
+        unresolved = 0.0;
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {
                 const int k = i * n + c;
@@ -992,6 +994,7 @@ class ConstrainedStepper {
                 double error = (start.p[c].high - equation.stage[i].Lv[c]) + (start.p[c].low + (h * sum - across_rows));
                 right[i * n + c] = scaled[c] * error;
                 scale = h * scale + std::abs(start.p[c].high) + equation.stage[i].Lv_scale[c] + across_size;
+                unresolved = std::max(unresolved, rounding_unit * scale * scaled[c] * scaled[c]);
                 if (scale > nothing) error = std::abs(error) / (rounding_unit * scale);
                 worst = larger(error, worst);
             }
@@ -1008,7 +1011,8 @@ class ConstrainedStepper {
 
     // The largest g at the Lobatto points in rounding units of its terms.
     double rows_error(double h) const {
-        double worst = 0.0, swiftest = 0.0;
+        // Velocities that are rounding alone are as large as the last residuals leave them, at rest too.
+        double worst = 0.0, swiftest = unresolved;
         for (const double velocity : equation.V) swiftest = std::max(swiftest, std::abs(velocity));
         for (const ConstraintJet& jet : point) {
             for (const int row : here.order) {
