@@ -260,6 +260,29 @@ def test_motions_are_those_with_matrices(robot, integrator):
     assert eliminated.quality[..., 0].max() <= 100.0
 
 
+def test_round_off_grows_as_disturbances_do():
+    """A panda over 3 s in steps of 10 ms: correct solvers agree in a step, and part as an ulp in the start does."""
+    scene, integrator, steps = vp.Scene(vp.load_robot("panda")), vp.Gauss(2), 300
+    n = scene.robot.dof
+    q0, v0 = 0.5 * sum(scene.robot.position_limits), np.zeros(n)
+    given = 1e-2, steps
+    dense, eliminated = (
+        rolled(scene, q0, v0, *given, solver, integrator) for solver in (Solver.dense, Solver.elimination)
+    )
+    moved = rolled(scene, np.nextafter(q0, np.inf), v0, *given, Solver.dense, integrator)
+    assert dense.done == eliminated.done == moved.done == steps
+    motion = vp.simulate(scene, q0, v0, dt=1e-2, steps=steps, controls=dense.u[0], integrator=integrator, check=False)
+    amplified = np.eye(2 * n)
+    for A in vp.linearize(scene, motion).A:
+        amplified = A @ amplified
+    growth = np.finfo(float).eps * np.abs(amplified[:n, :n]).max()
+    assert np.abs(eliminated.q[0, 0] - dense.q[0, 0]).max() <= 1e-15
+    for other in (eliminated, moved):
+        apart = np.abs(other.q[0, -1] - dense.q[0, -1]).max()
+        assert 1e-9 < apart < 1e-5
+        assert growth / 100.0 < apart < growth * 100.0
+
+
 @pytest.mark.parametrize("ramp", [False, True], ids=["shift", "ramp"])
 @pytest.mark.parametrize(("integrator", "stages"), [(vp.Midpoint(), 1), (vp.Gauss(2), 2)], ids=["midpoint", "gauss2"])
 def test_derivatives_are_those_with_matrices(robot, integrator, stages, ramp):

@@ -1,6 +1,7 @@
 """What docs/extending.md says, done: a class of one's own, and nothing else, is enough."""
 
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 
 import varpin as vp
+from varpin.cli import command
+from varpin.core import pulls_fast
 from varpin.core.arrays import Carried, ConstraintRows, Diffusion, Product
 from varpin.integrators import registry
 from varpin.integrators.collocation import Collocation
@@ -17,6 +20,7 @@ from varpin.mechanics import constraints
 from varpin.mechanics.forces import point_of
 from varpin.mechanics.noise import CompiledFields
 from varpin.mechanics.scene import OF_COUPLINGS, OF_ELEMENTS
+from varpin.simulation import choice
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 
@@ -137,3 +141,32 @@ def test_the_page_names_files_that_are_there():
     named = {name.rpartition("/")[2] for name in re.findall(r"`([\w/]+\.(?:py|hpp|cpp))`", text)}
     assert named
     assert named <= found
+
+
+def test_q0_takes_the_way_that_the_page_says(monkeypatch):
+    """Its Python functions are called in its order, and the core is asked between the choice and the start."""
+    listed = re.search(r"\*\*`q0` from(.*?)\*\*A torque", PAGE.read_text(encoding="utf-8"), re.S).group(1)
+    way = re.findall(r"^\d+\. `([\w/]+\.\w+)`: (?:`(\w+)`)?", listed, re.M)
+    assert len({file for file, _ in way}) == 15
+    root, called = Path(vp.__file__).parent, []
+
+    def note(frame, event, _):
+        if event == "call" and root in (path := Path(frame.f_code.co_filename)).parents:
+            called.append((path.relative_to(root).as_posix(), frame.f_code.co_name))
+
+    def asked(*given):
+        called.append(("look.hpp", "pulls_fast"))
+        return pulls_fast(*given)
+
+    monkeypatch.setattr(choice, "pulls_fast", asked)
+    before = sys.getprofile()
+    sys.setprofile(note)
+    try:
+        assert command.main(["simulate", "ur5", "--q0", "0.3", "--steps", "2", "--quiet"]) == 0
+    finally:
+        sys.setprofile(before)
+    rest = iter(called)
+    for place in way:
+        if place[0].endswith(".py") or place in called:
+            assert place in rest, place
+    assert ("look.hpp", "pulls_fast") in way

@@ -1,4 +1,4 @@
-// Arrays at the border to Python: their types, and the check of their shapes.
+// Arrays at the border to Python: their types, and the check of their shapes. docs/core.md, "The map".
 #pragma once
 
 #include <nanobind/nanobind.h>

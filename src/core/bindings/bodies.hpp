@@ -1,4 +1,4 @@
-// Bodies with their joints from Python arrays, and rotations as row-major NumPy arrays.
+// Bodies with their joints from Python arrays, and rotations as row-major NumPy arrays. docs/core.md, "The map".
 #pragma once
 
 #include <stdexcept>

@@ -1,3 +1,4 @@
+// One function for each file of bindings. docs/core.md, "The map".
 #pragma once
 
 #include <nanobind/nanobind.h>

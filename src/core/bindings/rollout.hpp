@@ -1,4 +1,5 @@
 // Common bindings of rollouts and derivatives of steps for the variational integrators, with and without constraints.
+// docs/core.md, "The map".
 #pragma once
 
 #include <nanobind/stl/tuple.h>

@@ -1,5 +1,5 @@
 // Input and output of a rollout at the border: the Python named tuples Commands and Nodes, checked and converted to
-// those of policy.hpp and nodes.hpp.
+// those of policy.hpp and nodes.hpp. docs/core.md, "The map".
 #pragma once
 
 #include <cstdint>

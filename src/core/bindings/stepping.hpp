@@ -1,4 +1,5 @@
 // Steps of the variational integrators and their derivatives, for sizes known at compile time or at run time.
+// docs/core.md, "Processors".
 #pragma once
 
 #include <cstdint>

@@ -1,4 +1,4 @@
-// A watch with references to its arrays.
+// A watch with references to its arrays. docs/core.md, "The map".
 #pragma once
 
 #include <cstdint>

@@ -43,6 +43,22 @@ Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 
+# Forces on joints among the values, a row (coordinate, numbers) for each element; and the message where they differ.
+OF_ELEMENTS = {
+    "CoulombFriction": "dry friction differs",
+    "JointStop": "joint stops differ",
+    "PositionServo": "position servos differ",
+}
+# Forces on frames, a row (body a, body b, numbers) for each; left out where there are none.
+OF_COUPLINGS = {
+    "FrameLoad": "forces on frames differ",
+    "FrameWrench": "forces on frames differ",
+    "FrameSpring": "springs between frames differ",
+    "FrameLengthSpring": "springs between frames differ",
+    "FrameTurnSpring": "springs between frames differ",
+    "FrameDamper": "dampers between frames differ",
+    "FrameTurnDamper": "dampers between frames differ",
+}
 # Names of a scene's values, and the message where they differ; values by joint are also reported with numbers.
 VALUES = {
     "gravity": "gravity differs",
@@ -57,16 +73,8 @@ VALUES = {
     "translation": "the positions of the robot's joints differ",
     "ratio": "the ratios of the robot's mimic joints differ",
     "offset": "the offsets of the robot's mimic joints differ",
-    "CoulombFriction": "dry friction differs",
-    "JointStop": "joint stops differ",
-    "PositionServo": "position servos differ",
-    "FrameLoad": "forces on frames differ",
-    "FrameWrench": "forces on frames differ",
-    "FrameSpring": "springs between frames differ",
-    "FrameLengthSpring": "springs between frames differ",
-    "FrameTurnSpring": "springs between frames differ",
-    "FrameDamper": "dampers between frames differ",
-    "FrameTurnDamper": "dampers between frames differ",
+    **OF_ELEMENTS,
+    **OF_COUPLINGS,
     "functions": "custom forces differ",
     "constraints.between": "constraints between frames differ",
     "constraints.ties": "joint ties differ",
@@ -76,12 +84,6 @@ VALUES = {
     "noise.quadratic": "the intensity of the noise differs",
     "noise.center": "the center of the noise differs",
 }
-# Forces on joints among the values: a row (coordinate, numbers) for each element.
-OF_ELEMENTS = ("CoulombFriction", "JointStop", "PositionServo")
-# Forces on frames among the values: a row (body a, body b, numbers) for each; left out where there are none.
-OF_COUPLINGS = (
-    "FrameLoad", "FrameWrench", "FrameSpring", "FrameLengthSpring", "FrameTurnSpring", "FrameDamper", "FrameTurnDamper",
-)  # fmt: skip
 # Constraints among the values; left out where there are none.
 OF_CONSTRAINTS = ("constraints.between", "constraints.ties", "constraints.custom")
 OF_FORCES = (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS)

@@ -1,4 +1,4 @@
-// A body of a tree, with its joint.
+// A body of a tree, with its joint: docs/core.md, "The map".
 #pragma once
 
 #include "varpin/spatial.hpp"

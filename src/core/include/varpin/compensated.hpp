@@ -1,4 +1,4 @@
-// Compensated sums, and angles without whole turns.
+// Compensated sums, and angles without whole turns. docs/mathematics.md, "Solving a step".
 //
 // The angle of a joint after a million turns has only nine decimals in floating point. The Lagrangian is periodic in
 // such an angle, so sweeps take it within one turn. Whole turns are counted separately; the reported angle has them.

@@ -1,6 +1,6 @@
 // Small dense factorizations: at the size of an arm, the overhead of a LAPACK call exceeds its work. Matrices are
 // square with rows of length n; a function works on the rows and columns [begin, end) of one block. Inner loops run
-// along rows.
+// along rows. docs/mathematics.md, "Solving a step".
 #pragma once
 
 #include <algorithm>

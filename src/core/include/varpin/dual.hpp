@@ -1,4 +1,5 @@
 // Numbers with one derivative: value + slope e, e^2 = 0. The jet of such numbers is differentiated along a direction.
+// docs/mathematics.md, "Linearization" and "Second derivatives".
 #pragma once
 
 #include <cmath>

@@ -1,5 +1,5 @@
-// Elements: forces on single joints besides inertia and gravity. docs/core.md, "Forces". A new force is a struct here,
-// a name in bindings/mechanism.cpp and a class in mechanics/forces.py: docs/extending.md.
+// Elements: forces on single joints besides inertia and gravity. docs/core.md, "Forces". docs/extending.md lists what a
+// new force touches besides its struct here.
 //
 // An element acts on one coordinate and has one or both of
 //

@@ -1,4 +1,5 @@
 // Storage for the elimination of bodies, from the last to the first, and for coordinates that several bodies share.
+// docs/mathematics.md, "Linear in the number of joints".
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,5 @@
 // Checks of a finished motion: the energy that it turns over, rates of the scene that its steps cannot resolve, and
-// whether other steps give the same motion. The caller sets the thresholds.
+// whether other steps give the same motion. The caller sets the thresholds. docs/limits.md, "The warnings".
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,5 @@
 // The output of a rollout of P paths over N steps: the node after each step, and solver statistics.
+// docs/core.md, "The map".
 #pragma once
 
 #include <cstdint>

@@ -1,5 +1,5 @@
 // Two numbers in one vector register. Compilers vectorize long loops by themselves, but not the short loops over the
-// entries of a six-vector.
+// entries of a six-vector. docs/mathematics.md, "Linear in the number of joints".
 #pragma once
 
 namespace varpin {

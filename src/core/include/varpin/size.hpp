@@ -1,4 +1,5 @@
 // Sizes known at compile time, for which the compiler unrolls loops, or at run time, as int, with the same code.
+// docs/core.md, "Processors".
 #pragma once
 
 #include <array>

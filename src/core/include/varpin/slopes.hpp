@@ -1,4 +1,5 @@
-// Derivatives in a coordinate and in its velocity, in one vector register.
+// Derivatives in a coordinate and in its velocity, in one vector register. docs/mathematics.md,
+// "Explicit methods".
 #pragma once
 
 #include "varpin/pair.hpp"

@@ -1,5 +1,6 @@
 // Spatial algebra (Featherstone 2008): motions and forces as (linear, angular) pairs, inertias as mass, first and
 // second moments, all about one point and in the same axes. T is double, or Dual for derivatives along a direction.
+// docs/mathematics.md, "The Lagrangian jet".
 #pragma once
 
 namespace varpin {

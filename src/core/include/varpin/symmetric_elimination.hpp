@@ -1,4 +1,5 @@
 // Elimination (elimination.hpp) of a symmetric matrix with rows of any size, also in trees with ties.
+// docs/mathematics.md, "Linear in the number of joints".
 #pragma once
 
 #include <algorithm>

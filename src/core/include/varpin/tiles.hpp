@@ -1,5 +1,5 @@
 // Products of small matrices in tiles of 4 x 4 entries, whose sums stay in registers. Matrices are padded with zeros to
-// whole tiles, so that products have no remaining rows or columns.
+// whole tiles, so that products have no remaining rows or columns. docs/core.md, "Processors".
 #pragma once
 
 #include <algorithm>

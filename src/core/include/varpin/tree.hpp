@@ -1,4 +1,5 @@
 // The robot as a tree of bodies, each on one joint about or along the z axis of its own frame, in a scene.
+// docs/mathematics.md, "The Lagrangian jet".
 #pragma once
 
 #include <algorithm>

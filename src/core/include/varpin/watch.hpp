@@ -1,4 +1,5 @@
-// The running cost of a motion during its simulation, and whether to stop the motion early.
+// The running cost of a motion during its simulation, and whether to stop the motion early. Its costs:
+// docs/mathematics.md, "Costs in the task".
 #pragma once
 
 #include <cstddef>

@@ -1,5 +1,6 @@
 // Whether the processor has vectors of four numbers. Functions that profit are compiled twice from one inlined
 // function, without fused multiply-add: identical results with half the instructions of vectors of two.
+// docs/core.md, "Processors".
 #pragma once
 
 #if defined(__x86_64__) && defined(__GNUC__)
