@@ -1,4 +1,4 @@
-"""What a warning is about: the one place in the tests that quotes the sentences, so that a reword changes one line."""
+"""What a warning or a reason is about: the one place in the tests that quotes sentences; a reword changes one line."""
 
 from __future__ import annotations
 
@@ -19,6 +19,32 @@ MARKS = {
     "replay": "cannot be replayed",
     "between nodes": "between nodes",
     "noise left out": "least cost without noise",
+    "growth": "disturbances grow",
+    "steps in parts": "parts",
+    "ringing": "will ring",
+    "moved start": "q0 was moved",
+    "missed tolerance": "is not met",
+    "unchecked": "was not checked",
+    "look interrupted": "interrupted before the plan was replayed",
+    "late plans": "planning took",
+    "two goals": "two goals",
+    "left limits": "leave their limits",
+    "outside limits": "outside its limits",
+    "open loops": "are open",
+    "one motion": "one and the same motion",
+    "no finite number": "no finite number",
+    "computed again": "is computed again",
+    "untrusted gains": "cannot be trusted",
+    # Of reasons and reports.
+    "rounding in Quu": "rounding may have changed Quu",
+    "no lower cost": "no step lowers the cost",
+    "unmet constraint": "cannot be met from here",
+    "no plan from here": "no plan can be made from here",
+    "no plan within constraints": "no plan within the constraints",
+    "no half step": "half the step cannot be taken",
+    "interruption": "interrupted",
+    "unfinished plan": "the plan is unfinished",
+    "out of reach": "not within reach",
 }
 
 

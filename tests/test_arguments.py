@@ -213,5 +213,5 @@ class TestTheCoreGetsWhatFits:
     )
     def test_trajectories_changed_by_hand(self, name, value):
         motion = vp.simulate(SCENE, [0.1, 0.2], [0.0, 0.0], dt=1e-3, steps=5)
-        with pytest.raises(vp.InputError, match="a trajectory"):
+        with refused(vp.InputError, "trajectory"):
             dataclasses.replace(motion, **{name: value})

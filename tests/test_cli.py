@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 from chromium import commands
+from findings import about
 from refusals import naming, unnamed
 from rich.console import Console
 
@@ -324,7 +325,7 @@ def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, capsys):
     monkeypatch.setattr("varpin.cli.replay.replay", lambda *words, **options: shown.append(options) or Viewer())
     monkeypatch.setattr("varpin.cli.replay.time.sleep", interrupt)
     assert main(["replay", saved, "--robot", arm, "--once"]) == 0
-    assert "http://here; Ctrl-C ends it" in capsys.readouterr().err
+    assert not unnamed(capsys.readouterr().err, "http://here", "Ctrl-C")
     assert shown[0]["open"]
     assert not shown[0]["loop"]
 
@@ -400,9 +401,9 @@ def test_failed_step_keeps_what_was_before_it(arm, tmp_path, capsys, monkeypatch
     assert main(["simulate", arm, "--steps", "20", "--save", str(path)]) == 3
     out, err = capsys.readouterr()
     (line,) = err.splitlines()
-    assert line.startswith("varpin: error: step 7 (t = 0.007 s) cannot be trusted: the step is at a fold")
-    assert "What came before is kept; a smaller dt may go further" in line
-    assert "7 of 20, 0.001 s each" in out
+    assert not unnamed(line, "varpin: error", "step 7", "t = 0.007 s", "the step is at a fold")
+    assert not unnamed(line, "dt")
+    assert not unnamed(out, "7 of 20", "0.001 s")
     assert vp.Trajectory.load(path).steps == 7
 
 
@@ -423,8 +424,9 @@ def test_interrupted_run_keeps_its_data(arm, tmp_path, capsys, monkeypatch):
     out, err = capsys.readouterr()
     saved = vp.Trajectory.load(path)
     assert 0 < saved.steps < 40000
-    assert err == f"varpin: interrupted after {saved.steps} of 40000 steps, which are kept\n"
-    assert f"{saved.steps} of 40000, 0.0001 s each" in out
+    (line,) = err.splitlines()
+    assert not unnamed(line, "varpin: interrupted", str(saved.steps), "40000")
+    assert not unnamed(out, f"{saved.steps} of 40000", "0.0001 s")
     assert "a.npz" in out
 
 
@@ -591,7 +593,7 @@ def test_process_simulates_and_saves(arm, tmp_path):
     path = tmp_path / "a.npz"
     done = python_m_varpin("simulate", arm, "--q0", "-5e-1", "0.2", "--steps", "100", "--save", str(path))
     assert done.returncode == 0, done.stderr
-    assert "100, 0.001 s each" in done.stdout
+    assert not unnamed(done.stdout, "100", "0.001 s")
     assert vp.Trajectory.load(path).q[0].tolist() == [-0.5, 0.2]
 
 
@@ -646,7 +648,7 @@ def test_tradeoff_prints_a_table_and_goes_on_where_it_stopped(arm, tmp_path, cap
     printed, err = capsys.readouterr()
     # On a slow machine it says how far it is.
     assert all(re.fullmatch(r"varpin: \d+ of \d+ runs", line) for line in err.splitlines())
-    for words in ("arm: speed against accuracy over 0.5 s", "RungeKutta4", "Midpoint", "Pareto", "accurate to"):
+    for words in ("arm", "0.5 s", "RungeKutta4", "Midpoint", "Pareto"):
         assert words in printed
     assert sorted(path.name for path in out.iterdir()) == [f"tradeoff.{kind}" for kind in ("csv", "html", "npz", "png")]
     monkeypatch.setattr("varpin.study.tradeoff.precision._measure", lambda *_: pytest.fail("it is there already"))
@@ -662,7 +664,7 @@ def test_tradeoff_interrupted_is_status_130(arm, capsys, monkeypatch):
 
     monkeypatch.setattr("varpin.study.tradeoff.precision._measure", interrupt)
     assert main(["tradeoff", arm, "--duration", "0.5", "--dt", "0.05", "--quiet"]) == 130
-    assert "interrupted after 0 of " in capsys.readouterr().err
+    assert not unnamed(capsys.readouterr().err, "interrupted", "0")
 
 
 def test_advise_says_what_to_take(arm, tmp_path, capsys):
@@ -670,25 +672,23 @@ def test_advise_says_what_to_take(arm, tmp_path, capsys):
     assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    assert re.match(
-        r"\w+.* at dt = \S+ s: error \S+ in .*, the cheapest within an error of 1e-06 in q after 0.5 s\n", out
-    )
+    assert not unnamed(out.splitlines()[0], "dt", "1e-06", "0.5 s")
     assert out.count("│ Gauss") >= 2
     assert main(["advise", arm, "--budget", "2e-3", "--out", str(tmp_path / "advice"), *options]) == 0
     assert {path.name for path in (tmp_path / "advice").iterdir()} == {"advice.png", "advice.html"}
     page = (tmp_path / "advice" / "advice.html").read_text()
-    assert "the most accurate after 0.5 s within 2 ms" in page
+    assert not unnamed(page, "0.5 s", "2 ms")
     assert page.count("<tr class=front>") == 1
     assert 'src="data:image/png;base64,' in page
-    assert "the most accurate after 0.5 s within 2 ms" in capsys.readouterr().out
+    assert not unnamed(capsys.readouterr().out.splitlines()[0], "0.5 s", "2 ms")
     assert main(["advise", arm, "--tolerance", "1e-20", *options]) == 3
-    assert "not within reach" in capsys.readouterr().out
+    assert about(capsys.readouterr().out, "out of reach")
     assert main(["advise", arm, "--tolerance", "0"]) == 2
     assert not unnamed(error_of(capsys), "tolerance")
 
 
 def test_advise_needs_one_wish(arm, capsys):
-    assert "one of the arguments --tolerance --budget is required" in usage_error(["advise", arm], capsys)
+    assert not unnamed(usage_error(["advise", arm], capsys), "--tolerance", "--budget")
 
 
 SCENE = """
@@ -723,7 +723,7 @@ def scene(tmp_path, monkeypatch):
 def test_scene_is_simulated(scene, tmp_path, capsys):
     assert main(["simulate", scene, "--plot", "motion.png"]) == 0
     out = capsys.readouterr().out
-    assert "20, 0.005 s each" in out
+    assert not unnamed(out, "20", "0.005 s")
     assert {path.name for path in tmp_path.iterdir()} == {"scene.toml", "kept.npz", "motion.png"}
     assert vp.Trajectory.load("kept.npz").steps == 20
 

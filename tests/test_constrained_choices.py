@@ -5,6 +5,8 @@ import functools
 import numpy as np
 import pytest
 from battery.loops import LOOPS
+from findings import about
+from refusals import refused
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints
@@ -46,12 +48,12 @@ def test_tolerances_are_met(number, tolerance):
 def test_a_tolerance_with_a_start_off_the_constraints_says_that_it_was_moved():
     scene, q, v = four_bar()
     motion = vp.simulate(scene, q + 1e-3, v, duration=0.2, tolerance=1e-6)
-    assert any("q0 was moved" in sentence for sentence in motion.warnings)
+    assert about(motion.warnings, "moved start")
 
 
 def test_methods_that_keep_no_constraints_are_refused_with_a_tolerance():
     scene, q, v = four_bar()
-    with pytest.raises(vp.InputError, match="Radau"):
+    with refused(vp.InputError, "Radau"):
         vp.simulate(scene, q, v, duration=0.2, tolerance=1e-6, integrator=vp.Radau(3))
 
 
@@ -77,7 +79,7 @@ def test_a_custom_constraint_that_fails_under_a_tolerance_is_an_error_with_the_m
 
     own = vp.CustomConstraint(1, value, lambda q: [[1.0, -0.5]])
     scene = vp.Scene(vp.planar_chain(2), gravity=False, constraints=own)
-    with pytest.raises(vp.ConstraintError, match="too far") as caught:
+    with refused(vp.ConstraintError, "too far") as caught:
         vp.simulate(scene, [0.5, 1.0], [1.0, 2.0], duration=0.5, tolerance=1e-4)
     assert 0.5 < caught.value.trajectory.q[-1, 0] < 0.61
 
@@ -104,11 +106,11 @@ def test_work_and_precision_under_constraints(tmp_path):
     same = vp.work_precision(scene, q, v, duration=0.4, dts=[0.01, 0.005], repeats=1, save=path)
     assert [run.seconds for run in same.runs] == [run.seconds for run in record.runs]
     other = vp.Scene(scene.robot, damping=0.1, constraints=vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="z"))
-    with pytest.raises(vp.FileError, match="scene"):
+    with refused(vp.FileError, "scene"):
         vp.work_precision(other, q, v, duration=0.4, dts=[0.01], save=path)
-    with pytest.raises(vp.InputError, match="leave reference= out"):
+    with refused(vp.InputError, "reference="):
         vp.work_precision(scene, q, v, duration=0.4, reference=vp.Reference())
-    with pytest.raises(vp.InputError, match="RungeKutta4 keeps no constraints"):
+    with refused(vp.InputError, "RungeKutta4", "constraints"):
         vp.work_precision(scene, q, v, duration=0.4, integrators=[vp.RungeKutta4()])
 
 
@@ -124,7 +126,7 @@ def test_advice_under_constraints():
 def test_advice_says_in_the_log_that_the_start_was_moved(caplog):
     scene, q, v = four_bar()
     vp.advise(scene, q + 1e-3, v, duration=0.1, tolerance=1e-3)
-    assert "q0 was moved" in caplog.text
+    assert about(caplog.messages, "moved start")
 
 
 def test_energy_errors_are_those_of_loops_without_a_hand():

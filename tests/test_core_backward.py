@@ -231,7 +231,7 @@ def test_gains_that_do_not_fit_are_refused():
         core.BackwardPass(2, gradient, hessian).run(H, 4, 0.0, steps, gains)
     with refused(ValueError, "states"):
         core.BackwardPass(1, gradient, hessian).run(H, 1, 0.0, steps, gains)
-    with pytest.raises(ValueError, match="change is needed"):
+    with refused(ValueError, "change"):
         core.RootPass(2, squares_of(gradient[None], hessian[None]).core, gradient).run(
             H, 1, 0.0, steps, gains, squares_of(given["gradient"], given["hessian"]).core
         )

@@ -56,7 +56,7 @@ class TestUrdf:
             path = write_urdf(tmp_path, link("l1", INERTIAL.replace('"1.3"', f'"{word}"')), joint("j1", "base", "l1"))
             with refused(vp.SingularMassMatrix, "'j1'"):
                 vp.load_robot(path)
-            assert any("no finite number: it is massless" in said for said in vp.inspect_robot(path).warnings)
+            assert about(vp.inspect_robot(path).warnings, "no finite number")
 
     def test_numbers_in_odd_white_space(self, tmp_path):
         odd = INERTIAL.replace('value="1.3"', 'value=" 1.3&#9;"').replace("0.02 0.05 0.1", "&#10;0.02&#9;0.05  0.1 ")

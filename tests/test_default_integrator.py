@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin.integrators.base import Failure
@@ -104,7 +105,7 @@ def test_a_step_that_fails_is_taken_by_another(monkeypatch):
 
     monkeypatch.setattr(vp.Gauss, "rollout", failing)
     assert vp.simulate(scene, q0, v0, dt=DT, steps=STEPS, controls=controls).steps == STEPS
-    with pytest.raises(vp.StepFailure, match="made up"):
+    with refused(vp.StepFailure, "made up"):
         vp.simulate(scene, q0, v0, dt=DT, steps=STEPS, controls=controls, integrator=vp.Gauss(2))
 
 

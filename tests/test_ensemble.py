@@ -6,7 +6,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 from findings import about
-from refusals import refused
+from refusals import naming, refused
 
 import varpin as vp
 import varpin.ensemble
@@ -252,14 +252,14 @@ def test_failing_paths_are_left_out_from_where_they_fail(monkeypatch, caplog):
     options = FRAGILE | {"paths": 40, "q0": starts(40), "v0": np.zeros(3)}
     with caplog.at_level(logging.WARNING, "varpin.ensemble"):
         end = run(fragile_scene(), **options)
-    assert any("of 40 paths failed" in warning for warning in end.warnings)
+    assert naming(end.warnings, "40 paths")
     failed = {failure.path: failure for failure in end.failures}
     steps = {path: failure.step for path, failure in failed.items()}
     assert len(set(steps.values())) >= 3
     assert set(steps) <= set(range(0, 40, 3))
     assert len(steps) == len(end.failures)
     first = min(end.failures, key=lambda failure: failure.step)
-    assert f"{len(steps)} of 40 paths failed, the first at step {first.step}: {first.reason}" in caplog.text
+    assert naming(caplog.messages, f"{len(steps)} of 40 paths", f"step {first.step}", first.reason)
     for path, child in enumerate(np.random.default_rng(7).spawn(40)):
         done = steps.get(path, 60)
         for name in ("q", "v", "p", "energy"):
@@ -357,7 +357,7 @@ def test_a_coarse_step_is_told_of(caplog):
         end = run(scene, **coarse)
         again = run(scene, **coarse)
     assert about(end.warnings, "energy")
-    assert any("dt = 0.05 s is coarse for ExplicitEuler" in warning for warning in end.warnings)
+    assert naming(about(end.warnings, "coarse steps"), "dt = 0.05 s", "ExplicitEuler")
     assert all(warning.startswith("path ") for warning in end.warnings)
     assert again.warnings == end.warnings
     # Once in the log, and in every form of the result.
@@ -365,7 +365,7 @@ def test_a_coarse_step_is_told_of(caplog):
     assert repr(end).endswith(f", {len(end.warnings)} warnings)")
     for warning in end.warnings:
         assert f"warning: {warning}" in str(end)
-        assert "is coarse for ExplicitEuler" in end._repr_html_()
+        assert about(end._repr_html_(), "coarse steps")
     assert run(vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(1e-2)), dt=1e-3).warnings == ()
 
 

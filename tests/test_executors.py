@@ -184,7 +184,7 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
     for warning in found.warnings:
         assert f"warning: {warning}" in str(found)
     assert f"{len(found.warnings)} warning" in repr(found)
-    assert "coarse" in found._repr_html_()
+    assert about(found._repr_html_(), "coarse steps")
 
 
 def test_work_and_precision_on_processes(spawned, tmp_path):

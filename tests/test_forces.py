@@ -5,8 +5,9 @@ import pickle
 import numpy as np
 import pinocchio as pin
 import pytest
+from findings import about
 from naive import gradient
-from refusals import refused
+from refusals import refused, unnamed
 from scipy.integrate import solve_ivp
 from test_elimination import rolled
 
@@ -350,7 +351,7 @@ def test_servos_go_where_they_are_told():
             scene, [0.0, 0.0], [0.0, 0.0], dt=1e-3, steps=1000, controls=[0.7, 0.7], integrator=integrator
         )
         np.testing.assert_allclose(motion.q[::100], exact[:, :2], atol=error)
-        assert not [words for words in motion.warnings if "energy" in words]
+        assert not about(motion.warnings, "energy")
     stiff = vp.Scene(robot, forces=vp.PositionServo(1e7, 1e5))
     motion = vp.simulate(
         stiff, [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=100, controls=[0.1, -0.1], integrator=vp.Radau(2)
@@ -490,8 +491,8 @@ def test_limits_are_held_against_what_drives_and_stops_do():
         return " ".join(vp.simulate(scene, q, v, dt=1e-3, steps=steps, check=False, **options).warnings)
 
     assert "effort" not in said(scene, q, np.zeros(6), 20, controls={"elbow_joint": 0.5})
-    assert "4.85e+03 N m below -150" in said(scene, q, np.zeros(6), 20, controls={"elbow_joint": 0.0})
+    assert not unnamed(said(scene, q, np.zeros(6), 20, controls={"elbow_joint": 0.0}), "4.85e+03 N m", "-150")
     loose = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e3, lower=-50, upper=50)])
-    assert "leave their limits" in said(loose, [0, 0, 2.9, 0, 0, 0], [0, 0, 6.0, 0, 0, 0], 400)
+    assert about(said(loose, [0, 0, 2.9, 0, 0, 0], [0, 0, 6.0, 0, 0, 0], 400), "left limits")
     stiff = vp.Scene(robot, gravity=False, forces=[vp.JointStop(1e5, 1e3)])
-    assert "leave their limits" not in said(stiff, [0, 0, 3.0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], 400)
+    assert not about(said(stiff, [0, 0, 3.0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], 400), "left limits")

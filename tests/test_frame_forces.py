@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pinocchio as pin
 import pytest
+from findings import about
 from naive import directional, gradient, joint_axis, rotation
 from refusals import refused
 from scipy.integrate import solve_ivp
@@ -343,7 +344,7 @@ def test_groups_that_couplings_join():
     assert np.abs(A[7:10, 3:7]).min() > 0.0
     # Errors of the energy that passes between arms are no errors.
     motion = vp.simulate(scene, q, np.zeros(7), dt=1e-3, steps=300, integrator=vp.RungeKutta4())
-    assert not [words for words in motion.warnings if "energy" in words]
+    assert not about(motion.warnings, "energy")
 
 
 def test_elimination_leaves_steps_with_couplings_to_the_dense_solver():
@@ -355,7 +356,7 @@ def test_elimination_leaves_steps_with_couplings_to_the_dense_solver():
     ways = [rolled(scene, q, v, 1e-3, 10, way, vp.Gauss(2)) for way in (Solver.dense, Solver.elimination)]
     for name in ("q", "p", "energy"):
         np.testing.assert_allclose(getattr(ways[0], name), getattr(ways[1], name), rtol=1e-9, atol=1e-9)
-    with pytest.raises(ValueError, match="couplings act"):
+    with refused(ValueError, "couplings"):
         Elimination(scene.core, q, v)
 
 

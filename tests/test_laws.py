@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from findings import about
-from refusals import refused
+from refusals import refused, unnamed
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import fsolve
@@ -180,7 +180,7 @@ def test_a_law_is_read_off_where_it_does_not_saturate():
     motion, told = run(scene, [0.0], [0.0], saturated(100.0, 134.0, 3.0), dt=5e-3, steps=600)
     assert (np.abs(motion.u) == 3.0).any()
     assert told
-    assert "each multiplies deviations by" in motion.warnings[0]
+    assert about(motion.warnings[0], "unstable loop")
 
 
 def clipped_loops():
@@ -241,7 +241,7 @@ def test_a_clipped_loop_is_judged_by_its_few_nodes_inside_its_limits():
     assert np.abs(motion.q - 1.0).max() > 1e3 * 3e-4
     plant = Plant(scene)
     radius = plant.spectral_radius(spring_and_damper(kp, kd), np.array([[-kp, -kd]]), 2 * 5.33e-3, np.ones(1))
-    assert f"each multiplies deviations by {radius:.4g}" in motion.warnings[0]
+    assert not unnamed(motion.warnings[0], f"{radius:.4g}")
 
 
 @pytest.mark.parametrize("steps", [600, 1200])
@@ -258,8 +258,7 @@ def test_a_law_that_is_never_inside_its_limits_is_told_of(steps):
 
     cycling = late(saturated(1e6, 10.0, 20.0), 1.2)
     assert (np.abs(cycling.u) == 20.0).all()
-    assert "goes from one of its limits, -20 and 20, to the other" in cycling.warnings[0]
-    assert "shorter period or lower gains" in cycling.warnings[0]
+    assert not unnamed(cycling.warnings[0], "limits", "-20", "20", "period", "gains")
     for law in (
         lambda t, q, v: np.clip(-1e3 * (q - 3.0 * np.sin(6.0 * t)) - 50.0 * v, -10.0, 10.0),
         lambda t, q, v: np.clip(-3e3 * (q - np.sin(8.0 * t)) - 60.0 * (v - 8.0 * np.cos(8.0 * t)), -10.0, 10.0),
@@ -363,7 +362,7 @@ def test_a_loop_that_is_slowly_unstable(radius):
     motion, told = run(rod, [0.3], [0.2], lambda t, q, v: -kd * v, dt=4e-3, steps=60)
     assert told == (radius > 1.0)
     if told:
-        assert f"multiplies deviations by {radius:.4g}" in motion.warnings[0]
+        assert not unnamed(motion.warnings[0], f"{radius:.4g}")
     # Its goal moves, and no equilibrium is there to look at: the motion tells.
     _, told = run(rod, [0.3], [0.2], lambda t, q, v: -kd * (v - 3.0), dt=4e-3, steps=400)
     assert told == (radius > 1.0)
@@ -376,7 +375,7 @@ def test_slow_turns_of_a_complex_pair():
     for kp in (30.0, 300.0):
         motion, told = run(rod, [0.3], [0.0], spring_and_damper(kp, 0.0, 0.0), dt=dt, steps=600)
         assert told
-        assert f"multiplies deviations by {np.sqrt(1.0 + 0.5 * kp * dt**2 / inertia):.4g}" in motion.warnings[0]
+        assert not unnamed(motion.warnings[0], f"{np.sqrt(1.0 + 0.5 * kp * dt**2 / inertia):.4g}")
 
 
 def cases_without_alarm():
@@ -505,8 +504,7 @@ def test_the_sentence_says_what_to_do(caplog):
         motion, _ = run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=5e-3, steps=50)
         run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=5e-3, steps=50)
     (sentence,) = motion.warnings
-    assert "unstable at its period of 0.005 s: each multiplies deviations by 2.136" in sentence
-    assert "with a period of 0.0025 s or lower gains it is stable" in sentence
+    assert not unnamed(sentence, "unstable", "0.005 s", "2.136", "0.0025 s", "gains")
     assert [record.getMessage() for record in caplog.records] == [sentence]
     assert not run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=2.5e-3, steps=50)[1]
     assert run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=5e-3, steps=50, check=False)[0].warnings == ()

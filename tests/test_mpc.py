@@ -4,8 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from findings import about
 from mechanisms import slider
-from refusals import refused
+from refusals import refused, unnamed
 
 import varpin as vp
 import varpin.control.mpc
@@ -138,7 +139,7 @@ def test_a_late_plan_leaves_the_one_before_to_act():
         integrator=vp.RungeKutta4(),
     )
     np.testing.assert_allclose(run.motion.q, plan.q, rtol=0, atol=1e-10)
-    assert "19 later than" in str(run)
+    assert not unnamed(str(run), "19")
 
 
 def test_controls_stay_within_their_limits():
@@ -232,7 +233,7 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
     assert (caught.value.step, caught.value.time) == (part.steps, pytest.approx(0.02 * ticks))
     if whose == "solve":
         assert part.steps == 10 * ticks
-        assert "no plan can be made from here" in str(caught.value)
+        assert about(str(caught.value), "no plan from here")
         assert isinstance(caught.value.__cause__, vp.StepFailure)
 
 
@@ -257,7 +258,7 @@ def test_a_cost_that_fails_keeps_the_motion_of_all_ticks_before(whose):
     motion = caught.value.trajectory
     assert motion.steps == 30
     assert motion.q[0] == whole.motion.q[0]
-    assert "motion so far is in error.trajectory" in str(caught.value)
+    assert not unnamed(str(caught.value), "error.trajectory")
     assert isinstance(caught.value.__cause__, vp.CostError)
     assert caught.value.__cause__.trajectory is None
     assert caught.value.cost == caught.value.__cause__.cost

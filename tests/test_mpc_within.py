@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from refusals import naming, refused
+from refusals import naming, refused, unnamed
 
 import varpin as vp
 
@@ -114,8 +114,8 @@ def test_ticks_that_find_no_plan_are_told_of():
     assert far.infeasible > 3
     assert far.constraints[0].infeasible.sum() == far.infeasible
     assert naming(far.warnings, "no plan", "ReachFrame('tip')")
-    assert any("cannot be met" in plan.reason or "in a row" in plan.reason for plan in far.plans)
-    assert "ReachFrame('tip'): violated by" in str(far)
+    assert any(plan.status is vp.Status.INFEASIBLE for plan in far.plans)
+    assert not unnamed(str(far), "ReachFrame('tip')")
     assert np.isfinite(far.plans[-1].multipliers.values).all()
 
 

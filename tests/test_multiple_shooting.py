@@ -5,6 +5,7 @@ import logging
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import naming, refused
 
 import varpin as vp
 from varpin.control import Status
@@ -107,7 +108,7 @@ def test_around_an_obstacle():
     assert found.status.converged
     assert found.violation <= 1e-9
     assert found.cost < 0.2 * own.cost
-    with pytest.raises(vp.InputError, match="either states or resume"):
+    with refused(vp.InputError, "states", "resume"):
         vp.solve(problem, resume=found, states=line([1.0, 0.5]))
 
 
@@ -145,38 +146,37 @@ def test_paths_beyond_limits_are_told_of(caplog):
     path[5, 2] = 9.0
     with caplog.at_level(logging.WARNING):
         vp.solve(problem, states=path, max_iterations=0, check=False)
-    assert "joint 'elbow_joint' is" in caplog.text
-    assert "beyond its limit at node 5" in caplog.text
+    assert naming(caplog.messages, "'elbow_joint'", "node 5")
 
 
 @pytest.mark.parametrize(
-    ("states", "message"),
+    ("states", "facts"),
     [
-        (line([1.0, 0.5], 20), r"a row for each of 51 nodes.*got 21"),
-        (np.zeros((51, 3)), r"states must have shape \(51, 2\)"),
+        (line([1.0, 0.5], 20), ("51", "21")),
+        (np.zeros((51, 3)), ("states", "(51, 2)")),
         (np.full((51, 2), np.nan), "states"),
-        (line([1.0, 0.5]) + np.array([0.0, 0.1]), r"begin at the problem's q0: joint 'joint2' is at 0.1"),
-        ((np.zeros((51, 2)),), r"a pair \(q, v\), got 1"),
-        ((np.zeros((51, 2)), np.zeros((50, 2))), "states: v must have a row for each of 51 nodes"),
+        (line([1.0, 0.5]) + np.array([0.0, 0.1]), ("q0", "'joint2'", "0.1")),
+        ((np.zeros((51, 2)),), ("(q, v)", "1")),
+        ((np.zeros((51, 2)), np.zeros((50, 2))), ("states", "v", "51")),
         ("path", "states"),
     ],
 )
-def test_refused_states(states, message):
-    with pytest.raises(vp.InputError, match=message):
+def test_refused_states(states, facts):
+    with refused(vp.InputError, facts):
         vp.solve(reach(), states=states)
 
 
 def test_refused_beside_states():
     problem = reach()
     plan = vp.solve(problem, max_iterations=0, check=False)
-    with pytest.raises(vp.InputError, match="without feedback"):
+    with refused(vp.InputError, "states"):
         vp.solve(problem, plan, states=line([1.0, 0.5]))
-    with pytest.raises(vp.InputError, match="either states or resume"):
+    with refused(vp.InputError, "states", "resume"):
         vp.solve(problem, resume=plan, states=line([1.0, 0.5]))
-    with pytest.raises(vp.InputError, match="held controls"):
+    with refused(vp.InputError, "states", "held"):
         vp.solve(reach(controls="linear"), states=line([1.0, 0.5]))
     other = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.0], [0.0], dt=0.01, steps=3)
-    with pytest.raises(vp.InputError, match="of joints"):
+    with refused(vp.InputError, "joints"):
         vp.solve(problem, states=other)
     slower = vp.simulate(problem.scene, problem.q0, [0.0, 0.0], dt=2.0 * problem.dt, steps=problem.steps)
     with pytest.raises(vp.InputError, match="dt"):

@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
+from findings import about
 from naive import continuous
-from refusals import refused
+from refusals import refused, unnamed
 from test_sddp import WEIGHTS, arm_problem, lq_problem, problem_without_noise, run, small
 
 import varpin as vp
@@ -371,8 +372,7 @@ def test_verification_prints_a_table_with_the_loss_in_percent():
 
 def test_monte_carlo_prints_how_far_it_is_from_the_prediction():
     text = str(vp.MonteCarlo(cost=1.1, standard_error=0.05, predicted=1.0, paths=197, failures=3))
-    assert "1.100000e+00 +- 5.0e-02 (197 paths; 3 more ran away" in text
-    assert "+10.00 %, +2.0 standard errors" in text
+    assert not unnamed(text, "1.100000e+00", "5.0e-02", "197", "3", "+10.00 %", "+2.0")
     assert text.splitlines()[-1].startswith("how to read it: ")
     assert "standard errors)" not in str(vp.MonteCarlo(1.0, 0.0, 1.0, 2, 0))
 
@@ -421,6 +421,6 @@ def test_verification_says_that_the_search_had_not_converged():
     short, done = vp.solve(problem, max_iterations=1), vp.solve(problem)
     told, calm = (plan.verify(tolerance=1e-3) for plan in (short, done))
     assert (told.status, calm.status) == (vp.Status.MAX_ITERATIONS, vp.Status.CONVERGED)
-    assert str(told).splitlines()[-1].startswith("the plan is unfinished, not converged: more iterations may help")
-    assert "more iterations may help" in told._repr_html_()
-    assert "unfinished" not in str(calm) + calm._repr_html_()
+    assert about(str(told).splitlines()[-1], "unfinished plan")
+    assert about(told._repr_html_(), "unfinished plan")
+    assert not about([str(calm), calm._repr_html_()], "unfinished plan")

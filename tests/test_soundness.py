@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from findings import about
+from refusals import unnamed
 
 import varpin as vp
 from varpin.core import fastest_damping
@@ -132,7 +133,7 @@ def test_a_slider_that_is_far_and_fast_does_not_hide_a_hinge():
             vp.simulate(scene, np.zeros(2), [0.0, speed], dt=0.05, steps=20, integrator=integrator)
             for speed in (0.0, 1e6)
         )
-        said = [any("is coarse" in text for text in motion.warnings) for motion in (calm, fast)]
+        said = [bool(about(motion.warnings, "coarse steps")) for motion in (calm, fast)]
         assert said == [coarse, coarse]
 
 
@@ -140,7 +141,8 @@ def test_energy_that_drifts_is_spoken_of():
     motion = vp.simulate(vp.Scene(ROD), [1.0], [0.0], dt=1e-3, steps=20_000, integrator=vp.ExplicitEuler())
     (sentence,) = motion.warnings
     drift = np.abs(motion.energy - motion.energy[0]).max()
-    assert f"the energy is off by {drift:.3g} J" in sentence
+    assert about(sentence, "energy")
+    assert not unnamed(sentence, f"{drift:.3g} J")
     assert np.abs(motion.statistics.energy_defect).max() == pytest.approx(drift)
     assert vp.simulate(vp.Scene(ROD), [1.0], [0.0], dt=1e-3, steps=20_000).warnings == ()
 
@@ -364,7 +366,7 @@ def test_a_spindle_hides_nothing(kind):
         motion = vp.simulate(scene, *start, dt=0.01, steps=100, integrator=integrator)
         off = (np.abs(motion.q - exact.q).max(axis=0) / np.ptp(exact.q, axis=0))[:2].max()
         assert (off > 0.5) if wrong else (off < 0.01)
-        assert any("coarse" in sentence and "'arm" in sentence for sentence in motion.warnings) == wrong
+        assert any("'arm" in sentence for sentence in about(motion.warnings, "coarse steps")) == wrong
         if not wrong:
             assert motion.warnings == ()
 
@@ -519,9 +521,9 @@ def test_parts_of_steps_are_no_reason_to_warn():
     motion = vp.simulate(scene, rest, rest, dt=0.1, steps=200, integrator=vp.Gauss(4))
     assert motion.statistics.split_steps > 0
     (told,) = motion.warnings
-    assert told.startswith("disturbances grow here")
+    assert about(told, "growth")
     unchecked = vp.simulate(scene, rest, rest, dt=0.1, steps=200, integrator=vp.Gauss(4), check=False)
-    assert any("parts" in sentence for sentence in unchecked.warnings)
+    assert about(unchecked.warnings, "steps in parts")
 
 
 @pytest.fixture
@@ -586,7 +588,7 @@ def test_a_single_step_is_held_against_two_of_half_its_length(integrator, evalua
     assert evaluations() <= 3 * int((motion.statistics.jets + motion.statistics.sweeps).sum())
     scene, motion = oscillator(1.5, vp.Midpoint(), steps=1, check=False)
     (found,) = examined(scene, vp.Midpoint(), motion)[1]
-    assert "coarse" in found.sentence
+    assert about(found.sentence, "coarse steps")
 
 
 @pytest.mark.parametrize("integrator", EXPLICIT, ids=str)

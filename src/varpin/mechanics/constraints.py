@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tied
 from varpin.errors import InputError, UnknownJoint
-from varpin.mechanics.forces import Point, kept, point_of, require_movable, shown
+from varpin.mechanics.forces import Point, kept, point_of, require_index, require_movable, shown
 from varpin.model import Robot
 from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, tuple_of
 from varpin.support.frozen import Frozen
@@ -61,6 +61,33 @@ class Constraint(Frozen, ABC):
             UnknownJoint: A joint is no coordinate of the robot.
             UnknownFrame: The robot has no such frame.
         """
+
+
+def bound_constraint(constraint: Constraint, robot: Robot) -> Bound:
+    """``constraint.bind(robot)``, which the core can take: subclasses of users are checked here.
+
+    Raises:
+        InputError: A body, coordinate or vector out of range, or not a label for each row.
+    """
+    bound = constraint.bind(robot)
+    where = f"{type(constraint).__name__}.bind returned"
+    if not isinstance(bound, Bound):
+        raise InputError(f"{where} {bound!r}, which is no Bound")
+    vectors, products, ties, customs = bound.rows
+    for part in (part for vector in vectors for part in vector):
+        require_index(f"{where} {part!r}: its body", part.body, -1, len(robot.tree.parent))
+    for product in products:
+        for index in (product.x, product.y):
+            require_index(f"{where} {product!r}: its vector", index, 0, len(vectors))
+    for tie in ties:
+        for index in (tie.follower, tie.leader):
+            require_index(f"{where} {tie!r}: its coordinate", index, 0, robot.dof)
+    for index in (index for pair in bound.aligned for index in pair):
+        require_index(f"{where} aligned = {bound.aligned!r}: its vector", index, 0, len(vectors))
+    rows = len(products) + len(ties) + sum(custom.rows for custom in customs)
+    if len(bound.labels) != rows:
+        raise InputError(f"{where} {len(bound.labels)} labels for {rows} rows")
+    return bound
 
 
 def _shown(value: Any) -> str:

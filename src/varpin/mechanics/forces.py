@@ -59,6 +59,47 @@ class Force(Frozen, ABC):
         """
 
 
+# Parameters that the core's kinds of elements and couplings have; a coupling has six more for its two points.
+_OF_ELEMENT = {
+    "Armature": 1, "CoulombFriction": 4, "JointDamper": 1, "JointSpring": 2, "JointStop": 5, "PositionServo": 3,
+}  # fmt: skip
+_OF_COUPLING = {
+    "FrameDamper": 3, "FrameLengthSpring": 2, "FrameLoad": 3, "FrameSpring": 6, "FrameTurnDamper": 3,
+    "FrameTurnSpring": 1, "FrameWrench": 7,
+}  # fmt: skip
+
+
+def bound_force(force: Force, robot: Robot) -> tuple[Element | Coupling, ...]:
+    """``force.bind(robot)``, of which the core can take every element: subclasses of users are checked here.
+
+    Raises:
+        InputError: An element of an unknown kind, with a coordinate or body out of range, or with wrong values.
+    """
+    bound = tuple(force.bind(robot))
+    for each in bound:
+        where = f"{type(force).__name__}.bind returned {each!r}"
+        if isinstance(each, Element):
+            kinds, points = _OF_ELEMENT, 0
+            require_index(f"{where}: its coordinate", each.coordinate, 0, robot.dof)
+        elif isinstance(each, Coupling):
+            kinds, points = _OF_COUPLING, 6
+            for end in (each.a, each.b):
+                require_index(f"{where}: its body", end, -1, len(robot.tree.parent))
+        else:
+            raise InputError(f"{where}, which is neither an Element nor a Coupling")
+        if each.kind not in kinds:
+            raise InputError(f"{where}, of an unknown kind; kinds: {', '.join(kinds)}")
+        if len(each.values) != points + kinds[each.kind] or np.isnan(as_floats("values", each.values)).any():
+            raise InputError(f"{where}, which must have {points + kinds[each.kind]} values, none of them NaN")
+    return bound
+
+
+def require_index(what: str, index: Any, least: int, end: int) -> None:
+    """Refuse an index that is no integer from ``least`` to ``end`` - 1."""
+    if isinstance(index, bool) or not isinstance(index, int | np.integer) or not least <= index < end:
+        raise InputError(f"{what} must be an integer from {least} to {end - 1}, got {index!r}")
+
+
 def kept(name: str, value: Any) -> Any:
     """An immutable copy of a parameter."""
     if value is None or isinstance(value, str):

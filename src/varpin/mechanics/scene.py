@@ -18,13 +18,21 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.core import Mechanism as Core
 from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
-from varpin.mechanics.constraints import Bound, Constraint, CustomConstraint, constraints_of, joined
+from varpin.mechanics.constraints import (
+    Bound,
+    Constraint,
+    CustomConstraint,
+    bound_constraint,
+    constraints_of,
+    joined,
+)
 from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.forces import (
     CoulombFriction,
     Force,
     JointDamper,
     JointSpring,
+    bound_force,
     dissipates,
     forces_of,
     keeps_energy,
@@ -206,7 +214,7 @@ class Scene(Frozen):
         values["actuation"] = _served(robot, _actuation(robot, actuation), values["elements"])
         _refuse_noisy_servos(noise, values["elements"], robot)
         values["constraints"] = constraints_of(constraints)
-        bound, order = joined([constraint.bind(robot) for constraint in values["constraints"]])
+        bound, order = joined([bound_constraint(constraint, robot) for constraint in values["constraints"]])
         _require_positions(robot, values["actuation"], values["elements"], bound)
         values["actuation"], bound = _with_rates(values["actuation"], bound)
         values["noise"] = bind(noise, values["actuation"], robot.joint_names)
@@ -805,7 +813,7 @@ def _forces(
         given = (JointDamper(short[0]), *given)
     if short[1].any():
         given = (JointSpring(short[1], slack), *given)
-    bound = [each for force in given for each in force.bind(robot)]
+    bound = [each for force in given for each in bound_force(force, robot)]
     elements = [each for each in bound if isinstance(each, Element)]
     own_code = tuple(force for force in given if isinstance(force, CustomForce))
     total = {kind: np.zeros(robot.dof) for kind in ("JointDamper", "JointSpring", "Armature")}
