@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.backward import states
 from varpin.control.problem import OptimalControlProblem, bind_cost
 from varpin.errors import InputError, VarpinError
@@ -38,7 +38,6 @@ except ImportError as missing:
         "in a separate environment, as it installs the Pinocchio that it was built against"
     ) from missing
 
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

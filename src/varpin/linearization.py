@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import Integrator, integrator_of
 from varpin.integrators.base import diffusion_and_drift, open_loop
@@ -19,8 +20,6 @@ from varpin.mechanics.scene import Scene, require_scene
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory, require_motion, require_scene_of
-
-Floats = NDArray[np.float64]
 
 # Number of steps that are repeated to check the scene of a motion without scene values, and tolerances as shares of
 # the largest change of velocity in the step and of the largest velocity.

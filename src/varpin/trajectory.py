@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin._version import __version__
+from varpin.arrays import Floats, Integers
 from varpin.errors import FileError, InputError
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
 from varpin.mechanics.scene import OF_FORCES, VALUES, Scene, differences, same
@@ -22,8 +23,6 @@ from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, table, warning_count
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 FORMAT = "varpin.trajectory/2"

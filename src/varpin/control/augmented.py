@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 from typing import Any, ParamSpec
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.backward import backward
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
@@ -37,7 +37,6 @@ from varpin.simulation.soundness import announce
 from varpin.support.checks import count, positive
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 P = ParamSpec("P")
 
 logger = logging.getLogger(__name__)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin import core
+from varpin.arrays import Floats
 from varpin.control.costs import CostError, Expansion
 from varpin.control.descent import Model, Stake, at_stake
 from varpin.control.linear_controls import RULE, Derivatives, LinearSteps, at_samples, linear_steps, size
@@ -29,7 +30,6 @@ from varpin.linearization import (
 )
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Number of nodes that are linearized at a time; longer motions do not keep their derivatives.

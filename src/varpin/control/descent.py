@@ -8,13 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.costs import Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
 # Rounding errors of costs and states, in units of the last digit.

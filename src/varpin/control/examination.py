@@ -6,8 +6,8 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.hints import hints
 from varpin.control.history import ITERATIONS, Status
@@ -22,8 +22,6 @@ from varpin.integrators.base import open_line, open_loop
 from varpin.simulation.chatter import alternation, restlessness
 from varpin.simulation.record import rollout
 from varpin.simulation.soundness import Finding, announce, examined, findings_from_record
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint, KeepClear, ReachFrame, WithinJointLimits
 from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
 from varpin.control.costs.base import Scaled
@@ -15,8 +15,6 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.model import Robot
 from varpin.model.kinematics import FrameKinematics
 from varpin.simulation.soundness import Finding
-
-Floats = NDArray[np.float64]
 
 # Greatest plausible angle [rad], two turns, and distance of a goal in units of the reach: others look like wrong units.
 _TURNS, _AFAR = 4.0 * np.pi, 50.0

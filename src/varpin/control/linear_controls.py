@@ -10,11 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem
-
-Floats = NDArray[np.float64]
 
 # The sampling rule of a cost in (X, u) at the beginning of the step.
 RULE: Floats = np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])

@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.linear_controls import at_samples
 from varpin.control.problem import OptimalControlProblem
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # Step of the central differences, relative to the largest value of each variable along the motion.
 _SHIFT = 1e-5

@@ -10,8 +10,8 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.costs import CostSum
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.verification import excess, percent
@@ -28,8 +28,6 @@ from varpin.support.checks import count
 from varpin.support.executors import executing, in_order
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control import Kept, OptimalControlProblem, Solution, kept, looked_at, replan, solve
 from varpin.control.costs import CostError
 from varpin.control.history import Status
@@ -30,8 +31,6 @@ from varpin.support.checks import JointValues, control_values, count, positive, 
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
 from varpin.trajectory import Nodes, Trajectory, chained
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.backward import Along, Plan, backward, states
 from varpin.control.costs import CostError, Expansion
 from varpin.control.history import Iteration
@@ -35,8 +35,6 @@ from varpin.simulation.failures import StepFailure, named
 from varpin.simulation.record import Motions
 from varpin.support.checks import as_floats, finite_array
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

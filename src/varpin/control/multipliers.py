@@ -8,13 +8,12 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.problem import OptimalControlProblem
 from varpin.io.archive import Axes
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # Greatest violation of a constraint at its places in a feasible plan, in its own unit.
 FEASIBLE = 1e-6

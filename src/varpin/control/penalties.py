@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.costs import ControlRate, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Greatest number of backward passes that determine the active rows of the penalties.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.backward import states
 from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.problem import OptimalControlProblem
@@ -21,7 +22,6 @@ from varpin.integrators.base import open_loop
 from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # Greatest number of Newton steps.

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint, BoundRate, Horizon, PlanConstraint
 from varpin.control.costs import (
     BoundSum,
@@ -51,8 +52,6 @@ from varpin.support.checks import (
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 from varpin.trajectory import Trajectory, require_motion
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control import search
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Iteration, Status
@@ -21,8 +22,6 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # A penalty's weight grows by _GROWTH after a tick that leaves more than _ENOUGH of its constraint's violation, up to
 # _HEAVIEST times its first weight: stiffer penalties take more iterations than a tick has.

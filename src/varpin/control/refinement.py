@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.control.history import Status
 from varpin.control.problem import OptimalControlProblem
@@ -20,7 +19,6 @@ from varpin.errors import InputError, VarpinError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.record import rollout
 
-Floats = NDArray[np.float64]
 Search = Callable[[OptimalControlProblem, LinearPolicy | None], Solution]
 
 logger = logging.getLogger(__name__)

@@ -15,8 +15,9 @@ from dataclasses import dataclass, is_dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.control.backward import Along, Plan, backward, noise_shares, states
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
@@ -53,7 +54,6 @@ from varpin.support.checks import (
 )
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Callback = Callable[[Iteration], None] | Callable[[Iteration, Trajectory], None]
 Report = Callable[[Iteration, Trajectory], None]
 Progress = Callable[[int, int], None]

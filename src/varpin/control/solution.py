@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.costs import barriers_of
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
@@ -28,8 +28,6 @@ from varpin.support.checks import JointValues, count, is_one_of, positive
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

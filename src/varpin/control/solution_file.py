@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.multipliers import Multipliers
 from varpin.control.problem import OptimalControlProblem
@@ -22,7 +23,6 @@ from varpin.model import Robot
 from varpin.support.checks import path_like
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Members = Mapping[str, NDArray[Any]]
 
 _FORMAT = "varpin.solution/2"

@@ -9,11 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin import core
-
-Floats = NDArray[np.float64]
+from varpin.arrays import Floats
 
 # Size of eigenvalues that are rounding errors in a Hessian with unit diagonal.
 _ROUNDING = 1e-12

@@ -9,16 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem
 from varpin.core import Watch
 from varpin.core.arrays import Bytes, Commands, Nodes
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure, Lines, lines, statistics_of
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

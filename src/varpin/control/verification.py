@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import BoundSum
 from varpin.control.history import Status
@@ -23,8 +23,6 @@ from varpin.simulation.friction import rate_at_rest
 from varpin.simulation.record import rollout
 from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

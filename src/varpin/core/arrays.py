@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from varpin.arrays import Floats, Integers
+
 Bytes = NDArray[np.uint8]
 
 _HELD: Floats = np.zeros((0, 0, 0))

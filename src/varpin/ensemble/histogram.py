@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from varpin.arrays import Floats, Integers
 
 # Total number of bins, over all nodes and states, and the smallest and largest number for one state at one node.
 _BINS, _FEWEST_BINS, _MOST_BINS = 2**25, 64, 1000

@@ -7,15 +7,13 @@ from concurrent.futures import Executor
 from contextlib import closing
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.ensemble.paths import Extremes, Shared, Task
 from varpin.simulation.loop_stability import examined_in_loop
 from varpin.simulation.record import Motions
 from varpin.simulation.soundness import Finding
 from varpin.support.executors import in_order
-
-Floats = NDArray[np.float64]
 
 # Up to this number of paths, every path is examined.
 _ALL_EXAMINED = 10

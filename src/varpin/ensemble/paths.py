@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
 from varpin.ensemble.histogram import count_in_bins
 from varpin.ensemble.record import PathFailure
@@ -23,8 +24,6 @@ from varpin.mechanics.wiener import Children
 from varpin.simulation.record import located
 from varpin.support.frozen import Frozen
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 # By quantity ("split", "energy", "speed"): its largest value, and the path that has it.
 Extremes = dict[str, tuple[float, int]]
 

@@ -9,8 +9,8 @@ from concurrent.futures import Executor
 from contextlib import closing
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.ensemble.looks import looked_at, looked_at_here
 from varpin.ensemble.paths import Part, Shared, simulate_paths, without_geometry
 from varpin.ensemble.record import Ensemble, EnsembleInterrupted
@@ -27,8 +27,6 @@ from varpin.simulation.soundness import Finding, announce
 from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
 from varpin.support.executors import executing, in_order
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

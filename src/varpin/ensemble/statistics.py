@@ -10,13 +10,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.ensemble.histogram import Histogram
 from varpin.ensemble.looks import greater
 from varpin.ensemble.paths import Extremes, Moments, Part, Shared, Task, chunks
 from varpin.ensemble.record import Ensemble, EnsembleStatistics, PathFailure
 from varpin.simulation.soundness import Finding
-
-Floats = NDArray[np.float64]
 
 # Without stored paths, quantiles are exact up to this many numbers, P (N + 1) 2n.
 _EXACT = 2**25

@@ -14,14 +14,13 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core import Watch
 from varpin.core.arrays import Commands, Nodes
 from varpin.errors import InputError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Bytes, StepStatistics, Trajectory, joined
-
-Floats = NDArray[np.float64]
 
 # Fields of a segment with one row for each node.
 _ARRAYS = ("q", "p", "v", "u", "energy")

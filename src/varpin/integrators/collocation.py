@@ -9,12 +9,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators.tableau import stability
 from varpin.integrators.variational import Guard, Variational
 from varpin.support.checks import count
-
-Floats = NDArray[np.float64]
 
 MOST_STAGES = 6
 

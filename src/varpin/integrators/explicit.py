@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin import core
+from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, Outcome, Watch
 from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import LinearizationError, SingularMassMatrix
@@ -31,8 +32,6 @@ from varpin.integrators.base import (
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.trajectory import Bytes, Trajectory
-
-Floats = NDArray[np.float64]
 
 REASONS: dict[int, str] = {
     Outcome.not_finite: "the state is no longer finite",

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from varpin.arrays import Floats
 from varpin.core import Tableau
 from varpin.integrators.collocation import Collocation
 from varpin.integrators.tableau import gauss, gauss_coefficients, lobatto_places
-
-Floats = NDArray[np.float64]
 
 # Shares of the guard's energy balance and energy budget for methods with more than one stage.
 BALANCE_SHARE, BUDGET_SHARE = 1 / 25, 1 / 100

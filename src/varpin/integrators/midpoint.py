@@ -12,12 +12,11 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core import Tableau
 from varpin.integrators.tableau import lobatto_places, midpoint
 from varpin.integrators.variational import Guard, Variational
 from varpin.support.checks import fraction
-
-Floats = NDArray[np.float64]
 
 
 def largest_step(M: Floats, Lqq: Floats, margin: float) -> float:

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from varpin.arrays import Floats
 from varpin.core import Tableau
 from varpin.integrators.collocation import Collocation
 from varpin.integrators.gauss import BUDGET_SHARE
 from varpin.integrators.tableau import radau, radau_coefficients
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

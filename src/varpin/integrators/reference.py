@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
 from varpin.core.arrays import Commands, Nodes, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
@@ -29,7 +29,6 @@ from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Rate = Callable[[float, Floats], Floats]
 Force = Callable[[float], Floats]
 

@@ -6,9 +6,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core import Tableau
-
-Floats = NDArray[np.float64]
 
 
 def interpolation(nodes: Floats, at: Floats) -> Floats:

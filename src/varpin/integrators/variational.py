@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core import (
     ConstrainedRollout,
     Guards,
@@ -45,8 +45,6 @@ from varpin.integrators.base import (
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.support.checks import count, fraction, is_one_of, positive
 from varpin.trajectory import MOST_HALVINGS, Bytes, Trajectory
-
-Floats = NDArray[np.float64]
 
 # Tolerance of an energy balance that is not checked.
 _UNCHECKED = 1e300

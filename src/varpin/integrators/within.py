@@ -9,13 +9,12 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.integrators.base import open_loop
 from varpin.integrators.tableau import gauss_coefficients, interpolation
 
-Floats = NDArray[np.float64]
 Times = tuple[float, ...]
 
 

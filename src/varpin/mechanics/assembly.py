@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.model.tree import place_on_body
 from varpin.support.checks import JointValues, joint_array
-
-Floats = NDArray[np.float64]
 
 # Rank tolerance of the constraint Jacobian in the kinetic-energy metric, relative to the largest singular value.
 _RANK = 1e-9

@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tied
 from varpin.errors import InputError, UnknownJoint
 from varpin.mechanics.forces import Point, kept, point_of, require_index, require_movable, shown
@@ -24,7 +25,6 @@ from varpin.model import Robot
 from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, tuple_of
 from varpin.support.frozen import Frozen
 
-Floats = NDArray[np.float64]
 _AXES = "xyz"
 
 

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError
 from varpin.mechanics.forces import Force
 from varpin.model import Robot
 from varpin.support.frozen import Frozen
 
-Floats = NDArray[np.float64]
 Field: TypeAlias = Callable[[Floats, Floats], ArrayLike]
 Slopes: TypeAlias = Callable[[Floats, Floats], tuple[ArrayLike, ArrayLike]]
 

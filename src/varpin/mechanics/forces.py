@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError, UnknownJoint
 from varpin.model import Robot
@@ -26,7 +27,6 @@ from varpin.model.tree import place_of_frame
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array, tuple_of
 from varpin.support.frozen import Frozen
 
-Floats = NDArray[np.float64]
 # A frame name or (frame name, point in the frame's axes); a Point may also be a point in world axes.
 FramePoint: TypeAlias = str | tuple[str, ArrayLike]
 Point: TypeAlias = FramePoint | ArrayLike

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.mechanics.scene import Scene
-
-Floats = NDArray[np.float64]
 
 
 def in_parts_of_steps(scene: Scene, u: Floats, q: Floats, v: Floats, dt: float, parts: int) -> Floats:

@@ -10,16 +10,14 @@ from typing import Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.mechanics.forces import keeps_energy, of_kind
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.model.tree import joint_axis, z_to
 from varpin.support.checks import JointValues, fraction, joint_array, positive
 from varpin.textbook import rigid_body_Lqq
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

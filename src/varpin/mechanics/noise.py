@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Diffusion
 from varpin.errors import InputError
 from varpin.support.checks import (
@@ -29,8 +30,6 @@ from varpin.support.checks import (
     require_finite,
 )
 from varpin.support.frozen import Frozen
-
-Floats = NDArray[np.float64]
 
 
 class NoiseFieldError(InputError):

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.support.checks import (
@@ -25,8 +26,6 @@ from varpin.support.checks import (
     takes,
 )
 from varpin.support.frozen import Frozen
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.arrays import Floats
 from varpin.core import Mechanism as Core
 from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
@@ -46,8 +47,6 @@ from varpin.support.checks import JointValues, as_floats, finite_array, joint_ar
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 from varpin.support.weak import Weak
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

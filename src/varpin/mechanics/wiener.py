@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.support.checks import as_floats, count, finite_array, positive, require_finite
-
-Floats = NDArray[np.float64]
 
 # Children spawned in one call.
 _BATCH = 10_000

@@ -6,7 +6,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from varpin.errors import InputError, RobotError, UnknownJoint
 from varpin.model.mimic import Tie, joint_index, rebuild
@@ -14,7 +14,6 @@ from varpin.model.sources import Description, hang_shapes
 from varpin.model.urdf import build_model, build_shapes, read_urdf
 from varpin.support.checks import JointValues, as_floats, broadcast_array, finite, positive
 
-Floats = NDArray[np.float64]
 Base: TypeAlias = Literal["planar"] | ArrayLike | pin.SE3 | None
 
 # A mesh is closed if the norm of its summed directed areas is at most this share of its area.

@@ -10,8 +10,9 @@ from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.model.robot import Robot, geometry
@@ -19,8 +20,6 @@ from varpin.model.tree import place_of_frame, z_to
 from varpin.model.urdf import decoded, parsed
 from varpin.support.checks import finite_array, over_time, positive, rotation_matrix
 from varpin.support.frozen import Frozen
-
-Floats = NDArray[np.float64]
 
 coal = pin.coal
 

@@ -4,11 +4,9 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.model.urdf import Inertial
-
-Floats = NDArray[np.float64]
 
 # Relative tolerance of the triangle inequality. A thin plate satisfies it with equality, and misses it by about this
 # much if its numbers are rounded.

@@ -6,17 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats, Integers
 from varpin.core import Links as Core
 from varpin.core.arrays import Tree
 from varpin.errors import InputError
 from varpin.model.robot import Robot
 from varpin.model.tree import frame_on_body
 from varpin.support.frozen import Frozen
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.errors import InputError, UnknownFrame
 from varpin.support.checks import as_floats, finite_array, real, require_finite
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
 from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
@@ -36,8 +37,6 @@ from varpin.model.urdf import build_model, build_shapes, missing_meshes, missing
 from varpin.support.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed, table
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

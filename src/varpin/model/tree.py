@@ -7,12 +7,10 @@ import pinocchio as pin
 import scipy
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, UnknownFrame, UnsupportedJoint
 from varpin.model.mimic import Tie
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 def joint_axis(model: pin.Model, joint: int) -> tuple[bool, Floats]:

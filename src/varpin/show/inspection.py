@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Guard, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -22,8 +23,6 @@ from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.urdf import Urdf, read_urdf
 from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
 from varpin.support.checks import JointValues, joint_array
-
-Floats = NDArray[np.float64]
 
 # Thresholds of warnings: ratios of masses and of principal moments of neighbouring links, and the condition number of M
 # with a unit diagonal. The largest values among the arms of example-robot-data are 320, 2e5 and 830.

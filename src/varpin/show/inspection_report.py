@@ -7,17 +7,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from varpin.arrays import Floats
 from varpin.model import Robot
 from varpin.support import markup, tables
 from varpin.support.frozen import Frozen
 
-Floats = NDArray[np.float64]
 Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
 FrameKind = Literal["link", "joint", "fixed joint", "frame"]
 

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.trajectory import Trajectory, kinematic_input_rows
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from varpin.study.tradeoff import Advice, OptimalControlTradeoff, WorkPrecision
     from varpin.study.tradeoff.precision import Quantity
 
-Floats = NDArray[np.float64]
 
 # Okabe and Ito's palette for colour-blind readers, without its yellow, which is faint on white.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")

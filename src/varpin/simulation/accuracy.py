@@ -11,11 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats, Integers
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Thresholds of errors. Energy balance: share of the energy turned over. Position: share of the joint's way over a
 # period (the range that q covers), and of the way of the joint that goes furthest. Velocity: share of the joint's

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core import longest_alternation
-
-Floats = NDArray[np.float64]
 
 # Least second difference of a velocity that counts, as a share of the joint's largest velocity: it is four times the
 # alternating part.

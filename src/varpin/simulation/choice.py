@@ -9,16 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core import fastest_damping, pulls_fast
 from varpin.integrators import Gauss, Integrator, Midpoint, Radau
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
 from varpin.simulation.damping import fast_damping, stops_ahead, turns_fast
 from varpin.simulation.refinement import candidates, first_steps
-
-Floats = NDArray[np.float64]
 
 # The default, and the default under noise, where more stages do not raise the strong order.
 _USUAL, _NOISY = Gauss(2), Midpoint()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.integrators import Integrator
@@ -17,8 +17,6 @@ from varpin.mechanics.scene import Scene, refuse_inputs
 from varpin.simulation.functions import ControlLaw, decision, evaluated, sampled
 from varpin.simulation.record import Record, next_command
 from varpin.support.checks import JointValues, as_floats, control_array, require_finite
-
-Floats = NDArray[np.float64]
 
 # All controls but a control law: known before the motion, or fed back by the core.
 Controls = JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None

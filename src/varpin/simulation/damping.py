@@ -11,15 +11,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats, Integers
 from varpin.core import fastest_damping, pulls_fast
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
 from varpin.simulation.friction import Stop, rate_at_stops, stops
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Nodes spread over the motion: one of this many, and the least and the largest number.
 _OF, _LEAST, _MOST = 16, 4, 12

@@ -6,15 +6,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import VarpinError
 from varpin.integrators.base import Failure
 from varpin.mechanics.scene import Scene
 from varpin.simulation import limits
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 
 class Interrupted(KeyboardInterrupt):

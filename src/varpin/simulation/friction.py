@@ -9,13 +9,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core import fastest_damping
 from varpin.mechanics.forces import dissipates, of_kind
 from varpin.mechanics.scene import Scene
-
-Floats = NDArray[np.float64]
 
 # Most steps in which friction is examined: of each joint, and in all.
 _OF_A_JOINT, _MOST = 2, 6

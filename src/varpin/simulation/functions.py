@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, UnknownJoint
 from varpin.integrators import Integrator
@@ -21,8 +22,6 @@ from varpin.simulation.record import Record
 from varpin.simulation.soundness import Finding
 from varpin.support.checks import JointValues, control_values, finite_array, takes
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Number of steps in which the mean of a function of time is compared with that of two half steps, and the largest

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator, Reference
 from varpin.integrators.base import open_loop
@@ -20,8 +21,6 @@ from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
 from varpin.simulation.retaking import finer, taken_again
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # Begin of the warning.
 SAID = "disturbances grow here"

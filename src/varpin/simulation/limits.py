@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.mechanics.forces import drive_forces, of_kind
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # First words of the warnings. The motion may still be a correct solution of its equations.
 POSITION = "joints leave their limits"

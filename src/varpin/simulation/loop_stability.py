@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
@@ -25,8 +26,6 @@ from varpin.mechanics.scene import Scene
 from varpin.simulation.chatter import RUN, alternation
 from varpin.simulation.soundness import Finding, examined, with_warnings
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 _ADVICE = "take a shorter period or lower gains; where neither helps, look at the signs of the law"
 KIND = "unstable loop"

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
@@ -20,7 +21,6 @@ from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 # Number of nodes with a linearization, and the most joints of a robot that is examined.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator, Segment
@@ -14,8 +14,6 @@ from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.simulation.failures import ConstraintError, ForceError, StepError
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # Number of segments from which on they are joined into one.
 _PARTS = 256

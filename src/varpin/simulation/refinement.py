@@ -12,14 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import VarpinError
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 
-Floats = NDArray[np.float64]
 Run = Callable[[Integrator, int], "Sample"]
 
 # The default candidates of every choice.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_loop
@@ -17,8 +17,6 @@ from varpin.mechanics.assembly import along_constraints, nearest
 from varpin.mechanics.inputs import in_parts_of_steps
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # Number of steps of the first piece; each further piece doubles the number of all steps.
 _FIRST = 32

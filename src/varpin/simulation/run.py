@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Segment
@@ -30,8 +31,6 @@ from varpin.simulation.start import on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
 from varpin.support.checks import JointValues, count, joint_array
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.integrators import Integrator, Reference
 from varpin.mechanics.forces import of_kind
@@ -17,8 +16,6 @@ from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
 from varpin.simulation.retaking import stopping, taken_again
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # Most places with repeated steps, the steps of each, the parts of each step, and the stages of the method.
 _PLACES, _LENGTH, _PARTS, _STAGES = 12, 2, 16, 4

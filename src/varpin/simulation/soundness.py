@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats, Integers
 from varpin.core import energy_turnover, glance, windows_agree
 from varpin.integrators import ExplicitEuler, Integrator, Reference
 from varpin.integrators.base import open_loop
@@ -52,9 +53,6 @@ from varpin.simulation.phase import phase_lost
 from varpin.simulation.retaking import Again, Finer, finer, stopping, taken_again
 from varpin.simulation.saturation import bent
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Errors are in units of the thresholds WRONG_ENERGY, WRONG_POSITION, WRONG_MOTION and WRONG_VELOCITY.
 # Estimated error from which on a warning is given: estimates are accurate to some percent.

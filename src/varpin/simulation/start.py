@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.scene import CORRECTED, Scene
 from varpin.simulation.soundness import Finding
-
-Floats = NDArray[np.float64]
 
 # Shift of a start onto its constraints up to which no warning is given [rad or m]: rounding.
 _ROUNDING = 1e-9

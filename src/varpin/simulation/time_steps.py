@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
 from varpin.integrators import Integrator, Reference, integrator_of
@@ -25,8 +25,6 @@ from varpin.simulation.soundness import Finding
 from varpin.simulation.tolerance import Motion, Raised, choose
 from varpin.support.checks import count, positive
 from varpin.trajectory import Accuracy
-
-Floats = NDArray[np.float64]
 
 # Factor on the number of steps of a run whose user's function failed, when the failing step is looked for.
 _REFINED = 16

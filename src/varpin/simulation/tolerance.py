@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.integrators import Integrator
 from varpin.integrators.base import rows, steps_of
@@ -30,8 +30,6 @@ from varpin.simulation.refinement import (
     distance,
     first_steps,
 )
-
-Floats = NDArray[np.float64]
 
 # Work between two checks for Ctrl-C, in steps of one joint.
 _CHUNK = 100_000

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.integrators import Integrator
 from varpin.linearization import linearize
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -16,8 +17,6 @@ from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.simulation.choice import usual_integrator
 from varpin.simulation.run import simulate
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
-
-Floats = NDArray[np.float64]
 
 # Central differences of eighth order.
 _WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.errors import FileError, InputError, UnknownJoint
 
-Floats = NDArray[np.float64]
 # One number for each joint, in order or by the joint's name.
 JointValues: TypeAlias = ArrayLike | Mapping[str, float]
 

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats, Integers
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.support.checks import finite
 from varpin.support.frozen import Frozen
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

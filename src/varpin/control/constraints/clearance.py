@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.control.constraints.base import (
     BoundConstraint,
     Horizon,
@@ -22,8 +23,6 @@ from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.model.clearance import Clearance, Obstacle, clearance
 from varpin.support.checks import finite, path_like
-
-Floats = NDArray[np.float64]
 
 # Scale: a tenth of an arm's reach [m].
 _LENGTH = 0.1

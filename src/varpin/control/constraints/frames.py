@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.control.constraints.base import (
     BoundConstraint,
     Horizon,
@@ -23,8 +24,6 @@ from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.support.checks import as_floats, checked_limits, finite, finite_array, over_time, positive, rotation_matrix
-
-Floats = NDArray[np.float64]
 
 _XYZ = ("x", "y", "z")
 # Scales: a tenth of an arm's reach [m] and of a large rotation [rad].

@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats, Integers
 from varpin.control.constraints.base import (
     BoundConstraint,
     Horizon,
-    Integers,
     PlanConstraint,
     checked_margin,
     nodes_after,
@@ -22,8 +21,6 @@ from varpin.control.constraints.base import (
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.support.checks import JointValues, as_floats, control_array, finite_array, named_limits, real
-
-Floats = NDArray[np.float64]
 
 # Scales of joints without a finite range [rad or m; rad/s or m/s].
 _POSITION, _SPEED = 0.1, 0.5

@@ -7,16 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, CompiledCost, Cost, Points, Scaled, Terminal
 from varpin.control.costs.residual import TaskCost
 from varpin.control.costs.terms import Terms
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.support.checks import JointValues, checked_limits, joint_array
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

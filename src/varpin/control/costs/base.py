@@ -15,8 +15,9 @@ from functools import cached_property
 from numbers import Real
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.control.costs.terms import Terms
 from varpin.errors import InputError, VarpinError
 from varpin.model import Robot
@@ -25,7 +26,6 @@ from varpin.support.frozen import Frozen
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Reference = ArrayLike | Callable[[float], ArrayLike]
 
 

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, Cost, CostError, Expansion, Points
 from varpin.errors import InputError
 from varpin.support.checks import as_floats, finite_array
 
-Floats = NDArray[np.float64]
 Function = Callable[[Floats, Floats, Floats, Floats], ArrayLike]
 Derivatives = Callable[[Floats, Floats, Floats, Floats], tuple[ArrayLike, ArrayLike]]
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.costs.base import (
     BoundCost,
     CompiledCost,
@@ -20,8 +20,6 @@ from varpin.control.costs.base import (
 )
 from varpin.control.costs.terms import Terms
 from varpin.support.checks import JointValues, as_floats, control_array, joint_array
-
-Floats = NDArray[np.float64]
 
 
 class _Quadratic(Cost):

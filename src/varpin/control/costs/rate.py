@@ -6,15 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, Cost, CostSum, Points, Scaled, checked_weight, weight_matrix
 from varpin.core import change_values, expand_changes
 from varpin.errors import InputError
 from varpin.support.checks import JointValues, as_floats, control_array, finite_array, require_finite
 from varpin.support.frozen import Frozen
-
-Floats = NDArray[np.float64]
 
 
 class ControlRateCost(Cost):

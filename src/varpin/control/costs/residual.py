@@ -10,13 +10,12 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, Cost, Points, checked_weight, weight_matrix
 from varpin.errors import InputError
 from varpin.model import Robot
-
-Floats = NDArray[np.float64]
 
 
 class TaskCost(Cost):

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats, Integers
 from varpin.control.costs.base import BoundCost, CompiledCost, CostError, Points, Reference, sample
 from varpin.control.costs.residual import TaskCost
 from varpin.control.costs.terms import Terms
@@ -22,9 +23,6 @@ from varpin.model.kinematics import (
     mass_carriers,
 )
 from varpin.support.checks import as_floats, positive, require_finite
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 class _FrameCost(TaskCost):

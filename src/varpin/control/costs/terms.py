@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats, Integers
 from varpin.core import CostTerms, Subject
 from varpin.model.kinematics import FrameKinematics, Links
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _NO_DIRECTIONS = np.zeros(0, dtype=np.int64)
 

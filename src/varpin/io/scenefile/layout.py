@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.control.costs import Cost, CostSum, Terminal
 from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
 from varpin.io.scenefile.references import Timeline, constant
 from varpin.io.scenefile.spec import CostSpec, ForceSpec, degrees_for_radians
-from varpin.io.scenefile.table import Floats, SceneFileError, Table, suggestion
+from varpin.io.scenefile.table import SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Given
 from varpin.mechanics.constraints import Constraint, KinematicInput
 from varpin.mechanics.forces import Force, PositionServo

@@ -14,9 +14,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import FileError
 from varpin.io.archive import read_npz
-from varpin.io.scenefile.table import ByName, Floats, Table, shown, suggestion
+from varpin.io.scenefile.table import ByName, Table, shown, suggestion
 
 
 @dataclass(frozen=True, eq=False)

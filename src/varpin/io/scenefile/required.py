@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.io.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame, times_of
 from varpin.io.scenefile.plan_constraints import PLAN_CONSTRAINTS
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.spec import FORCES, FRAME_FORCES
-from varpin.io.scenefile.table import Floats
 from varpin.mechanics.forces import CoulombFriction, Force, JointStop
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene

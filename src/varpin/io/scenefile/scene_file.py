@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from varpin.arrays import Floats
 from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.control.costs import CostError
 from varpin.control.problem import integrator_for
@@ -21,7 +22,6 @@ from varpin.io.scenefile.reading import find_scene, read_scene
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.required import Required, idle_joints, requirements
 from varpin.io.scenefile.shown import marks_of
-from varpin.io.scenefile.table import Floats
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot

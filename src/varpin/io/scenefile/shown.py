@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import scipy
 
+from varpin.arrays import Floats
 from varpin.io.scenefile.layout import CostTerm, Layout
-from varpin.io.scenefile.table import Floats
 
 # Points of a path.
 _POINTS = 400

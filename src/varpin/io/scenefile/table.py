@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import VarpinError
 
-Floats = NDArray[np.float64]
 # One number for all, one for each in order, or a table by name in which those left out are 0.
 ByName = float | tuple[float, ...] | Mapping[str, float]
 

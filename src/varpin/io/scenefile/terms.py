@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import scipy
 
+from varpin.arrays import Floats
 from varpin.control.costs import (
     CenterOfMassCost,
     ControlCost,
@@ -24,7 +25,6 @@ from varpin.control.costs import (
     VelocityLimitBarrier,
 )
 from varpin.io.scenefile.references import Timeline
-from varpin.io.scenefile.table import Floats
 from varpin.model import Robot
 
 Space = Literal["q", "v", "u", "frame", "robot"]

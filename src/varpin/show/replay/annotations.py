@@ -12,6 +12,7 @@ import pinocchio as pin
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.show.replay.script import Outlook, Target, Trace
@@ -21,7 +22,6 @@ from varpin.trajectory import Trajectory, kinematic_input_rows
 if TYPE_CHECKING:
     from varpin.control.mpc import MpcRun
 
-Floats = NDArray[np.float64]
 
 # Smallest and largest number of points of a trace. Coarse motions are refined, as paths are curved between nodes.
 _FEWEST, _MOST = 200, 1000

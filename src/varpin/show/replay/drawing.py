@@ -11,8 +11,8 @@ import meshcat
 import numpy as np
 import pinocchio as pin
 from meshcat.animation import Animation, AnimationClip, AnimationTrack
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model.tree import z_to
 from varpin.show.replay import marks
@@ -28,8 +28,6 @@ from varpin.show.replay.picture import Picture, label, labels
 from varpin.show.replay.script import Actor, Outlook, Script, Target, Trace
 from varpin.show.replay.shapes import ShapeLoader
 from varpin.show.replay.view import across, set_view, side_by_side, view_direction
-
-Floats = NDArray[np.float64]
 
 # Largest coordinate [m]: viewers compute squares in single precision.
 _FARTHEST = 1e18

@@ -19,8 +19,9 @@ import umsgpack
 import zmq
 from meshcat.animation import Animation, AnimationClip, AnimationTrack
 from meshcat.visualizer import ViewerWindow
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from varpin.control import Iteration, OptimalControlProblem, Solution
     from varpin.control.mpc import MpcRun
 
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

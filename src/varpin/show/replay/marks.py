@@ -11,9 +11,8 @@ import numpy as np
 from meshcat.geometry import MeshBasicMaterial, MeshPhongMaterial, Object, TriangularMeshGeometry
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.model.tree import z_to
-
-Floats = NDArray[np.float64]
 
 _SIDES = 6
 

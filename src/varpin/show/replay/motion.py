@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model import Robot
 from varpin.show.replay.annotations import (
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
 # Threshold of the warning: error of a joint position between keyframes [rad or m].
 _VISIBLE = 0.02
 Motion: TypeAlias = "Trajectory | MpcRun | Solution | ArrayLike"

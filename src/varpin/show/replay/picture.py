@@ -9,12 +9,10 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.model import Robot, readable_geometry
 from varpin.model.tree import joint_axis, z_to
-
-Floats = NDArray[np.float64]
 
 logger = logging.getLogger(__name__)
 

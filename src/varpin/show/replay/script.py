@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.model import Robot
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.mechanics.constraints import Constraint, Distance, FrameOnFrame, PointOnLine, PointOnPlane, PointOnPoint
 from varpin.mechanics.forces import point_of
@@ -18,8 +18,6 @@ from varpin.show.replay.script import Region, Target, Tie
 
 if TYPE_CHECKING:
     from varpin.control.constraints import PlanConstraint
-
-Floats = NDArray[np.float64]
 
 
 def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None, tuple[PlanConstraint, ...], float]:

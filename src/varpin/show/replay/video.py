@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError, MissingDependency, VarpinError
 from varpin.io.archive import atomic_file
 from varpin.support.checks import count
@@ -24,7 +25,6 @@ from varpin.support.checks import count
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
 
-Floats = NDArray[np.float64]
 
 FORMATS = (".gif", ".mp4")
 

@@ -8,9 +8,8 @@ from itertools import pairwise
 
 import meshcat
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from varpin.arrays import Floats
 
 _VERTICAL_VIEW = math.radians(40.0)
 _ASPECT = 4.0 / 3.0

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import LinearizationError, VarpinError
 from varpin.integrators import Gauss, Integrator, Midpoint
 from varpin.linearization import linearize
@@ -22,8 +23,6 @@ from varpin.simulation.run import simulate
 from varpin.study.extremes.exact import SHORTEST, Exact
 from varpin.study.extremes.record import CONSERVED_MOMENTUM, LEVELS
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # Steps from rest of which half a step is much.
 _STARTING = 4

@@ -14,14 +14,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.core import ForwardDynamics
 from varpin.integrators import ExplicitEuler, Integrator
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import DISTURBANCE, changed, grown, light_speed, masses, noticed
 from varpin.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 _TOLERANCE = 1e-11
 # Speeds below this count as it [rad/s or m/s].

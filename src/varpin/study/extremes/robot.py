@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from varpin.arrays import Floats
 from varpin.errors import VarpinError
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -28,7 +29,6 @@ from varpin.study.extremes.record import LEVELS, Cell, Kind, Record, line_of
 from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
 INTEGRATORS: tuple[Integrator, ...] = (

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin._version import __version__
+from varpin.arrays import Floats
 from varpin.control import Solution, solve
 from varpin.errors import FileError, VarpinError
 from varpin.integrators import RungeKutta4
@@ -25,7 +25,6 @@ from varpin.linearization import linearize
 from varpin.study.paper import cases
 from varpin.study.paper.cases import CASES, MAIN, METHODS, VARIATIONS, Case, Setting
 
-Floats = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
 # The search's parameters: epsilon, alpha and beta of the paper; epsilon relative to the cost.

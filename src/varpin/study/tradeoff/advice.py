@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.errors import InputError
 from varpin.integrators import Guard, Integrator, Reference, largest_step
@@ -23,8 +22,6 @@ from varpin.simulation.refinement import REACH, SAFETY, Found, Method, Sample, S
 from varpin.study.tradeoff.setting import Setting, integrators_of
 from varpin.support.checks import JointValues, positive
 from varpin.support.markup import facts, table
-
-Floats = NDArray[np.float64]
 
 # Headings of a choice's entries in a table.
 COLUMNS = ("integrator", "dt [s]", "steps", "predicted time [s]", "predicted error in q", "note")

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.errors import FileError, InputError
@@ -20,8 +19,6 @@ from varpin.study.tradeoff.records import pareto_front
 from varpin.study.tradeoff.runs import Progress, Run, Tradeoff, complete
 from varpin.study.tradeoff.setting import Setting, digest, fastest, integrators_of
 from varpin.support.checks import count, positive, writable
-
-Floats = NDArray[np.float64]
 
 # Options of solve that are told of a search and change nothing in it.
 _ONLOOKERS = ("callback", "progress")

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.ensemble.paths import without_geometry
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.integrators import Gauss, Integrator, Reference
@@ -25,7 +25,6 @@ from varpin.study.tradeoff.setting import PARTS, Outcome, Setting, integrators_o
 from varpin.support.checks import JointValues, count, positive, writable
 from varpin.support.executors import in_order, require_executor
 
-Floats = NDArray[np.float64]
 Quantity = Literal["q", "end", "energy", "tip"]
 
 # The largest of the steps where none are named [s], and the number of its halvings: down to 0.16 ms, from which on

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.integrators.base import Segment, open_loop
@@ -25,7 +26,6 @@ from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, joint_array, positive
 from varpin.support.frozen import Frozen
 
-Floats = NDArray[np.float64]
 Result = TypeVar("Result")
 
 logger = logging.getLogger(__name__)
