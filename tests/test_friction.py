@@ -176,3 +176,22 @@ def test_verification_under_friction_that_is_too_fast_for_explicit_steps():
         integral += rough.dt * 1e-2 * (u**2).sum()
     true = integral + 1e3 * ((state[:2] - [0.6, -0.4]) ** 2).sum() + 10.0 * (state[2:] ** 2).sum()
     assert found.open_loop_cost == pytest.approx(true, rel=1e-4)
+
+
+def test_noise_beyond_the_width_of_friction_is_reported():
+    """Linearized friction damps noise that the friction hardly feels."""
+    robot = vp.planar_chain(2)
+
+    def plan(noise):
+        forces = [vp.CoulombFriction(0.3, 0.02)]
+        scene = vp.Scene(robot, gravity=False, forces=forces, noise=vp.AdditiveNoise(noise))
+        cost = vp.ControlCost(1.0) + vp.TrackingCost([0.0, 0.0], 1.0)
+        problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=0.01, steps=30)
+        return vp.solve(problem)
+
+    loud, calm = plan(0.3), plan(1e-4)
+    paths = loud.monte_carlo(paths=100, rng=0)
+    assert paths.cost > 3.0 * loud.cost
+    told = [any("width of its dry friction" in sentence for sentence in found.warnings) for found in (loud, calm)]
+    assert told == [True, False]
+    assert calm.monte_carlo(paths=100, rng=0).cost == pytest.approx(calm.cost, rel=0.3)

@@ -14,11 +14,13 @@ from varpin.control.history import ITERATIONS, Status
 from varpin.control.multipliers import FEASIBLE, TOLD
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
+from varpin.control.spread import covariances, state_slopes
 from varpin.control.verification import accurate_cost, percent
 from varpin.core.arrays import Commands
-from varpin.errors import VarpinError
+from varpin.errors import LinearizationError, VarpinError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
+from varpin.mechanics.forces import of_kind
 from varpin.simulation.chatter import alternation, restlessness
 from varpin.simulation.record import rollout
 from varpin.simulation.soundness import Finding, announce, examined, findings_from_record
@@ -33,6 +35,8 @@ LOSS, GAIN = 1e-3, 1e-2
 _OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
 # Greatest expected decrease of a stalled search, relative to its cost, without a warning.
 _LITTLE = 1e-3
+# Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
+_LINEAR_FRICTION = 0.25
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
@@ -80,6 +84,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     told += (
         _unfinished(solution)
         + _noise_left_out(solution)
+        + _friction_under_noise(solution)
         + (_alternating(solution) or _restless(solution))
         + foreseen(problem)
         + _between(solution)
@@ -190,6 +195,39 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
                 )
             )
     return found
+
+
+def _friction_under_noise(solution: Solution) -> list[Finding]:
+    """A finding if noise moves a joint by more than its dry friction is linear for."""
+    problem, motion = solution.problem, solution.trajectory
+    rubbing = of_kind(problem.scene.elements, "CoulombFriction")
+    if not (problem.scene.processes and rubbing):
+        return []
+    try:
+        P, slopes = covariances(problem, solution), state_slopes(problem, motion)
+    except LinearizationError:
+        return []
+    n = problem.scene.robot.dof
+    worst, name, width = 0.0, "", 0.0
+    for element in rubbing:
+        c, own = element.coordinate, element.values[1]
+        variance = np.einsum("kx,kxy,ky->k", slopes[:, n + c], P, slopes[:, n + c])
+        spread = np.sqrt(np.maximum(variance, 0.0))
+        # At speed dry friction is constant, and noise changes it little.
+        slow = np.abs(motion.v[:, c]) < 3.0 * (own + spread)
+        ratio = float((spread[slow] / own).max(initial=0.0))
+        if ratio > worst:
+            worst, name, width = ratio, motion.joint_names[c], own
+    if worst <= _LINEAR_FRICTION:
+        return []
+    return [
+        Finding(
+            "friction under noise",
+            f"noise moves joint {name!r} by {worst:.2g} times the width of its dry friction ({width:g} rad/s or m/s), "
+            "for which the friction is not linear: noise_cost, gains and margins are of the linearized friction and "
+            "may be wrong many times over; plan.monte_carlo() and simulate_ensemble have the whole of it",
+        )
+    ]
 
 
 def _noise_left_out(solution: Solution) -> list[Finding]:

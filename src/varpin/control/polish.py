@@ -16,10 +16,11 @@ from varpin.control.backward import states
 from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
+from varpin.control.spread import covariances, state_slopes
 from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
 from varpin.integrators.base import open_loop
-from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
+from varpin.linearization import Linearization, linearize_steps
 from varpin.trajectory import Trajectory
 
 Mask = NDArray[np.bool_]
@@ -219,40 +220,10 @@ def _of_rate(item: BoundRate, k: NDArray[np.int64], r: NDArray[np.int64], R: int
     return rows
 
 
-def state_slopes(problem: OptimalControlProblem, motion: Trajectory) -> Floats:
-    """d(q, v)/dx at the nodes (N + 1, 2n, 2n)."""
-    n = problem.scene.robot.dof
-    slopes = np.tile(np.eye(2 * n), (len(motion.q), 1, 1))
-    if problem.integrator.variational:
-        slopes[:, n:] = velocity_at_nodes(problem.scene, motion.q, motion.v)
-    return slopes
-
-
 def deviations(problem: OptimalControlProblem, plan: Solution, bound: BoundConstraint) -> Floats:
-    """Standard deviations (K, rows) of a state constraint under the plan's feedback and the scene's noise.
-
-    The covariance is that of the linearization, P' = Ac P Ac' + dt sum_i E[g_i g_i'], with each control held over its
-    decision; :func:`varpin.propagate_moments` is the same without feedback. Control limits are neglected.
-    """
-    motion, n, m = plan.trajectory, problem.scene.robot.dof, problem.scene.controls
-    lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0)
-    x = 2 * n
-    # Covariance of the state and the held control.
-    P, found = np.zeros((x + m, x + m)), np.zeros((problem.steps + 1, x, x))
-    for j in range(problem.steps):
-        if j % problem.hold == 0:
-            k = j // problem.hold
-            take = np.eye(x + m)
-            take[x:, :x] = plan.gains[k]
-            take[x:, x:] = 0.0 if plan.previous_gains is None else plan.previous_gains[k]
-            P = take @ P @ take.T
-        step = np.eye(x + m)
-        step[:x, :x], step[:x, x:] = lin.A[j], lin.B[j]
-        slope = np.concatenate([lin.Gx[j], lin.Gu[j]], axis=2)
-        kick = np.einsum("aib,bc,dic->ad", slope, P, slope) + lin.G[j] @ lin.G[j].T
-        P = step @ P @ step.T
-        P[:x, :x] += lin.dt * kick
-        found[j + 1] = P[:x, :x]
+    """Standard deviations (K, rows) of a state constraint under the plan's feedback and the scene's noise."""
+    motion = plan.trajectory
+    found = covariances(problem, plan)
     J = bound.jacobian(motion.q, motion.v) @ state_slopes(problem, motion)[bound.places]
     variance = np.einsum("krx,kxy,kry->kr", J, found[bound.places], J)
     spread: Floats = np.sqrt(np.maximum(variance, 0.0))

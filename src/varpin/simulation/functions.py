@@ -29,6 +29,7 @@ ControlLaw = Callable[[float, Floats, Floats], JointValues]
 _COMPARED, _ALIKE = 16, 0.05
 # Name of a function of time in errors.
 _OF_TIME = "OpenLoop: f(t)"
+_OF_TIMES = "OpenLoop, vectorized=True: f(t) of times t (K,)"
 
 
 def require_law(law: ControlLaw) -> None:
@@ -124,21 +125,21 @@ def _at_all_times(
     m = scene.controls
     parts = [part for part in (times[:1], times[1:]) if len(part)]
     try:
-        values = [finite_array(_OF_TIME, f(part.copy()), (len(part), m)) for part in parts]
+        values = [finite_array(_OF_TIMES, f(part.copy()), (len(part), m)) for part in parts]
     except Exception as failure:
         for step, at in zip(steps.tolist(), times.tolist(), strict=True):
             try:
                 value = f(np.array([at]))
             except Exception as error:
-                raise _error_raised(_OF_TIME, error, step, at, record) from error
+                raise _error_raised(_OF_TIMES, error, step, at, record) from error
             try:
-                finite_array(_OF_TIME, value, (1, m))
+                finite_array(_OF_TIMES, value, (1, m))
             except InputError as error:
                 raise _control_error(step, at, str(error), record) from None
         raise _control_error(
             int(steps[0]),
             float(times[0]),
-            f"{_OF_TIME}, vectorized, fails for {len(times)} times at once, and for none of them alone: {failure}",
+            f"{_OF_TIMES} fails for {len(times)} times at once, and for none of them alone: {failure}",
             record,
         ) from failure
     return np.concatenate(values) if values else np.zeros((0, m))

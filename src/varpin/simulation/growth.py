@@ -27,6 +27,8 @@ SAID = "disturbances grow here"
 
 # Number of repeated steps; fewest steps and most joints of an examined motion.
 _PLACES, _LEAST, _JOINTS = 6, 40, 60
+# Number of further steps, those that change velocities most, as where controls jump.
+_VIOLENT = 4
 # Threshold of the warning, as a share of the largest joint travel; and the part of it from which a motion is repeated.
 WARNED, NEAR = 0.02, 0.3
 # The share of the fastest mode's exponent by which a disturbance grows: at most half in 60 motions of arms and chains,
@@ -78,8 +80,8 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     other = finer(integrator, trajectory, damped=False, pulled=False)
     q, v = trajectory.q, trajectory.v
     at = _places(trajectory)
-    # A single violent step may be off by more than all others together.
-    repeated = np.append(at, np.abs(np.diff(v, axis=0)).max(axis=1).argmax())
+    # A few violent steps may be off by more than all others together.
+    repeated = np.append(at, np.abs(np.diff(v, axis=0)).max(axis=1).argsort()[-_VIOLENT:])
     forces = np.ascontiguousarray(trajectory.u[repeated] @ scene.actuation.T)
     nothing = open_loop(np.zeros((1, scene.controls)))
     once = other.method.motions(scene, q[repeated], v[repeated], nothing, forces[:, None], trajectory.dt)
@@ -90,7 +92,7 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     way = largest_of_its_kind(scene, np.ptp(q, axis=0))
     least = ROUNDING * (1.0 + np.abs(q).max())
     begins = ((in_q + in_v * trajectory.dt) / np.maximum(way, least)).max(axis=1)
-    small = NEAR * WARNED / max(steps * float(begins[:-1].max()), float(begins[-1]), 1e-300)
+    small = NEAR * WARNED / max(steps * float(begins[: len(at)].max()), float(begins[len(at) :].sum()), 1e-300)
     if small > np.exp(_MOST):
         return None
     try:

@@ -24,7 +24,9 @@ def marks_of(layout: Layout, duration: float) -> dict[str, Any]:
     wanted = [term for term in layout.costs if term.target is not None and term.weight.all()]
     positions = [term for term in wanted if term.spec.kind == "frame_position"]
     orientations = [term for term in wanted if term.spec.kind == "frame_orientation"]
-    marks: dict[str, Any] = {"trace": list(dict.fromkeys(term.spec.frame for term in positions))}
+    marks: dict[str, Any] = {}
+    if positions:
+        marks["trace"] = list(dict.fromkeys(term.spec.frame for term in positions))
     targets: dict[str, Floats] = {}
     references: dict[str, Floats] = {}
     for term in positions:
@@ -42,7 +44,7 @@ def marks_of(layout: Layout, duration: float) -> dict[str, Any]:
         marks["reference"] = references
     if (ghost := _ghost(layout, duration)) is not None:
         marks["ghost"] = ghost
-        marks["trace"] = marks["trace"] or True
+        marks.setdefault("trace", True)
     return marks
 
 

@@ -266,7 +266,9 @@ def _reason(
     if not reached:
         lines = [f"{wish} is not within reach of what was tried; the best is {best}"]
     elif tolerance is not None:
-        lines = [f"{best}, the cheapest within {wish} after {duration:g} s"]
+        # Times are measured, and near ties go to the choice whose error is the safer one.
+        tied = any(other.seconds < best.seconds for other in others[:1])
+        lines = [f"{best}, {'one of the cheapest' if tied else 'the cheapest'} within {wish} after {duration:g} s"]
     else:
         lines = [f"{best}, the most accurate after {duration:g} s within {wish}"]
     if others and tolerance is not None and reached:
