@@ -33,6 +33,8 @@ NEEDS = {
     "many-machines.md": "distributed",
     "mujoco.md": "mujoco",
 }
+# Pages that run in less than 3 s of processor time; the site runs most others while it is built.
+QUICK = ("drake.md", "many-machines.md", "mujoco.md", "notebooks.md", "plan-constraints.md", "robots.md")
 WIDEST = 96
 
 
@@ -44,8 +46,10 @@ def blocks(page, language):
     return re.findall(rf"^```{language}\n(.*?)^```$", text_of(page), re.M | re.S)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")])
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[] if page in QUICK else pytest.mark.slow) for page in PAGES if blocks(page, "python")],
+)
 def test_a_page_runs_from_top_to_bottom(page, tmp_path):
     if page in NEEDS:
         pytest.importorskip(NEEDS[page])

@@ -4,6 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import random_inertia, random_rotation, random_tree
+from scipy.linalg import eigh
 
 import varpin as vp
 from varpin.core import Elimination, ForwardDynamics, Solver, VariationalRollout, variational_derivatives
@@ -281,6 +282,46 @@ def test_round_off_grows_as_disturbances_do():
         apart = np.abs(other.q[0, -1] - dense.q[0, -1]).max()
         assert 1e-9 < apart < 1e-5
         assert growth / 100.0 < apart < growth * 100.0
+
+
+def wide_star(bodies):
+    """Branches of three bodies each on one trunk."""
+    return star((bodies - 1) // 3, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("bodies", "backend"), [(300, "pinocchio"), (1000, "compiled")])
+@pytest.mark.parametrize(
+    "build",
+    [vp.planar_chain, wide_star, lambda bodies: vp.load_robot(random_tree(5, bodies=bodies))],
+    ids=["chain", "star", "tree"],
+)
+def test_large_trees_are_solved_for_as_with_the_matrix(build, bodies, backend):
+    """A step, M, and the guard on both sides of the step at which the least eigenvalue is zero.
+
+    Pinocchio's tables (n, n, n) do not fit into memory for 1000 bodies; there the matrices are those of the sweeps.
+    """
+    robot = build(bodies)
+    n = robot.dof
+    scene, (q, v) = vp.Scene(robot), state_of(robot)
+    q, v = 0.1 * q, 0.1 * v
+    jet = vp.lagrangian_jet(scene, q, v, backend=backend)
+    # M - c L_qq has a zero eigenvalue where c is one over the largest of L_qq in the metric of M.
+    edge = 1.0 / eigh(jet.Lqq, jet.Lvv, eigvals_only=True)[-1]
+    assert edge > 0.0
+    elimination = Elimination(scene.core, q, v)
+    assert elimination.least_pivot_ratio(0.0, 0.99 * edge, robot.tree.armature) > 0.0
+    assert elimination.least_pivot_ratio(0.0, 1.01 * edge, robot.tree.armature) <= 0.0
+    # The symmetric part of N is M - h^2 L_qq.
+    h = 0.5 * np.sqrt(edge)
+    N = jet.Lvv + h * (jet.Lvq - jet.Lvq.T) - h**2 * jet.Lqq
+    b = np.random.default_rng(9).normal(size=n)
+    x, *_, positive = elimination.step(h, h, robot.tree.armature, b)
+    assert positive
+    assert solved_like(x, N, b)
+    x, _, positive = elimination.mass(b)
+    assert positive
+    assert solved_like(x, jet.Lvv, b)
 
 
 @pytest.mark.parametrize("ramp", [False, True], ids=["shift", "ramp"])

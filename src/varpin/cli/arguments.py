@@ -170,7 +170,7 @@ def simulate_words(request: argparse.Namespace, integrator: Integrator, dt: floa
 
 
 def _text(value: object) -> str:
-    """A number, numbers or a joint's number as a word of the command line."""
+    """An option's value as a word of the command line: a number, several with commas, or JOINT=VALUE."""
     if isinstance(value, tuple):
         return f"{value[0]}={_text(value[1])}"
     if isinstance(value, list):

@@ -286,7 +286,7 @@ def _between(solution: Solution) -> list[Finding]:
         ).repeat(PARTS, axis=0)
         outside = _at_start(problem, whole)
         if outside is not None:
-            # A row violated at the start is so until the first node.
+            # A row that is violated at the start cannot hold before the first node, so it is not reported there.
             c[: PARTS - 1, outside > 0.0] = -np.inf
         place, row = np.unravel_index(int(np.argmax(c)), c.shape)
         if c[place, row] > TOLD * bound.scale:

@@ -438,7 +438,7 @@ class OptimalControlProblem(Frozen):
         return self.rule
 
     def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
-        """(q, v, u) at the points of :attr:`model_rule`, as :meth:`samples`."""
+        """States and controls at the sample points :attr:`model_rule`, in the form of :meth:`samples`."""
         return self.samples(q, v, u)
 
     @cached_property

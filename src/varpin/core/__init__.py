@@ -1,4 +1,4 @@
-"""The compiled core: C++ in ``src/core``, one header an idea, built when the package is."""
+"""The compiled core. Its C++ is in ``src/core``, one header for each idea, and is built with the package."""
 
 from varpin.core._core import BackwardPass as BackwardPass
 from varpin.core._core import ConstrainedRollout as ConstrainedRollout

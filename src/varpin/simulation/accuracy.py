@@ -34,8 +34,9 @@ CLOSE, _BETWEEN = 0.4, 15
 _SOON = (80, 160)
 # Growth of a disturbance from which on a motion counts as unpredictable; and the disturbance, relative to q and v.
 PREDICTABLE, DISTURBANCE = 10.0, 1e-7
-# Least unit of the errors of a joint that hardly moves: the smaller of LITTLE times the largest way or speed of the
-# joints of its kind, and LIGHT times the speed at which it would have their energy.
+# A joint's errors are measured in units of its own motion. For a joint that hardly moves, the unit is at least the
+# smaller of two: LITTLE times the largest way or speed among joints of its kind, and LIGHT times the speed at which the
+# joint would have their energy.
 LITTLE, LIGHT = 1e-2, 1e-2
 # Least unit of a joint's errors in one window, as a share of its motion up to there.
 _REST = 1e-3

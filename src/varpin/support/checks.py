@@ -199,7 +199,11 @@ def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, 
 
 
 def as_floats(name: str, value: object) -> Floats:
-    """``value`` as a new float array; raises an InputError that names it otherwise."""
+    """``value`` as a new float array.
+
+    Raises:
+        InputError: It is no array of real numbers; the message has its ``name``.
+    """
     try:
         array = np.asarray(value)
         numbers = array.dtype.kind in "biuf" or all(isinstance(entry, Real) for entry in array.flat)

@@ -460,17 +460,17 @@ class ConstrainedStepper {
     // Parameters of a kinematic input's motion: the goal, or the rates at both ends of a cubic.
     enum class Goal { position, begin, end };
 
-    // Coefficients of a joint's displacement: of the distance to its goal, and of its rates at both ends times the time
-    // to the goal.
+    // A driven joint's displacement is ahead * (distance to the goal) + T (begin * (rate at the start) + end * (rate at
+    // the goal)), with T the time to the goal.
     struct Way {
         double ahead, begin, end;
     };
-    // The coefficients at a share of the time to the goal.
+    // These coefficients after the share `at` of T.
     Way way_at(int d, double at) const {
         if (mechanism.constraints.driven()[d].rate < 0) return {at, 0.0, 0.0};
         return {at * at * (3.0 - 2.0 * at), at * (1.0 - at) * (1.0 - at), at * at * (at - 1.0)};
     }
-    // The same for its rate: of the mean rate to the goal, and of both rates.
+    // Those of the joint's rate: ahead * (distance / T) + begin * (rate at the start) + end * (rate at the goal).
     Way pace_at(int d, double at) const {
         if (mechanism.constraints.driven()[d].rate < 0) return {1.0, 0.0, 0.0};
         return {6.0 * at * (1.0 - at), (1.0 - at) * (1.0 - 3.0 * at), at * (3.0 * at - 2.0)};
