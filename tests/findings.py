@@ -44,6 +44,7 @@ MARKS = {
     "no half step": "half the step cannot be taken",
     "interruption": "interrupted",
     "unfinished plan": "the plan is unfinished",
+    "runaway": "away",
     "out of reach": "not within reach",
 }
 

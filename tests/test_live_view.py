@@ -271,7 +271,7 @@ def test_says_what_does_not_fit(opened, chain, scene):
         view.show(np.zeros((3, 2)))
     with refused(vp.InputError, "LiveView", "Robot", "Scene", "OptimalControlProblem"):
         vp.LiveView(chain.model)
-    with refused(vp.InputError, "trace", "'chain2'", "'hand'"):
+    with refused(vp.UnknownFrame, "trace", "'chain2'", "'hand'"):
         vp.LiveView(scene, trace="hand")
     with refused(vp.InputError, "speed", "0.0"):
         vp.LiveView(scene, speed=0.0)

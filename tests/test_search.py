@@ -63,8 +63,8 @@ def constant(value):
 
 
 def numbers(reason):
-    """The promised decrease and the tolerance on it."""
-    promise = re.search(r"promises a decrease of (\S+?)[;, ]", reason)
+    """The expected decrease and the tolerance on it."""
+    promise = re.search(r"expected decrease is (\S+?)[;, ]", reason)
     share = re.search(r"at stake is (\S+)$", reason)
     return float(promise[1]), float(share[1])
 

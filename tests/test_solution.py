@@ -96,7 +96,14 @@ def test_accuracy_is_honest():
     sol = vp.solve(problem)
     q, v, integral = continuous(problem.scene, problem.q0, problem.v0, sol.controls, problem.dt, running)
     true = integral + end(q[-1], v[-1])
-    assert sol.verify(max_substeps=2).accuracy == np.inf
+    alone = sol.verify(max_substeps=2)
+    assert alone.accuracy == np.inf
+    assert np.isfinite([alone.open_loop_cost, alone.closed_loop_cost]).all()
+    assert not alone.told
+    assert not unnamed(str(alone), "max_substeps of 4")
+    assert not about(str(alone), "runaway")
+    for most in (2, 3, 5, 11):
+        assert sol.verify(tolerance=1e-15, max_substeps=most).substeps == 2 ** int(np.log2(most))
     for most in (4, 8, 16):
         found = sol.verify(tolerance=1e-15, max_substeps=most)
         assert found.substeps == most
@@ -363,7 +370,7 @@ def test_verification_prints_a_table_with_the_loss_in_percent():
     assert rest[1].startswith("how to read it: ")
     assert (found.open_loop_loss, found.closed_loop_loss) == (pytest.approx(0.25), pytest.approx(0.01))
     lost = vp.Verification(2.0, np.nan, np.nan, np.nan, np.nan, 1e-3, 8, np.inf)
-    assert str(lost).count("runs away") == 2
+    assert len(about(str(lost).splitlines(), "runaway")) == 3
     assert "nan" not in str(lost)
     assert "inf" not in str(lost)
     # Nothing is a part of a cost of nothing.

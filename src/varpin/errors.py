@@ -119,7 +119,7 @@ class AssemblyError(InputError):
 
 
 class UnknownFrame(InputError):
-    """A frame name that the robot does not have.
+    """A frame name that the robot, or none of several robots, has.
 
     Attributes:
         frame: The given name.
@@ -127,11 +127,13 @@ class UnknownFrame(InputError):
         matches: Similar names.
     """
 
-    def __init__(self, frame: str, frames: Iterable[str], robot: str) -> None:
+    def __init__(self, frame: str, frames: Iterable[str], *robots: str, option: str = "") -> None:
         self.frame = frame
         self.frames = tuple(frames)
         self.matches, hint = _meant(frame, self.frames)
-        super().__init__(f"robot {robot!r} has no frame {frame!r}; {hint}frames: {', '.join(self.frames)}")
+        owner = f"robot {robots[0]!r} has" if len(robots) == 1 else f"robots {', '.join(map(repr, robots))} have"
+        where = f"{option}: " if option else ""
+        super().__init__(f"{where}{owner} no frame {frame!r}; {hint}frames: {', '.join(self.frames)}")
 
 
 class UnknownPosture(InputError):

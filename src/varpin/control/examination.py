@@ -157,9 +157,9 @@ def _unfinished(solution: Solution) -> list[Finding]:
     ended = solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE)
     if not (cut or ended) or not history:
         return []
-    promised = history[-1].expected_decrease
+    expected_decrease = history[-1].expected_decrease
     # With a negligible expected decrease the plan is as good as converged.
-    if solution.status is Status.STALLED and promised <= _LITTLE * abs(solution.cost):
+    if solution.status is Status.STALLED and expected_decrease <= _LITTLE * abs(solution.cost):
         return []
     return [Finding("not converged", f"the search ended before it converged: {solution.reason}")]
 

@@ -74,16 +74,16 @@ def noise_gradient(
     for c in range(2 * n + m):
         change = []
         for sign in (1.0, -1.0):
-            moved = np.zeros(2 * n + m)
-            moved[c] = sign * shift[c]
+            step = np.zeros(2 * n + m)
+            step[c] = sign * shift[c]
             # Every other step begins at a shifted state; the node after it moves accordingly.
             shares = np.empty(N)
             for first in range(min(2, N)):
                 rows = slice(first, N, 2)
                 dx, du = np.zeros((N + 1, 2 * n)), np.zeros((N, m))
-                dx[:-1][rows], du[rows] = moved[: 2 * n], moved[2 * n :]
-                dx[1:][rows] = here.J[rows] @ moved
-                near = _steps_of(problem, _moved(trajectory, dx, du, slopes, variational), processes)
+                dx[:-1][rows], du[rows] = step[: 2 * n], step[2 * n :]
+                dx[1:][rows] = here.J[rows] @ step
+                near = _steps_of(problem, _perturbed(trajectory, dx, du, slopes, variational), processes)
                 shares[rows] = _shares(problem, near, W, C)[rows]
             change.append(shares)
         found[:, c] = (change[0] - change[1]) / (2.0 * shift[c])
@@ -94,7 +94,7 @@ def noise_gradient(
         for sign in (1.0, -1.0):
             dx = np.zeros((N + 1, 2 * n))
             dx[N, c] = sign * shift[c]
-            end = _moved(trajectory, dx, np.zeros((N, m)), slopes, variational)
+            end = _perturbed(trajectory, dx, np.zeros((N, m)), slopes, variational)
             change.append(0.5 * (_end_hessian(problem, end) * C[N, : 2 * n, : 2 * n]).sum())
         at_end[c] = (change[0] - change[1]) / (2.0 * shift[c])
     found[-1] += here.J[-1].T @ at_end
@@ -114,7 +114,7 @@ def _end_hessian(problem: OptimalControlProblem, trajectory: Trajectory) -> Floa
     return np.asarray(D.T @ H @ D)
 
 
-def _moved(trajectory: Trajectory, dx: Floats, du: Floats, slopes: Floats, variational: bool) -> Trajectory:
+def _perturbed(trajectory: Trajectory, dx: Floats, du: Floats, slopes: Floats, variational: bool) -> Trajectory:
     """A trajectory with shifted nodes and controls; its steps do not connect, but each can be linearized."""
     n = trajectory.q.shape[1]
     q = trajectory.q + dx[:, :n]

@@ -320,7 +320,7 @@ class GapClosing:
             return None
         # First the linear response to the removal of the forces under the plan's feedback, then a pass around it.
         x, u = around.responded(plan, np.zeros_like(plan.feedforward), forces=True)
-        shifted = around.moved(x, u)
+        shifted = around.shifted(x, u)
         found = backward(problem, motion.trajectory, regularization, along=shifted)
         if found is None:
             return None
@@ -448,7 +448,7 @@ class _Around(Along):
         samples = np.concatenate(problem.model_samples(q, v, np.repeat(u, problem.hold, axis=0)), axis=1)
         return samples, np.concatenate([q[-1], v[-1]])
 
-    def moved(self, x: Floats, u: Floats) -> _Around:
+    def shifted(self, x: Floats, u: Floats) -> _Around:
         """The expansions shifted by changes of the states (N + 1, 2n) and controls (R, m), to second order."""
         there, (samples, end) = copy(self), self._at_samples(x, u)
         there.added = _products(self.running.hessian, samples)

@@ -106,14 +106,14 @@ def _corrected(
         G = around.rows(active).reshape(-1, R, m)
         left = c + np.einsum("aRm,Rm->a", G, np.where(free, 0.0, ahead))
         ahead = np.where(free, _least_change((G * (free * size)).reshape(len(G), -1), left).reshape(R, m) * size, ahead)
-        moved, change = around.moved(ahead)
+        response, change = around.response(ahead)
         beyond = free & ((u + change < lower) | (u + change > upper))
         if not beyond.any():
             break
         free = free & ~beyond
         change = np.clip(u + change, lower, upper) - u
         ahead = np.where(beyond, change, ahead)
-    gains, reference = plan.gains, states(problem, motion) + moved
+    gains, reference = plan.gains, states(problem, motion) + response
     reference = reference[: -1 : problem.hold]
     if plan.previous_gains is not None:
         before = np.vstack([u[:1], (u + change)[:-1]])
@@ -195,7 +195,7 @@ class _Around:
                     G[:, own - 1] += G[:, own] @ self.previous[own]
         return G.reshape(total, R * m)
 
-    def moved(self, ahead: Floats) -> tuple[Floats, Floats]:
+    def response(self, ahead: Floats) -> tuple[Floats, Floats]:
         """Changes of the states (N + 1, 2n) and controls (R, m) for feed-forward changes ``ahead`` (R, m)."""
         A, B, hold = self.linear.A, self.linear.B, self.problem.hold
         found, change = np.zeros((len(A) + 1, A.shape[1])), ahead.copy()

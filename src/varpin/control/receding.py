@@ -64,8 +64,10 @@ def replan(
         )
     old, new = previous.problem.bound_constraints, problem.bound_constraints
     hold = problem.hold
-    multipliers = [_moved(*parts, decisions, hold) for parts in zip(old, new, split(old, known.values), strict=True)]
-    backoff = [_moved(*parts, 0, hold) for parts in zip(old, new, split(old, known.backoff), strict=True)]
+    multipliers = [
+        _shifted_to(*parts, decisions, hold) for parts in zip(old, new, split(old, known.values), strict=True)
+    ]
+    backoff = [_shifted_to(*parts, 0, hold) for parts in zip(old, new, split(old, known.backoff), strict=True)]
     cost = abs(previous.cost)
     least = np.array([cost / item.scale**2 / np.sqrt(len(item.places)) for item in new])
     first_weights = np.maximum(known.first_weights, least)
@@ -112,12 +114,12 @@ def replan(
     return _judged(kept, known)
 
 
-def _moved(old: BoundConstraint, new: BoundConstraint, values: Floats, decisions: int, hold: int) -> Floats:
+def _shifted_to(old: BoundConstraint, new: BoundConstraint, values: Floats, decisions: int, hold: int) -> Floats:
     """Values at a constraint's places (K, rows), shifted by ``decisions``; the last is repeated, a goal's stays."""
     by = decisions if new.of_controls else decisions * hold
     rows = np.minimum(np.searchsorted(old.places, new.places + by), len(old.places) - 1)
-    moved: Floats = values[rows]
-    return moved
+    shifted: Floats = values[rows]
+    return shifted
 
 
 def _judged(plan: Solution, before: Multipliers) -> Solution:
@@ -193,11 +195,11 @@ def kept(
     found = []
     for i, bound in enumerate(fine):
         planned = np.array([plan.constraints[i].violation for plan in plans])
-        moved, t = np.zeros(0), np.zeros(0)
+        violated, t = np.zeros(0), np.zeros(0)
         if not bound.source.equality:
             c = bound.value(motion.q, motion.v, motion.u)
-            moved, t = np.maximum(c, 0.0).max(axis=1), bound.times
+            violated, t = np.maximum(c, 0.0).max(axis=1), bound.times
         tolerance = TOLD * bound.scale
         failed = infeasible & (planned > tolerance)
-        found.append(Kept(bound.source.label, bound.unit, tolerance, planned, moved, t, failed))
+        found.append(Kept(bound.source.label, bound.unit, tolerance, planned, violated, t, failed))
     return tuple(found)

@@ -750,7 +750,7 @@ class _Search:
         return True
 
     def _expected(self) -> str:
-        return f"the model promises a decrease of {np.nan if self.plan is None else self.plan.expected_decrease:.1e}"
+        return f"the expected decrease is {np.nan if self.plan is None else self.plan.expected_decrease:.1e}"
 
     def _numbers(self, tolerance: float, *, afresh: bool = False) -> str:
         """Expected decrease and tolerance in words; ``afresh`` with as little regularization as the model needs."""

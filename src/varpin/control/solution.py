@@ -324,8 +324,8 @@ class Solution(Frozen):
 
         Main args:
             tolerance: On the relative change of the cost when the substeps are doubled.
-            max_substeps: Greatest number of substeps in a step of the plan; ``accuracy`` tells if the tolerance was
-                missed.
+            max_substeps: Greatest number of substeps in a step of the plan, >= 2; ``accuracy`` tells if the tolerance
+                was missed. They double from 2 on, so with less than 4 there is nothing to compare.
 
         Other Args:
             progress: Called before each doubling with (substeps, max_substeps).

@@ -81,7 +81,9 @@ class Verification:
         closed_loop_gap: The same with feedback.
         defect: Largest distance in q of an accurately integrated step from the plan's [rad or m].
         substeps: Substeps of the accurate integration in one step of the plan.
-        accuracy: Relative change over the last doubling of the substeps, of the cost that changed more.
+        accuracy: Relative change over the last doubling of the substeps, of the cost that changed more. Infinite where
+            no cost could be compared: all motions diverge, or they diverged with fewer substeps, or ``max_substeps``
+            allowed no doubling.
         status: How the search for the plan ended.
         integrator: The accurate integrator: ``Radau(stages=3)`` where dampers, friction or servos are much faster than
             the plan's step.
@@ -112,7 +114,12 @@ class Verification:
     @property
     def told(self) -> bool:
         """Whether the costs are known to a percent; if not, nothing can be concluded about the plan."""
-        return not (np.isfinite(self.accuracy) and self.accuracy > _UNTOLD)
+        return self._diverges or self.accuracy <= _UNTOLD
+
+    @property
+    def _diverges(self) -> bool:
+        """Whether the motion diverges under the controls alone and with feedback."""
+        return not np.isfinite([self.open_loop_cost, self.closed_loop_cost]).any()
 
     @property
     def open_loop_loss(self) -> float:
@@ -126,10 +133,16 @@ class Verification:
 
     @property
     def _untold(self) -> str:
+        finer = f"give max_substeps of {2 * self.substeps} or more"
+        if np.isinf(self.accuracy):
+            return (
+                f"these costs say nothing of the plan: those with {self.substeps} steps of {self.integrator} in one of "
+                f"the plan's were compared with no others: {finer}"
+            )
         return (
             f"these costs say nothing of the plan: with {self.substeps} steps of {self.integrator} in one of the "
             f"plan's they still change by {percent(self.accuracy)}. Springs, dampers, dry friction or stops are too "
-            f"fast: give max_substeps above {self.substeps}, or friction a greater width"
+            f"fast: {finer}, or friction a greater width"
         )
 
     @property
@@ -156,11 +169,14 @@ class Verification:
         for name, cost, loss, gap in self._rows:
             values = (f"{cost:14.6e}{loss:>12}  {gap}" if np.isfinite(cost) else f"{'runs away':>14}").rstrip()
             lines.append(f"{name:16}{values}")
-        good = f"{self.accuracy:.0e}" if np.isfinite(self.accuracy) else "nothing: no motion stays"
+        if np.isfinite(self.accuracy):
+            good = f"costs are good to {self.accuracy:.0e} of themselves"
+        else:
+            good = "all motions run away" if self._diverges else "how good the costs are is not known"
         return "\n".join(
             [
                 *lines,
-                f"a step is off by {self.defect:.2e} rad or m at most; costs are good to {good} of themselves "
+                f"a step is off by {self.defect:.2e} rad or m at most; {good} "
                 f"({self.substeps} substeps a step, {self.integrator})",
                 f"how to read it: {_READING}" if self.told else self._untold,
                 *map(str, self.constraints),
@@ -257,7 +273,7 @@ def _against(
         ]
         before = opened[0], closed[0]
         accuracy = max(changes, default=np.inf)
-        if accuracy <= tolerance or substeps >= max_substeps:
+        if accuracy <= tolerance or 2 * substeps > max_substeps:
             break
         substeps *= 2
     end = plan.q[-1]

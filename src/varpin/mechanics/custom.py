@@ -203,14 +203,16 @@ class CustomForce(Force):
                     why = "derivatives(q, v) does not return the derivatives of f"
                 raise CustomForceError(
                     f"CustomForce {self.name}: {why}: {name}[{r}, {c}] is {given[r, c]:.8g}, and differences of f give "
-                    f"{column[r]:.8g}, at {_place(q, v)}"
+                    f"{column[r]:.8g}, at {_state_text(q, v)}"
                 )
 
     def _called(self, call: Callable[[], object], what: str, q: Floats, v: Floats) -> object:
         try:
             return call()
         except Exception as error:
-            raise CustomForceError(f"CustomForce {self.name}: {what} raised {error!r} at {_place(q, v)}") from error
+            raise CustomForceError(
+                f"CustomForce {self.name}: {what} raised {error!r} at {_state_text(q, v)}"
+            ) from error
 
     def _read(self, value: object, what: str, shape: tuple[int, ...], q: Floats, v: Floats) -> Floats:
         given = np.asarray(value)
@@ -220,11 +222,11 @@ class CustomForce(Force):
                 f"{reprlib.repr(value)} of shape {given.shape}"
             )
         if not np.isfinite(given).all():
-            raise CustomForceError(f"CustomForce {self.name}: {what} is not finite at {_place(q, v)}: {given}")
+            raise CustomForceError(f"CustomForce {self.name}: {what} is not finite at {_state_text(q, v)}: {given}")
         return np.ascontiguousarray(given, dtype=np.float64)
 
 
-def _place(q: Floats, v: Floats) -> str:
+def _state_text(q: Floats, v: Floats) -> str:
     return f"q = {np.array2string(q, precision=6)}, v = {np.array2string(v, precision=6)}"
 
 

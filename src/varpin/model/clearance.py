@@ -245,7 +245,7 @@ def _boxed(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Flo
     shapes = [_shape(body) for body in (one, other)]
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     for k in range(N):
-        places = [_place(body, at, k) for body, at in ((one, here), (other, there))]
+        places = [_transform(body, at, k) for body, at in ((one, here), (other, there))]
         result.clear()
         d[k] = coal.distance(shapes[0], places[0], shapes[1], places[1], request, result)
         first[k], second[k] = result.getNearestPoint1(), result.getNearestPoint2()
@@ -260,7 +260,7 @@ def _shape(body: _Body) -> Any:
     return coal.Capsule(body.radius, length) if length > 0.0 else coal.Sphere(body.radius)
 
 
-def _place(body: _Body, at: _Placed, k: int) -> Any:
+def _transform(body: _Body, at: _Placed, k: int) -> Any:
     begin, end, R = at[0][k], at[1][k], at[2][k]
     if body.sides is None:
         way = end - begin

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
@@ -13,7 +12,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
-from varpin.errors import InputError
+from varpin.errors import InputError, UnknownFrame
 from varpin.model import Robot
 from varpin.show.replay.script import Outlook, Target, Trace
 from varpin.support.checks import JointValues, as_floats, joint_array, require_finite
@@ -39,7 +38,8 @@ def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequen
         names: One or several names, of which each robot takes those it has; True for its end effector.
 
     Raises:
-        InputError: No robot has a frame of that name.
+        InputError: A name is no string.
+        UnknownFrame: No robot has a frame of that name.
     """
     if isinstance(names, bool | np.bool_):
         return [(robot.end_effector,) if names else () for robot in robots]
@@ -49,10 +49,7 @@ def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequen
             raise InputError(f"{option} must be names of frames, got {name!r}")
         if not any(robot.free_model.existFrame(name) for robot in robots):
             known = dict.fromkeys(frame.name for robot in robots for frame in robot.free_model.frames)
-            close = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
-            hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"frames: {', '.join(known)}"
-            owner = f"robot {robots[0].name!r} has" if len(robots) == 1 else "the robots have"
-            raise InputError(f"{option}: {owner} no frame {name!r}; {hint}")
+            raise UnknownFrame(name, known, *(robot.name for robot in robots), option=option)
     return [tuple(name for name in wanted if robot.free_model.existFrame(name)) for robot in robots]
 
 

@@ -253,8 +253,8 @@ class LiveView:
                 self._begin_run()
                 self._clear_plans()
             if iteration.step > 0.0 or not self._plans:
-                self._show_plan(motion.t - motion.t[0], motion.q)
-            self._show_text(f"iteration {iteration.index}, cost {iteration.cost:.5g}", last=True)
+                self._draw_plan(motion.t - motion.t[0], motion.q)
+            self._set_caption(f"iteration {iteration.index}, cost {iteration.cost:.5g}", last=True)
             self._planned = time.monotonic()
 
     def show(self, motion: Trajectory | Solution | MpcRun) -> None:
@@ -263,18 +263,18 @@ class LiveView:
         Raises:
             InputError: It is none of these, or of another robot.
         """
-        moved = getattr(motion, "trajectory", getattr(motion, "motion", motion))
-        if not isinstance(moved, Trajectory):
+        played = getattr(motion, "trajectory", getattr(motion, "motion", motion))
+        if not isinstance(played, Trajectory):
             raise InputError(f"motion must be a trajectory, a plan or a run of an Mpc, got {type(motion).__name__}")
-        self._require(moved.q)
+        self._require(played.q)
         if self._silent:
             return
         with self._sending():
             self._begin_run()
             self._clear_plans()
             self._loop_began = -math.inf
-            self._show_plan(moved.t - moved.t[0], moved.q)
-            self._show_text(f"{moved.duration:.4g} s", last=True)
+            self._draw_plan(played.t - played.t[0], played.q)
+            self._set_caption(f"{played.duration:.4g} s", last=True)
 
     @property
     def _silent(self) -> bool:
@@ -333,7 +333,7 @@ class LiveView:
         if now > self._shown:
             self._draw_path(np.concatenate([rows_at(between, t, q), rows]))
         self._pose(rows[0])
-        self._show_text(f"t = {now:.2f}{of or ' s'}", last=last)
+        self._set_caption(f"t = {now:.2f}{of or ' s'}", last=last)
         self._shown, self._drawn = now, time.monotonic()
 
     def _pose(self, q: Floats) -> None:
@@ -384,7 +384,7 @@ class LiveView:
         while len(self._pieces) > _PIECES * len(self._traced):
             self._viewer[self._pieces.pop(0)].delete()
 
-    def _show_plan(self, t: Floats, q: Floats) -> None:
+    def _draw_plan(self, t: Floats, q: Floats) -> None:
         """Play a motion in a loop, from the phase of the previous one, and draw its paths."""
         if self._iterates:
             for node in self._iterates[-1]:
@@ -447,7 +447,7 @@ class LiveView:
             self._viewer[node].delete()
         self._iterates, self._planned = [], -math.inf
 
-    def _show_text(self, words: str, *, last: bool = False) -> None:
+    def _set_caption(self, words: str, *, last: bool = False) -> None:
         """Show a text above the robot, not more often than every ``_TEXT_INTERVAL`` unless it is the last."""
         now = time.monotonic()
         if words == self._text or (now - self._text_time < _TEXT_INTERVAL and not last):

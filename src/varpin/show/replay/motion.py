@@ -147,12 +147,12 @@ def replay(
             "for a notebook"
         )
     runs = [run if _is_run(run) else None for _, run in shown]
-    pairs = [(arm, _moved(moved)) for arm, moved in shown]
-    steps = [moved.dt for _, moved in pairs if isinstance(moved, Trajectory)]
+    pairs = [(arm, _trajectory_of(run)) for arm, run in shown]
+    steps = [path.dt for _, path in pairs if isinstance(path, Trajectory)]
     if dt is not None and len(steps) == len(pairs):
         raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {steps[0]:g} s")
     motions = [
-        _motion(arm, moved, dt, f"motion {k + 1}" if several else "motion") for k, (arm, moved) in enumerate(pairs)
+        _motion(arm, path, dt, f"motion {k + 1}" if several else "motion") for k, (arm, path) in enumerate(pairs)
     ]
     speed, fps = positive("speed", speed, "1"), positive("fps", fps, "1/s")
     max_frames = count("max_frames", max_frames, least=2)
@@ -211,7 +211,7 @@ def replay(
     if inline:
         return viewer.inline(script, frame_size(size))
     if page is None and film is None:
-        return viewer.show(script)
+        return viewer.open_viewer(script)
     with tempfile.TemporaryDirectory() as folder:
         written = viewer.write_page(page or Path(folder, "page.html"), script)
         return written if film is None else film.take(written, float(script.times[-1]))
@@ -233,7 +233,7 @@ def _is_run(motion: object) -> TypeGuard[MpcRun]:
     return hasattr(motion, "planned")
 
 
-def _moved(motion: Motion) -> Trajectory | ArrayLike:
+def _trajectory_of(motion: Motion) -> Trajectory | ArrayLike:
     """The motion of a controller's run or of a plan; others are returned as they are."""
     if _is_run(motion):
         return motion.motion

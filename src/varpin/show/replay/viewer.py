@@ -36,7 +36,7 @@ def _page(script: Script) -> str:
     return page.html(script)
 
 
-def show(script: Script) -> meshcat.Visualizer:
+def open_viewer(script: Script) -> meshcat.Visualizer:
     """Draw a script in a new meshcat server, and open it in a web browser."""
     with contextlib.redirect_stdout(io.StringIO()):
         viewer = meshcat.Visualizer()
