@@ -16,9 +16,10 @@ from varpin.arrays import Floats
 from varpin.control.costs import CostError, Expansion
 from varpin.control.descent import Model, Stake, at_stake
 from varpin.control.linear_controls import RULE, Derivatives, LinearSteps, at_samples, linear_steps, size
-from varpin.control.moments import Feedback, noise_gradient
+from varpin.control.moments import noise_gradient
 from varpin.control.penalties import PenalizedProblem, PenalizedRate, flat, rate_columns
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.spread import Feedback
 from varpin.control.square_root import Squares, squares_of
 from varpin.errors import LinearizationError
 from varpin.linearization import (

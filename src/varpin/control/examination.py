@@ -14,7 +14,7 @@ from varpin.control.history import ITERATIONS, Status
 from varpin.control.multipliers import FEASIBLE, TOLD
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
-from varpin.control.spread import covariances, state_slopes
+from varpin.control.spread import Feedback, covariances, state_slopes
 from varpin.control.verification import accurate_cost, percent
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, VarpinError
@@ -204,7 +204,8 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
     if not (problem.scene.processes and rubbing):
         return []
     try:
-        P, slopes = covariances(problem, solution), state_slopes(problem, motion)
+        P = covariances(problem, motion, Feedback(solution.gains, solution.previous_gains))
+        slopes = state_slopes(problem, motion)
     except LinearizationError:
         return []
     n = problem.scene.robot.dof

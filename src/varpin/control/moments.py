@@ -16,19 +16,12 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.control.linear_controls import at_samples
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.spread import Feedback, decision, propagated
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
 
 # Step of the central differences, relative to the largest value of each variable along the motion.
 _SHIFT = 1e-5
-
-
-@dataclass(frozen=True, eq=False)
-class Feedback:
-    """Gains (R, m, 2n) on the state, and (R, m, m) on the previous control where its change has a cost."""
-
-    state: Floats
-    before: Floats | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +56,7 @@ def noise_gradient(
     n, m, N = problem.scene.robot.dof, problem.scene.controls, problem.steps
     here = _steps_of(problem, trajectory, processes)
     W = _values(problem, here, feedback, _end_hessian(problem, trajectory), rate)
-    C = _covariances(problem, here, feedback)
+    C = propagated(here.J, here.g, here.gz, problem, feedback)
     variational = problem.integrator.variational
     x = np.concatenate([trajectory.q, trajectory.p if variational else trajectory.v], axis=1)
     y = np.concatenate([x[:-1], trajectory.u], axis=1)
@@ -174,15 +167,6 @@ def _shares(problem: OptimalControlProblem, steps: _Steps, W: Floats, C: Floats)
     return total
 
 
-def _decision(feedback: Feedback, r: int, x: int, m: int) -> Floats:
-    """The matrix from (x, previous control) to (x, u)."""
-    T = np.zeros((x + m, x + m))
-    T[:x, :x], T[x:, :x] = np.eye(x), feedback.state[r]
-    if feedback.before is not None:
-        T[x:, x:] = feedback.before[r]
-    return T
-
-
 def _values(
     problem: OptimalControlProblem, steps: _Steps, feedback: Feedback, terminal: Floats, rate: Floats
 ) -> Floats:
@@ -194,28 +178,10 @@ def _values(
         W[k] = _hessian(problem, steps, W[k + 1], k)
         if k % problem.hold == 0:
             r = k // problem.hold
-            T = _decision(feedback, r, x, m)
+            T = decision(feedback, r, x, m)
             W[k] = T.T @ W[k] @ T
             if len(rate):
                 change = T[x:].copy()
                 change[:, x:] -= np.eye(m)
                 W[k] += change.T @ rate[r] @ change
     return W
-
-
-def _covariances(problem: OptimalControlProblem, steps: _Steps, feedback: Feedback) -> Floats:
-    """Covariances of (x, u) at the beginning of each step and at the end (N + 1, 2n + m, 2n + m)."""
-    N, x, m = problem.steps, steps.J.shape[1], problem.scene.controls
-    C, covariance = np.zeros((N + 1, x + m, x + m)), np.zeros((x + m, x + m))
-    for k in range(N):
-        if k % problem.hold == 0:
-            T = _decision(feedback, k // problem.hold, x, m)
-            covariance = T @ covariance @ T.T
-        C[k] = covariance
-        through = np.zeros((x + m, x + m))
-        through[:x], through[x:, x:] = steps.J[k], np.eye(m)
-        g, gz = steps.g[k], steps.gz[k]
-        covariance = through @ covariance @ through.T
-        covariance[:x, :x] += problem.dt * (g @ g.T + np.einsum("akz,zy,bky->ab", gz, C[k], gz, optimize=True))
-    C[N] = covariance
-    return C

@@ -16,7 +16,7 @@ from varpin.control.backward import states
 from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
-from varpin.control.spread import covariances, state_slopes
+from varpin.control.spread import Feedback, covariances, state_slopes
 from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
 from varpin.integrators.base import open_loop
@@ -223,7 +223,7 @@ def _of_rate(item: BoundRate, k: NDArray[np.int64], r: NDArray[np.int64], R: int
 def deviations(problem: OptimalControlProblem, plan: Solution, bound: BoundConstraint) -> Floats:
     """Standard deviations (K, rows) of a state constraint under the plan's feedback and the scene's noise."""
     motion = plan.trajectory
-    found = covariances(problem, plan)
+    found = covariances(problem, motion, Feedback(plan.gains, plan.previous_gains))
     J = bound.jacobian(motion.q, motion.v) @ state_slopes(problem, motion)[bound.places]
     variance = np.einsum("krx,kxy,kry->kr", J, found[bound.places], J)
     spread: Floats = np.sqrt(np.maximum(variance, 0.0))

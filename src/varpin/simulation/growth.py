@@ -19,6 +19,7 @@ from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
+from varpin.simulation.modes import first_order, rate_bounds
 from varpin.simulation.retaking import finer, taken_again
 from varpin.trajectory import Trajectory
 
@@ -101,7 +102,7 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         return None
     # Eigenvalues take longer than all else: at half of the places.
     aq, av = slopes
-    if small > _factor(_largest_rate(aq, av), trajectory):
+    if small > _factor(float(np.median(rate_bounds(aq, av))), trajectory):
         return None
     if small > _factor(float(np.median(_modes(aq[::2], av[::2]))), trajectory):
         return None
@@ -140,19 +141,9 @@ def _slopes(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> tupl
     return aq, av
 
 
-def _largest_rate(aq: Floats, av: Floats) -> float:
-    """A bound of the rates of all modes [1/s], from norms of the linearized accelerations."""
-    by_q, by_v = (np.abs(slope).sum(axis=2).max(axis=1) for slope in (aq, av))
-    return float(np.median(np.sqrt(by_q) + by_v))
-
-
 def _modes(aq: Floats, av: Floats) -> Floats:
     """The rate at which the fastest mode of the linearized accelerations grows at each place (K,) [1/s]."""
-    n = aq.shape[1]
-    J = np.zeros((len(aq), 2 * n, 2 * n))
-    J[:, range(n), range(n, 2 * n)] = 1.0
-    J[:, n:, :n], J[:, n:, n:] = aq, av
-    rates: Floats = np.linalg.eigvals(J).real.max(axis=1)
+    rates: Floats = np.linalg.eigvals(first_order(aq, av)).real.max(axis=1)
     return rates
 
 

@@ -24,6 +24,7 @@ from varpin.mechanics.forces import drive_forces
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.chatter import RUN, alternation
+from varpin.simulation.modes import first_order
 from varpin.simulation.soundness import Finding, examined, with_warnings
 from varpin.trajectory import Trajectory
 
@@ -569,10 +570,10 @@ def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, Floats, float]
         jet = lagrangian_jet(scene, q, np.zeros(n))
         u, Kq = u + law.S @ jet.Lq, Kq + law.S @ jet.Lqq
     force = scene.actuation @ u
-    a, aq, av, af = (value[0] for value in accelerations(scene, q[None], np.zeros((1, n)), force[None]))
-    pushed = af @ scene.actuation
+    a, aq, av, af = accelerations(scene, q[None], np.zeros((1, n)), force[None])
+    pushed = af[0] @ scene.actuation
     sizes = np.abs(law.Kq) @ (np.abs(q) + law.span.unit[:n]) + np.abs(law.c)
-    terms = np.abs(pushed) @ sizes + np.abs(a - af @ force)
-    A = np.block([[np.zeros((n, n)), np.eye(n)], [aq, av]])
+    terms = np.abs(pushed) @ sizes + np.abs(a[0] - af[0] @ force)
     B = np.concatenate([np.zeros_like(pushed), pushed])
-    return Loop(A, B, np.concatenate([Kq, law.Kv], axis=1), law.span, q), a, float(terms.max())
+    gains = np.concatenate([Kq, law.Kv], axis=1)
+    return Loop(first_order(aq, av)[0], B, gains, law.span, q), a[0], float(terms.max())

@@ -19,6 +19,7 @@ from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
+from varpin.simulation.modes import first_order, rate_bounds
 from varpin.trajectory import Trajectory
 
 Complexes = NDArray[np.complex128]
@@ -72,7 +73,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         return None
     h = trajectory.dt / float(np.maximum(trajectory.statistics.substeps, 1).mean())
     # Upper bounds of the modes' rates. Slower modes lose less, as long as they turn by little in a step.
-    bounds = np.sqrt(np.abs(aq).sum(axis=2).max(axis=1)) + np.abs(av).sum(axis=2).max(axis=1)
+    bounds = rate_bounds(aq, av)
     fastest = float(bounds.max())
     drift = _drift(integrator, np.array([1j * fastest]), h)
     if drift is None or (h * fastest < 1.0 and abs(drift[0]) * trajectory.t[-1] < WARNED):
@@ -85,15 +86,14 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         slowest = np.maximum(bounds[list(ends)].min(), np.finfo(np.float64).tiny)
         growth = float((fastest / slowest) ** (integrator.order + 1))
     alike = _damped_alike(scene, av)
-    A = np.zeros((2 * n, 2 * n))
-    A[:n, n:] = np.eye(n)
+    A = first_order(aq, av)
     for k in dict.fromkeys([*ends, *range(len(at))]):
         # Modes with the damping of those at the ends, and hardly faster, have nearly as small an error.
         if k not in ends and alike and most * growth < _NOTHING * WARNED:
             break
-        node, A[n:, :n], A[n:, n:] = at[k], aq[k], av[k]
+        node = at[k]
         try:
-            rates, modes = np.linalg.eig(A)
+            rates, modes = np.linalg.eig(A[k])
             parts = np.linalg.solve(modes, np.append(v[k], a[k]))
         except np.linalg.LinAlgError:
             most = np.inf

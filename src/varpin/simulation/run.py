@@ -102,7 +102,7 @@ def simulate(
             as long where small disturbances may grow.
         progress: Called now and then with (steps done, steps in all). A function with three required arguments, such
             as :class:`varpin.LiveView`, also gets a :class:`varpin.Nodes` with the nodes since the last call, whose
-            last node comes first again.
+            last node comes first again. The count begins anew where a motion is repeated with another integrator.
 
     Returns:
         The trajectory, frozen.
@@ -160,10 +160,11 @@ def simulate(
     if integrator is None:
         integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0, ahead=law is not None)
     task = _Task(scene, q0, v0, controls, period, dt, steps, dw, check)
-    record, hold, other, interrupted = _integrated(task, integrator, reporter, replaceable=replaceable)
-    while other is not None:
-        integrator = other
+    while True:
         record, hold, other, interrupted = _integrated(task, integrator, reporter, replaceable=replaceable)
+        if other is None:
+            break
+        integrator = other
     try:
         try:
             trajectory, found = _checked(scene, integrator, record.trajectory(), hold, check=check)
