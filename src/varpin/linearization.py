@@ -100,7 +100,7 @@ class Linearization:
 
 
 def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | None = None) -> Linearization:
-    """Linearize every step of a trajectory.
+    """Linearize every step of a trajectory: (1.7) and (1.10) of the paper.
 
     Main args:
         scene: The scene of the trajectory.
@@ -449,7 +449,7 @@ def _sizes(arrays: Mapping[str, Floats]) -> str:
 def propagate_moments(
     linearization: Linearization, mean: ArrayLike | None = None, covariance: ArrayLike | None = None
 ) -> Moments:
-    """Mean and covariance of dx under the linearization with du = 0, in closed form.
+    """Mean and covariance of dx under the linearization (L3) with du = 0, in closed form.
 
         mean' = A mean,    P' = A P A' + dt sum_i [ Gx_i P Gx_i' + g_i g_i' ],    g_i = Gx_i mean + G_i
 

@@ -121,7 +121,7 @@ class Bounds(NamedTuple):
 
 @dataclass(frozen=True, eq=False, init=False)
 class Scene(Frozen):
-    """A robot with gravity, forces, actuation, noise and constraints.
+    """A robot with gravity, forces, actuation, noise and constraints; its equation of motion is (1.1) of the paper.
 
     Attributes:
         robot: The robot.

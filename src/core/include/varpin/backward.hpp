@@ -28,6 +28,7 @@
 
 namespace varpin {
 
+// The recursion (O2) over the steps, from the last to the first.
 class BackwardPass {
   public:
     // Starts from the gradient (2n) and the Hessian (2n, 2n) of the terminal cost in x.
@@ -235,8 +236,8 @@ class BackwardPass {
         return true;
     }
 
-    // k within limits at deviations `ahead` (2n + m) of the state and the previous control from the nominal ones, null
-    // for zero; the result applies at zero deviation again.
+    // k within limits, (O4), at deviations `ahead` (2n + m) of the state and the previous control from the nominal
+    // ones, null for zero; the result applies at zero deviation again.
     bool keep_within(const double* slack, const double* ahead, const double* rate, double* k) {
         const double* Qu = Qz.data() + x;
         std::copy_n(Qu, m, pulled.data());
@@ -336,7 +337,7 @@ class BackwardPass {
         mirror(W, x);
     }
 
-    // Gains G on the previous control of a decision, and the rows and columns of the value in it.
+    // Gains G on the previous control of a decision, and the rows and columns of the value in it, (O6).
     void value_of_previous(const double* R, const double* pull, const double* k, double* G) {
         for (int i = 0; i < m; ++i) {
             for (int c = 0; c < m; ++c) G[i * m + c] = box.held[i] ? 0.0 : R[i * m + c];

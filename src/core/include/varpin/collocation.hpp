@@ -57,7 +57,8 @@ struct Start {
     const double* force_at(int stage) const { return force + stage * stride; }
 };
 
-// The step equation; numbers of joints and stages may be known at compile time.
+// The step equation: (D3) with the forces (D4), the paper's (1.8) and (1.9). Numbers of joints and stages may be known
+// at compile time.
 template <class Size = int, class Stages = int>
 class Collocation {
   public:
@@ -449,8 +450,8 @@ class Collocation {
         return stages == 1 ? residuals_of(1, h, start) : residuals_of(stages, h, start);
     }
 
-    // The discrete Euler-Lagrange residual r_i(V) of each stage into `residual`; returns the largest in rounding units.
-    // Called with the constant 1 for one stage, so that the compiler removes the loops over stages.
+    // The discrete Euler-Lagrange residual r_i(V) of each stage, (S1) and (C1), into `residual`; returns the largest in
+    // rounding units. Called with the constant 1 for one stage, so that the compiler removes the loops over stages.
     [[gnu::always_inline]] inline double residuals_of(const int stages, double h, const Start& start) {
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
@@ -479,7 +480,7 @@ class Collocation {
         return worst;
     }
 
-    // The block of N, (s width, s width).
+    // The block (s width, s width) of N, (C3).
     void assemble(double h, Block block, double* matrix) {
         if (stages == 1) return assemble_one(h, block, matrix);
         const int width = block.end - block.begin, size = stages * width;
@@ -737,6 +738,7 @@ class Collocation {
         }
     }
 
+    // Equations (L1) and (L2) for any number of stages:
     // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h F_f df + h sum_i b_i K_i dq0 + sum_j G_j dV_j, with K = L_qq + F_q
     // and G_j = h b_j (A_j' + F_v,j) + h^2 sum_i b_i a_ij K_i.
     void end_derivatives(double h, Block block, const std::vector<double>& dV, double* Jx, double* Jf) {

@@ -74,6 +74,7 @@ struct ConstrainedState {
     std::vector<double> impulses;      // (steps, m) impulses of the last roll
 };
 
+// Steps that make the action (H1) stationary.
 class ConstrainedStepper {
   public:
     // `places` is t_kj (s + 1, s).
@@ -966,7 +967,8 @@ class ConstrainedStepper {
         }
     }
 
-    // Write the residuals of the stages to `right`, then -g / h; returns the largest in rounding units of its terms.
+    // Write the residuals of the stages, (H2), to `right`, then -g / h; returns the largest in rounding units of its
+    // terms.
     double residuals(double h, const Start& start) {
         double worst = 0.0;
         const int r = here.rank();

@@ -377,7 +377,7 @@ void add_armature(const Tree& tree, const T* v, Jet<T, Size>& w) {
 
 }  // namespace detail
 
-// The whole jet at (q, v), into w.
+// The whole jet, (J1) and (J2), at (q, v) into w.
 template <class T, class Size>
 void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, Size>& w) {
     const Tree& tree = mechanism.tree;

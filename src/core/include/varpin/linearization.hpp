@@ -218,7 +218,8 @@ class VariationalLinearization {
         return both;
     }
 
-    // Add start' (z . d2(q1, p1)) start at the stepper's root, after part_derivatives; `start` (2n, 3n) may be null.
+    // Add start' (z . d2(q1, p1)) start, (L4), at the stepper's root, after part_derivatives; `start` (2n, 3n) may be
+    // null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
         const Tableau& tableau = equation.tableau;

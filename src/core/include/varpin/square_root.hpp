@@ -71,6 +71,7 @@ class RowStack {
     std::vector<double> values_, work_;
 };
 
+// The recursion of the backward pass on R and r of (O3), from the last step to the first.
 class RootPass {
   public:
     // Starts from the terminal cost in x (2n), and its gradient.
