@@ -154,26 +154,14 @@ class Collocation {
                 fresh = true;
                 continue;
             }
-            for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
+            take_correction();
             ++effort.newton_iterations;
-            if (fresh && !jets_wanted) {
-                const double left = left_by_bending(h, worst);
-                if (worst <= tolerance || sure * left <= tolerance) {
-                    correct_slopes(h);
-                    worst = std::min(worst, left);
-                    break;
-                }
+            const double contraction = contraction_of(before, size);
+            if (!jets_wanted && certainly_last(h, fresh, contraction, tolerance, worst)) {
+                correct_slopes(h);
+                break;
             }
-            fresh = false;
-            if (before < infinity) {
-                const double contraction = std::sqrt(size / before);
-                if (sure * contraction * worst <= tolerance && !jets_wanted) {
-                    correct_slopes(h);
-                    worst *= contraction;
-                    break;
-                }
-                fresh = !(worst * contraction * contraction * contraction <= tolerance);
-            }
+            fresh = before < infinity && !(worst * contraction * contraction * contraction <= tolerance);
             before = size;
         }
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
@@ -327,6 +315,29 @@ class Collocation {
                                       // translates a body on a rotating one, where its product is NaN without motion
     std::vector<double> element_curvature;  // (s, n) of the elements' potentials, if there is an elimination
     std::vector<double> diagonal;           // (s, s, n) of N, without the contributions of bodies in an elimination
+
+    void take_correction() {
+        for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
+    }
+
+    // The factor by which corrections shrink, from the kinetic sizes of the last two; infinite after the first.
+    static double contraction_of(double before, double size) {
+        return before < infinity ? std::sqrt(size / before) : infinity;
+    }
+
+    // Whether a correction needs no evaluation of the residual that it leaves, `worst` before it: by the nonlinearity
+    // of the equation if its factors were `fresh`, or by the contraction. If so, `worst` becomes the estimate.
+    bool certainly_last(double h, bool fresh, double contraction, double tolerance, double& worst) {
+        const double left = fresh ? left_by_bending(h, worst) : infinity;
+        if (fresh && (worst <= tolerance || sure * left <= tolerance)) {
+            worst = std::min(worst, left);
+        } else if (sure * contraction * worst <= tolerance) {
+            worst *= contraction;
+        } else {
+            return false;
+        }
+        return true;
+    }
 
     // Estimate of the residual, in rounding units, that second derivatives of r leave after the correction in `delta`
     // with fresh factors. Kinetic and potential energy are nonlinear in the angles of bodies: the estimate is the angle
