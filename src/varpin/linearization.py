@@ -136,9 +136,8 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     if scene.processes == 0:
         return Linearization(
             A=Jx,
-            B=(Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(
-                steps, 2 * n, m
-            ),  # one product instead of many small ones
+            # One product instead of many small ones.
+            B=Jf if scene.direct else (Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(steps, 2 * n, m),
             K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
             J=Jk,
             F=np.zeros((steps, n, 0)),
@@ -165,7 +164,7 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     if left < 1.0:
         # The part of a kick after the step is evaluated at the step's end.
         end_q, end_v = trajectory.q[1:], trajectory.v[1:]
-        if trajectory.dw.any():
+        if trajectory.noisy:
             end_q, end_v = integrator.quiet_ends(scene, trajectory)
         end = scene.noise.fields(end_q, end_v, trajectory.u, first)
         end_x = _in_momentum(scene, end_q, end_v, end)

@@ -301,7 +301,7 @@ std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
         nb::gil_scoped_release release;
         Jet<double> w(mechanism.tree);
         for (std::size_t s = 0; s < rows; ++s) {
-            lagrangian_jet(mechanism, q.data() + s * n, v.data() + s * n, w);
+            momentum_slopes(mechanism, q.data() + s * n, v.data() + s * n, w);
             std::copy(w.M.begin(), w.M.end(), M + s * n * n);
             std::copy(w.A.begin(), w.A.end(), A + s * n * n);
         }
@@ -321,7 +321,7 @@ Out velocity_slopes(const Mechanism& mechanism, In<2> q, In<2> v) {
     Jet<double> w(mechanism.tree);
     const int size = mechanism.dof();
     for (std::size_t s = 0; s < rows; ++s) {
-        lagrangian_jet(mechanism, q.data() + s * n, v.data() + s * n, w);
+        momentum_slopes(mechanism, q.data() + s * n, v.data() + s * n, w);
         double* slope = slopes + s * 2 * n * n;
         for (std::size_t i = 0; i < n; ++i) {
             for (std::size_t j = 0; j < n; ++j) slope[i * 2 * n + j] = -w.A[i * n + j];

@@ -368,6 +368,11 @@ class Scene(Frozen):
             return self.actuation
         return np.vstack([self.actuation, np.eye(self.controls)[rates]])
 
+    @cached_property
+    def direct(self) -> bool:
+        """Whether each control is the input of a linearized step: :attr:`transmission` is the identity."""
+        return np.array_equal(self.transmission, np.eye(len(self.transmission)))
+
     @property
     def _gear(self) -> Floats:
         """Force (n,) per unit of a control that drives one joint only: 1, or the stiffness of its servo."""

@@ -195,7 +195,7 @@ class RootPass {
             const Sample& at = steps.rule[sample];
             const double weight = h * at.weight, factor = std::sqrt(weight);
             const double* L = running.root_of(point, size);
-            step.expand(at);
+            step.expand(at, x);
             for (int i = 0; i < size; ++i) {
                 double* row = stack.push();
                 for (int j = 0; j < x; ++j) add_to_row(factor * L[i * size + j], step.D[j], row);
