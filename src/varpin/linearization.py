@@ -121,7 +121,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
         found = replace(found, K=_kick_columns(scene, trajectory, found.J))
     if not trajectory.u_stages.shape[1]:
         return found
-    return replace(found, ramp=integrator.ramps(scene, trajectory) @ scene.actuation)
+    return replace(found, ramp=integrator.ramps(scene, trajectory) @ scene.transmission)
 
 
 def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:

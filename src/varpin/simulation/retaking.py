@@ -14,7 +14,7 @@ from varpin.integrators.collocation import MOST_STAGES
 from varpin.integrators.variational import Variational
 from varpin.integrators.within import Times, changing, in_parts
 from varpin.mechanics.assembly import along_constraints, nearest
-from varpin.mechanics.inputs import in_parts_of_steps
+from varpin.mechanics.inputs import in_parts_of_steps, prescribing
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -179,7 +179,8 @@ class Again:
         commands = open_loop(in_parts_of_steps(scene, *given, trajectory.dt, parts))
         if trajectory.u_stages.shape[1]:
             at = method.stage_times
-            commands = changing(in_parts(trajectory.u_stages[taken], self._times, parts, at), at)
+            parted = changing(in_parts(trajectory.u_stages[taken], self._times, parts, at), at)
+            commands = prescribing(scene, parted, commands.u)
         no_drift = np.zeros((0, 0, scene.robot.dof))
         (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, no_drift, trajectory.dt / parts)
         done = len(segment.q) // parts

@@ -200,12 +200,13 @@ class ConstrainedStepper {
     // Set the rates of cubic kinematic inputs at their goals, in the order of their rows; others are not read.
     void take_rates(const double* own) { std::copy(own, own + goal_rate.size(), goal_rate.begin()); }
 
-    // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`.
+    // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`. The entry of a driven
+    // joint is its goal, at all stages.
     void take_force(const double* own, bool varies) {
         stride = varies ? n : 0;
-        std::copy(own, own + (varies ? stages * n : n), force.begin());
-        if (varies) given = force;
+        std::copy(own, own + n, force.begin());
         take_goals();
+        if (varies) take_stages(own);
     }
 
     // One whole step, in as many substeps as the guards require; as VariationalStepper::step.
@@ -255,8 +256,8 @@ class ConstrainedStepper {
     Outcome from_guess(double h, const double* V, ConstrainedState& state) {
         std::copy(V, V + stages * n, equation.V.begin());
         std::fill(impulse.begin(), impulse.end(), 0.0);
-        share = 1.0;
         left = 1;
+        bring_force(0.0, 0);
         return attempt(h, state, true);
     }
 
@@ -289,12 +290,12 @@ class ConstrainedStepper {
                 const double* extra = drift ? drift + row * n : nullptr;
                 const double* within = stage_controls(commands, p, s, stages, u, line);
                 stride = within ? n : 0;
+                constant_force(mechanism, extra, u + s * controls, force.data());
+                take_goals();
                 if (within) {
                     stage_forces(mechanism, extra, within, stages, given.data());
-                } else {
-                    constant_force(mechanism, extra, u + s * controls, force.data());
+                    take_stages(given.data());
                 }
-                take_goals();
                 for (std::size_t d = 0; d < goal_rate.size(); ++d) {
                     const int control = mechanism.constraints.driven()[d].rate;
                     if (control >= 0) goal_rate[d] = u[s * controls + control];
@@ -709,6 +710,14 @@ class ConstrainedStepper {
         for (std::size_t d = 0; d < driven.size(); ++d) {
             goal[d] = force[driven[d].coordinate];
             force[driven[d].coordinate] = 0.0;
+        }
+    }
+
+    // Take forces (s, n) at the stages of the step; no force but that of its row acts on a driven joint.
+    void take_stages(const double* own) {
+        if (own != given.data()) std::copy(own, own + stages * n, given.begin());
+        for (const DrivenRow& row : mechanism.constraints.driven()) {
+            for (int i = 0; i < stages; ++i) given[i * n + row.coordinate] = 0.0;
         }
     }
 
