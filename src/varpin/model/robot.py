@@ -144,7 +144,7 @@ class Robot(Frozen):
         Joints of the posture that are not coordinates of the robot (locked, mimic or absent joints) are ignored.
 
         Main args:
-            name: Name of the posture: ``"home"``.
+            name: Name of the posture: ``"home"``; or ``"arm/home"``, short for ``group="arm"``.
 
         Other Args:
             group: The joint group to take the posture of, where several groups have one of this name. If left out, the
@@ -161,6 +161,10 @@ class Robot(Frozen):
         """
         q = joint_array("others", others, self.joint_names, uniform=True)
         found = [state for state in self.group_states if state.name == name]
+        first, slash, rest = str(name).partition("/")
+        if not found and slash and group is None:
+            name, group = rest, first
+            found = [state for state in self.group_states if state.name == name]
         if not found:
             raise UnknownPosture(name, self.postures, self.name)
         groups = ", ".join(state.group for state in found)
@@ -287,7 +291,7 @@ class Robot(Frozen):
 
     @property
     def friction(self) -> Floats:
-        """Dry friction in the description (n,) [N m or N], for ``CoulombFriction(robot.friction)``."""
+        """Dry friction in the description (n,) [N m or N]; ``Scene(friction="robot")`` uses it."""
         return self._at_coordinates(self.free_model.friction, np.abs(self.tree.ratio))
 
     def _at_coordinates(self, values: ArrayLike, weights: Floats) -> Floats:
