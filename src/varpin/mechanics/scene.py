@@ -41,7 +41,7 @@ from varpin.mechanics.forces import (
     of_kind,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
-from varpin.model import Robot, require_sound
+from varpin.model import Robot, degrees_hint, require_sound
 from varpin.model.tree import block_ends, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, joint_array
 from varpin.support.frozen import Frozen
@@ -831,6 +831,8 @@ def _forces(
         given = (JointDamper(viscous), *given)
     if stiff.any():
         given = (JointSpring(stiff, slack), *given)
+        if units := degrees_hint(robot, "rest", slack):
+            logger.warning(units)
     bound = [each for force in given for each in bound_force(force, robot)]
     elements = [each for each in bound if isinstance(each, Element)]
     own_code = tuple(force for force in given if isinstance(force, CustomForce))

@@ -17,6 +17,7 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
 from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
+from varpin.model.degrees import ADVICE, looks_like_degrees
 from varpin.model.inertia import faults
 from varpin.model.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.model.mjcf import build_mjcf_model, build_mjcf_shapes
@@ -542,8 +543,10 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     if kind.nv == 1 and kind.nq == 1:
         low, high = (float(limits[kind.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
         if low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
+            units = not joint_axis(model, joint)[0] and looks_like_degrees(position[0])
+            hint = f", and looks like degrees: {ADVICE}" if units else ""
             logger.warning(
-                "%s = %g locks the joint outside its limits, %g and %g [rad or m]", name, position[0], low, high
+                "%s = %g locks the joint outside its limits, %g and %g [rad or m]%s", name, position[0], low, high, hint
             )
     if kind.nv > 1:
         reference = pin.neutral(model)

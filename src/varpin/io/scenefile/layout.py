@@ -13,14 +13,14 @@ from varpin.arrays import Floats
 from varpin.control.costs import Cost, CostSum, Terminal
 from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
 from varpin.io.scenefile.references import Timeline, constant
-from varpin.io.scenefile.spec import CostSpec, ForceSpec, degrees_for_radians
+from varpin.io.scenefile.spec import CostSpec, ForceSpec
 from varpin.io.scenefile.table import SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Given
 from varpin.mechanics.constraints import Constraint, KinematicInput
 from varpin.mechanics.forces import CoulombFriction, Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.mechanics.scene import Scene, closest_controls, resistance
-from varpin.model import Robot, combine, load_robot
+from varpin.model import Robot, combine, load_robot, looks_like_degrees
 
 if TYPE_CHECKING:
     from varpin.io.scenefile.tables import RobotKeys
@@ -283,7 +283,7 @@ def _load(spec: SceneSpec, held: Mapping[str, float], whole: Robot | None = None
 
 def _one(given: RobotKeys, table: Table, held: Mapping[str, float]) -> Robot:
     for joint, value in given.lock.items():
-        if isinstance(value, float) and degrees_for_radians(value):
+        if isinstance(value, float) and looks_like_degrees(value):
             raise table.error(f"lock.{joint}", f"{value:g} looks like degrees: positions are in rad or m")
     try:
         return load_robot(
@@ -430,7 +430,7 @@ def _require_controls(layout: Layout) -> None:
     given = layout.controls.at(times_of(spec))
     for joint, column in zip(layout.actuated[served | moved].tolist(), given.T[served | moved], strict=True):
         worst = float(column[np.argmax(np.abs(column))])
-        if not layout.robot.slides[joint] and degrees_for_radians(worst):
+        if not layout.robot.slides[joint] and looks_like_degrees(worst):
             name = layout.robot.joint_names[joint]
             raise table.error("controls", f"{worst:g} of {name!r} looks like degrees: positions are in rad")
     force, limit = np.abs(given * layout.gear), np.where(served | moved, np.inf, layout.torque_limit)
@@ -450,7 +450,7 @@ def times_of(spec: SceneSpec) -> Floats:
 
 def _refuse_degrees(table: Table, name: str, values: Floats, robot: Robot) -> None:
     for joint, value, slide in zip(robot.joint_names, values.tolist(), robot.slides.tolist(), strict=True):
-        if not slide and degrees_for_radians(value):
+        if not slide and looks_like_degrees(value):
             raise table.error(name, f"{value:g} of {joint!r} looks like degrees: angles are in rad")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -145,8 +144,3 @@ class CostSpec:
     frame: str
     numbers: Mapping[str, float]
     words: Mapping[str, str]
-
-
-def degrees_for_radians(value: float) -> bool:
-    """Whether an angle [rad] is larger than two turns, and therefore probably in degrees."""
-    return abs(value) > 4.0 * math.pi
