@@ -202,7 +202,7 @@ def test_unknown_robot_gets_close_matches(capsys, command):
         (["frobnicate"], ("varpin: error", "'frobnicate'", "simulate")),
         (["--frobnicate"], "varpin: error"),
         (["simulate"], ("varpin simulate: error", "ROBOT")),
-        (["simulate", "finger", "--q0", "a"], ("--q0", "'a'", "JOINT=VALUE")),
+        (["simulate", "finger", "--v0", "a"], ("--v0", "'a'", "JOINT=VALUE")),
         (["simulate", "finger", "--lock", "elbow"], ("--lock", "'elbow'", "JOINT=VALUE")),
         (["simulate", "finger", "--lock", "elbow=x"], ("--lock", "'elbow=x'", "JOINT=VALUE")),
         (["simulate", "finger", "--steps", "1.5"], ("--steps", "'1.5'")),

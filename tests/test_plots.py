@@ -280,10 +280,33 @@ def test_limits_are_drawn_where_the_motion_comes_near_them():
     assert limit_lines(motion, robot) == []
     # The elbow goes to its limit; the others' are far away.
     turned = dataclasses.replace(motion, q=np.linspace(q0, np.where(np.arange(6) == 2, upper, q0), 3))
-    levels = {round(float(line.get_segments()[0][0, 1]), 6) for line in limit_lines(turned, robot)}
+    *lines, key = limit_lines(turned, robot)
+    levels = {round(float(line.get_segments()[0][0, 1]), 6) for line in lines}
+    assert (key.get_segments(), key.get_label()) == ([], "limits")
     assert round(float(upper[2]), 6) in levels
     assert all(np.abs(np.array([*lower, *upper]) - level).min() < 1e-6 for level in levels)
     assert limit_lines(turned, None) == []
+
+
+def legend_of(owner):
+    legends = owner.legends if isinstance(owner, Figure) else [owner.get_legend()]
+    return [text.get_text() for legend in legends if legend is not None for text in legend.get_texts()]
+
+
+def test_limits_have_an_entry_in_every_legend():
+    """In one panel, also of one joint, and once in an overview whose velocities alone come near their limits."""
+    robot, motion = swing(links=1)
+    model = robot.model.copy()
+    model.velocityLimit = np.array([1.05 * np.abs(motion.v).max()])
+    limited = vp.load_robot(model)
+    assert legend_of(plots.plot_velocities(motion, robot=limited)[1]) == ["joint1", "limits"]
+    assert legend_of(plots.plot_joints(motion, robot=limited)[1]) == []
+    figure, axes = plots.plot_trajectory(motion, robot=limited)
+    assert legend_of(figure) == ["joint1", "limits"]
+    assert [legend_of(panel) for panel in axes] == [[]] * 3
+    grid = Figure().subplots(4, 1)
+    plots.plot_trajectory(motion, axes=grid, robot=limited)
+    assert [legend_of(panel) for panel in grid] == [[], ["joint1", "limits"], [], []]
 
 
 def limit_lines(trajectory, robot):

@@ -786,7 +786,7 @@ def test_the_documented_scene_is_one(tmp_path):
     # It has every key that there is.
     data = tomllib.loads(whole)
     assert set(data) == {
-        *("title", "gravity", "damping", "robot", "springs", "force", "actuation", "noise", "initial"),
+        *("title", "gravity", "damping", "friction", "robot", "springs", "force", "actuation", "noise", "initial"),
         *("horizon", "integrator", "cost", "simulate", "solve", "outputs"),
     }
     for text in parts:
@@ -900,13 +900,13 @@ def keys_of(data, path=""):
 
 def test_documented_keys_are_those_there_are():
     whole, _, references = documented()
-    allowed, free = allowed_keys(), {"robot.lock"}
+    allowed = allowed_keys()
     used = keys_of(tomllib.loads(whole))
     for path, keys in used:
         if path in allowed:
             assert keys <= allowed[path], path
     sections = documented_sections()
-    for path in allowed.keys() - free:
+    for path in allowed:
         written = set(re.findall(r"\w+", sections[path])) if path else set()
         # Constraints of the mechanism, which no plan goes with, and of plans have pages of their own.
         assert allowed[path] - {"constraint", "plan_constraint"} <= written.union(

@@ -150,7 +150,10 @@ class UnknownPosture(InputError):
         self.postures = tuple(postures)
         self.matches, hint = _meant(posture, self.postures)
         known = f"{hint}postures: {', '.join(self.postures)}"
-        none = "it has none: give the SRDF file that has them, load_robot(..., srdf=path)"
+        none = (
+            "it has none: give the SRDF file that has them, load_robot(..., srdf=path), or srdf under [robot] in a "
+            "scene file, or --srdf of a command"
+        )
         super().__init__(f"robot {robot!r} has no posture {posture!r}; {known if self.postures else none}")
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import BY_NAME, Integrator, integrator_of, options_of
 from varpin.io.scenefile import SceneFile, load_scene, scenes
@@ -73,12 +74,16 @@ def robot_options(request: argparse.Namespace) -> dict[str, Any]:
 def add_motion(parser: argparse.ArgumentParser) -> None:
     """Add the initial state of a motion, and the forces on it."""
     start = parser.add_argument_group("start")
-    add_vector(start, "q0", "initial configuration [rad or m]; default: 0")
+    text = "initial configuration [rad or m], or the name of a posture of the robot's SRDF file (home); default: 0"
+    add_vector(start, "q0", text, _position)
+    start.add_argument("--srdf", metavar="FILE", help="SRDF file of the postures; default: that of the robot's file")
     add_vector(start, "v0", "initial velocity [rad/s or m/s]; default: 0")
     surroundings = parser.add_argument_group("surroundings")
     add_gravity(surroundings)
     text = "viscous damping [N m s/rad or N s/m], or 'robot' for that of the robot's description; default: 0"
-    add_vector(surroundings, "damping", text, _damping)
+    add_vector(surroundings, "damping", text, _number_or_robot)
+    text = "dry friction [N m or N], or 'robot' for that of the robot's description; default: 0"
+    add_vector(surroundings, "friction", text, _number_or_robot)
     add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
     add_vector(surroundings, "rest", "rest positions of the springs [rad or m]; default: 0")
     add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
@@ -159,7 +164,8 @@ def simulate_words(request: argparse.Namespace, integrator: Integrator, dt: floa
     for folder in request.package_dir or ():
         words += ["--package-dir", folder]
     words += ["--base", request.base] if request.base is not None else []
-    for option in ("armature", "q0", "v0", "damping", "stiffness", "rest", "torque"):
+    words += ["--srdf", request.srdf] if request.srdf is not None else []
+    for option in ("armature", "q0", "v0", "damping", "friction", "stiffness", "rest", "torque"):
         if (given := getattr(request, option)) is not None:
             words += [f"--{option}", *(_text(item) for item in given)]
     if request.gravity is False:
@@ -215,12 +221,18 @@ def _number(word: str) -> float | tuple[str, float]:
     return (name, number) if equals else number
 
 
-def _damping(word: str) -> float | tuple[str, float] | str:
+def _position(word: str) -> float | tuple[str, float] | str:
+    """As :func:`_number`, or the name of a posture, which begins with a letter."""
+    text = word.strip()
+    return text if text[:1].isalpha() and "=" not in text else _number(word)
+
+
+def _number_or_robot(word: str) -> float | tuple[str, float] | str:
     """As :func:`_number`, or the word ``robot``."""
     return "robot" if word.strip() == "robot" else _number(word)
 
 
-def values_of(option: str, given: Sequence[float | tuple[str, float]] | None) -> JointValues | None:
+def values_of(option: str, given: Sequence[float | tuple[str, float] | str] | None) -> JointValues | None:
     """Value of an option of :func:`add_vector`: None if it was not given, one number, several, or some by name.
 
     Raises:
@@ -240,7 +252,7 @@ def values_of(option: str, given: Sequence[float | tuple[str, float]] | None) ->
     return dict(named)
 
 
-def _vector(option: str, given: Sequence[float | tuple[str, float]] | None, robot: Robot) -> NDArray[np.float64]:
+def _vector(option: str, given: Sequence[float | tuple[str, float] | str] | None, robot: Robot) -> NDArray[np.float64]:
     """The numbers (n,) of an option; zeros if it was not given."""
     values = values_of(option, given)
     numbers = np.size(0.0 if values is None or isinstance(values, Mapping) else values)
@@ -252,26 +264,41 @@ def _vector(option: str, given: Sequence[float | tuple[str, float]] | None, robo
     return joint_array(option, 0.0 if values is None else values, robot.joint_names, uniform=True)
 
 
-def _damping_of(request: argparse.Namespace, robot: Robot) -> NDArray[np.float64] | Literal["robot"] | None:
-    given = request.damping
+def _resistance(
+    option: str, request: argparse.Namespace, robot: Robot
+) -> NDArray[np.float64] | Literal["robot"] | None:
+    """The value of --damping or --friction."""
+    given = getattr(request, option)
     if given is None or "robot" not in given:
-        return None if given is None else _vector("damping", given, robot)
+        return None if given is None else _vector(option, given, robot)
     if len(given) > 1:
-        raise InputError("--damping takes either numbers or the word robot, not both at once")
+        raise InputError(f"--{option} takes either numbers or the word robot, not both at once")
     return "robot"
+
+
+def _configuration(option: str, given: Sequence[float | tuple[str, float] | str] | None, robot: Robot) -> Floats:
+    """Positions (n,) of an option [rad or m]: numbers, or a posture of the robot."""
+    names = [item for item in given or () if isinstance(item, str)]
+    if not names:
+        return _vector(option, given, robot)
+    if len(given or ()) > 1:
+        raise InputError(f"--{option} takes either numbers or the name of one posture, got {names[0]!r} and others")
+    return robot.posture(names[0])
 
 
 def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, NDArray[np.float64] | None]:
     """The scene, q0, v0, and the torque unless it is zero."""
-    robot = load_robot(request.robot, **robot_options(request))
+    robot = load_robot(request.robot, **robot_options(request), srdf=request.srdf)
     scene = Scene(
         robot,
         gravity=request.gravity,
-        damping=_damping_of(request, robot),
+        damping=_resistance("damping", request, robot),
+        friction=_resistance("friction", request, robot),
         stiffness=_vector("stiffness", request.stiffness, robot),
         rest=_vector("rest", request.rest, robot),
     )
-    q0, v0, torque = (_vector(name, getattr(request, name), robot) for name in ("q0", "v0", "torque"))
+    q0 = _configuration("q0", request.q0, robot)
+    v0, torque = (_vector(name, getattr(request, name), robot) for name in ("v0", "torque"))
     return scene, q0, v0, torque if torque.any() else None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
-from varpin.control.hints import hints
+from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.multipliers import FEASIBLE, TOLD
 from varpin.control.problem import OptimalControlProblem, integrator_for
@@ -78,7 +78,8 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     """Findings about a plan: its energy balance, velocities, constraints, convergence and cost in finer steps."""
     problem, motion = solution.problem, solution.trajectory
     _, found = examined(problem.scene, problem.integrator, motion)
-    told = [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
+    told = foreseen(problem)
+    told += [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
     if solution.refinement is not None and not solution.refinement.met:
         told.append(Finding("true cost", solution.refinement.reason))
     told += (
@@ -86,7 +87,6 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
         + _noise_left_out(solution)
         + _friction_under_noise(solution)
         + (_alternating(solution) or _restless(solution))
-        + foreseen(problem)
         + _between(solution)
     )
     try:
@@ -174,8 +174,10 @@ def _at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats 
 
 
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
-    """Findings about a problem's constraints before any search."""
-    return [*starts_outside(problem), *hints(problem)]
+    """Findings about a problem before any search; values in wrong units come first."""
+    found = hints(problem)
+    units = [finding for finding in found if finding.kind in UNITS]
+    return [*units, *starts_outside(problem), *(finding for finding in found if finding.kind not in UNITS)]
 
 
 def starts_outside(problem: OptimalControlProblem) -> list[Finding]:

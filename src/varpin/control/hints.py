@@ -1,4 +1,4 @@
-"""Findings about a problem's constraints before any search: infeasible ones, and values in wrong units."""
+"""Findings about a problem before any search: constraints that no motion meets, and values in wrong units."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from varpin.control.constraints import BoundConstraint, KeepClear, ReachFrame, W
 from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
 from varpin.control.costs.base import Scaled
 from varpin.control.problem import OptimalControlProblem
-from varpin.model import Robot
-from varpin.model.kinematics import FrameKinematics
+from varpin.model import ADVICE, Robot, degrees_hint, looks_like_degrees
+from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.simulation.soundness import Finding
+from varpin.simulation.start import in_degrees
 
-# Greatest plausible angle [rad], two turns, and distance of a goal in units of the reach: others look like wrong units.
-_TURNS, _AFAR = 4.0 * np.pi, 50.0
+# Largest plausible distance of a goal, in units of the reach: a larger one looks like millimetres.
+_AFAR = 50.0
+# Kinds of findings about values in wrong units.
+UNITS = ("start in degrees", "goal in degrees", "goal in millimetres", "limits in degrees")
+_MILLIMETRES = ": it may be in millimetres, and positions are in metres"
 # Random postures in which the distance of a pair of bodies is tested.
 _POSTURES = 64
 # A joint limit of at least _ENDLESS [rad or m] is none: postures are then within a turn, or _RAIL [m], to either side.
@@ -28,9 +32,8 @@ _SAME = 1e-6
 
 def hints(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about constraints that no motion satisfies, and about values that look like degrees or millimetres."""
-    if not problem.constraints:
-        return []
-    found = [*_goals(problem), *_limits(problem), *_ends(problem)]
+    found = [*in_degrees(problem.scene, problem.q0)]
+    found += [*_goals(problem), *_targets(problem), *_limits(problem), *_ends(problem)]
     for bound in problem.bound_constraints:
         found += _overlaps(problem, bound)
     return found
@@ -58,11 +61,11 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
         most = reach(goal.robot, goal.kinematics)
         away = float(np.linalg.norm(goal.position - goal.kinematics.links.translation[0]))
         if away > most:
-            units = ": it may be in millimetres, and positions are in metres" if away > _AFAR * most else ""
+            far = away > _AFAR * most
             yield Finding(
-                "goal out of reach",
+                "goal in millimetres" if far else "goal out of reach",
                 f"{goal.label} has its goal {away:.4g} m from the first joint, and the frame gets {most:.4g} m from "
-                f"there at most{units}: no motion ends there",
+                f"there at most{_MILLIMETRES if far else ''}: no motion ends there",
             )
     for one, other in combinations(goals, 2):
         a, b = one.source, other.source
@@ -97,6 +100,24 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
                 )
 
 
+def _targets(problem: OptimalControlProblem) -> Iterator[Finding]:
+    """Constant targets of costs on a frame's position that look like millimetres."""
+    robot, told = problem.scene.robot, set()
+    for term in _parts(problem.cost):
+        if not isinstance(term, FramePositionCost) or callable(term.target) or np.ndim(term.target) != 1:
+            continue
+        frame = frame_kinematics(robot, term.frame)
+        most = reach(robot, frame)
+        away = float(np.linalg.norm(np.asarray(term.target) - frame.links.translation[0]))
+        if away > _AFAR * most and term.frame not in told:
+            told.add(term.frame)
+            yield Finding(
+                "goal in millimetres",
+                f"FramePositionCost({term.frame!r}) has its target {away:.4g} m from the first joint, and the frame "
+                f"gets {most:.4g} m from there at most{_MILLIMETRES}",
+            )
+
+
 def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Joint limits that look like degrees."""
     turning = _turning(problem.scene.robot)
@@ -107,31 +128,25 @@ def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
         given = np.isfinite(limits.limits) & (limits.limits != np.array(limits.robot.position_limits))
         wide = np.where(given, np.abs(limits.limits), 0.0).max(axis=0) * turning
         joint = int(np.argmax(wide))
-        if wide[joint] > _TURNS:
+        if looks_like_degrees(wide[joint]):
             yield Finding(
                 "limits in degrees",
                 f"{limits.label} lets {limits.robot.joint_names[joint]} turn to {wide[joint]:.4g} rad, "
-                f"{wide[joint] / (2.0 * np.pi):.0f} turns: limits are in radians, np.deg2rad makes them of degrees",
+                f"{wide[joint] / (2.0 * np.pi):.0f} turns, and looks like degrees: {ADVICE}",
             )
 
 
 def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Goal configurations outside the joint limits, or that look like degrees."""
     robot = problem.scene.robot
-    turning = _turning(robot)
     for term in _last(problem.cost):
         if not isinstance(term, TrackingCost) or not isinstance(term.reference, np.ndarray):
             continue
         end = term.reference
         if end.shape != (robot.dof,):
             continue
-        joint = int(np.argmax(np.abs(end) * turning))
-        if abs(end[joint]) * turning[joint] > _TURNS:
-            yield Finding(
-                "goal in degrees",
-                f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} at {end[joint]:.4g} rad, "
-                f"{abs(end[joint]) / (2.0 * np.pi):.0f} turns: angles are in radians, np.deg2rad makes them of degrees",
-            )
+        if sentence := degrees_hint(robot, "the goal of the terminal TrackingCost", end):
+            yield Finding("goal in degrees", sentence)
             continue
         for limits in problem.constraints:
             if not isinstance(limits, WithinJointLimits):
@@ -186,10 +201,19 @@ def _turning(robot: Robot) -> Floats:
 
 def _last(cost: Cost) -> Iterator[Cost]:
     """The terminal costs, without factors."""
+    return (part for part, at_end in _parts_of(cost) if at_end)
+
+
+def _parts(cost: Cost) -> Iterator[Cost]:
+    """The running and terminal costs, without factors."""
+    return (part for part, _ in _parts_of(cost))
+
+
+def _parts_of(cost: Cost) -> Iterator[tuple[Cost, bool]]:
+    """The terms of a cost without factors, and whether each is terminal."""
     for term in cost.terms:
         inner, at_end = term, False
         while isinstance(inner, Terminal | Scaled):
             at_end = at_end or isinstance(inner, Terminal)
             inner = inner.cost
-        if at_end:
-            yield from (part.cost if isinstance(part, Scaled) else part for part in inner.terms)
+        yield from ((part.cost if isinstance(part, Scaled) else part, at_end) for part in inner.terms)

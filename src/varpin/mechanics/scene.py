@@ -41,7 +41,7 @@ from varpin.mechanics.forces import (
     of_kind,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
-from varpin.model import Robot, require_sound
+from varpin.model import Robot, degrees_hint, require_sound
 from varpin.model.tree import block_ends, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, joint_array
 from varpin.support.frozen import Frozen
@@ -166,6 +166,7 @@ class Scene(Frozen):
         gravity: ArrayLike | bool = True,
         forces: Force | Sequence[Force] = (),
         damping: JointValues | Literal["robot"] | None = None,
+        friction: JointValues | Literal["robot"] | None = None,
         stiffness: JointValues = 0.0,
         rest: JointValues = 0.0,
         actuation: ArrayLike | Sequence[str] | None = None,
@@ -184,6 +185,9 @@ class Scene(Frozen):
                 ``{"elbow": 0.1}``, >= 0 [N m s/rad or N s/m]; 0 for joints that are not named. ``"robot"`` takes the
                 damping of the robot's description (:attr:`varpin.Robot.damping`). If left out there is no damping, and
                 the log warns if the description gives damping or dry friction.
+            friction: Short for a :class:`varpin.CoulombFriction` of this level in ``forces``, in the forms of
+                ``damping``, >= 0 [N m or N]. ``"robot"`` takes the dry friction of the robot's description
+                (:attr:`varpin.Robot.friction`).
             stiffness: Short for a :class:`varpin.JointSpring` in ``forces``, in the forms of ``damping``,
                 >= 0 [N m/rad or N/m].
 
@@ -194,8 +198,8 @@ class Scene(Frozen):
             constraints: Constraints of the motion: closed loops, gears, rods, such as :class:`varpin.PointOnPoint`.
 
         Raises:
-            InputError: A wrong shape; a value that is not finite; negative damping or stiffness; a force, noise model
-                or constraint that does not fit the robot.
+            InputError: A wrong shape; a value that is not finite; negative damping, friction or stiffness; a force,
+                noise model or constraint that does not fit the robot.
             UnknownJoint: An argument names a joint that is no coordinate of the robot.
             UnknownFrame: A force or constraint names a frame that the robot does not have.
         """
@@ -209,7 +213,7 @@ class Scene(Frozen):
             "robot": robot,
             "gravity": _gravity(gravity),
         }
-        values |= _forces(robot, forces, damping, stiffness, rest)
+        values |= _forces(robot, forces, damping, friction, stiffness, rest)
         values["actuation"] = _served(robot, _actuation(robot, actuation), values["elements"])
         _refuse_noisy_servos(noise, values["elements"], robot)
         values["constraints"] = constraints_of(constraints)
@@ -769,19 +773,30 @@ def _gravity(gravity: ArrayLike | bool) -> Floats:
     return finite_array("gravity", given, (3,))
 
 
-def damping_of(robot: Robot, given: JointValues | Literal["robot"] | None, forces: Sequence[Force] = ()) -> Floats:
-    """Damping (n,) from the argument of a scene; logs friction of the robot's description that the scene leaves out."""
-    if isinstance(given, str) and given != "robot":
-        raise InputError(f"damping must be numbers, or 'robot' for those of the robot's description, got {given!r}")
-    if given is None or isinstance(given, str):
-        damped = given is not None or any(isinstance(force, JointDamper) for force in forces)
-        dry = any(isinstance(force, CoulombFriction) for force in forces)
-        _log_friction(robot, damped=damped, dry=dry)
-        given = 0.0 if given is None else robot.damping
-    return not_negative("damping", given, robot)
+def resistance(
+    robot: Robot,
+    damping: JointValues | Literal["robot"] | None,
+    friction: JointValues | Literal["robot"] | None,
+    forces: Sequence[Force] = (),
+) -> tuple[Floats, Floats]:
+    """Damping and dry friction (n,), (n,) from the arguments of a scene.
+
+    Logs what the robot's description gives and the scene leaves out.
+    """
+    for name, given in (("damping", damping), ("friction", friction)):
+        if isinstance(given, str) and given != "robot":
+            raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {given!r}")
+    # Numbers for the damping are a decision on the dry friction, too: these scenes log nothing.
+    if damping is None or isinstance(damping, str):
+        damped = damping is not None or any(isinstance(force, JointDamper) for force in forces)
+        dry = friction is not None or any(isinstance(force, CoulombFriction) for force in forces)
+        _log_left_out(robot, damped=damped, dry=dry)
+    given_damping = robot.damping if isinstance(damping, str) else 0.0 if damping is None else damping
+    level = robot.friction if isinstance(friction, str) else 0.0 if friction is None else friction
+    return not_negative("damping", given_damping, robot), not_negative("friction", level, robot)
 
 
-def _log_friction(robot: Robot, *, damped: bool, dry: bool) -> None:
+def _log_left_out(robot: Robot, *, damped: bool, dry: bool) -> None:
     """Log damping and dry friction of the description that the scene has none of."""
     left_out = []
     if robot.damping.any() and not damped:
@@ -792,7 +807,7 @@ def _log_friction(robot: Robot, *, damped: bool, dry: bool) -> None:
     if robot.friction.any() and not dry:
         left_out.append(
             f"dry friction [N m or N] of {_by_joint(robot, robot.friction)} "
-            "(forces=[varpin.CoulombFriction(robot.friction)] takes it)"
+            "(friction='robot' takes it, friction=0 silences this message)"
         )
     if left_out:
         message = "robot %r: the scene leaves out what the description gives: %s"
@@ -811,18 +826,24 @@ def _forces(
     robot: Robot,
     forces: Force | Sequence[Force],
     damping: JointValues | Literal["robot"] | None,
+    friction: JointValues | Literal["robot"] | None,
     stiffness: JointValues,
     rest: JointValues,
 ) -> dict[str, Any]:
     """The attributes of a scene that follow from its forces, by name."""
     # Both are checked even if they are zero and make no element.
     given = forces_of(forces)
-    short = damping_of(robot, damping, given), not_negative("stiffness", stiffness, robot)
+    viscous, dry = resistance(robot, damping, friction, given)
+    stiff = not_negative("stiffness", stiffness, robot)
     slack = joint_array("rest", rest, robot.joint_names, uniform=True)
-    if short[0].any():
-        given = (JointDamper(short[0]), *given)
-    if short[1].any():
-        given = (JointSpring(short[1], slack), *given)
+    if dry.any():
+        given = (CoulombFriction(dry), *given)
+    if viscous.any():
+        given = (JointDamper(viscous), *given)
+    if stiff.any():
+        given = (JointSpring(stiff, slack), *given)
+        if units := degrees_hint(robot, "rest", slack):
+            logger.warning(units)
     bound = [each for force in given for each in bound_force(force, robot)]
     elements = [each for each in bound if isinstance(each, Element)]
     own_code = tuple(force for force in given if isinstance(force, CustomForce))

@@ -17,6 +17,7 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
 from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
+from varpin.model.degrees import ADVICE, looks_like_degrees
 from varpin.model.inertia import faults
 from varpin.model.mimic import Tie, joint_index, rebuild, tied_model
 from varpin.model.mjcf import build_mjcf_model, build_mjcf_shapes
@@ -144,7 +145,7 @@ class Robot(Frozen):
         Joints of the posture that are not coordinates of the robot (locked, mimic or absent joints) are ignored.
 
         Main args:
-            name: Name of the posture: ``"home"``.
+            name: Name of the posture: ``"home"``; or ``"arm/home"``, short for ``group="arm"``.
 
         Other Args:
             group: The joint group to take the posture of, where several groups have one of this name. If left out, the
@@ -161,6 +162,10 @@ class Robot(Frozen):
         """
         q = joint_array("others", others, self.joint_names, uniform=True)
         found = [state for state in self.group_states if state.name == name]
+        first, slash, rest = str(name).partition("/")
+        if not found and slash and group is None:
+            name, group = rest, first
+            found = [state for state in self.group_states if state.name == name]
         if not found:
             raise UnknownPosture(name, self.postures, self.name)
         groups = ", ".join(state.group for state in found)
@@ -287,7 +292,7 @@ class Robot(Frozen):
 
     @property
     def friction(self) -> Floats:
-        """Dry friction in the description (n,) [N m or N], for ``CoulombFriction(robot.friction)``."""
+        """Dry friction in the description (n,) [N m or N]; ``Scene(friction="robot")`` uses it."""
         return self._at_coordinates(self.free_model.friction, np.abs(self.tree.ratio))
 
     def _at_coordinates(self, values: ArrayLike, weights: Floats) -> Floats:
@@ -538,8 +543,10 @@ def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
     if kind.nv == 1 and kind.nq == 1:
         low, high = (float(limits[kind.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
         if low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
+            units = not joint_axis(model, joint)[0] and looks_like_degrees(position[0])
+            hint = f", and looks like degrees: {ADVICE}" if units else ""
             logger.warning(
-                "%s = %g locks the joint outside its limits, %g and %g [rad or m]", name, position[0], low, high
+                "%s = %g locks the joint outside its limits, %g and %g [rad or m]%s", name, position[0], low, high, hint
             )
     if kind.nv > 1:
         reference = pin.neutral(model)

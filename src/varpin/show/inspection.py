@@ -370,7 +370,7 @@ def _damping_warnings(robot: Robot) -> Iterator[str]:
             "dry friction",
             robot.friction,
             "N m or N",
-            "which a scene uses with forces=[varpin.CoulombFriction(robot.friction)]",
+            "which a scene uses with friction='robot'",
         ),
     ):
         given = ", ".join(f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value)

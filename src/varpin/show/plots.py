@@ -31,8 +31,12 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#00
 DASHES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)), (0, (9, 3)))
 # Line widths: the second is for lines beyond all combinations of colours and dashes.
 _WIDTHS = (1.4, 0.7)
+# Entry of the legend for the limits.
+_LIMITS = "limits"
 # Rows of a column of the legend.
 _LEGEND_ROWS = 20
+# Look of a line that marks a value.
+_MARK: dict[str, Any] = {"color": "0.6", "linewidth": 0.8, "linestyle": "--", "zorder": 1}
 # Largest number of points of a line; thinning keeps the extremes.
 _POINTS = 8000
 
@@ -196,17 +200,24 @@ def plot_trajectory(
     elif labels is not None and len(labels) != trajectory.u.shape[1]:
         raise InputError(f"labels must be {trajectory.u.shape[1]}, one a control, got {len(labels)}")
     plot_energy_error(trajectory, panels[-1])
-    # Joints have the same colours in all panels and share one legend.
-    handles, names = panels[0].get_legend_handles_labels()
+    # Joints have the same colours in all panels and share one legend, which also has the key of limits in any panel.
+    entries = [dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True)) for panel in panels[:-1]]
+    limits = next((entry[_LIMITS] for entry in entries if _LIMITS in entry), None)
+    shared = {name: handle for name, handle in entries[0].items() if name != _LIMITS}
+    joints = len(shared)
+    if limits is not None:
+        shared[_LIMITS] = limits
     mixed = len({joint is None for joint in _served(trajectory)}) > 1
-    for panel in panels[1:-1]:
-        same = len(panel.get_legend_handles_labels()[1]) == len(names) and not (panel is panels[2] and mixed)
-        if panel.get_legend() is not None and (panel is panels[1] or (same and labels is None)):
+    for panel, own in zip(panels[1:-1], entries[1:], strict=True):
+        same = len(own.keys() - {_LIMITS}) == joints and not (panel is panels[2] and mixed)
+        alone = axes is not None and _LIMITS in own and _LIMITS not in entries[0]
+        if panel.get_legend() is not None and not alone and (panel is panels[1] or (same and labels is None)):
             panel.get_legend().remove()
-    if axes is None and panels[0].get_legend() is not None:
+    if axes is None and (panels[0].get_legend() is not None or limits is not None):
         # A legend of the figure, as that of one panel would push the others apart.
-        panels[0].get_legend().remove()
-        new.legend(handles, names, loc="outside right upper", frameon=False, fontsize="small")
+        if panels[0].get_legend() is not None:
+            panels[0].get_legend().remove()
+        new.legend(shared.values(), shared.keys(), loc="outside right upper", frameon=False, fontsize="small")
     for panel in panels[:-1]:
         panel.set_xlabel("")
     if axes is None:
@@ -245,7 +256,8 @@ def plot_work_precision(
     axes.set_yscale("log")
     floor = {"q": record.reference_error, "end": record.reference_error, "tip": record.tip_reference_error}
     if floor.get(quantity, 0.0) > 0.0:
-        axes.axhline(floor[quantity], color="0.6", linewidth=0.8, linestyle="--", zorder=1)
+        axes.axhline(floor[quantity], label="error of the reference", **_MARK)
+        _legend(axes)
     axes.set_xlabel(f"wall time for {record.duration:g} s [s]")
     axes.set_ylabel(labels[quantity])
     return figure, axes
@@ -275,9 +287,10 @@ def plot_advice(advice: Advice, axes: Axes | None = None) -> tuple[Figure | SubF
     figure, axes = _plot_trade(points, best, axes, "advised" if np.isfinite(advice.error) else "the most accurate")
     axes.set_yscale("log")
     if advice.tolerance is not None:
-        axes.axhline(advice.tolerance, color="0.6", linewidth=0.8, linestyle="--", zorder=1)
+        axes.axhline(advice.tolerance, label="tolerance", **_MARK)
     if advice.budget is not None:
-        axes.axvline(advice.budget, color="0.6", linewidth=0.8, linestyle="--", zorder=1)
+        axes.axvline(advice.budget, label="budget", **_MARK)
+    _legend(axes)
     axes.set_xlabel("predicted wall time [s]")
     axes.set_ylabel("predicted error in q at the end [rad or m]")
     return figure, axes
@@ -327,8 +340,13 @@ def _plot_trade(
     axes.plot(*zip(*best, strict=True), label=front_name, linewidth=0.8, **ring)
     axes.set_xscale("log")
     apply_style(axes)
-    axes.legend(frameon=False, fontsize="small")
+    _legend(axes)
     return figure, axes
+
+
+def _legend(axes: Axes) -> None:
+    """The legend of a figure of speed against accuracy."""
+    axes.legend(frameon=False, fontsize="small")
 
 
 def _plot_nodes(
@@ -374,13 +392,17 @@ def _draw_limits(axes: Axes, values: Floats, limits: tuple[Floats, Floats]) -> N
         return
     low, high = float(values.min()), float(values.max())
     near = 0.3 * (high - low)
+    look = {"transform": axes.get_yaxis_transform(), "linewidth": 0.9, "linestyle": (0, (1, 2)), "zorder": 1}
+    drawn = False
     for k, style in enumerate(_styles(values.shape[1])):
         for limit in (limits[0][k], limits[1][k]):
             if low - near <= limit <= high + near:
-                across = axes.get_yaxis_transform()
-                look = {"color": style["color"], "linewidth": 0.9, "linestyle": (0, (1, 2)), "zorder": 1}
                 # hlines adds a collection: the axes' lines are the joints.
-                axes.hlines(limit, 0.0, 1.0, transform=across, **look)
+                axes.hlines(limit, 0.0, 1.0, color=style["color"], **look)
+                drawn = True
+    if drawn:
+        # The entry of the legend, of no joint's colour.
+        axes.hlines([], 0.0, 1.0, color="0.3", label=_LIMITS, **look)
 
 
 def _axes(axes: Axes | None) -> tuple[Figure | SubFigure, Axes]:
@@ -464,13 +486,14 @@ def _finish(axes: Axes, trajectory: Trajectory, label: str, lines: int) -> None:
         for line in axes.lines:
             if np.size(line.get_xdata()) == 1:
                 line.set_marker("o")
-    if lines > 1:
+    entries = axes.get_legend_handles_labels()[1]
+    if lines > 1 or _LIMITS in entries:
         axes.legend(
             loc="upper left",
             bbox_to_anchor=(1.0, 1.0),
             frameon=False,
             fontsize="small",
-            ncols=-(-lines // _LEGEND_ROWS),
+            ncols=-(-len(entries) // _LEGEND_ROWS),
         )
 
 

@@ -27,7 +27,7 @@ from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstabl
 from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import Record, function_error
 from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
-from varpin.simulation.start import on_constraints
+from varpin.simulation.start import in_degrees, on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
 from varpin.support.checks import JointValues, count, joint_array
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
@@ -130,9 +130,10 @@ def simulate(
     if controls is None and (scene.servo_joints or scene.inputs):
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
-    early: tuple[Finding, ...] = ()
+    early = in_degrees(scene, q0)
     if scene.constraints:
-        q0, v0, early = on_constraints(scene, q0, v0)
+        q0, v0, moved = on_constraints(scene, q0, v0)
+        early = (*early, *moved)
     if tolerance is not None:
         span = duration_for_tolerance(dt, steps, duration)
         chosen = steps_for_tolerance(scene, q0, v0, span, tolerance, controls, integrator)

@@ -8,10 +8,17 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.scene import CORRECTED, Scene
+from varpin.model import degrees_hint
 from varpin.simulation.soundness import Finding
 
 # Shift of a start onto its constraints up to which no warning is given [rad or m]: rounding.
 _ROUNDING = 1e-9
+
+
+def in_degrees(scene: Scene, q0: Floats) -> tuple[Finding, ...]:
+    """A warning if an angle of the initial configuration (n,) looks like degrees."""
+    sentence = degrees_hint(scene.robot, "q0", q0)
+    return (Finding("start in degrees", sentence),) if sentence else ()
 
 
 def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats, tuple[Finding, ...]]:
@@ -23,9 +30,10 @@ def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats
     """
     label, miss = missed(scene, q0)
     if miss > CORRECTED:
+        units = degrees_hint(scene.robot, "q0", q0)
         raise InputError(
             f"q0 misses {label} by {miss:.4g} m or rad: varpin.assemble(scene, q0) looks for the nearest configuration "
-            "that keeps the constraints"
+            f"that keeps the constraints{'; ' if units else ''}{units}"
         )
     q = nearest(scene, q0)
     if (twice := dependent_input(scene, q)) is not None:

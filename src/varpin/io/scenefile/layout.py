@@ -13,14 +13,14 @@ from varpin.arrays import Floats
 from varpin.control.costs import Cost, CostSum, Terminal
 from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
 from varpin.io.scenefile.references import Timeline, constant
-from varpin.io.scenefile.spec import CostSpec, ForceSpec, degrees_for_radians
+from varpin.io.scenefile.spec import CostSpec, ForceSpec
 from varpin.io.scenefile.table import SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Given
 from varpin.mechanics.constraints import Constraint, KinematicInput
-from varpin.mechanics.forces import Force, PositionServo
+from varpin.mechanics.forces import CoulombFriction, Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
-from varpin.mechanics.scene import Scene, closest_controls, damping_of
-from varpin.model import Robot, combine, load_robot
+from varpin.mechanics.scene import Scene, closest_controls, resistance
+from varpin.model import Robot, combine, load_robot, looks_like_degrees
 
 if TYPE_CHECKING:
     from varpin.io.scenefile.tables import RobotKeys
@@ -283,7 +283,7 @@ def _load(spec: SceneSpec, held: Mapping[str, float], whole: Robot | None = None
 
 def _one(given: RobotKeys, table: Table, held: Mapping[str, float]) -> Robot:
     for joint, value in given.lock.items():
-        if degrees_for_radians(value):
+        if isinstance(value, float) and looks_like_degrees(value):
             raise table.error(f"lock.{joint}", f"{value:g} looks like degrees: positions are in rad or m")
     try:
         return load_robot(
@@ -292,6 +292,8 @@ def _one(given: RobotKeys, table: Table, held: Mapping[str, float]) -> Robot:
             lock={**given.lock, **held},
             mimic="free" if given.mimic == "free" else "tied",
             payload=given.payload,
+            xacro_args=given.xacro_args or None,
+            srdf=given.srdf,
             base=given.base,
             armature=given.armature,
             inertia=given.inertia,
@@ -333,8 +335,8 @@ def lay_out(spec: SceneSpec) -> Layout:
 def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
     names, root = robot.joint_names, spec.root
     springs, initial, actuation = root.table("springs"), root.table("initial"), root.table("actuation")
-    rest = springs.spread("rest", spec.rest, names)
-    q0 = initial.spread("q", spec.q0, names)
+    rest = springs.positions("rest", spec.rest, robot)
+    q0 = initial.positions("q", spec.q0, robot)
     for table, name, values in ((springs, "rest", rest), (initial, "q", q0)):
         _refuse_degrees(table, name, values, robot)
     if spec.actuated is not None:
@@ -343,10 +345,6 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
                 raise actuation.error(
                     f"joints[{index}]", f"there is no joint {joint!r}; {suggestion(joint, names, 'joints')}"
                 )
-    if spec.damping is None or isinstance(spec.damping, str):
-        damping = damping_of(robot, spec.damping)
-    else:
-        damping = root.spread("damping", spec.damping, names)
     driven = names if spec.actuated is None else spec.actuated
     gear = actuation.spread("gear", spec.gear, driven, "driven joint")
     if not gear.all():
@@ -354,13 +352,20 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
     actuated = np.array([names.index(joint) for joint in driven], dtype=np.int64)
     forces = tuple(_force(force, robot) for force in spec.forces)
     _require_own_controls(spec, forces, names, actuated, gear)
+    given = {
+        name: value if value is None or isinstance(value, str) else root.spread(name, value, names)
+        for name, value in (("damping", spec.damping), ("friction", spec.friction))
+    }
+    damping, friction = resistance(robot, given["damping"], given["friction"], [force.force() for force in forces])
+    if friction.any():
+        forces = (JointForces(CoulombFriction, {"level": friction}), *forces)
     limit = _torque_limit(spec, robot, actuated, driven)
     controls = spec.controls
     timeline: Timeline | str | None
     if controls is None or isinstance(controls, str):
         timeline = controls
     else:
-        timeline = controls.timeline(driven, spec.duration, "driven joint")
+        timeline = controls.timeline(driven, spec.duration, "driven joint", robot)
     layout = Layout(
         spec=spec,
         robot=robot,
@@ -375,7 +380,7 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
         actuated=actuated,
         gear=gear,
         torque_limit=limit,
-        noise=tuple(_noises(spec, names, driven)),
+        noise=tuple(_noises(spec, robot, driven)),
         costs=tuple(_term(term, robot, driven, q0, spec.duration) for term in spec.costs),
         controls=timeline,
         held={},
@@ -425,7 +430,7 @@ def _require_controls(layout: Layout) -> None:
     given = layout.controls.at(times_of(spec))
     for joint, column in zip(layout.actuated[served | moved].tolist(), given.T[served | moved], strict=True):
         worst = float(column[np.argmax(np.abs(column))])
-        if not layout.robot.slides[joint] and degrees_for_radians(worst):
+        if not layout.robot.slides[joint] and looks_like_degrees(worst):
             name = layout.robot.joint_names[joint]
             raise table.error("controls", f"{worst:g} of {name!r} looks like degrees: positions are in rad")
     force, limit = np.abs(given * layout.gear), np.where(served | moved, np.inf, layout.torque_limit)
@@ -445,7 +450,7 @@ def times_of(spec: SceneSpec) -> Floats:
 
 def _refuse_degrees(table: Table, name: str, values: Floats, robot: Robot) -> None:
     for joint, value, slide in zip(robot.joint_names, values.tolist(), robot.slides.tolist(), strict=True):
-        if not slide and degrees_for_radians(value):
+        if not slide and looks_like_degrees(value):
             raise table.error(name, f"{value:g} of {joint!r} looks like degrees: angles are in rad")
 
 
@@ -471,7 +476,9 @@ def _torque_limit(spec: SceneSpec, robot: Robot, actuated: NDArray[np.int64], dr
 def _force(spec: ForceSpec, robot: Robot) -> JointForces:
     absent = {"lower": -np.inf, "upper": np.inf, "effort": np.inf}
     values = {
-        name: spec.table.spread(name, value, robot.joint_names, absent=absent.get(name, 0.0))
+        name: robot.friction
+        if isinstance(value, str)
+        else spec.table.spread(name, value, robot.joint_names, absent=absent.get(name, 0.0))
         for name, value in spec.values.items()
     }
     found = JointForces(spec.kind, values)
@@ -502,12 +509,12 @@ def _has_moving_end(force: Force, robot: Robot) -> bool:
     return any(joints_of_frame(robot, frame).any() for frame in frames)
 
 
-def _noises(spec: SceneSpec, names: Sequence[str], driven: Sequence[str]) -> list[Noises]:
+def _noises(spec: SceneSpec, robot: Robot, driven: Sequence[str]) -> list[Noises]:
     found = []
     for index, model in enumerate(spec.noise):
         table = spec.root.table(f"noise[{index}]")
-        whose, what = (driven, "driven joint") if model.type == "control" else (names, "joint")
-        center = None if model.center is None else table.spread("center", model.center, names)
+        whose, what = (driven, "driven joint") if model.type == "control" else (robot.joint_names, "joint")
+        center = None if model.center is None else table.positions("center", model.center, robot)
         found.append(Noises(model.type, table.spread("intensity", model.intensity, whose, what), center))
     return found
 
@@ -525,10 +532,10 @@ def _term(spec: CostSpec, robot: Robot, driven: Sequence[str], q0: Floats, durat
     target = None
     if spec.reference is not None:
         components, kind = (joints, what) if term.of_joints else (term.components, "component")
-        target = spec.reference.timeline(components, duration, kind)
+        target = spec.reference.timeline(components, duration, kind, robot)
         if term.space == "q" and target.constant and term.reference is not None:
             _refuse_degrees(table, term.reference, target(0.0), robot)
     holding_q = None
     if spec.holding_q is not None:
-        holding_q = table.spread("hold", spec.holding_q, robot.joint_names) if spec.holding_q != () else q0
+        holding_q = table.positions("hold", spec.holding_q, robot) if spec.holding_q != () else q0
     return CostTerm(spec, weight, target, holding_q)

@@ -18,6 +18,7 @@ from varpin.arrays import Floats
 from varpin.errors import FileError
 from varpin.io.archive import read_npz
 from varpin.io.scenefile.table import ByName, Table, shown, suggestion
+from varpin.model import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,7 @@ class Reference:
     Attributes:
         table: The table that contains it.
         name: Its key.
-        offset: Constant part of constants and sines.
+        offset: Constant part of constants and sines; or the name of a posture, for constants of joints.
         sines: Sines added to the offset.
         times: Times of waypoints [s].
         values: Waypoints, one row each.
@@ -126,14 +127,14 @@ class Reference:
 
     table: Table
     name: str
-    offset: ByName = 0.0
+    offset: ByName | str = 0.0
     sines: tuple[Sine, ...] = ()
     times: tuple[float, ...] = ()
     values: tuple[tuple[float, ...], ...] = ()
     smooth: bool = False
     file: Path | None = None
 
-    def timeline(self, names: Sequence[str], duration: float, what: str) -> Timeline:
+    def timeline(self, names: Sequence[str], duration: float, what: str, robot: Robot) -> Timeline:
         """Its values over time for the components ``names``.
 
         Raises:
@@ -154,6 +155,8 @@ class Reference:
             except ValueError as error:
                 raise self.table.error(f"{self.name}.values", f"no smooth curve goes through them: {error}") from None
         where = f"{self.name}.offset" if self.sines else self.name
+        if isinstance(self.offset, str):
+            return constant(self.table.positions(where, self.offset, robot))
         offset = self.table.spread(where, self.offset, names, what)
         if not self.sines:
             return constant(offset)

@@ -119,7 +119,7 @@ def _resting(layout: Layout) -> Floats:
 
 def _pushed(layout: Layout, scene: Scene) -> Mask:
     """Joints (n,) on which springs, stops and forces on frames act in the initial configuration."""
-    floating = Scene(layout.robot, gravity=False, forces=scene.forces, actuation=layout.actuation)
+    floating = Scene(layout.robot, gravity=False, damping=0.0, forces=scene.forces, actuation=layout.actuation)
     return np.asarray(floating.holding_torque(layout.q0) != 0.0)
 
 

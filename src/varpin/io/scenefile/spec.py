@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from varpin.io.scenefile.plan_constraints import Kind
 from varpin.io.scenefile.references import Reference
@@ -67,12 +66,12 @@ class ForceSpec:
 
     Attributes:
         kind: Class of the force.
-        values: Its attributes by joint, those that the file gives.
+        values: Its attributes by joint, those that the file gives; ``"robot"`` for a level of the description.
         table: Its table, for messages.
     """
 
     kind: type[Force]
-    values: Mapping[str, ByName]
+    values: Mapping[str, ByName | Literal["robot"]]
     table: Table
 
 
@@ -128,7 +127,8 @@ class CostSpec:
         weight: Weights by component.
         terminal: Whether it is a terminal cost instead of an integral over time.
         reference: Its target over time, if it has one.
-        holding_q: A configuration whose holding torques are the reference, by joint; ``()`` for the initial one.
+        holding_q: A configuration whose holding torques are the reference, by joint or the name of a posture; ``()``
+            for the initial one.
         frame: Name of its frame; empty for terms without one.
         numbers: Its other keys with numbers.
         words: Its other keys with words.
@@ -140,12 +140,7 @@ class CostSpec:
     weight: ByName
     terminal: bool
     reference: Reference | None
-    holding_q: ByName | None
+    holding_q: ByName | str | None
     frame: str
     numbers: Mapping[str, float]
     words: Mapping[str, str]
-
-
-def degrees_for_radians(value: float) -> bool:
-    """Whether an angle [rad] is larger than two turns, and therefore probably in degrees."""
-    return abs(value) > 4.0 * math.pi

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.errors import VarpinError
+from varpin.errors import InputError, VarpinError
+from varpin.model import Robot
 
 # One number for all, one for each in order, or a table by name in which those left out are 0.
 ByName = float | tuple[float, ...] | Mapping[str, float]
@@ -75,6 +76,15 @@ class Table:
                 )
             return np.array(value, dtype=np.float64)
         return np.full(len(names), float(value))
+
+    def positions(self, name: str, value: ByName | str, robot: Robot) -> Floats:
+        """Positions of the joints (n,) [rad or m]: a posture of the robot by its name, or as :meth:`spread`."""
+        if not isinstance(value, str):
+            return self.spread(name, value, robot.joint_names)
+        try:
+            return robot.posture(value)
+        except InputError as error:
+            raise self.error(name, str(error)) from None
 
 
 def shown(value: object) -> str:

@@ -50,10 +50,13 @@ from varpin.io.scenefile.spec import (
 from varpin.io.scenefile.table import ByName, Table, inside
 from varpin.io.scenefile.terms import TERMS, Term
 from varpin.mechanics.constraints import FrameOnFrame
+from varpin.mechanics.forces import CoulombFriction
 from varpin.model import Payload
 from varpin.support.checks import is_file
 
 _THREE = tuple[float, float, float]
+# The value of the robot's description.
+_ROBOT = Annotated[str, word("robot")]
 
 
 def _checked(kind: Any, check: Callable[..., Any]) -> Rule:
@@ -90,10 +93,26 @@ def _existing(path: Path) -> Path:
     return path
 
 
+def _file(text: str, info: ValidationInfo) -> Path:
+    return _existing(_beside(text, info))
+
+
 def _robot_source(text: str, info: ValidationInfo) -> str | Path:
     """The name of a robot, or the path of an existing file."""
     named = not Path(text).suffix and "/" not in text and "\\" not in text
     return text if named else _existing(_beside(text, info))
+
+
+# The position of a locked joint. A joint with several axes, or a continuous one, has several numbers.
+_LOCK = either(
+    "a number [rad or m], or the configuration of a joint with several axes",
+    number=Annotated[float, number("rad or m")],
+    list=Annotated[tuple[float, ...], numbers()],
+)
+# The value of an argument of a xacro file.
+_ARGUMENT = either("a text, a number, true or false", text=str, number=int | float, flag=bool)
+# A posture of the robot's SRDF file by name.
+_POSTURE = Annotated[str, TEXT]
 
 
 class PayloadKeys(Keys):
@@ -141,9 +160,11 @@ class RobotKeys(Keys):
     """[robot]."""
 
     source: Annotated[str | Path, _checked(TEXT, _robot_source)]
-    lock: dict[str, Annotated[float, number("rad or m")]] = Field(default_factory=dict)
+    lock: dict[str, Annotated[Any, _LOCK]] = Field(default_factory=dict)
     mimic: Annotated[str, word("tied", "free")] = "tied"
     package_dirs: Annotated[tuple[str, ...], _distinct(_checked(TEXT, _folder))] = ()
+    xacro_args: dict[str, Annotated[Any, _ARGUMENT]] = Field(default_factory=dict)
+    srdf: Annotated[Path | None, _checked(TEXT, _file)] = None
     payload: tuple[Annotated[Payload, _checked(PayloadKeys, PayloadKeys.payload)], ...] = ()
     base: Annotated[
         Any,
@@ -172,7 +193,7 @@ class SpringKeys(Keys):
     """[springs]."""
 
     stiffness: Annotated[ByName, values("N m/rad or N/m", least=0.0)] = 0.0
-    rest: Annotated[ByName, values("rad or m")] = 0.0
+    rest: Annotated[ByName | str, values("rad or m", text=_POSTURE)] = 0.0
 
 
 class ActuationKeys(Keys):
@@ -180,9 +201,7 @@ class ActuationKeys(Keys):
 
     joints: Annotated[tuple[str, ...] | None, _distinct(TEXT)] = None
     gear: Annotated[ByName, values()] = 1.0
-    torque_limit: Annotated[ByName | str | None, values("N m or N", least=0.0, text=Annotated[str, word("robot")])] = (
-        None
-    )
+    torque_limit: Annotated[ByName | str | None, values("N m or N", least=0.0, text=_ROBOT)] = None
 
     @model_validator(mode="after")
     def _require_joints(self) -> ActuationKeys:
@@ -196,7 +215,7 @@ class NoiseKeys(Keys):
 
     type: Annotated[str, word("additive", "control", "state")]
     intensity: Annotated[ByName, values(least=0.0)]
-    center: Annotated[ByName | None, values("rad or m")] = None
+    center: Annotated[ByName | str | None, values("rad or m", text=_POSTURE)] = None
 
     @model_validator(mode="after")
     def _require_no_center(self) -> NoiseKeys:
@@ -208,7 +227,7 @@ class NoiseKeys(Keys):
 class InitialKeys(Keys):
     """[initial]."""
 
-    q: Annotated[ByName, values("rad or m")] = 0.0
+    q: Annotated[ByName | str, values("rad or m", text=_POSTURE)] = 0.0
     v: Annotated[ByName, values("rad/s or m/s")] = 0.0
 
 
@@ -370,6 +389,8 @@ def _integrator_keys(kind: Any) -> type[Keys]:
 # [[force]] on joints: the fields of the force, by joint.
 def _force_keys(kind: Any) -> type[Keys]:
     keys: dict[str, Any] = {item.name: (Annotated[Any, values()], _default(item)) for item in fields(kind)}
+    if kind is CoulombFriction:
+        keys["level"] = (Annotated[Any, values("N m or N", text=_ROBOT)], ...)
     return create_model(kind.__name__, __base__=TypedKeys, **keys)
 
 
@@ -439,12 +460,13 @@ def _cost_keys(name: str, term: Term) -> type[Keys]:
     weight = number(least=0.0) if len(term.axes) == 1 else values(least=0.0)
     keys: dict[str, Any] = {"weight": (Annotated[Any, weight], 1.0)}
     if term.reference is not None:
-        rule = values() if term.initial else _reference()
+        of_postures = {"text": _POSTURE} if term.space == "q" else {}
+        rule = values() if term.initial else _reference(**of_postures)
         keys[term.reference] = (Annotated[Any, rule], None if term.optional or term.holding else ...)
     if term.frame:
         keys["frame"] = (Annotated[str, TEXT], ...)
     if term.holding:
-        keys["hold"] = (Annotated[Any, values("rad or m", flag=Literal[True])], None)
+        keys["hold"] = (Annotated[Any, values("rad or m", flag=Literal[True], text=_POSTURE)], None)
     if term.can_end:
         keys["terminal"] = (Annotated[bool, FLAG], False)
     for key, default in term.numbers.items():
@@ -479,7 +501,8 @@ class SceneKeys(Keys):
         bool | tuple[float, ...],
         either("true, false or three numbers [m/s^2]", flag=bool, list=Annotated[Any, numbers(3, "m/s^2")]),
     ] = True
-    damping: Annotated[Any, values("N m s/rad or N s/m", least=0.0, text=Annotated[str, word("robot")])] = None
+    damping: Annotated[Any, values("N m s/rad or N s/m", least=0.0, text=_ROBOT)] = None
+    friction: Annotated[Any, values("N m or N", least=0.0, text=_ROBOT)] = None
     robot: Annotated[
         tuple[RobotKeys, ...],
         _checked(
@@ -515,8 +538,9 @@ class SceneSpec:
         gravity: Gravity [m/s^2], or whether there is any.
         damping: Viscous damping by joint [N m s/rad or N s/m], or "robot" for that of the description; None where it is
             left out.
+        friction: Dry friction by joint [N m or N], in the forms of ``damping``.
         stiffness: Stiffness of joint springs, by joint [N m/rad or N/m].
-        rest: Rest positions of joint springs, by joint [rad or m].
+        rest: Rest positions of joint springs, by joint [rad or m], or the name of a posture.
         forces: Other forces on joints.
         frame_forces: Forces on frames.
         constraints: Constraints of the motion.
@@ -525,7 +549,7 @@ class SceneSpec:
         gear: Generalized force per control, by driven joint.
         torque_limit: Bounds by driven joint [N m or N]; ``"robot"`` for those of the description; None for none.
         noise: Noise models.
-        q0: Initial configuration by joint [rad or m].
+        q0: Initial configuration by joint [rad or m], or the name of a posture.
         v0: Initial velocity by joint [rad/s or m/s].
         dt: Time step [s].
         steps: N.
@@ -548,8 +572,9 @@ class SceneSpec:
     prefixes: tuple[str, ...] | None
     gravity: bool | tuple[float, ...]
     damping: ByName | Literal["robot"] | None
+    friction: ByName | Literal["robot"] | None
     stiffness: ByName
-    rest: ByName
+    rest: ByName | str
     forces: tuple[ForceSpec, ...]
     frame_forces: tuple[FrameForceSpec, ...]
     constraints: tuple[ConstraintSpec, ...]
@@ -558,7 +583,7 @@ class SceneSpec:
     gear: ByName
     torque_limit: ByName | str | None
     noise: tuple[NoiseKeys, ...]
-    q0: ByName
+    q0: ByName | str
     v0: ByName
     dt: float
     steps: int
@@ -604,6 +629,7 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         prefixes=tuple(robot.prefix for robot in members) if members else None,
         gravity=keys.gravity,
         damping=keys.damping,
+        friction=keys.friction,
         stiffness=keys.springs.stiffness,
         rest=keys.springs.rest,
         forces=tuple(force for force in forces if isinstance(force, ForceSpec)),

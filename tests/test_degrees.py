@@ -1,0 +1,86 @@
+"""Angles in degrees and places in millimetres are pointed out wherever positions enter."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from refusals import refused, unnamed
+
+import varpin as vp
+from varpin.cli import main
+from varpin.model import degrees_hint
+
+HOME = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0])
+FACTS = ("'shoulder_lift_joint'", "-90 rad", "14 turns", "looks like degrees", "np.deg2rad")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return vp.Scene(vp.load_robot("ur5"), gravity=False)
+
+
+def test_a_start_in_degrees(scene, capsys):
+    motion = vp.simulate(scene, HOME, np.zeros(6), dt=1e-3, steps=2)
+    assert not unnamed(motion.warnings[0], FACTS)
+    assert not any(
+        "degrees" in told for told in vp.simulate(scene, np.deg2rad(HOME), np.zeros(6), dt=1e-3, steps=2).warnings
+    )
+    ensemble = vp.simulate_ensemble(scene, HOME, np.zeros(6), dt=1e-3, steps=2, paths=2, rng=0, workers=1)
+    assert not unnamed(ensemble.warnings[0], FACTS)
+    assert main(["simulate", "ur5", "--steps", "2", "--q0", *map(str, HOME)]) == 0
+    assert not unnamed(" ".join(capsys.readouterr().err.split()), FACTS)
+
+
+def test_a_plan_names_units_before_everything_else(scene):
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.FramePositionCost(scene.robot, "tool0", [400.0, 100.0, 500.0]))
+    problem = vp.OptimalControlProblem(scene, cost, np.zeros(6), np.zeros(6), dt=0.05, steps=4)
+    assert not unnamed(vp.solve(problem, max_iterations=2).warnings[0], ("'tool0'", "millimetres"))
+    reach = vp.ReachFrame(scene.robot, "tool0", position=[400.0, 100.0, 500.0])
+    inside = vp.WithinVelocityLimits(scene.robot)
+    problem = vp.OptimalControlProblem(
+        scene, vp.ControlCost(1e-3), np.zeros(6), np.full(6, 4.0), dt=0.05, steps=4, constraints=[inside, reach]
+    )
+    plan = vp.solve(problem, max_iterations=1)
+    assert "millimetres" in plan.warnings[0]
+    assert any("start" in told for told in plan.warnings)
+    for goal, told in ((HOME, True), (np.deg2rad(HOME), False)):
+        cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(goal, 1.0))
+        problem = vp.OptimalControlProblem(scene, cost, np.zeros(6), np.zeros(6), dt=0.05, steps=4)
+        plan = vp.solve(problem, max_iterations=2)
+        assert any(not unnamed(warning, FACTS) for warning in plan.warnings) == told
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), HOME, np.zeros(6), dt=0.05, steps=4)
+    assert not unnamed(vp.solve(problem).warnings[0], FACTS)
+
+
+def test_joints_without_limits_may_have_turned_many_times():
+    """A wheel that has turned is no mistake; a number of two decimals is typed."""
+    model = pin.Model()
+    place = model.addJoint(0, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
+    model.appendBodyToJoint(place, pin.Inertia(1.0, np.zeros(3), 0.1 * np.eye(3)), pin.SE3.Identity())
+    wheel = vp.load_robot(model)
+    told = {q: bool(degrees_hint(wheel, "q0", np.array([q]))) for q in (90.0, -22.25, 12.5, 33.3333333, 1e3 / 7.0)}
+    assert told == {90.0: True, -22.25: True, 12.5: False, 33.3333333: False, 1e3 / 7.0: False}
+    slider = vp.load_robot(pin_slider())
+    assert degrees_hint(slider, "q0", np.array([90.0])) == ""
+
+
+def pin_slider():
+    model = pin.Model()
+    place = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "cart")
+    model.appendBodyToJoint(place, pin.Inertia(1.0, np.zeros(3), 0.1 * np.eye(3)), pin.SE3.Identity())
+    return model
+
+
+def test_other_positions_in_degrees(scene, caplog):
+    with caplog.at_level(logging.WARNING):
+        vp.load_robot("ur5", lock={"elbow_joint": 90})
+        vp.Scene(scene.robot, stiffness=1.0, rest=HOME)
+    elbow, rest = (record.getMessage() for record in caplog.records)
+    assert not unnamed(elbow, ("elbow_joint", "90", "looks like degrees", "np.deg2rad"))
+    assert not unnamed(rest, ("rest", *FACTS))
+    closed = vp.Scene(scene.robot, constraints=[vp.PointOnPoint("tool0", [0.8, 0.1, 0.2])])
+    with refused(vp.InputError, "q0", *FACTS):
+        vp.simulate(closed, HOME, np.zeros(6), dt=1e-3, steps=2)
