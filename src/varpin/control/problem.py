@@ -69,9 +69,9 @@ _STIFF = 200.0
 class OptimalControlProblem(Frozen):
     """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
 
-    The expected cost is (O1). With ``controls="linear"`` they are linear in time between the nodes, with one decision
-    at each node, the first one included. Smooth motions then need a fraction of the nodes. Limits hold at the nodes,
-    and so everywhere.
+    The expected cost is (O1). With ``controls="linear"`` controls are linear in time between the nodes, with one
+    decision at each node, the first one included. Smooth motions then need a fraction of the nodes. Limits hold at the
+    nodes, and so everywhere.
 
     Running costs are integrals in time, sampled in each step, and references are functions of time, so the problem is
     the same at every ``dt``. Controls stay within their limits, feedback included. Costs add up, and numbers scale
