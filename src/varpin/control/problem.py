@@ -190,9 +190,13 @@ class OptimalControlProblem(Frozen):
                 "the nodes; plan with interpolation='linear', and keep it smooth by a ControlRateCost"
             )
         if controls == "linear" and hold != 1:
-            raise InputError(f"linear controls change at every node: leave hold = {hold} out, or take controls='held'")
+            raise InputError(
+                f"linear controls change at every node: leave hold = {hold} out, or take controls='held'", "controls"
+            )
         if controls == "linear" and scene.processes:
-            raise InputError("plans with linear controls take no noise: use controls='held', or leave the noise out")
+            raise InputError(
+                "plans with linear controls take no noise: use controls='held', or leave the noise out", "controls"
+            )
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
         if m == 0:
@@ -211,7 +215,7 @@ class OptimalControlProblem(Frozen):
         rate = control_rate(cost, m, scene.control_joints)
         given = _constraints(constraints)
         if given and controls == "linear":
-            raise InputError("plans with linear controls take no constraints: use controls='held'")
+            raise InputError("plans with linear controls take no constraints: use controls='held'", "controls")
         values = {
             "scene": scene,
             "cost": cost,
@@ -682,7 +686,14 @@ def _bind_constraints(
     times = t0 + np.arange(steps + 1, dtype=np.float64) * dt
     before = None if rate is None else rate.before
     horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before)
-    return tuple(item.bind(horizon) for item in constraints)
+    bound = []
+    for i, item in enumerate(constraints):
+        try:
+            bound.append(item.bind(horizon))
+        except InputError as error:
+            error.argument = f"constraints[{i}]"
+            raise
+    return tuple(bound)
 
 
 def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:
