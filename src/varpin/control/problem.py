@@ -69,9 +69,9 @@ _STIFF = 200.0
 class OptimalControlProblem(Frozen):
     """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
 
-    The expected cost is (O1). With ``controls="linear"`` they are linear in time between the nodes, with one decision
-    at each node, the first one included. Smooth motions then need a fraction of the nodes. Limits hold at the nodes,
-    and so everywhere.
+    The expected cost is (O1). With ``controls="linear"`` controls are linear in time between the nodes, with one
+    decision at each node, the first one included. Smooth motions then need a fraction of the nodes. Limits hold at the
+    nodes, and so everywhere.
 
     Running costs are integrals in time, sampled in each step, and references are functions of time, so the problem is
     the same at every ``dt``. Controls stay within their limits, feedback included. Costs add up, and numbers scale
@@ -193,9 +193,13 @@ class OptimalControlProblem(Frozen):
                 "nodes: leave sampling out, for 'gauss'"
             )
         if controls == "linear" and hold != 1:
-            raise InputError(f"linear controls change at every node: leave hold = {hold} out, or take controls='held'")
+            raise InputError(
+                f"linear controls change at every node: leave hold = {hold} out, or take controls='held'", "controls"
+            )
         if controls == "linear" and scene.processes:
-            raise InputError("plans with linear controls take no noise: use controls='held', or leave the noise out")
+            raise InputError(
+                "plans with linear controls take no noise: use controls='held', or leave the noise out", "controls"
+            )
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
         if m == 0:
@@ -214,7 +218,7 @@ class OptimalControlProblem(Frozen):
         rate = control_rate(cost, m, scene.control_joints)
         given = _constraints(constraints)
         if given and controls == "linear":
-            raise InputError("plans with linear controls take no constraints: use controls='held'")
+            raise InputError("plans with linear controls take no constraints: use controls='held'", "controls")
         values = {
             "scene": scene,
             "cost": cost,
@@ -685,7 +689,14 @@ def _bind_constraints(
     times = t0 + np.arange(steps + 1, dtype=np.float64) * dt
     before = None if rate is None else rate.before
     horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before)
-    return tuple(item.bind(horizon) for item in constraints)
+    bound = []
+    for i, item in enumerate(constraints):
+        try:
+            bound.append(item.bind(horizon))
+        except InputError as error:
+            error.argument = f"constraints[{i}]"
+            raise
+    return tuple(bound)
 
 
 def _rule(sampling: str, dt: float, *, cubic: bool) -> tuple[Floats, Floats]:

@@ -321,16 +321,6 @@ def join(segments: Sequence[Segment]) -> Segment:
     return Segment(**nodes, statistics=statistics, failure=segments[-1].failure, impulses=impulses)
 
 
-def check_functions(scene: Scene, q0: Floats, v0: Floats) -> None:
-    """Compare derivatives of custom forces with differences, once for a scene, at the first start (P, n).
-
-    Raises:
-        CustomForceError: The derivatives are wrong.
-    """
-    if scene.custom is not None and len(q0):
-        scene.custom.check(q0[0], v0[0])
-
-
 def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
     """Diffusion fields F (n, k) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
 

@@ -410,14 +410,18 @@ class Scene(Frozen):
         """The joints whose control is the target position of a servo."""
         return tuple(self.robot.joint_names[servo.coordinate] for servo in of_kind(self.elements, "PositionServo"))
 
+    @cached_property
+    def holding(self) -> Floats:
+        """Matrix (m, n) of the neutral controls at q, ``holding @ q``: see :meth:`command_at`."""
+        holding = np.zeros((self.controls, self.robot.dof))
+        for c in (*(servo.coordinate for servo in of_kind(self.elements, "PositionServo")), *self.inputs.values()):
+            holding[int(np.argmax(np.abs(self.actuation[c]))), c] = 1.0
+        return holding
+
     def command_at(self, q: Floats) -> Floats:
         """Neutral controls (m,) at q (n,): zero forces; servos and kinematic inputs hold their positions."""
-        command = np.zeros(self.controls)
-        for servo in of_kind(self.elements, "PositionServo"):
-            command[int(np.argmax(np.abs(self.actuation[servo.coordinate])))] = q[servo.coordinate]
-        for c in self.inputs.values():
-            command[int(np.argmax(self.actuation[c]))] = q[c]
-        return command
+        held: Floats = self.holding @ q
+        return held
 
     @property
     def processes(self) -> int:
