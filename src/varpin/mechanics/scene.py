@@ -29,6 +29,8 @@ from varpin.mechanics.constraints import (
 )
 from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.forces import (
+    COUPLINGS,
+    ELEMENTS,
     CoulombFriction,
     Force,
     JointDamper,
@@ -50,14 +52,11 @@ from varpin.support.weak import Weak
 
 logger = logging.getLogger(__name__)
 
-# Forces on joints among the values, a row (coordinate, numbers) for each element; and the message where they differ.
-OF_ELEMENTS = {
+# Messages where forces of these kinds differ, which have better names than their kinds.
+_NAMES = {
     "CoulombFriction": "dry friction differs",
     "JointStop": "joint stops differ",
     "PositionServo": "position servos differ",
-}
-# Forces on frames, a row (body a, body b, numbers) for each; left out where there are none.
-OF_COUPLINGS = {
     "FrameLoad": "forces on frames differ",
     "FrameWrench": "forces on frames differ",
     "FrameSpring": "springs between frames differ",
@@ -66,6 +65,13 @@ OF_COUPLINGS = {
     "FrameDamper": "dampers between frames differ",
     "FrameTurnDamper": "dampers between frames differ",
 }
+# Kinds of elements that are among the values as sums by joint.
+_SUMMED = ("Armature", "JointDamper", "JointSpring")
+# Other forces on joints among the values, a row (coordinate, numbers) for each element; and the message where they
+# differ.
+OF_ELEMENTS = {kind: _NAMES.get(kind, f"{kind} differs") for kind in ELEMENTS if kind not in _SUMMED}
+# Forces on frames, a row (body a, body b, numbers) for each; left out where there are none.
+OF_COUPLINGS = {kind: _NAMES.get(kind, f"{kind} differs") for kind in COUPLINGS}
 # Names of a scene's values, and the message where they differ; values by joint are also reported with numbers.
 VALUES = {
     "gravity": "gravity differs",
@@ -750,8 +756,8 @@ def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> l
     if values:
         found += [
             f"{VALUES[name]} in the scene"
-            for name in (*OF_COUPLINGS, *OF_CONSTRAINTS, "functions")
-            if name in scene.values and name not in values
+            for name in (*OF_FORCES, "functions")
+            if name not in values and np.size(scene.values.get(name, ()))
         ]
     return list(dict.fromkeys(found))
 
