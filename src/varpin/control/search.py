@@ -77,7 +77,7 @@ _LOSSY = 1e-8
 # Iterations without significant decrease before the search stalls. The cost is discontinuous where guards cut steps.
 _PATIENCE = 15
 # Share of the first motion's cost at stake that is added to the current one: an optimum of cost zero has none.
-_NOTHING = 1e-9
+NOTHING = 1e-9
 # Approximate shortest step of a line search, and its greatest number of trials.
 _SHORTEST, _TRIALS = 1e-6, 40
 # Bounds on the substeps of a trial. A trial stops where a step needs more than _HALVINGS halvings and more than the
@@ -715,10 +715,10 @@ class _Search:
 
     def _share(self, tolerance: float) -> float:
         """Tolerance on the expected decrease, in units of the cost."""
-        return tolerance * (self.along.stake.moved + _NOTHING * self.first)
+        return tolerance * (self.along.stake.moved + NOTHING * self.first)
 
     def _is_there(self, plan: Plan, tolerance: float) -> bool:
-        least = tolerance * _NOTHING * self.first
+        least = tolerance * NOTHING * self.first
         if self.problem.cost.nonnegative and plan.expected_decrease > tolerance * self.cost + least:
             # The value of a sum of squares bounds its cost at stake.
             return False
