@@ -184,6 +184,8 @@ def calls():
     changes = {"weight": np.eye(m), "before": draw(1, m)}
     yield "changes", core.change_values, {**changes, "u": draw(P, N, m)}
     yield "expanded changes", core.expand_changes, {**changes, "u": draw(N, m)}
+    models = {"gradient": draw(N, m), "hessian": draw(N, m, m), "displacement": draw(N, m)}
+    yield "stake", core.stake_of, models
     box = {"H": np.eye(m), "g": draw(m), "limits": np.array([[-0.1] * m, [0.1] * m]), "guess": np.zeros(m)}
     yield "box", core.box_minimum, box
 

@@ -1,5 +1,6 @@
 """The documentation says what is so: its code runs, its links lead somewhere, and the API is complete."""
 
+import ast
 import inspect
 import re
 import shlex
@@ -132,19 +133,22 @@ def equations(cell):
         yield from (f"({stem}{k})" for k in range(int(begin), int(end) + 1))
 
 
+DEFINITIONS = (ast.FunctionDef, ast.ClassDef)
 PLACE = re.compile(r"`([\w/]+\.(?:hpp|py))`: `(\w+)`")
 
 
-def source_with(file, name):
-    """The text of a file that defines a function or a class."""
-    folder = ROOT / ("src/core/include/varpin" if file.endswith(".hpp") else "src/varpin")
-    source = (folder / file).read_text(encoding="utf-8")
+def described(file, name):
+    """The docstrings of the functions or classes of this name in a Python file, or the comments above those in C++."""
     if file.endswith(".py"):
-        defined = rf"^ *(?:def|class) {name}\b"
+        nodes = ast.walk(ast.parse((ROOT / "src/varpin" / file).read_text(encoding="utf-8")))
+        named = [node for node in nodes if getattr(node, "name", None) == name and isinstance(node, DEFINITIONS)]
+        found = [ast.get_docstring(node) or "" for node in named]
     else:
-        defined = rf"^ *(?!return)(?:[\w:<>*&]+ )+{name}\b(?!;).*[{{,]$"
-    assert re.search(defined, source, re.M), f"{file} defines no {name}"
-    return source
+        source = (ROOT / "src/core/include/varpin" / file).read_text(encoding="utf-8")
+        defined = rf"^ *(?!return)(?:[\w:<>*&\[\]]+ )+{name}\b(?!;).*[{{,]$"
+        found = re.findall(rf"((?:^ *//.*\n)*)(?:^ *template .*\n)?{defined}", source, re.M)
+    assert found, f"{file} defines no {name}"
+    return "\n".join(found)
 
 
 def equation_map():
@@ -163,11 +167,11 @@ def test_every_equation_is_on_the_map():
 
 @pytest.mark.parametrize(("numbers", "functions"), equation_map())
 def test_an_equation_is_computed_where_the_map_says(numbers, functions):
-    """The file defines the function, and names the equation in turn."""
+    """And what is said of the function names the equation in turn."""
     assert functions
     for file, name in functions:
-        source = source_with(file, name)
-        assert not [number for number in numbers if number not in source], f"{file} does not name {numbers}"
+        unnamed = set(numbers) - set(equations(described(file, name)))
+        assert not unnamed, f"{name} in {file} does not name {sorted(unnamed)}"
 
 
 HEADERS = sorted((ROOT / "src" / "core").rglob("*.hpp"))
@@ -199,7 +203,7 @@ def test_decisions_are_made_where_the_page_says():
     for row in rows:
         assert PLACE.findall(row), row
         for file, name in PLACE.findall(row):
-            source_with(file, name)
+            described(file, name)
 
 
 def test_every_public_name_is_on_one_page_of_the_api():

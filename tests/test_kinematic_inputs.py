@@ -275,6 +275,56 @@ def test_a_plan_by_hand_holds_on_the_continuous_system():
     assert ends[0] < ends[1]
 
 
+def smoothly(dt, steps, **options):
+    """The task of :func:`hanging` with a cubic input: positions and velocities at nodes."""
+    begin = np.array([0.5 * np.pi, 0.0])
+    goal = begin + np.array([0.8, -0.8])
+    scene = vp.Scene(
+        vp.planar_chain(2), actuation=["joint1"], constraints=vp.KinematicInput("joint1", "cubic"), **options
+    )
+    cost = vp.VelocityCost(0.05) + vp.ControlRateCost([[0.0, 0.0], [0.0, 0.02]], before=[begin[0], 0.0])
+    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost(10.0))
+    return vp.OptimalControlProblem(scene, cost, begin, np.zeros(2), dt=dt, steps=steps), goal
+
+
+def test_a_plan_chooses_positions_and_velocities_of_a_cubic():
+    """Its cost does not change to first order, by differences, and is that on the continuous system."""
+    problem, goal = smoothly(0.08, 15)
+    plan = vp.solve(problem)
+    assert plan.status.converged
+    u = plan.trajectory.u
+    np.testing.assert_allclose(plan.trajectory.q[1:, 0], u[:, 0], atol=1e-12)
+    np.testing.assert_allclose(plan.trajectory.v[1:, 0], u[:, 1], atol=1e-9)
+
+    def value(u):
+        motion = problem.simulate(u)
+        return float(problem.costs(motion.q, motion.v, motion.u))
+
+    assert value(u) == pytest.approx(plan.cost, rel=1e-12)
+    for step, control in ((3, 0), (3, 1), (14, 1)):
+        e = np.zeros_like(u)
+        e[step, control] = 1e-4
+        slope = (value(u + e) - value(u - e)) / 2e-4
+        bend = (value(u + e) - 2.0 * plan.cost + value(u - e)) / 1e-8
+        assert abs(slope) < 1e-4 * bend
+    told = plan.verify(tolerance=1e-5)
+    assert abs(told.closed_loop_loss) < 1e-3
+    assert told.defect < 1e-4
+    assert np.abs(plan.trajectory.q[-1] - goal).max() < 2e-3
+
+
+def test_a_controller_moves_a_cubic():
+    problem, goal = smoothly(0.08, 12)
+    run = vp.Mpc(problem).run(vp.Plant(problem.scene, substeps=2), duration=1.6)
+    motion = run.motion
+    np.testing.assert_allclose(motion.q[-1], goal, atol=0.05)
+    np.testing.assert_allclose(motion.q[1:, 0], motion.u[:, 0], atol=1e-12)
+    np.testing.assert_allclose(motion.v[1:, 0], motion.u[:, 1], atol=1e-8)
+    with refused(vp.InputError, "plant", "KinematicInputs", "joint1"):
+        two = vp.Scene(problem.scene.robot, actuation=["joint1", "joint2"], constraints=vp.KinematicInput("joint1"))
+        vp.Mpc(problem).run(vp.Plant(two), duration=0.1)
+
+
 def test_a_mechanism_without_freedom_may_turn_round():
     """Where it does, the energy that it takes is tiny, and no balance of it is asked for."""
     scene, q, _ = crank()
@@ -323,22 +373,14 @@ def test_what_does_not_know_inputs_refuses_them():
     scene, q, v = crank()
     robot, loop = scene.robot, scene.constraints[0]
     hand = vp.KinematicInput("joint1")
-    held = vp.LinearPolicy(np.zeros((3, 1)), np.zeros((3, 1, 6)), np.zeros((3, 6)), hold=2, on="momentum")
-    tries = [
-        lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=lambda t, q, v: [0.0]),
-        lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=vp.OpenLoop(lambda t: [0.0])),
-        lambda: vp.simulate(scene, q, v, dt=0.01, steps=3, controls=held),
-    ]
-    for attempt in tries:
-        with refused(vp.InputError, "KinematicInput"):
-            attempt()
     cost = vp.ControlCost(1.0)
     for options in ({"hold": 3}, {"controls": "linear"}):
         with refused(vp.InputError, "hold", "controls='linear'"):
             vp.OptimalControlProblem(scene, cost, q, v, dt=0.01, steps=3, **options)
     smooth = vp.Scene(robot, constraints=[loop, vp.KinematicInput("joint1", "cubic")])
-    with refused(vp.InputError, "KinematicInput", "cubic"):
-        vp.OptimalControlProblem(smooth, cost, q, v, dt=0.01, steps=3)
+    for sampling in ("midpoint", "start"):
+        with refused(vp.InputError, "KinematicInput", "cubic", repr(sampling), "'gauss'"):
+            vp.OptimalControlProblem(smooth, cost, q, v, dt=0.01, steps=3, sampling=sampling)
     with refused(vp.InputError, "interpolation", "'linear'", "'cubic'", "'spline'"):
         vp.Scene(robot, constraints=vp.KinematicInput("joint1", "spline"))
     two = [loop, hand, vp.KinematicInput("joint2")]

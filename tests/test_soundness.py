@@ -16,10 +16,12 @@ import varpin as vp
 from varpin.core import fastest_damping
 from varpin.integrators import explicit, variational
 from varpin.integrators.base import open_loop
+from varpin.mechanics.wiener import wiener_increments
 from varpin.model.chain import rod_chain
 from varpin.simulation import limits
 from varpin.simulation.accuracy import CLOSE, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY, Window, examined_nodes
 from varpin.simulation.chatter import alternation
+from varpin.simulation.retaking import shortest_parts, taken_again
 from varpin.simulation.soundness import (
     CAUTION,
     LEAST_WORK,
@@ -702,3 +704,28 @@ def test_rounding_of_joints_that_a_falling_lift_carries_is_no_motion(dt, steps):
     assert motion.q[-1, 0] == pytest.approx(-0.5 * 9.81 * (dt * steps) ** 2, rel=1e-9)
     assert 0.0 < np.abs(motion.v[:, 1:]).max() < 1e-12
     assert motion.warnings == ()
+
+
+def test_parts_of_unequal_length_are_repeated_as_short_as_the_shortest():
+    """Under violent noise guards make parts of 1/16 to 1/256 of a step: the mean of them is too long."""
+    scene = vp.Scene(rod_chain([1.0] * 2, [1.0] * 2), noise=vp.AdditiveNoise(1000.0))
+    dw = wiener_increments(2, 1e-2, 200, 0)
+    motion = vp.simulate(scene, np.zeros(2), np.zeros(2), dt=1e-2, steps=200, increments=dw, integrator=vp.Gauss(4))
+    parts = shortest_parts(motion)
+    numbers = motion.statistics
+    split = numbers.substeps > 1
+    ends = np.cumsum(numbers.substeps[split])
+    deepest = np.array([int(own.max()) for own in np.split(numbers.halvings, ends[:-1])])
+    assert (parts[~split] == 1).all()
+    assert (parts[split] <= 1 << deepest).all()
+    assert np.mean(parts[split] == 1 << deepest) > 0.9
+    assert motion.warnings
+    # As many equal parts are further off than the motion itself.
+    at, times = 152, vp.Gauss(4).stage_times
+    mean = int(2 ** np.ceil(np.log2(numbers.substeps[at : at + 24].mean())))
+    fine, right, coarse = (
+        taken_again(scene, vp.Gauss(5), motion, times, at, 3, own)[0] for own in (parts[at : at + 3], 1024, mean)
+    )
+    off = np.abs(motion.q[at : at + 4] - right).max()
+    assert np.abs(fine - right).max() < 0.1 * off
+    assert np.abs(coarse - right).max() > off

@@ -100,7 +100,7 @@ class Linearization:
 
 
 def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | None = None) -> Linearization:
-    """Linearize every step of a trajectory.
+    """Linearize every step of a trajectory: (1.7) and (1.10) of the paper.
 
     Main args:
         scene: The scene of the trajectory.
@@ -121,7 +121,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
         found = replace(found, K=_kick_columns(scene, trajectory, found.J))
     if not trajectory.u_stages.shape[1]:
         return found
-    return replace(found, ramp=integrator.ramps(scene, trajectory) @ scene.actuation)
+    return replace(found, ramp=integrator.ramps(scene, trajectory) @ scene.transmission)
 
 
 def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:
@@ -136,9 +136,8 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     if scene.processes == 0:
         return Linearization(
             A=Jx,
-            B=(Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(
-                steps, 2 * n, m
-            ),  # one product instead of many small ones
+            # One product instead of many small ones.
+            B=Jf if scene.direct else (Jf.reshape(-1, Jf.shape[2]) @ scene.transmission).reshape(steps, 2 * n, m),
             K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
             J=Jk,
             F=np.zeros((steps, n, 0)),
@@ -165,7 +164,7 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     if left < 1.0:
         # The part of a kick after the step is evaluated at the step's end.
         end_q, end_v = trajectory.q[1:], trajectory.v[1:]
-        if trajectory.dw.any():
+        if trajectory.noisy:
             end_q, end_v = integrator.quiet_ends(scene, trajectory)
         end = scene.noise.fields(end_q, end_v, trajectory.u, first)
         end_x = _in_momentum(scene, end_q, end_v, end)
@@ -449,7 +448,7 @@ def _sizes(arrays: Mapping[str, Floats]) -> str:
 def propagate_moments(
     linearization: Linearization, mean: ArrayLike | None = None, covariance: ArrayLike | None = None
 ) -> Moments:
-    """Mean and covariance of dx under the linearization with du = 0, in closed form.
+    """Mean and covariance of dx under the linearization (L3) with du = 0, in closed form.
 
         mean' = A mean,    P' = A P A' + dt sum_i [ Gx_i P Gx_i' + g_i g_i' ],    g_i = Gx_i mean + G_i
 

@@ -80,7 +80,7 @@ def state_noise(C: float, center: Floats) -> Fields:
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """An arm and the forces on it.
+    """An arm and the forces on it, of which (1.1) is the equation of motion.
 
     Attributes:
         model: Pinocchio model, with its gravity. Every joint has one configuration and one velocity variable, in the
@@ -214,7 +214,8 @@ class Slots(NamedTuple):
 def discrete_lagrangian(system: System, q0: Floats, q1: Floats, h: float, a: float = 0.5) -> Slots:
     """L_d = h L((1 - a) q0 + a q1, (q1 - q0) / h), the generalized midpoint rule before (1.2), by the chain rule.
 
-    q_m = (1 - a) q0 + a q1 has the derivatives 1 - a and a, v_m = (q1 - q0) / h has -1/h and 1/h.
+    Equations (D1) and (D2). q_m = (1 - a) q0 + a q1 has the derivatives 1 - a and a, v_m = (q1 - q0) / h has -1/h and
+    1/h.
     """
     _, Lq, Lv, Lqq, Lvq, M = jet = lagrangian(system, (1 - a) * q0 + a * q1, (q1 - q0) / h)
     b, Lqv = 1 - a, Lvq.T
@@ -240,7 +241,10 @@ class Forces(NamedTuple):
 
 
 def discrete_forces(system: System, q0: Floats, q1: Floats, u: Floats, h: float) -> Forces:
-    """F- = F+ = (h/2) F_c(q_m, v_m, u) of (1.2), with F_c = B u - damping v."""
+    """F- = F+ = (h/2) F_c(q_m, v_m, u) of (1.2), with F_c = B u - damping v.
+
+    The Ito correction of (1.3) is zero, because the fields F_i do not depend on v.
+    """
     D = np.diag(system.damping)
     F = 0.5 * h * (system.actuation @ u - system.damping * (q1 - q0) / h)
     return Forces(F, 0.5 * D, -0.5 * D, 0.5 * h * system.actuation)
@@ -260,7 +264,7 @@ def step(
     dw: Floats | None = None,
     iterations: int = 50,
 ) -> tuple[Floats, Floats]:
-    """One step (q0, p0) -> (q1, p1).
+    """One step (q0, p0) -> (q1, p1): (1.4), (1.5) and (1.6) in the position-momentum form (D3), with the forces (D4).
 
     Solves p0 + D1 L_d + F- + sum_i F_i(q0, u) dw_i = 0 for q1 (1.8) by Newton's iteration, whose matrix is
     D2D1 L_d + D2 F-, and computes p1 = D2 L_d + F+ (1.9). The iteration ends when corrections reach rounding, or no
@@ -322,7 +326,7 @@ class StepLinearization(NamedTuple):
 
 
 def linearize_step(system: System, q0: Floats, q1: Floats, u: Floats, h: float, a: float = 0.5) -> StepLinearization:
-    """Derivatives of a step at dw = 0 by implicit differentiation of (1.8), then of (1.9)."""
+    """Derivatives of a step at dw = 0 by implicit differentiation of (1.8), then of (1.9): (1.7) and (1.10)."""
     slots, forces = discrete_lagrangian(system, q0, q1, h, a), discrete_forces(system, q0, q1, u, h)
     minus_inverse = -np.linalg.inv(slots.D2D1 + forces.D2)  # -M_{k+1}^-1
     N = slots.D2D2 + forces.D2
@@ -379,7 +383,7 @@ class BackwardPass(NamedTuple):
 def backward_pass(
     system: System, cost: TrackingCost, motion: Motion, h: float, a: float = 0.5, regularization: float = 0.0
 ) -> BackwardPass:
-    """The quadratic model of the cost-to-go, from the end to the start.
+    """The quadratic model of the cost-to-go, from the end to the start, (O2).
 
     With the value v0 + Vx.dx + dx'Vxx dx / 2 after a step and Sg = h K'Vxx K, noise adds sum_i F_i'Sg F_i / 2 to the
     expected value before it; Sg is constant in its derivatives. If no F_i depends on q or u, the controls are DDP's.

@@ -283,6 +283,11 @@ class Trajectory(Frozen):
         return len(self.t) - 1
 
     @property
+    def noisy(self) -> bool:
+        """Whether noise was drawn in some step."""
+        return bool(self.dw.size) and bool(self.dw.any())
+
+    @property
     def duration(self) -> float:
         """Time from the first node to the last [s]."""
         return float(self.t[-1] - self.t[0])

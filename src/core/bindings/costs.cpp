@@ -9,6 +9,7 @@
 #include "arrays.hpp"
 #include "bodies.hpp"
 #include "registrations.hpp"
+#include "varpin/stake.hpp"
 #include "watched.hpp"
 
 namespace varpin::border {
@@ -185,6 +186,22 @@ std::tuple<Out, Out> samples(In<2> rule, In<3> q, In<3> v) {
     return {sampled_q, sampled_v};
 }
 
+// Free and moved stake of models with gradients (N, k) and Hessians (N, k, k), or one (1, k, k), at points displaced by
+// `displacement` (N, k).
+std::tuple<double, double> stake_of(In<2> gradient, In<3> hessian, In<2> displacement) {
+    const std::size_t rows = gradient.shape(0), size = gradient.shape(1);
+    const bool one = hessian.shape(0) == 1;
+    require(hessian, "hessian", {one ? 1 : rows, size, size});
+    require(displacement, "displacement", {rows, size});
+    nb::gil_scoped_release release;
+    Stake stake;
+    for (std::size_t s = 0; s < rows; ++s) {
+        stake.add(gradient.data() + s * size, hessian.data() + (one ? 0 : s * size * size),
+                  displacement.data() + s * size, size);
+    }
+    return {stake.free, stake.moved};
+}
+
 }  // namespace
 
 void register_costs(nb::module_& m) {
@@ -224,6 +241,7 @@ void register_costs(nb::module_& m) {
         .def_prop_ro("verdict", [](const HeldWatch& watch) { return watch.core.verdict; });
     m.def("change_values", &change_values, "weight"_a, "before"_a, "u"_a);
     m.def("expand_changes", &expand_changes, "weight"_a, "before"_a, "u"_a);
+    m.def("stake_of", &stake_of, "gradient"_a, "hessian"_a, "displacement"_a);
     m.def("sample_steps", &samples, "rule"_a, "q"_a, "v"_a);
 }
 

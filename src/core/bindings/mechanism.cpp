@@ -172,6 +172,69 @@ OuterForce outer_force_of(nb::object function, std::size_t n) {
     };
 }
 
+void describe_links(Tree& tree, const In<1>& mass, const In<2>& center, const In<2>& inertia,
+                    const Integers<1>& origin) {
+    for (std::size_t j = 0; j < tree.bodies.size(); ++j) {
+        Body& link = tree.bodies[j];
+        if (origin(j) == 0 && link.parent < 0) throw std::invalid_argument("a root must be an origin");
+        link.mass = mass(j);
+        link.center = {center(j, 0), center(j, 1), center(j, 2)};
+        link.inertia = {inertia(j, 0), inertia(j, 1), inertia(j, 2), inertia(j, 3), inertia(j, 4), inertia(j, 5)};
+        link.origin = origin(j) != 0;
+    }
+}
+
+void take_coordinates(Tree& tree, const Integers<1>& group, int groups, const Integers<1>& periodic) {
+    for (std::size_t c = 0; c < group.shape(0); ++c) {
+        if (group(c) < 0 || group(c) >= groups) throw std::invalid_argument("a coordinate's group is out of range");
+        tree.group.push_back(static_cast<int>(group(c)));
+        tree.periodic.push_back(periodic(c) != 0);
+    }
+    tree.groups = groups;
+}
+
+void take_blocks(Tree& tree, const Integers<1>& ends, int n) {
+    int begin = 0;
+    for (std::size_t b = 0; b < ends.shape(0); ++b) {
+        if (ends(b) <= begin || ends(b) > n)
+            throw std::invalid_argument("the ends of blocks must increase up to the number of coordinates");
+        tree.blocks.push_back({begin, static_cast<int>(ends(b))});
+        begin = static_cast<int>(ends(b));
+    }
+    if (begin != n) throw std::invalid_argument("the last block must end with the last coordinate");
+}
+
+void take_light_parts(Tree& tree, const Integers<1>& loads, const Integers<2>& carried) {
+    for (std::size_t r = 0; r < loads.shape(0); ++r) {
+        if (loads(r) < 0 || loads(r) >= static_cast<std::int64_t>(tree.bodies.size()) ||
+            tree.bodies[loads(r)].parent < 0)
+            throw std::invalid_argument("the first body of a light part must have a parent");
+        LightPart part;
+        part.body = static_cast<int>(loads(r));
+        for (std::size_t c = 0; c < carried.shape(1); ++c) part.carried.push_back(carried(r, c) != 0);
+        tree.light_parts.push_back(part);
+    }
+}
+
+Forces forces_of(const Named& forces, int n) {
+    std::vector<Element> elements;
+    for (const auto& [kind, coordinate, values] : forces) {
+        if (coordinate < 0 || coordinate >= n) throw std::invalid_argument("an element's coordinate is out of range");
+        elements.push_back(element_of(kind, coordinate, values));
+    }
+    return elements;
+}
+
+Couplings couplings_of(const NamedCouplings& couplings, const std::vector<Body>& bodies) {
+    std::vector<CoupledElement> between;
+    for (const auto& [kind, a, b, values] : couplings) {
+        if (std::min(a, b) < -1 || std::max(a, b) >= static_cast<int>(bodies.size()) || std::max(a, b) < 0)
+            throw std::invalid_argument("a coupling's bodies are out of range");
+        between.push_back(coupling_of(kind, a, b, values));
+    }
+    return {between, bodies};
+}
+
 Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation, In<2> translation, In<1> mass,
                        In<2> center, In<2> inertia, Integers<1> coordinate, In<1> ratio, In<1> offset,
                        Integers<1> origin, Integers<1> loads, Integers<2> carried, Integers<1> periodic, In<1> armature,
@@ -194,52 +257,14 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     require(centers, "centers", {n, processes});
     Mechanism out;
     out.tree.bodies = jointed_bodies(parent, prismatic, rotation, translation, coordinate, ratio, offset, n);
-    for (std::size_t j = 0; j < bodies; ++j) {
-        if (origin(j) == 0 && parent(j) < 0) throw std::invalid_argument("a root must be an origin");
-        Body& link = out.tree.bodies[j];
-        link.mass = mass(j);
-        link.center = {center(j, 0), center(j, 1), center(j, 2)};
-        link.inertia = {inertia(j, 0), inertia(j, 1), inertia(j, 2), inertia(j, 3), inertia(j, 4), inertia(j, 5)};
-        link.origin = origin(j) != 0;
-    }
-    for (std::size_t c = 0; c < n; ++c) {
-        if (group(c) < 0 || group(c) >= groups) throw std::invalid_argument("a coordinate's group is out of range");
-        out.tree.group.push_back(static_cast<int>(group(c)));
-        out.tree.periodic.push_back(periodic(c) != 0);
-    }
-    out.tree.groups = groups;
-    int begin = 0;
-    for (std::size_t b = 0; b < ends.shape(0); ++b) {
-        if (ends(b) <= begin || ends(b) > static_cast<std::int64_t>(n))
-            throw std::invalid_argument("the ends of blocks must increase up to the number of coordinates");
-        out.tree.blocks.push_back({begin, static_cast<int>(ends(b))});
-        begin = static_cast<int>(ends(b));
-    }
-    if (begin != static_cast<int>(n)) throw std::invalid_argument("the last block must end with the last coordinate");
-    for (std::size_t r = 0; r < loads.shape(0); ++r) {
-        if (loads(r) < 0 || loads(r) >= static_cast<std::int64_t>(bodies) || parent(loads(r)) < 0)
-            throw std::invalid_argument("the first body of a light part must have a parent");
-        LightPart part;
-        part.body = static_cast<int>(loads(r));
-        for (std::size_t c = 0; c < n; ++c) part.carried.push_back(carried(r, c) != 0);
-        out.tree.light_parts.push_back(part);
-    }
+    describe_links(out.tree, mass, center, inertia, origin);
+    take_coordinates(out.tree, group, groups, periodic);
+    take_blocks(out.tree, ends, static_cast<int>(n));
+    take_light_parts(out.tree, loads, carried);
     out.tree.armature = copied(armature);
     out.gravity = {gravity(0), gravity(1), gravity(2)};
-    std::vector<Element> elements;
-    for (const auto& [kind, coordinate, values] : forces) {
-        if (coordinate < 0 || coordinate >= static_cast<int>(n))
-            throw std::invalid_argument("an element's coordinate is out of range");
-        elements.push_back(element_of(kind, coordinate, values));
-    }
-    out.forces = Forces(elements);
-    std::vector<CoupledElement> between;
-    for (const auto& [kind, a, b, values] : couplings) {
-        if (std::min(a, b) < -1 || std::max(a, b) >= static_cast<int>(bodies) || std::max(a, b) < 0)
-            throw std::invalid_argument("a coupling's bodies are out of range");
-        between.push_back(coupling_of(kind, a, b, values));
-    }
-    out.couplings = Couplings(between, out.tree.bodies);
+    out.forces = forces_of(forces, static_cast<int>(n));
+    out.couplings = couplings_of(couplings, out.tree.bodies);
     out.constraints = constraints_of(constraints, out.tree.bodies, n);
     if (!custom.is_none()) out.couplings.take_outer(outer_force_of(std::move(custom), n));
     out.controls = static_cast<int>(m);
@@ -276,7 +301,7 @@ std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
         nb::gil_scoped_release release;
         Jet<double> w(mechanism.tree);
         for (std::size_t s = 0; s < rows; ++s) {
-            lagrangian_jet(mechanism, q.data() + s * n, v.data() + s * n, w);
+            momentum_slopes(mechanism, q.data() + s * n, v.data() + s * n, w);
             std::copy(w.M.begin(), w.M.end(), M + s * n * n);
             std::copy(w.A.begin(), w.A.end(), A + s * n * n);
         }
@@ -296,7 +321,7 @@ Out velocity_slopes(const Mechanism& mechanism, In<2> q, In<2> v) {
     Jet<double> w(mechanism.tree);
     const int size = mechanism.dof();
     for (std::size_t s = 0; s < rows; ++s) {
-        lagrangian_jet(mechanism, q.data() + s * n, v.data() + s * n, w);
+        momentum_slopes(mechanism, q.data() + s * n, v.data() + s * n, w);
         double* slope = slopes + s * 2 * n * n;
         for (std::size_t i = 0; i < n; ++i) {
             for (std::size_t j = 0; j < n; ++j) slope[i * 2 * n + j] = -w.A[i * n + j];

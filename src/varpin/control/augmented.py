@@ -63,7 +63,7 @@ _AIM = 1e-8
 
 
 def within_constraints(search: Callable[P, Solution]) -> Callable[P, Solution]:
-    """Extend ``search``, which solves problems without constraints, to problems with constraints.
+    """Extend ``search``, which solves problems without constraints, to problems with constraints, (P1).
 
     The signature stays: the first argument is the problem, and the others are options of each round.
     """

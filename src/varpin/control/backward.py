@@ -492,7 +492,7 @@ class Along:
         """The steps with the control in the state, where controls are linear between nodes."""
         problem, running = self.problem, self.running
         lin, velocity = self.linearized(0, problem.steps)
-        ramp = problem.integrator.ramps(problem.scene, self.trajectory) @ problem.scene.actuation
+        ramp = problem.integrator.ramps(problem.scene, self.trajectory) @ problem.scene.transmission
         found = Derivatives(lin.A, lin.B - ramp, ramp, velocity)
         return linear_steps(problem, found, running.gradient, running.hessian, self.rate, self.pull)
 

@@ -12,6 +12,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.costs import Expansion
 from varpin.control.problem import OptimalControlProblem
+from varpin.core import stake_of
 from varpin.trajectory import Trajectory
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -80,9 +81,8 @@ def at_stake(problem: OptimalControlProblem, trajectory: Trajectory, model: Mode
     for factor, expansion, z in ((weight, model.running, along), (1.0, model.terminal, end)):
         change = z.copy()
         change[:, : len(start)] -= start
-        could, does = _falls(expansion), np.maximum(0.5 * _forms(expansion.hessian, change), 0.0)
-        free += factor * float(could.sum())
-        moved += factor * float(np.minimum(could, does).sum())
+        could, does = stake_of(expansion.gradient, expansion.hessian, change)
+        free, moved = free + factor * could, moved + factor * does
     if problem.rate is not None:
         rate = float(problem.rate.value(problem.decided(trajectory), problem.period))
         free, moved = free + rate, moved + rate
@@ -93,25 +93,3 @@ def _variables(problem: OptimalControlProblem, trajectory: Trajectory) -> tuple[
     """(q, v, u) at the samples of a motion, and (q, v) at its end."""
     along = np.concatenate(problem.model_samples(trajectory.q, trajectory.v, problem.control_rows(trajectory)), axis=1)
     return along, np.concatenate([trajectory.q[-1:], trajectory.v[-1:]], axis=1)
-
-
-def _forms(hessian: Floats, z: Floats) -> Floats:
-    """The quadratic form z' H z at each point."""
-    product = z @ hessian[0] if len(hessian) == 1 else (hessian @ z[:, :, None])[:, :, 0]
-    total: Floats = (product * z).sum(axis=1)
-    return total
-
-
-def _falls(expansion: Expansion) -> Floats:
-    """Decrease of each point's quadratic model along its steepest descent, scaled by the diagonal of its Hessian.
-
-    It is the total decrease where no variables are coupled, and infinite where the model is unbounded below.
-    """
-    gradient, hessian = expansion.gradient, expansion.hessian
-    diagonal = np.diagonal(hessian, axis1=1, axis2=2)
-    curved = diagonal > 0.0
-    step = np.where(curved, gradient / np.where(curved, diagonal, 1.0), 0.0)
-    slope, curvature = (gradient * step).sum(axis=1), _forms(hessian, step)
-    endless = ((gradient != 0.0) & ~curved).any(axis=1) | ((slope > 0.0) & (curvature <= 0.0))
-    fall: Floats = np.where(slope > 0.0, 0.5 * slope**2 / np.where(curvature > 0.0, curvature, 1.0), 0.0)
-    return np.where(endless, np.inf, fall)

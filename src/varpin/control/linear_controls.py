@@ -46,7 +46,7 @@ def size(problem: OptimalControlProblem) -> int:
 def linear_steps(
     problem: OptimalControlProblem, found: Derivatives, gradient: Floats, hessian: Floats, rate: Floats, pull: Floats
 ) -> LinearSteps:
-    """The steps of a plan with linear controls.
+    """The steps of a plan with linear controls, (O11).
 
     Args:
         problem: The problem.

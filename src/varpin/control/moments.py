@@ -42,7 +42,7 @@ def noise_gradient(
     rate: Floats,
     processes: NDArray[np.bool_],
 ) -> Floats:
-    """The gradient (N, 2n + m) of the noise cost in the state and the control at the beginning of each step.
+    """The gradient (N, 2n + m) of the noise cost in the state and the control at the beginning of each step, (O12).
 
     It leaves out the part through the strength of the noise, which the backward pass already has.
 

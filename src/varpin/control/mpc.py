@@ -315,9 +315,11 @@ class Mpc:
                 f"the plant has servos on {', '.join(plant.scene.servo_joints) or 'no joints'}; the problem on "
                 f"{', '.join(problem.scene.servo_joints) or 'no joints'}"
             )
-        if _linear_inputs(plant.scene) != _linear_inputs(problem.scene):
-            inputs = (", ".join(_linear_inputs(scene)) or "no joints" for scene in (plant.scene, problem.scene))
-            raise InputError("the plant has linear KinematicInputs on {}; the problem on {}".format(*inputs))
+        for kind in ("linear", "cubic"):
+            inputs = [_inputs(scene, cubic=kind == "cubic") for scene in (plant.scene, problem.scene)]
+            if inputs[0] != inputs[1]:
+                told = (", ".join(names) or "no joints" for names in inputs)
+                raise InputError(f"the plant has {kind} KinematicInputs on {next(told)}; the problem on {next(told)}")
         ticks = max(1, round(positive("duration", duration, "s") / self.period))
         dt = self.period / plant.substeps
         generator = None if rng is None else np.random.default_rng(rng)
@@ -488,11 +490,10 @@ def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integr
     return integrator_along(scene, chosen, plan.q, plan.v, plan.u, dt)
 
 
-def _linear_inputs(scene: Scene) -> tuple[str, ...]:
-    """Names of the joints with linear kinematic inputs."""
-    return tuple(
-        scene.robot.joint_names[c] for c, rate in zip(scene.inputs.values(), scene.rates, strict=True) if rate < 0
-    )
+def _inputs(scene: Scene, *, cubic: bool) -> tuple[str, ...]:
+    """Names of the joints with linear, or with cubic, kinematic inputs."""
+    inputs = zip(scene.inputs.values(), scene.rates, strict=True)
+    return tuple(scene.robot.joint_names[c] for c, rate in inputs if (rate >= 0) == cubic)
 
 
 def _simulated(
@@ -506,7 +507,7 @@ def _simulated(
     before: Sequence[Trajectory],
 ) -> Trajectory:
     """The plant's motion in one tick; a failure holds the motion ``before``, too."""
-    # Joints with kinematic inputs move linearly to their next positions over the tick.
+    # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
     controls = in_parts_of_steps(plant.scene, u[None], q[None], v[None], dt * plant.substeps, plant.substeps)
     options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": controls, "integrator": method}
     options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}

@@ -26,7 +26,7 @@ _PASSES = 60
 
 @dataclass(frozen=True, eq=False)
 class Penalty(Frozen):
-    """The penalty (weight / 2) sum s^2 of one constraint, s = c + backoff + multipliers / weight.
+    """The penalty (weight / 2) sum s^2 of one constraint, (P2), with s = c + backoff + multipliers / weight.
 
     For c <= 0, negative s costs nothing. The penalty differs from the usual form of the augmented Lagrangian by the
     constant multipliers^2 / (2 weight), and is never negative.

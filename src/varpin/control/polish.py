@@ -89,7 +89,7 @@ def _corrected(
     values: list[Floats],
     active: list[Mask],
 ) -> Commands:
-    """Commands with the least change of the controls that moves active rows onto their bounds, to first order."""
+    """Commands with the least change of the controls that moves active rows onto their bounds, to first order, (P4)."""
     R, m = problem.decisions, problem.scene.controls
     u = motion.u[:: problem.hold]
     lower, upper = problem.control_limits

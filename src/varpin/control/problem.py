@@ -69,8 +69,9 @@ _STIFF = 200.0
 class OptimalControlProblem(Frozen):
     """Minimize the expected cost of a motion from (q0, v0) over the controls, each held over ``hold`` steps.
 
-    With ``controls="linear"`` they are linear in time between the nodes, with one decision at each node, the first one
-    included. Smooth motions then need a fraction of the nodes. Limits hold at the nodes, and so everywhere.
+    The expected cost is (O1). With ``controls="linear"`` they are linear in time between the nodes, with one decision
+    at each node, the first one included. Smooth motions then need a fraction of the nodes. Limits hold at the nodes,
+    and so everywhere.
 
     Running costs are integrals in time, sampled in each step, and references are functions of time, so the problem is
     the same at every ``dt``. Controls stay within their limits, feedback included. Costs add up, and numbers scale
@@ -103,7 +104,8 @@ class OptimalControlProblem(Frozen):
         integrator: Any of varpin's. If left out, ``Gauss(stages=4)``; ``Radau(stages=4)`` where dry friction or dampers
             are more than 200 times as fast as the step at ``q0`` and rest, and the scene has no constraints.
         sampling: Where in each step running costs are sampled. ``"gauss"``, the default: at its two Gauss points, with
-            a cubic motion between the nodes, of fourth order. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of
+            a cubic motion between the nodes, of fourth order; at four points where a :class:`varpin.KinematicInput` is
+            cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of
             second order; it is blind to velocities that alternate from node to node, as optimal ones often do.
             ``"start"``: at the step's first node, a left sum as in the paper, of first order.
         hold: Steps that share one control: a digital controller's period over the integrator's step.
@@ -164,7 +166,8 @@ class OptimalControlProblem(Frozen):
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or a lower limit above the upper one; linear controls
                 with ``hold``, in a scene with noise or with constraints; ``hold`` or linear controls with a
-                :class:`KinematicInput`, or a cubic one; constraints that are no plan constraints or of another robot.
+                :class:`KinematicInput`; another ``sampling`` than "gauss" with a cubic one; constraints that are no
+                plan constraints or of another robot.
             CostError: A reference function fails.
             AssemblyError: The scene's constraints cannot be satisfied near q0.
         """
@@ -181,12 +184,13 @@ class OptimalControlProblem(Frozen):
         if scene.inputs and (hold != 1 or controls == "linear"):
             raise InputError(
                 "the control of a KinematicInput is its joint's position at the next node: leave hold and "
-                "controls='linear' out; the joint moves linearly between nodes"
+                "controls='linear' out; the joint moves linearly, or on a cubic, between nodes"
             )
-        if max(scene.rates, default=-1) >= 0:
+        cubic = max(scene.rates, default=-1) >= 0
+        if cubic and sampling != "gauss":
             raise InputError(
-                "plans take no cubic KinematicInput: costs sampled within a step miss the effect of its velocities at "
-                "the nodes; plan with interpolation='linear', and keep it smooth by a ControlRateCost"
+                f"costs sampled by the rule {sampling!r} do not see the velocities of a cubic KinematicInput at the "
+                "nodes: leave sampling out, for 'gauss'"
             )
         if controls == "linear" and hold != 1:
             raise InputError(f"linear controls change at every node: leave hold = {hold} out, or take controls='held'")
@@ -196,7 +200,7 @@ class OptimalControlProblem(Frozen):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
         if m == 0:
             raise InputError("the scene has no controls, so there is nothing to optimize")
-        places, rule = _rule(sampling, dt)
+        places, rule = _rule(sampling, dt, cubic=cubic)
         times = _times(places, steps, dt)
         t0 = real("t0", t0)
         points = Points(
@@ -362,7 +366,7 @@ class OptimalControlProblem(Frozen):
             changed["rate"] = control_rate(changed["cost"], scene.controls, scene.control_joints)
         if t0 is not None and real("t0", t0) != self.t0:
             changed["t0"] = t0 = real("t0", t0)
-            times = t0 + _times(_rule(self.sampling, self.dt)[0], self.steps, self.dt)
+            times = t0 + _times(self.places, self.steps, self.dt)
             points = replace(self.running.points, t=times, t0=t0)
             changed["running"], changed["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))
         if self.constraints and ("constraints" in changed or "t0" in changed):
@@ -616,7 +620,7 @@ class OptimalControlProblem(Frozen):
     @property
     def places(self) -> Floats:
         """Sample points of running costs in a step of unit length (s,)."""
-        return _rule(self.sampling, self.dt)[0]
+        return _rule(self.sampling, self.dt, cubic=max(self.scene.rates, default=-1) >= 0)[0]
 
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
@@ -684,21 +688,27 @@ def _bind_constraints(
     return tuple(item.bind(horizon) for item in constraints)
 
 
-def _rule(sampling: str, dt: float) -> tuple[Floats, Floats]:
+def _rule(sampling: str, dt: float, *, cubic: bool) -> tuple[Floats, Floats]:
     """Sample points in a step of unit length (s,), and the coefficients of the samples (s, 9).
 
-    A row has the weight, then the coefficients of (q0, v0, q1, v1) for q, then those for v.
+    A row has the weight, the same for all samples, then the coefficients of (q0, v0, q1, v1) for q, then those for v.
+    With ``cubic`` inputs, whose velocities at the nodes are controls, "gauss" means four points, exact to degree five:
+    velocities may change while they stay the same at Gauss's two points.
     """
     if sampling == "start":
         return np.zeros(1), np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     if sampling == "midpoint":
         return np.array([0.5]), np.array([[1.0, 0.5, 0.0, 0.5, 0.0, -1.0 / dt, 0.0, 1.0 / dt, 0.0]])
     places = 0.5 + np.array([-1.0, 1.0]) * np.sqrt(3.0) / 6.0
+    if cubic:
+        # Chebyshev's rule of equal weights.
+        inner, outer = np.sqrt((1.0 + np.array([-2.0, 2.0]) / np.sqrt(5.0)) / 3.0)
+        places = 0.5 + 0.5 * np.array([-outer, -inner, inner, outer])
     rows = []
     for s in places:
         position = [(1 + 2 * s) * (1 - s) ** 2, dt * s * (1 - s) ** 2, s**2 * (3 - 2 * s), dt * s**2 * (s - 1)]
         slope = 6 * s * (1 - s) / dt
-        rows.append([0.5, *position, -slope, (1 - s) * (1 - 3 * s), slope, s * (3 * s - 2)])
+        rows.append([1.0 / len(places), *position, -slope, (1 - s) * (1 - 3 * s), slope, s * (3 * s - 2)])
     return places, np.array(rows)
 
 

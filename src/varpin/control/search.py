@@ -12,7 +12,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -450,6 +450,15 @@ class _Bounds:
     watched: bool
 
 
+class _Here(NamedTuple):
+    """What all trials of a line search start from."""
+
+    controls: Floats  # of the decisions (R, m)
+    feedback: Commands  # without the feed-forward part
+    added: Floats  # noise cost of each step
+    total: float  # the expected cost
+
+
 @dataclass(frozen=True, eq=False)
 class _Trial:
     """A trial of the line search.
@@ -839,13 +848,18 @@ class _Search:
             return _Step(0.0, 0, 0.0, 0.0)
         added = noise_shares(self.problem, self.trajectory, self.plan)
         taken, length, tried, trials = _Trial(), 0.0, None, 0
-        feedback = self._feedback(self.plan)
+        here = _Here(
+            self.problem.decided(self.trajectory),
+            self._feedback(self.plan),
+            added,
+            float(self.shares.sum() + added.sum()),
+        )
         left: Sequence[float] = _lengths(self.backtracking)
         for bounds in self._bounds():
             cut = []
             for step in left:
                 trials += 1
-                trial = self._try(step, feedback, added, bounds)
+                trial = self._try(step, self.plan, here, bounds)
                 if trial.expected <= self.armijo * step * self.plan.slope and trial.expected < taken.expected:
                     taken, length = trial, step
                     if trial.expected <= _POOR * step * self.plan.slope:
@@ -883,25 +897,23 @@ class _Search:
             yield _Bounds(_cut_less(integrator, halvings), parts, watched=halvings > _HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
-    def _try(self, step: float, feedback: Commands, added: Floats, bounds: _Bounds) -> _Trial:
+    def _try(self, step: float, plan: Plan, here: _Here, bounds: _Bounds) -> _Trial:
         """A trial of length ``step`` along the plan, stopped early where its substeps or its cost exceed bounds."""
-        problem, plan = self.problem, self.plan
-        if plan is None:
-            return _Trial()
+        problem = self.problem
         # Where the rest of the cost and the noise cost cannot be negative, a partial sum bounds the total from below.
         bounded = problem.cost.nonnegative and not (self.exact and problem.processes)
-        most = float(self.shares.sum() + added.sum()) + self.armijo * step * plan.slope if bounded else np.inf
+        most = here.total + self.armijo * step * plan.slope if bounded else np.inf
         parts = np.inf
         if bounds.parts < np.inf and (bounds.watched or step < 1.0):
             # Explicit methods have no substeps.
             parts = bounds.parts * max(1, int(self.trajectory.statistics.substeps[: self.trials.third].sum()))
-        u = problem.decided(self.trajectory) + step * plan.feedforward
+        u = here.controls + step * plan.feedforward
         if problem.limited:
             u = _onto_limits(u, problem.control_limits)
-        commands = feedback._replace(u=u)
+        commands = here.feedback._replace(u=u)
         if problem.linear:
             # The first control has no feedback: its state is given.
-            commands = feedback._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
+            commands = here.feedback._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
         try:
             attempt = self.trials.attempt(
                 commands, integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
@@ -911,15 +923,18 @@ class _Search:
                 few = attempt.failure is not None and bounds.integrator != problem.integrator
                 return _Trial(cut=few or attempt.verdict is Watch.Verdict.cut)
             there = attempt.shares()
-            noise = noise_shares(problem, attempt.trajectory(), plan) if problem.processes else added
-            more = self._noise_beyond(attempt.trajectory(), plan) if self.whole else 0.0
+            noise = more = 0.0
+            if problem.processes:
+                noise = float((noise_shares(problem, attempt.trajectory(), plan) - here.added).sum())
+            if self.whole:
+                more = self._noise_beyond(attempt.trajectory(), plan)
         except _TRIAL_ERRORS as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
         if not np.isfinite(there).all():
             return _Trial()
         cost = float((there - self.shares).sum())
-        return _Trial(attempt, there, cost, cost + float((noise - added).sum()) + more)
+        return _Trial(attempt, there, cost, cost + noise + more)
 
     def _noise_beyond(self, trial: Trajectory, plan: Plan) -> float:
         """Noise cost along a trial with the value function there, minus that with the current plan's."""

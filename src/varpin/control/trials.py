@@ -56,9 +56,19 @@ class Attempt:
     def trajectory(self) -> Trajectory:
         """The motion up to where it ended."""
         trials, done = self.trials, int(self.written.done[0])
+        scene, known = trials.problem.scene, trials.whole
+        statistics = statistics_of(self.written, 0, done, self.halvings)
+        if known is not None and self.whole and self.line is None:
+            # Checked once: all whole motions of a problem have the same shapes.
+            q, v, p, energy = self.nodes
+            changed = {"q": q, "v": v, "p": p, "energy": energy, "u": self.u}
+            if scene.constraints:
+                changed["constraint_forces"] = self.impulses / trials.problem.dt
+            for array in (*changed.values(), *vars(statistics).values()):
+                array.setflags(write=False)
+            return known.changed(**changed, statistics=statistics)
         q, v, p, energy = (nodes[: done + 1] for nodes in self.nodes)
-        scene = trials.problem.scene
-        return Trajectory(
+        made = Trajectory(
             t=trials.times[: done + 1],
             q=q,
             v=v,
@@ -71,17 +81,25 @@ class Attempt:
             integrator=trials.text,
             robot=scene.robot.name,
             joint_names=scene.robot.joint_names,
-            statistics=statistics_of(self.written, 0, done, self.halvings),
+            statistics=statistics,
             scene_values=scene.values,
             u_stages=np.zeros((done, 0, scene.controls)) if self.line is None else self.line.stages[:done],
             u_nodes=np.zeros((done + 1, 0)) if self.line is None else self.line.nodes[: done + 1],
             constraint_forces=self.impulses[:done] / trials.problem.dt,
             constraint_labels=scene.constraint_labels,
         )
+        if self.whole and self.line is None:
+            trials.whole = made
+        return made
 
 
 class Trials:
-    """Motions of a problem without noise, under commands of any kind; they share their work arrays."""
+    """Motions of a problem without noise, under commands of any kind.
+
+    Attributes:
+        times: Times of the nodes (N + 1,) [s].
+        whole: The first of them that reached the end, under held controls; later ones share what does not change.
+    """
 
     def __init__(self, problem: OptimalControlProblem) -> None:
         self.problem = problem
@@ -91,6 +109,7 @@ class Trials:
         self.silence = np.zeros((problem.steps, scene.processes))
         self.masses = scene.robot.tree.mass.copy()
         self.text = str(problem.integrator)
+        self.whole: Trajectory | None = None
         self._weight = problem.dt * float(problem.rule[0, 0])
         # Early on, the cost so far is a poor bound.
         self._third = problem.decisions // 3 * problem.hold or problem.steps + 1

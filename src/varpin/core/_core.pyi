@@ -629,3 +629,9 @@ def expand_changes(weight: Floats, before: Floats, u: Floats) -> tuple[Floats, F
 
 def sample_steps(rule: Floats, q: Floats, v: Floats) -> tuple[Floats, Floats]:
     """Samples (P, N s, n) of q and v from their nodes (P, N + 1, n), by a rule (s, 9)."""
+
+def stake_of(gradient: Floats, hessian: Floats, displacement: Floats) -> tuple[float, float]:
+    """Free and moved stake, equation (O9), of models with gradients (N, k) and Hessians (N or 1, k, k).
+
+    The second is bounded by each model's change over its ``displacement`` (N, k).
+    """

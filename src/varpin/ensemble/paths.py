@@ -19,6 +19,7 @@ from varpin.errors import VarpinError
 from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import Failure, rows
 from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.inputs import as_moved
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import Children
 from varpin.simulation.record import located
@@ -293,7 +294,13 @@ class _Chunk:
                 # The control of the step to node k is in row k - 1.
                 row = first - 1 if name == "u" else first
                 if row >= 0:
-                    array[i, row : row + k] = getattr(segment, name)[:k]
+                    array[i, row : row + k] = self._controls(segment, k) if name == "u" else getattr(segment, name)[:k]
+
+    def _controls(self, segment: Segment, steps: int) -> Floats:
+        """The controls of a segment (steps, m); those of kinematic inputs are their positions at the ends of steps."""
+        scene, u = self.shared.scene, segment.u[:steps]
+        moving = scene.inputs and self.shared.commands.hold > 1
+        return as_moved(scene, segment.q[:steps], segment.v[:steps], u) if moving else u
 
     def _reduce(self, first: int, done: Integers) -> None:
         """Add the block to the statistics. It begins at node ``first`` and has ``done[i]`` nodes of path i."""

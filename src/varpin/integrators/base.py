@@ -334,7 +334,8 @@ def check_functions(scene: Scene, q0: Floats, v0: Floats) -> None:
 def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
     """Diffusion fields F (n, k) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
 
-    The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N]; it is zero if no field depends on the velocity.
+    The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N], equation (N1) and (1.3) of the paper; it is zero if no field
+    depends on the velocity.
     """
     diffusion = scene.noise.fields(q[None], v[None], u[None], start)
     F = diffusion.F[0]

@@ -22,8 +22,8 @@ from varpin.support.checks import fraction
 def largest_step(M: Floats, Lqq: Floats, margin: float) -> float:
     """The largest dt [s] of steps that the branch guard accepts with alpha = 1/2 near a state with these M and L_qq.
 
-    At this dt, M - dt^2 / (4 (1 - margin)) L_qq ceases to be positive definite. It is infinite if no direction is
-    unstable. It is no measure of accuracy.
+    Equation (G2). At this dt, M - dt^2 / (4 (1 - margin)) L_qq ceases to be positive definite. It is infinite if no
+    direction is unstable. It is no measure of accuracy.
     """
     rates = scipy.linalg.eigh(Lqq, M, eigvals_only=True)
     # Zero curvature gives tiny eigenvalues of either sign by rounding.

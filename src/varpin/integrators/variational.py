@@ -195,7 +195,7 @@ class Variational(Integrator):
         Without noise the steps are the same, and there is nothing to check. Otherwise the steps differ by the noise
         impulses, and their roots must lie on the branch that is connected to dt -> 0.
         """
-        if self.guard is None or not trajectory.dw.any():
+        if self.guard is None or not trajectory.noisy:
             return _core_guards(None)
         return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
 
@@ -433,9 +433,9 @@ class Variational(Integrator):
         With noise that step starts from another momentum, so the guess is the velocity at its start.
         """
         q, v, c = trajectory.q, trajectory.v, self._times()[None, :, None]
-        if trajectory.dw.any():
+        if trajectory.noisy:
             return v[:-1, None] + np.zeros_like(c)
-        mean = (np.diff(q, axis=0) / trajectory.dt)[:, None]
+        mean = ((q[1:] - q[:-1]) / trajectory.dt)[:, None]
         if c.size == 1:
             return mean  # the exact root for one stage
         guess: Floats = (

@@ -271,8 +271,9 @@ class JointTie(Constraint):
 class KinematicInput(Constraint):
     """A joint with a prescribed motion: its control is its position at the end of each step, and its force results.
 
-    Row k of the controls holds the joint's position [rad or m] at node k + 1, in place of a force. The joint needs a
-    control of its own: a column of the actuation with a 1, as in the default actuation.
+    Row k of the controls holds the joint's position [rad or m] at node k + 1, in place of a force. A function of time
+    returns the position at that time, a control law the position at the end of its period. The joint needs a control of
+    its own: a column of the actuation with a 1, as in the default actuation.
     ``Trajectory.constraint_forces`` holds the mean force on the joint over each step [N m or N].
 
     Attributes:

@@ -1,10 +1,11 @@
-"""Controls of kinematic inputs for divided steps."""
+"""Controls of kinematic inputs: for divided steps, and as they are recorded."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.core.arrays import Commands
 from varpin.mechanics.scene import Scene
 
 
@@ -46,3 +47,33 @@ def held_in_parts(scene: Scene, u: Floats, q0: Floats, v0: Floats, dt: float, pa
         if rate >= 0:
             v[1:, c] = u[:-1, rate]
     return in_parts_of_steps(scene, u, q, v, dt, parts)
+
+
+def prescribing(scene: Scene, commands: Commands, ends: Floats) -> Commands:
+    """Commands that bring the scene's kinematic inputs to the controls ``ends`` (N, m) at the ends of N steps.
+
+    All other controls stay as they are. Inputs have the same control at all stages of a step.
+    """
+    own = scene.prescribed
+    if not len(own):
+        return commands
+    u = commands.u.copy()
+    u[:, own] = ends[:, own]
+    within = commands.within
+    if len(within):
+        within = within.copy()
+        within[:, :, own] = ends[:, None, own]
+    return commands._replace(u=u, within=within)
+
+
+def as_moved(scene: Scene, q: Floats, v: Floats, u: Floats) -> Floats:
+    """Controls u (..., m) with those of kinematic inputs replaced by where these are, q and v (..., n).
+
+    Where a decision takes several steps, an input is on its way at the end of most of them.
+    """
+    u = u.copy()
+    for c, rate in zip(scene.inputs.values(), scene.rates, strict=True):
+        u[..., int(np.argmax(scene.actuation[c]))] = q[..., c]
+        if rate >= 0:
+            u[..., rate] = v[..., c]
+    return u

@@ -47,7 +47,7 @@ class LagrangianJet:
 def lagrangian_jet(
     scene: Scene, q: JointValues, v: JointValues, *, backend: Literal["compiled", "pinocchio"] = "compiled"
 ) -> LagrangianJet:
-    """L and all its derivatives up to second order; gravity, springs and armature of the scene included.
+    """L, (J1), and all its derivatives up to second order, (J2); with gravity, springs and armature of the scene.
 
     Args:
         scene: The scene.
@@ -213,7 +213,7 @@ class DiscreteLagrangian:
 def discrete_lagrangian(
     scene: Scene, q0: JointValues, q1: JointValues, dt: float, *, alpha: float = 0.5
 ) -> DiscreteLagrangian:
-    """L_d(q0, q1) = dt L((1 - alpha) q0 + alpha q1, (q1 - q0) / dt) and its slot derivatives.
+    """L_d(q0, q1) = dt L((1 - alpha) q0 + alpha q1, (q1 - q0) / dt), (D1), and its slot derivatives, (D2).
 
     The generalized midpoint rule (Marsden and West 2001, Johnson and Murphey 2009), without friction and controls.
 

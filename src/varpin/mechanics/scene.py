@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism as Core
 from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
@@ -121,7 +121,7 @@ class Bounds(NamedTuple):
 
 @dataclass(frozen=True, eq=False, init=False)
 class Scene(Frozen):
-    """A robot with gravity, forces, actuation, noise and constraints.
+    """A robot with gravity, forces, actuation, noise and constraints; its equation of motion is (1.1) of the paper.
 
     Attributes:
         robot: The robot.
@@ -365,12 +365,23 @@ class Scene(Frozen):
         return tuple(tie.rate for tie in self.bound_constraints.rows.ties if tie.follower == tie.leader)
 
     @cached_property
+    def prescribed(self) -> Integers:
+        """The controls that are positions, and velocities, of kinematic inputs at the ends of steps."""
+        positions = [int(np.argmax(self.actuation[c])) for c in self.inputs.values()]
+        return np.array([*positions, *(rate for rate in self.rates if rate >= 0)], dtype=np.int64)
+
+    @cached_property
     def transmission(self) -> Floats:
         """Matrix from controls (m,) to the inputs of linearized steps: forces (n,), then velocities of cubic inputs."""
         rates = [rate for rate in self.rates if rate >= 0]
         if not rates:
             return self.actuation
         return np.vstack([self.actuation, np.eye(self.controls)[rates]])
+
+    @cached_property
+    def direct(self) -> bool:
+        """Whether each control is the input of a linearized step: :attr:`transmission` is the identity."""
+        return np.array_equal(self.transmission, np.eye(len(self.transmission)))
 
     @property
     def _gear(self) -> Floats:
@@ -662,8 +673,8 @@ def refuse_inputs(scene: Scene, what: str) -> None:
     if scene.inputs:
         names = ", ".join(scene.robot.joint_names[c] for c in scene.inputs.values())
         raise InputError(
-            f"{what} does not take scenes with a KinematicInput, and this one has them for {names}: simulate and "
-            "simulate_ensemble do with controls that are rows (N, m) or a plan's policy, and OptimalControlProblem does"
+            f"{what} does not take scenes with a KinematicInput, and this one has them for {names}: simulate, "
+            "simulate_ensemble and OptimalControlProblem do"
         )
 
 

@@ -101,6 +101,10 @@ class Window:
         judged = np.where(whole, (2 * span + 2) // 3, span)
         return cls(step, span, whole, judged, np.abs(np.diff(v, axis=0)).cumsum(axis=0))
 
+    def units(self, scene: Scene, trajectory: Trajectory, inertia: Floats) -> Floats:
+        """Units of the errors of q and v here (2, n)."""
+        return np.array(_units(scene, trajectory, self.step, self.span, self.whole, inertia))
+
     def error(
         self, scene: Scene, trajectory: Trajectory, inertia: Floats, off: tuple[Floats, Floats], *, cut: bool
     ) -> MotionError:

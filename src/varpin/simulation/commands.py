@@ -12,8 +12,9 @@ from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_loop, rows
 from varpin.integrators.within import Times, changing
+from varpin.mechanics.inputs import in_parts_of_steps, prescribing
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, refuse_inputs
+from varpin.mechanics.scene import Scene
 from varpin.simulation.functions import ControlLaw, decision, evaluated, sampled
 from varpin.simulation.record import Record, next_command
 from varpin.support.checks import JointValues, as_floats, control_array, require_finite
@@ -33,10 +34,6 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
             the controls are a control law.
         ControlError: The function of an OpenLoop failed; the error holds no trajectory.
     """
-    if isinstance(controls, OpenLoop | FirstOrderHold):
-        refuse_inputs(scene, f"a {type(controls).__name__}")
-    if isinstance(controls, LinearPolicy) and controls.hold != 1:
-        refuse_inputs(scene, "a LinearPolicy that holds its controls over several steps")
     if isinstance(controls, LinearPolicy):
         if controls.joints is not None and controls.joints != scene.control_joints:
             raise InputError(
@@ -64,7 +61,7 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
                 f"FirstOrderHold: u must have shape {(steps + 1, scene.controls)}, a row for each node of the motion, "
                 f"got {controls.u.shape}"
             )
-        return _on_lines(controls.u, integrator.stage_times)
+        return prescribing(scene, _on_lines(controls.u, integrator.stage_times), controls.u[1:])
     if callable(controls):
         raise InputError(
             "controls must be rows, a varpin.LinearPolicy, a varpin.OpenLoop or a varpin.FirstOrderHold here; only "
@@ -135,6 +132,11 @@ def next_block(controls: Controls | ControlLaw, commands: Commands, record: Reco
     if callable(controls):
         decides = record.steps % commands.hold == 0
         u = decision(controls, record) if decides else record.last.u[-1:]
+        if record.scene.inputs:
+            # All steps of the period: a kinematic input is on its way over them.
+            state = record.last.q[-1:], record.last.v[-1:]
+            u = in_parts_of_steps(record.scene, u, *state, commands.hold * record.dt, commands.hold)
+            return open_loop(u[:left])
         return open_loop(u)._replace(hold=min(1 if most == 1 else commands.hold, left))
     if isinstance(controls, OpenLoop):
         return sampled(controls, record, min(most, left))

@@ -15,7 +15,8 @@ from varpin.errors import InputError, UnknownJoint
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_loop
 from varpin.integrators.within import changing
-from varpin.mechanics.policy import OpenLoop
+from varpin.mechanics.inputs import as_moved, prescribing
+from varpin.mechanics.policy import FirstOrderHold, OpenLoop
 from varpin.mechanics.scene import Scene
 from varpin.simulation.failures import ControlError
 from varpin.simulation.record import Record
@@ -27,6 +28,8 @@ ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Number of steps in which the mean of a function of time is compared with that of two half steps, and the largest
 # difference without a warning, as a share of the mean.
 _COMPARED, _ALIKE = 16, 0.05
+# Distance of a kinematic input from its control at the start [rad or m, rad/s or m/s] without a warning.
+_ELSEWHERE = 1e-6
 # Name of a function of time in errors.
 _OF_TIME = "OpenLoop: f(t)"
 _OF_TIMES = "OpenLoop, vectorized=True: f(t) of times t (K,)"
@@ -77,7 +80,9 @@ def evaluated(
 ) -> Commands:
     """Controls that are a function of time at the stages of some steps, or in their middles for one-stage methods."""
     times, numbers = integrator.stage_times, np.array(steps, dtype=np.int64)
-    at = (numbers[:, None] + np.array(times or (0.5,))) * dt
+    # Kinematic inputs move to the values at the ends of steps.
+    places = (*(times or (0.5,)), *((1.0,) if scene.inputs else ()))
+    at = (numbers[:, None] + np.array(places)) * dt
     called = np.ones(at.shape, dtype=np.bool_)
     if times and times[0] == 0.0 and times[-1] == 1.0:
         # The first stage of a step is the last stage of the step before.
@@ -87,7 +92,8 @@ def evaluated(
     found[called] = values(controls.f, scene, at[called], np.repeat(numbers, called.sum(axis=1)), record)
     shared = np.flatnonzero(~called[:, 0])
     found[shared, 0] = found[shared - 1, -1]
-    return changing(found, times) if times else open_loop(found[:, 0])
+    ends, found = found[:, -1], found[:, : len(times) or 1]
+    return prescribing(scene, changing(found, times) if times else open_loop(found[:, 0]), ends)
 
 
 def _at_times(
@@ -161,7 +167,9 @@ def undersampled(
     except ControlError:
         return ()
     mean = 0.5 * (halves.u[::2] + halves.u[1::2])
-    total, off = (float(np.abs(part).sum()) for part in (mean, mean - trajectory.u[at]))
+    forces = np.setdiff1d(np.arange(scene.controls), scene.prescribed)
+    mean, taken = mean[:, forces], trajectory.u[at][:, forces]
+    total, off = (float(np.abs(part).sum()) for part in (mean, mean - taken))
     if not off > _ALIKE * total:
         return ()
     stages = f"{len(times)} stages of a step" if times else "middle of a step"
@@ -174,6 +182,26 @@ def undersampled(
             else f"the controls of OpenLoop change too fast for dt = {dt:g} s: half the step sees none of them",
         ),
     )
+
+
+def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floats, v0: Floats) -> tuple[Finding, ...]:
+    """A warning if a kinematic input's control at the first node differs from the motion's start (q0, v0)."""
+    if not scene.inputs:
+        return ()
+    if isinstance(controls, OpenLoop):
+        values = _at_all_times if controls.vectorized else _at_times
+        first = values(controls.f, scene, np.zeros(1), np.zeros(1, dtype=np.int64), None)[0]
+    else:
+        first = controls.u[0]
+    found = []
+    there = as_moved(scene, q0, v0, first)
+    for k in scene.prescribed[np.abs(there - first)[scene.prescribed] > _ELSEWHERE].tolist():
+        sentence = (
+            f"control {k}, of a KinematicInput, is {first[k]:.6g} at t = 0, and the motion begins with {there[k]:.6g}: "
+            "the joint makes up for the difference within the first step"
+        )
+        found.append(Finding("jump at the start", sentence))
+    return tuple(found)
 
 
 def _called(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from varpin.arrays import Floats
@@ -11,6 +13,7 @@ from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import Failure, join, lines, open_loop, rows, steps_of
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.inputs import as_moved
 from varpin.mechanics.scene import Scene
 from varpin.simulation.failures import ConstraintError, ForceError, StepError
 from varpin.trajectory import Trajectory
@@ -28,10 +31,20 @@ class Record:
     """
 
     def __init__(
-        self, scene: Scene, integrator: Integrator, dt: float, dw: Floats, first: Segment, line: Commands | None
+        self,
+        scene: Scene,
+        integrator: Integrator,
+        dt: float,
+        dw: Floats,
+        first: Segment,
+        line: Commands | None,
+        *,
+        held: bool = False,
     ) -> None:
         self.scene, self.integrator, self.dt, self.dw = scene, integrator, dt, dw
         self._line = line  # the commands of controls that are linear between nodes
+        # Whether controls of kinematic inputs are the goals of several steps; they are recorded step by step.
+        self._on_way = bool(scene.inputs) and (held or line is not None)
         self.steps, self.last = 0, first
         self._first = first
         self._joined: list[Segment] = []
@@ -57,7 +70,16 @@ class Record:
         dw = self.dw[: self.steps] if len(self.dw) else None
         within = np.concatenate(self._within) if self._within else None
         parts = [*self._joined, *self._parts]
-        return _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw, within, self._line)
+        made = _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw, within, self._line)
+        if not self._on_way:
+            return made
+        q, v, nodes = made.q, made.v, made.u_nodes
+        return replace(
+            made,
+            u=as_moved(self.scene, q[1:], v[1:], made.u),
+            u_stages=as_moved(self.scene, q[1:, None], v[1:, None], made.u_stages),
+            u_nodes=as_moved(self.scene, q, v, nodes) if nodes.shape[1] else nodes,
+        )
 
 
 def _trajectory(
@@ -133,9 +155,9 @@ def located(
     state, (first,) = integrator.start(scene, start[0][None], start[1][None])
     dw = np.zeros((0, scene.processes)) if increments is None else increments
     record = Record(scene, integrator, dt, dw, first, commands if len(commands.places) else None)
-    for _ in range(steps_of(commands)):
+    while record.steps < steps_of(commands):
         block = next_command(commands, record)
-        drawn = dw[None, record.steps : record.steps + 1] if len(dw) else dw[None, :0][:0]
+        drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
         try:
             (segment,) = integrator.rollout(scene, state, block, drawn, dt)
         except (CustomForceError, CustomConstraintError) as found:
@@ -148,8 +170,14 @@ def located(
 
 
 def next_command(commands: Commands, record: Record) -> Commands:
-    """The command of the next step alone: a new decision, or the last control while it is held."""
+    """The command of the next step alone: a new decision, or the last control while it is held.
+
+    In scenes with kinematic inputs it is that of all steps of a decision.
+    """
     decision, held = divmod(record.steps, commands.hold)
+    if commands.hold > 1 and record.scene.inputs:
+        # A kinematic input is on its way over all steps of a decision.
+        return rows(commands, decision, decision + 1)
     if held:
         return open_loop(record.last.u[-1:])
     before = record.last.u[None, -1] if record.steps else None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, RungeKutta4
 from varpin.integrators.base import open_loop
@@ -14,12 +14,17 @@ from varpin.integrators.collocation import MOST_STAGES
 from varpin.integrators.variational import Variational
 from varpin.integrators.within import Times, changing, in_parts
 from varpin.mechanics.assembly import along_constraints, nearest
-from varpin.mechanics.inputs import in_parts_of_steps
+from varpin.mechanics.inputs import in_parts_of_steps, prescribing
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
 # Number of steps of the first piece; each further piece doubles the number of all steps.
 _FIRST = 32
+# Each change of the length of a step begins the repetition anew, which takes as long as some steps. So of this many
+# steps in a row all have at least as many parts as any of them, up to the second number.
+_ALIKE, _FEW = 8, 4
+# Halvings by which parts are shorter than their number tells, at most.
+_UNEVEN = 2
 # Parts of a repeated step under constraints where dampers are faster than the step. With an odd number Gauss's factor
 # on modes that are far faster, 1 or -1, is that of one step.
 _DAMPED_PARTS = 7
@@ -71,11 +76,28 @@ def finer(
     return Finer(Gauss(max(2 if integrator.order <= 2 else 3, more), kick=kick), parts, 0.0)
 
 
-class Again:
-    """Repetition of ``count`` steps of a motion from node ``step`` on, each in ``parts``, under the same forces.
+def shortest_parts(trajectory: Trajectory) -> Integers:
+    """Number of equal parts (N,), a power of two, that are as short as the shortest part that guards made of each step.
 
-    ``times`` are the stage times of the motion's own integrator, at which the motion has its controls if they change
-    within steps. ``shift`` is added to q and v of the first node.
+    Guards divide a step where the motion is fast: as many equal parts would resolve it less well than the motion does.
+    Where a few parts are far shorter than the others, it is a multiple of their number.
+    """
+    substeps, halvings = trajectory.statistics.substeps, trajectory.statistics.halvings
+    parts = np.ones(trajectory.steps, dtype=np.int64)
+    if halvings.size:
+        split = substeps > 1
+        counts = substeps[split]
+        deepest = np.maximum.reduceat(halvings, np.cumsum(counts) - counts).astype(np.int64)
+        parts[split] = 1 << np.minimum(deepest, _UNEVEN + np.ceil(np.log2(counts)).astype(np.int64))
+    return parts
+
+
+class Again:
+    """Repetition of ``count`` steps of a motion from node ``step`` on under the same forces.
+
+    Each is divided into ``parts``: an integer, or (count,). ``times`` are the stage times of the motion's own
+    integrator, at which the motion has its controls if they change within steps. ``shift`` is added to q and v of the
+    first node.
 
     Attributes:
         q: Configurations at the nodes (count + 1, n), NaN where not known.
@@ -92,26 +114,56 @@ class Again:
         times: Times,
         step: int,
         count: int,
-        parts: int,
+        parts: int | Integers,
         shift: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self.q, self.v = np.full((2, count + 1, scene.robot.dof), np.nan)
         self.q[0], self.v[0] = trajectory.q[step] + shift[0], trajectory.v[step] + shift[1]
         self.done, self.ended = 0, count == 0
         self._scene, self._method, self._trajectory, self._step = scene, method, trajectory, step
-        self._count, self._parts, self._times = count, parts, times
+        self._count, self._times = count, times
+        self._parts = np.full(count, parts, dtype=np.int64)
+        for first in range(0, count, _ALIKE):
+            some = self._parts[first : first + _ALIKE]
+            some[:] = np.maximum(some, min(_FEW, some.max()))
         try:
             if scene.constraints and any(shift):
                 self.q[0] = nearest(scene, self.q[0])
                 self.v[0] = along_constraints(scene, self.q[0], self.v[0])
-            self._state, _ = method.start(scene, self.q[:1].copy(), self.v[:1].copy())
-        except (SingularMassMatrix, AssemblyError):
+        except AssemblyError:
             self.ended = True
+        self._start(0)
 
     def go_on(self, steps: int | None = None) -> None:
         """Repeat some more steps; if ``steps`` is left out, as many as there are already."""
-        scene, trajectory, method, parts, begin = self._scene, self._trajectory, self._method, self._parts, self.done
-        end = min(self._count, begin + (max(begin, _FIRST) if steps is None else steps))
+        end = min(self._count, self.done + (max(self.done, _FIRST) if steps is None else steps))
+        while not self.ended:
+            alike = self._parts[self.done : end] == self._parts[self.done]
+            last = end if alike.all() else self.done + int(alike.argmin())
+            self._repeat(last, int(self._parts[self.done]))
+            if self.done == end:
+                break
+
+    @property
+    def work(self) -> int:
+        """Number of steps taken for it, in parts."""
+        return int(self._parts[: self.done].sum())
+
+    def _start(self, node: int) -> None:
+        """Begin anew at a node."""
+        try:
+            self._state, _ = self._method.start(self._scene, self.q[[node]], self.v[[node]])
+        except (SingularMassMatrix, AssemblyError):
+            self.ended = True
+
+    def _repeat(self, end: int, parts: int) -> None:
+        """Repeat the steps up to one, each in so many parts."""
+        scene, trajectory, method, begin = self._scene, self._trajectory, self._method, self.done
+        if begin and parts != self._parts[begin - 1]:
+            # Guesses come from steps of the same length.
+            self._start(begin)
+            if self.ended:
+                return
         taken = slice(self._step + begin, self._step + end)
         drawn = scene.silence
         if trajectory.dw.any() and scene.noise.diffusion is not None:
@@ -127,7 +179,8 @@ class Again:
         commands = open_loop(in_parts_of_steps(scene, *given, trajectory.dt, parts))
         if trajectory.u_stages.shape[1]:
             at = method.stage_times
-            commands = changing(in_parts(trajectory.u_stages[taken], self._times, parts, at), at)
+            parted = changing(in_parts(trajectory.u_stages[taken], self._times, parts, at), at)
+            commands = prescribing(scene, parted, commands.u)
         no_drift = np.zeros((0, 0, scene.robot.dof))
         (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, no_drift, trajectory.dt / parts)
         done = len(segment.q) // parts
@@ -138,7 +191,13 @@ class Again:
 
 
 def taken_again(
-    scene: Scene, method: Integrator, trajectory: Trajectory, times: Times, step: int, count: int, parts: int
+    scene: Scene,
+    method: Integrator,
+    trajectory: Trajectory,
+    times: Times,
+    step: int,
+    count: int,
+    parts: int | Integers,
 ) -> tuple[Floats, Floats] | None:
     """Repeated steps: q and v at their nodes (count + 1, n). The arguments are those of :class:`Again`.
 

@@ -16,13 +16,13 @@ from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import Failure, open_loop, steps_of
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.policy import LinearPolicy, OpenLoop
-from varpin.mechanics.scene import Scene, refuse_inputs, require_scene
+from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
+from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
 from varpin.simulation.commands import Controls, commands_of, next_block
 from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, named
-from varpin.simulation.functions import ControlLaw, require_law, undersampled
+from varpin.simulation.functions import ControlLaw, begins_elsewhere, require_law, undersampled
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
 from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import Record, function_error
@@ -147,8 +147,6 @@ def simulate(
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)
     reporter = Reporter(progress, steps, dt)
     law = controls if callable(controls) else None
-    if callable(controls) or isinstance(controls, OpenLoop):
-        refuse_inputs(scene, "simulate with a function of time or a law")
     if law is not None:
         require_law(law)
     elif period != 1:
@@ -175,6 +173,8 @@ def simulate(
             trajectory, found = record.trajectory(), (Finding("check", sentence),)
         if check and isinstance(controls, OpenLoop):
             found = (*found, *undersampled(controls, scene, integrator, trajectory))
+        if check and isinstance(controls, OpenLoop | FirstOrderHold):
+            found = (*found, *begins_elsewhere(controls, scene, q0, v0))
         found = (*noise_forgotten(scene, rng, increments), *early, *found)
         trajectory = with_warnings(trajectory, found)
         if accuracy is not None:
@@ -221,7 +221,8 @@ def _integrated(
     if linear:
         # The loop's check is for held controls.
         hold = None
-    record = Record(scene, integrator, dt, task.dw, start, commands if linear else None)
+    held = commands.hold > 1 and not callable(controls)
+    record = Record(scene, integrator, dt, task.dw, start, commands if linear else None, held=held)
     # The cost of a sweep is linear in the number of joints, that of an elimination cubic.
     n = scene.robot.dof
     chunk = max(1, _CHUNK // (n + n**3 // 100))

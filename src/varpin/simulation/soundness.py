@@ -50,7 +50,7 @@ from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.simulation.phase import phase_lost
-from varpin.simulation.retaking import Again, Finer, finer, stopping, taken_again
+from varpin.simulation.retaking import Again, Finer, finer, shortest_parts, stopping, taken_again
 from varpin.simulation.saturation import bent
 from varpin.trajectory import Trajectory
 
@@ -720,22 +720,27 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         return None
     damped = bool(_fast_damping(scene, trajectory).rate)
     other = finer(integrator, trajectory, damped=damped, pulled=pulled, constrained=bool(scene.constraints))
+    # Where guards divided steps, the repeated ones are as short as their parts.
+    parts = other.parts * shortest_parts(trajectory)
     first = examined_nodes(scene, trajectory)
     inertia = inertias(scene, trajectory.q[first])
-    # Steps whose error is known to be small.
-    small = np.zeros(trajectory.steps, dtype=np.bool_)
+    # Steps whose error is known to be small, and how large it may be there in q and in v.
+    small, within = np.zeros(trajectory.steps, dtype=np.bool_), np.zeros((2, trajectory.q.shape[1]))
     left = LEAST_WORK + WORK * int(np.maximum(substeps, 1).sum())
     # Nodes near the first node of an examined window.
     seen = np.zeros(trajectory.steps + 1, dtype=np.bool_)
     worst = None
     for chosen in (first, between(trajectory.steps, first)):
         for step in chosen.tolist():
-            if seen[step] or (chosen is first and small[step:].all()):
+            if seen[step]:
                 continue
             window = Window.at(scene, trajectory, step)
             if chosen is first and small[step : step + int(window.judged.max())].all():
-                continue
-            estimate = _estimate(scene, integrator, trajectory, window, inertia, other, left)
+                # What is small beside a motion may be large beside what it calms down to.
+                units = window.units(scene, trajectory, inertia)
+                if (within < _SMALL * units).all():
+                    continue
+            estimate = _estimate(scene, integrator, trajectory, window, inertia, other, parts, left)
             if estimate is None:
                 continue
             near = min(_NEAR_BY, int(window.judged.max()) // 8)
@@ -747,6 +752,8 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
                 return worst
             if estimate.error.worst < _SMALL:
                 small[step : step + estimate.known] = True
+                units = window.units(scene, trajectory, inertia)
+                within = np.maximum(within, estimate.error.worst * units)
         if worst is None or worst.worst < _NEAR:
             break
     return worst
@@ -779,16 +786,19 @@ def _estimate(
     window: Window,
     inertia: Floats,
     other: Finer,
+    parts: Integers,
     most: int,
 ) -> _Estimate | None:
-    """The error in one window, by at most ``most`` steps; None where it cannot be estimated."""
+    """The error in one window, by at most ``most`` steps; None where it cannot be estimated.
+
+    ``parts`` (N,) are those in which each step of the motion is repeated.
+    """
     times = integrator.stage_times
     judged = int(window.judged.max())
-    taken = np.maximum(trajectory.statistics.substeps[window.step : window.step + judged], 1)
-    # Where guards divided steps, the repeated ones are as short as their parts.
-    parts = other.parts * int(2 ** np.ceil(np.log2(taken.mean())))
-    # Half of them, for the disturbed motion takes as many.
-    count = min(judged, max(1, most // (2 * parts)))
+    # Half of the steps, for the disturbed motion takes as many.
+    affordable = int(np.searchsorted(np.cumsum(parts[window.step : window.step + judged]), most // 2, side="right"))
+    count = min(judged, max(1, affordable))
+    parts = parts[window.step : window.step + count]
     q, v = (values[window.step : window.step + count + 1] for values in (trajectory.q, trajectory.v))
     if scene.noise.diffusion is None and trajectory.dw.any():
         # Noise in Python is left out of both motions.
@@ -801,7 +811,7 @@ def _estimate(
     # A motion that is far off is wrong or unpredictable: the repetition ends.
     while not again.ended and np.abs(again.q[again.done] - q[again.done]).max() <= far:
         again.go_on()
-    known, work = again.done, again.done * parts
+    known, work = again.done, again.work
     if not known:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
@@ -811,14 +821,14 @@ def _estimate(
     error = window.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=cut)
     if not error.worst < _SMALL:
         shift = disturbance(trajectory, window.step, known)
-        beside = Again(scene, other.method, trajectory, times, window.step, known, parts, shift)
+        beside = Again(scene, other.method, trajectory, times, window.step, known, parts[:known], shift)
         predictable = 0
         while not beside.ended and predictable == beside.done:
             beside.go_on()
             # Constraints may move the disturbed start by more than the disturbance.
             apart = max(shift[0], float(np.abs(beside.q[0] - again.q[0]).max()))
             predictable = grown(again.q[: beside.done + 1], beside.q[: beside.done + 1], apart)
-        work += beside.done * parts
+        work += beside.work
         if predictable < known:
             known, cut = max(1, predictable), True
             error = window.error(scene, trajectory, inertia, (off[0][: known + 1], off[1][: known + 1]), cut=True)

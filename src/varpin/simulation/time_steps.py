@@ -103,6 +103,16 @@ def _intervals(policy: LinearPolicy, duration: float) -> int:
     return parts
 
 
+def _line_in_parts(
+    scene: Scene, line: FirstOrderHold, q0: Floats, v0: Floats, duration: float, parts: int
+) -> FirstOrderHold:
+    """:meth:`FirstOrderHold.refined`, with kinematic inputs on the lines and cubics of the intervals."""
+    found = line.refined(parts)
+    u, own = found.u.copy(), scene.prescribed
+    u[1:, own] = held_in_parts(scene, line.u[1:], q0, v0, duration / (len(line.u) - 1), parts)[:, own]
+    return FirstOrderHold(u)
+
+
 def _unmet(record: Accuracy, floor: float) -> Finding:
     """The warning that a tolerance is not met, with the cause."""
     cause = (
@@ -171,7 +181,8 @@ def steps_for_tolerance(
         parts = len(controls.u) - 1
 
         def given(member: Integrator, steps: int) -> Commands:
-            return commands_of(scene, member, by_nodes.refined(steps // parts), steps, duration / steps)
+            fine = _line_in_parts(scene, by_nodes, q0, v0, duration, steps // parts)
+            return commands_of(scene, member, fine, steps, duration / steps)
     else:
         held = held_rows(scene, controls)
         parts = len(held)
@@ -215,7 +226,7 @@ def steps_for_tolerance(
         raise ToleranceError(wish, duration, choice.steps, choice.error)
     found = () if record.met else (_unmet(record, choice.floor),)
     if isinstance(controls, FirstOrderHold):
-        controls = controls.refined(choice.steps // parts)
+        controls = _line_in_parts(scene, controls, q0, v0, duration, choice.steps // parts)
     elif not isinstance(controls, LinearPolicy | OpenLoop):
         controls = held_in_parts(scene, held, q0, v0, duration / parts, choice.steps // parts)
     return choice.integrator, choice.steps, controls, record, found

@@ -28,6 +28,7 @@
 
 namespace varpin {
 
+// The recursion (O2) over the steps, from the last to the first.
 class BackwardPass {
   public:
     // Starts from the gradient (2n) and the Hessian (2n, 2n) of the terminal cost in x.
@@ -66,6 +67,27 @@ class BackwardPass {
     // A pass over a block of steps, with each control held over `hold` of them; blocks follow each other from the last
     // to the first. Returns -1, or the decision without a minimum.
     std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Gains& gains) {
+#if defined(__x86_64__) && defined(__GNUC__)
+        if (has_wide()) return run_wide(h, hold, regularization, steps, gains);
+#endif
+        return run_steps(h, hold, regularization, steps, gains);
+    }
+
+    int dof() const { return n; }
+    int controls() const { return m; }
+
+    Found found;
+
+  private:
+#if defined(__x86_64__) && defined(__GNUC__)
+    [[gnu::target("avx2"), gnu::flatten]] std::ptrdiff_t run_wide(double h, int hold, double regularization,
+                                                                  const ExpandedSteps& steps, const Gains& gains) {
+        return run_steps(h, hold, regularization, steps, gains);
+    }
+#endif
+
+    [[gnu::always_inline]] inline std::ptrdiff_t run_steps(double h, int hold, double regularization,
+                                                           const ExpandedSteps& steps, const Gains& gains) {
         for (std::ptrdiff_t s = steps.steps - 1; s >= 0; --s) {
             if (gains.costate) std::copy_n(costate.data(), x, gains.costate + s * x);
             carry(steps, s, steps.rate || (s + 1) % hold != 0);
@@ -81,12 +103,6 @@ class BackwardPass {
         return -1;
     }
 
-    int dof() const { return n; }
-    int controls() const { return m; }
-
-    Found found;
-
-  private:
     // Q and its gradients from the value after step s. With `held`, the value has rows for the control: that of the
     // next step, or the previous control of a change with a cost.
     void carry(const ExpandedSteps& steps, std::ptrdiff_t s, bool held) {
@@ -118,23 +134,30 @@ class BackwardPass {
         }
     }
 
-    // T = factor H D for the leading nonzero rows of the running cost's Hessian; returns their number.
-    int weigh(double factor, const double* H, const TiledMatrix& of) {
-        int rows = x;
-        while (rows > 0 &&
-               std::all_of(H + (rows - 1) * size, H + (rows - 1) * size + x, [](double entry) { return entry == 0.0; }))
-            --rows;
-        for (int i = 0; i < rows; ++i) {
+    // The rows of (q, v) on which the running cost at a sample depends.
+    Range rows_of(const double* g, const double* H) const {
+        const auto counts = [&](int i) {
+            return g[i] != 0.0 ||
+                   std::any_of(H + i * size, H + (i + 1) * size, [](double entry) { return entry != 0.0; });
+        };
+        Range rows{0, x};
+        while (rows.end > 0 && !counts(rows.end - 1)) --rows.end;
+        while (rows.begin < rows.end && !counts(rows.begin)) ++rows.begin;
+        return rows;
+    }
+
+    // T = factor H D in these rows of the running cost's Hessian.
+    void weigh(double factor, const double* H, const TiledMatrix& of, Range rows) {
+        for (int i = rows.begin; i < rows.end; ++i) {
             double* __restrict out = T[i];
             std::fill_n(out, T.stride(), 0.0);
-            for (int j = 0; j < rows; ++j) {
+            for (int j = rows.begin; j < rows.end; ++j) {
                 const double entry = factor * H[i * size + j];
                 if (entry == 0.0) continue;
                 const double* __restrict other = of[j];
                 for (int c = 0; c < of.stride(); ++c) out[c] += entry * other[c];
             }
         }
-        return rows;
     }
 
     // Add the samples h w l(z) of step s, with z = D (x, u).
@@ -145,16 +168,17 @@ class BackwardPass {
             const double* g = steps.gradient_at(point);
             const double* H = steps.hessian_at(point);
             const double weight = h * steps.rule[sample].weight;
-            step.expand(steps.rule[sample]);
+            const Range rows = rows_of(g, H);
+            step.expand(steps.rule[sample], rows);
             std::fill_n(row.begin(), x, 0.0);
             std::copy_n(g + x, m, row.begin() + x);
-            add_rows(g, step.D, x, row.data(), size);
+            add_rows(g, step.D, rows, row.data(), size);
             add_row(weight, row.data(), Qz);
             add_row(weight, row.data(), Cz);
-            const int rows = weigh(weight, H, step.D);
+            weigh(weight, H, step.D, rows);
             add_transposed_product(step.D, T, rows, Q, size, Part::upper);
             for (int r = x; r < size; ++r) {
-                for (int i = 0; i < x; ++i) {
+                for (int i = rows.begin; i < rows.end; ++i) {
                     const double entry = weight * H[r * size + i];
                     if (entry == 0.0) continue;
                     for (int c = 0; c < size; ++c) Q[c][r] += entry * step.D[i][c];
@@ -173,7 +197,9 @@ class BackwardPass {
         }
         for (std::ptrdiff_t k = 0; k < samples; ++k) {
             if (!step.expand_after(steps.rule[k])) continue;
-            const int rows = weigh(h * h * steps.rule[k].weight, steps.hessian_at(s * samples + k), step.P);
+            const double* H = steps.hessian_at(s * samples + k);
+            const Range rows = rows_of(steps.gradient_at(s * samples + k), H);
+            weigh(h * h * steps.rule[k].weight, H, step.P, rows);
             add_transposed_product(step.P, T, rows, S, x, Part::upper);
         }
         mirror(S, x);
@@ -235,8 +261,8 @@ class BackwardPass {
         return true;
     }
 
-    // k within limits at deviations `ahead` (2n + m) of the state and the previous control from the nominal ones, null
-    // for zero; the result applies at zero deviation again.
+    // k within limits, (O4), at deviations `ahead` (2n + m) of the state and the previous control from the nominal
+    // ones, null for zero; the result applies at zero deviation again.
     bool keep_within(const double* slack, const double* ahead, const double* rate, double* k) {
         const double* Qu = Qz.data() + x;
         std::copy_n(Qu, m, pulled.data());
@@ -336,7 +362,7 @@ class BackwardPass {
         mirror(W, x);
     }
 
-    // Gains G on the previous control of a decision, and the rows and columns of the value in it.
+    // Gains G on the previous control of a decision, and the rows and columns of the value in it, (O6).
     void value_of_previous(const double* R, const double* pull, const double* k, double* G) {
         for (int i = 0; i < m; ++i) {
             for (int c = 0; c < m; ++c) G[i * m + c] = box.held[i] ? 0.0 : R[i * m + c];

@@ -13,6 +13,7 @@
 
 namespace varpin {
 
+// The decision within limits, (O4).
 class BoxMinimum {
   public:
     explicit BoxMinimum(int size) : factors(size * size), held(size), m(size), downhill(size), step(size) {}

@@ -57,7 +57,8 @@ struct Start {
     const double* force_at(int stage) const { return force + stage * stride; }
 };
 
-// The step equation; numbers of joints and stages may be known at compile time.
+// The step equation: (D3) with the forces (D4), the paper's (1.8) and (1.9). Numbers of joints and stages may be known
+// at compile time.
 template <class Size = int, class Stages = int>
 class Collocation {
   public:
@@ -153,26 +154,14 @@ class Collocation {
                 fresh = true;
                 continue;
             }
-            for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
+            take_correction();
             ++effort.newton_iterations;
-            if (fresh && !jets_wanted) {
-                const double left = left_by_bending(h, worst);
-                if (worst <= tolerance || sure * left <= tolerance) {
-                    correct_slopes(h);
-                    worst = std::min(worst, left);
-                    break;
-                }
+            const double contraction = contraction_of(before, size);
+            if (!jets_wanted && certainly_last(h, fresh, contraction, tolerance, worst)) {
+                correct_slopes(h);
+                break;
             }
-            fresh = false;
-            if (before < infinity) {
-                const double contraction = std::sqrt(size / before);
-                if (sure * contraction * worst <= tolerance && !jets_wanted) {
-                    correct_slopes(h);
-                    worst *= contraction;
-                    break;
-                }
-                fresh = !(worst * contraction * contraction * contraction <= tolerance);
-            }
+            fresh = before < infinity && !(worst * contraction * contraction * contraction <= tolerance);
             before = size;
         }
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
@@ -327,6 +316,29 @@ class Collocation {
     std::vector<double> element_curvature;  // (s, n) of the elements' potentials, if there is an elimination
     std::vector<double> diagonal;           // (s, s, n) of N, without the contributions of bodies in an elimination
 
+    void take_correction() {
+        for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
+    }
+
+    // The factor by which corrections shrink, from the kinetic sizes of the last two; infinite after the first.
+    static double contraction_of(double before, double size) {
+        return before < infinity ? std::sqrt(size / before) : infinity;
+    }
+
+    // Whether a correction needs no evaluation of the residual that it leaves, `worst` before it: by the nonlinearity
+    // of the equation if its factors were `fresh`, or by the contraction. If so, `worst` becomes the estimate.
+    bool certainly_last(double h, bool fresh, double contraction, double tolerance, double& worst) {
+        const double left = fresh ? left_by_bending(h, worst) : infinity;
+        if (fresh && (worst <= tolerance || sure * left <= tolerance)) {
+            worst = std::min(worst, left);
+        } else if (sure * contraction * worst <= tolerance) {
+            worst *= contraction;
+        } else {
+            return false;
+        }
+        return true;
+    }
+
     // Estimate of the residual, in rounding units, that second derivatives of r leave after the correction in `delta`
     // with fresh factors. Kinetic and potential energy are nonlinear in the angles of bodies: the estimate is the angle
     // times the change of momenta, plus the squared angle times the momenta. Infinite if forces are nonlinear too.
@@ -449,8 +461,8 @@ class Collocation {
         return stages == 1 ? residuals_of(1, h, start) : residuals_of(stages, h, start);
     }
 
-    // The discrete Euler-Lagrange residual r_i(V) of each stage into `residual`; returns the largest in rounding units.
-    // Called with the constant 1 for one stage, so that the compiler removes the loops over stages.
+    // The discrete Euler-Lagrange residual r_i(V) of each stage, (S1) and (C1), into `residual`; returns the largest in
+    // rounding units. Called with the constant 1 for one stage, so that the compiler removes the loops over stages.
     [[gnu::always_inline]] inline double residuals_of(const int stages, double h, const Start& start) {
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
@@ -479,7 +491,7 @@ class Collocation {
         return worst;
     }
 
-    // The block of N, (s width, s width).
+    // The block (s width, s width) of N, (C3).
     void assemble(double h, Block block, double* matrix) {
         if (stages == 1) return assemble_one(h, block, matrix);
         const int width = block.end - block.begin, size = stages * width;
@@ -737,6 +749,7 @@ class Collocation {
         }
     }
 
+    // Equations (L1) and (L2) for any number of stages:
     // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h F_f df + h sum_i b_i K_i dq0 + sum_j G_j dV_j, with K = L_qq + F_q
     // and G_j = h b_j (A_j' + F_v,j) + h^2 sum_i b_i a_ij K_i.
     void end_derivatives(double h, Block block, const std::vector<double>& dV, double* Jx, double* Jf) {

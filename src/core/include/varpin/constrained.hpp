@@ -74,6 +74,7 @@ struct ConstrainedState {
     std::vector<double> impulses;      // (steps, m) impulses of the last roll
 };
 
+// Steps that make the action (H1) stationary.
 class ConstrainedStepper {
   public:
     // `places` is t_kj (s + 1, s).
@@ -199,12 +200,13 @@ class ConstrainedStepper {
     // Set the rates of cubic kinematic inputs at their goals, in the order of their rows; others are not read.
     void take_rates(const double* own) { std::copy(own, own + goal_rate.size(), goal_rate.begin()); }
 
-    // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`.
+    // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`. The entry of a driven
+    // joint is its goal, at all stages.
     void take_force(const double* own, bool varies) {
         stride = varies ? n : 0;
-        std::copy(own, own + (varies ? stages * n : n), force.begin());
-        if (varies) given = force;
+        std::copy(own, own + n, force.begin());
         take_goals();
+        if (varies) take_stages(own);
     }
 
     // One whole step, in as many substeps as the guards require; as VariationalStepper::step.
@@ -254,8 +256,8 @@ class ConstrainedStepper {
     Outcome from_guess(double h, const double* V, ConstrainedState& state) {
         std::copy(V, V + stages * n, equation.V.begin());
         std::fill(impulse.begin(), impulse.end(), 0.0);
-        share = 1.0;
         left = 1;
+        bring_force(0.0, 0);
         return attempt(h, state, true);
     }
 
@@ -288,12 +290,12 @@ class ConstrainedStepper {
                 const double* extra = drift ? drift + row * n : nullptr;
                 const double* within = stage_controls(commands, p, s, stages, u, line);
                 stride = within ? n : 0;
+                constant_force(mechanism, extra, u + s * controls, force.data());
+                take_goals();
                 if (within) {
                     stage_forces(mechanism, extra, within, stages, given.data());
-                } else {
-                    constant_force(mechanism, extra, u + s * controls, force.data());
+                    take_stages(given.data());
                 }
-                take_goals();
                 for (std::size_t d = 0; d < goal_rate.size(); ++d) {
                     const int control = mechanism.constraints.driven()[d].rate;
                     if (control >= 0) goal_rate[d] = u[s * controls + control];
@@ -316,58 +318,16 @@ class ConstrainedStepper {
     // zero for linear ones. The map does not require g(q0) = 0, and absorbs the part of p0 normal to the constraints.
     void derivatives(double h, const PathState& path, double* Jx, double* Jf, double* Jr) {
         exchange(here, origin);
-        const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
+        const int size = stages * (n + here.rank());
         assemble(h);
         factor_lu_pivoting(saddle.data(), size, rows.data());
-        dV.resize(entries(wide, w));
-        equation.right_sides(h, {0, n}, dV);
-        for (int row = 0; equation.kinds() == 2 && row < n; ++row) {
-            for (int c = 0; c < n; ++c) dV[row * w + 2 * n + c] = equation.by_momentum(h, c) * dV[row * w + n + c];
-        }
-        for (const DrivenRow& own : mechanism.constraints.driven()) {
-            for (int i = 0; i < wide; ++i) dV[i * w + 2 * n + own.coordinate] = 0.0;
-        }
         bend_points();
-        columns.assign(entries(size, w), 0.0);
-        for (int i = 0; i < wide; ++i) {
-            for (int c = 0; c < w; ++c) {
-                double entry = dV[i * w + c];
-                for (int k = 0; k < stages && c < n; ++k)
-                    entry -= weight[(i / n) * stages + k] * bends[(k * n + i % n) * n + c];
-                columns[i * w + c] = scaled[i % n] * entry;
-            }
-        }
-        for (int k = 0; k < stages; ++k) {
-            for (int a = 0; a < r; ++a) {
-                const int row = here.order[a];
-                double* own = &columns[(wide + k * r + a) * w];
-                for (int c = 0; c < n; ++c) own[c] = -row_scale[row] * point[k].C[row * n + c] / h;
-                const int d = driven_of(row);
-                if (d < 0) continue;
-                const int c = mechanism.constraints.driven()[d].coordinate;
-                const Way way = way_at(d, way_to(k + 1));
-                own[2 * n + c] = row_scale[row] * way.ahead / h;
-                own[c] += row_scale[row] * (1.0 - way.ahead) / h;
-            }
-        }
+        state_columns(h);
         end_columns(h, Jx, Jf);
-        // For a cubic: derivatives in the rates at both ends, in the column of its goal.
-        if (curved_paths) {
-            for (int end = 0; end < 2; ++end) {
-                columns.assign(entries(size, w), 0.0);
-                for (int k = 0; k < stages; ++k) {
-                    for (int a = 0; a < r; ++a) {
-                        const int d = driven_of(here.order[a]);
-                        if (d < 0) continue;
-                        const DrivenRow& own = mechanism.constraints.driven()[d];
-                        const Way way = way_at(d, way_to(k + 1));
-                        columns[(wide + k * r + a) * w + 2 * n + own.coordinate] =
-                            row_scale[own.row] * (end == 0 ? way.begin : way.end) / share;
-                    }
-                }
-                by_rates[end].resize(6 * n * n);
-                end_columns(h, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
-            }
+        for (int end = 0; end < 2 && curved_paths; ++end) {
+            rate_columns(end);
+            by_rates[end].resize(6 * n * n);
+            end_columns(h, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
         }
         exchange(here, origin);
         project_derivatives(h, path, Goal::position, Jx, Jf);
@@ -376,29 +336,7 @@ class ConstrainedStepper {
             project_derivatives(h, path, end == 0 ? Goal::begin : Goal::end, by_rates[end].data(),
                                 by_rates[end].data() + 4 * n * n);
         }
-        const std::vector<DrivenRow>& driven = mechanism.constraints.driven();
-        lagrangian_jet(mechanism, from_q.data(), from_v.data(), equation.stage[0]);
-        for (std::size_t d = 0; d < driven.size(); ++d) {
-            const double *at_begin = by_rates[0].data() + 4 * n * n, *at_end = by_rates[1].data() + 4 * n * n;
-            for (int i = 0; i < 2 * n; ++i)
-                Jr[i * driven.size() + d] = driven[d].rate < 0 ? 0.0 : at_end[i * n + driven[d].coordinate];
-            if (driven[d].rate < 0) continue;
-            // The rate at the beginning follows from the momentum, v = M^-1 p: M dv = dp - L_vq dq.
-            std::fill(y.begin(), y.end(), 0.0);
-            y[driven[d].coordinate] = 1.0;
-            whiten(origin, y.data(), y.data());
-            for (int i = 0; i < n; ++i) y[i] *= origin.root[i];
-            solve_upper(origin.ldl.data(), n, {0, n}, y.data());
-            for (int c = 0; c < n; ++c) {
-                double by_q = 0.0;
-                for (int j = 0; j < n; ++j) by_q -= y[j] * equation.stage[0].A[j * n + c];
-                for (int i = 0; i < 2 * n; ++i) {
-                    const double own = at_begin[i * n + driven[d].coordinate];
-                    Jx[i * 2 * n + c] += own * by_q;
-                    Jx[i * 2 * n + n + c] += own * y[c];
-                }
-            }
-        }
+        join_rates(Jx, Jr);
     }
 
     ConstraintBasis here;    // at the path's state
@@ -486,6 +424,85 @@ class ConstrainedStepper {
             if (driven[d].row == row) return static_cast<int>(d);
         }
         return -1;
+    }
+
+    // Right sides for derivatives in (q0, p0) and in the goals of kinematic inputs.
+    void state_columns(double h) {
+        const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
+        dV.resize(entries(wide, w));
+        equation.right_sides(h, {0, n}, dV);
+        for (int row = 0; equation.kinds() == 2 && row < n; ++row) {
+            for (int c = 0; c < n; ++c) dV[row * w + 2 * n + c] = equation.by_momentum(h, c) * dV[row * w + n + c];
+        }
+        for (const DrivenRow& own : mechanism.constraints.driven()) {
+            for (int i = 0; i < wide; ++i) dV[i * w + 2 * n + own.coordinate] = 0.0;
+        }
+        columns.assign(entries(size, w), 0.0);
+        for (int i = 0; i < wide; ++i) {
+            for (int c = 0; c < w; ++c) {
+                double entry = dV[i * w + c];
+                for (int k = 0; k < stages && c < n; ++k)
+                    entry -= weight[(i / n) * stages + k] * bends[(k * n + i % n) * n + c];
+                columns[i * w + c] = scaled[i % n] * entry;
+            }
+        }
+        for (int k = 0; k < stages; ++k) {
+            for (int a = 0; a < r; ++a) {
+                const int row = here.order[a];
+                double* own = &columns[(wide + k * r + a) * w];
+                for (int c = 0; c < n; ++c) own[c] = -row_scale[row] * point[k].C[row * n + c] / h;
+                const int d = driven_of(row);
+                if (d < 0) continue;
+                const int c = mechanism.constraints.driven()[d].coordinate;
+                const Way way = way_at(d, way_to(k + 1));
+                own[2 * n + c] = row_scale[row] * way.ahead / h;
+                own[c] += row_scale[row] * (1.0 - way.ahead) / h;
+            }
+        }
+    }
+
+    // Right sides for derivatives in the rate of each cubic input at the beginning (`end` 0) or at its goal (1), in the
+    // column of the goal.
+    void rate_columns(int end) {
+        const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
+        columns.assign(entries(size, w), 0.0);
+        for (int k = 0; k < stages; ++k) {
+            for (int a = 0; a < r; ++a) {
+                const int d = driven_of(here.order[a]);
+                if (d < 0) continue;
+                const DrivenRow& own = mechanism.constraints.driven()[d];
+                const Way way = way_at(d, way_to(k + 1));
+                columns[(wide + k * r + a) * w + 2 * n + own.coordinate] =
+                    row_scale[own.row] * (end == 0 ? way.begin : way.end) / share;
+            }
+        }
+    }
+
+    // Write the derivatives in the rates at the goals, and add those by way of the rates at the beginning, which follow
+    // from the momentum: v = M^-1 p, M dv = dp - L_vq dq.
+    void join_rates(double* Jx, double* Jr) {
+        const std::vector<DrivenRow>& driven = mechanism.constraints.driven();
+        lagrangian_jet(mechanism, from_q.data(), from_v.data(), equation.stage[0]);
+        for (std::size_t d = 0; d < driven.size(); ++d) {
+            const double *at_begin = by_rates[0].data() + 4 * n * n, *at_end = by_rates[1].data() + 4 * n * n;
+            for (int i = 0; i < 2 * n; ++i)
+                Jr[i * driven.size() + d] = driven[d].rate < 0 ? 0.0 : at_end[i * n + driven[d].coordinate];
+            if (driven[d].rate < 0) continue;
+            std::fill(y.begin(), y.end(), 0.0);
+            y[driven[d].coordinate] = 1.0;
+            whiten(origin, y.data(), y.data());
+            for (int i = 0; i < n; ++i) y[i] *= origin.root[i];
+            solve_upper(origin.ldl.data(), n, {0, n}, y.data());
+            for (int c = 0; c < n; ++c) {
+                double by_q = 0.0;
+                for (int j = 0; j < n; ++j) by_q -= y[j] * equation.stage[0].A[j * n + c];
+                for (int i = 0; i < 2 * n; ++i) {
+                    const double own = at_begin[i * n + driven[d].coordinate];
+                    Jx[i * 2 * n + c] += own * by_q;
+                    Jx[i * 2 * n + n + c] += own * y[c];
+                }
+            }
+        }
     }
 
     // Derivatives of the end of a substep without its last impulse, from the right sides in `columns` and the factors
@@ -585,9 +602,23 @@ class ConstrainedStepper {
         basis.root.resize(n);
         for (int i = 0; i < n; ++i) basis.root[i] = 1.0 / std::sqrt(basis.ldl[i * n + i]);
         if (!visited) mechanism.constraints.at(q, basis.jet);
+        measure_rows(basis);
+        const double next = choose_rows(rank, basis);
+        const int found = basis.rank();
+        basis.R.assign(found * found, 0.0);
+        for (int k = 0; k < found; ++k) {
+            for (int i = 0; i <= k; ++i) basis.R[i * found + k] = parts[basis.order[k] * n + i];
+        }
+        // Dependent rows have become independent: the rollout began at a singular configuration.
+        if (rank >= 0 && (next > 1e3 * dependent || found < rank)) basis.least = 0.0;
+        return true;
+    }
+
+    // The rows of C in the metric of the kinetic energy, and the size of the terms that cancel in each: their squares
+    // times the diagonal of M^-1.
+    void measure_rows(ConstraintBasis& basis) {
         basis.rows.resize(m * n);
         basis.size.assign(m, 0.0);
-        // Size of the terms that cancel in a row: their squares times the diagonal of M^-1.
         for (int c = 0; c < n; ++c) {
             double inverse = 0.0;
             for (int i = c; i < n; ++i) {
@@ -603,7 +634,11 @@ class ConstrainedStepper {
             whiten(basis, &basis.jet.C[r * n], &basis.rows[r * n]);
             basis.size[r] = std::sqrt(basis.size[r]);
         }
-        // Gram-Schmidt, twice, with pivoting: next is the row with the largest rest in units of its size.
+    }
+
+    // Write Q, the order and the least row of a basis by Gram-Schmidt, twice, with pivoting: next is the row with the
+    // largest rest in units of its size. Returns the rest of the first row beyond `rank`.
+    double choose_rows(int rank, ConstraintBasis& basis) {
         std::copy(basis.rows.begin(), basis.rows.end(), rest.begin());
         std::fill(taken.begin(), taken.end(), 0);
         basis.order.clear();
@@ -611,19 +646,9 @@ class ConstrainedStepper {
         basis.least = 1.0;
         basis.weakest = 0;
         const int most = rank < 0 ? std::min(m, n) : rank;
-        double next = 0.0;
         for (int k = 0; k <= most && k < m; ++k) {
-            int best = -1;
-            double farthest = 0.0;
-            for (int r = 0; r < m; ++r) {
-                if (taken[r]) continue;
-                const double own = norm(&rest[r * n]) / std::max(basis.size[r], nothing);
-                if (best < 0 || own > farthest) best = r, farthest = own;
-            }
-            if (k == most) {
-                next = farthest;
-                break;
-            }
+            const auto [best, farthest] = farthest_row(basis);
+            if (k == most) return farthest;
             if (!(farthest > dependent) && rank < 0) break;
             basis.least = farthest;
             basis.weakest = best;
@@ -632,28 +657,37 @@ class ConstrainedStepper {
             if (!(length > 0.0)) break;
             basis.order.push_back(best);
             for (int c = 0; c < n; ++c) basis.Q.push_back(rest[best * n + c] / length);
-            const double* q_k = &basis.Q[k * n];
+            parts[best * n + k] = inner(&basis.Q[k * n], &rest[best * n]);
             for (int r = 0; r < m; ++r) {
-                if (taken[r] && r != best) continue;
-                const double along = inner(q_k, &rest[r * n]);
-                parts[r * n + k] = along;
-                if (r == best) continue;
-                for (int c = 0; c < n; ++c) rest[r * n + c] -= along * q_k[c];
-                for (int i = 0; i <= k; ++i) {
-                    const double again = inner(&basis.Q[i * n], &rest[r * n]);
-                    parts[r * n + i] += again;
-                    for (int c = 0; c < n; ++c) rest[r * n + c] -= again * basis.Q[i * n + c];
-                }
+                if (!taken[r]) leave_rest(basis, k, r);
             }
         }
-        const int found = basis.rank();
-        basis.R.assign(found * found, 0.0);
-        for (int k = 0; k < found; ++k) {
-            for (int i = 0; i <= k; ++i) basis.R[i * found + k] = parts[basis.order[k] * n + i];
+        return 0.0;
+    }
+
+    // The row with the largest rest, in units of its size, of those that are not taken.
+    std::pair<int, double> farthest_row(const ConstraintBasis& basis) const {
+        int best = -1;
+        double farthest = 0.0;
+        for (int r = 0; r < m; ++r) {
+            if (taken[r]) continue;
+            const double own = norm(&rest[r * n]) / std::max(basis.size[r], nothing);
+            if (best < 0 || own > farthest) best = r, farthest = own;
         }
-        // Dependent rows have become independent: the rollout began at a singular configuration.
-        if (rank >= 0 && (next > 1e3 * dependent || found < rank)) basis.least = 0.0;
-        return true;
+        return {best, farthest};
+    }
+
+    // Remove the part along Q_k from the rest of a row, and what rounding has left along Q_0 .. Q_k.
+    void leave_rest(const ConstraintBasis& basis, int k, int row) {
+        double *own = &rest[row * n], *part = &parts[row * n];
+        const auto remove = [&](int i) {
+            const double* unit = &basis.Q[i * n];
+            const double along = inner(unit, own);
+            for (int c = 0; c < n; ++c) own[c] -= along * unit[c];
+            return along;
+        };
+        part[k] = remove(k);
+        for (int i = 0; i <= k; ++i) part[i] += remove(i);
     }
 
     // D^-1/2 L^-1 b.
@@ -676,6 +710,14 @@ class ConstrainedStepper {
         for (std::size_t d = 0; d < driven.size(); ++d) {
             goal[d] = force[driven[d].coordinate];
             force[driven[d].coordinate] = 0.0;
+        }
+    }
+
+    // Take forces (s, n) at the stages of the step; no force but that of its row acts on a driven joint.
+    void take_stages(const double* own) {
+        if (own != given.data()) std::copy(own, own + stages * n, given.begin());
+        for (const DrivenRow& row : mechanism.constraints.driven()) {
+            for (int i = 0; i < stages; ++i) given[i * n + row.coordinate] = 0.0;
         }
     }
 
@@ -759,13 +801,9 @@ class ConstrainedStepper {
         PathState& path = state.path;
         state.weakest = here.weakest;
         if (!(here.least > near_toggle) && m > 0 && here.rank() > 0) return Outcome::toggle;
-        for (std::size_t d = 0; d < goal.size(); ++d) begun[d] = state.rate[mechanism.constraints.driven()[d].row];
-        if (curved_paths) {
-            for (int i = 0; i < n; ++i) from_q[i] = path.position[i].value.high;
-            std::copy(path.v.begin(), path.v.end(), from_v.begin());
-        }
-        const Outcome solved = solve(h, path, jets_wanted);
-        if (solved != Outcome::solved) return solved;
+        keep_start(state);
+        Outcome outcome = solve(h, path, jets_wanted);
+        if (outcome != Outcome::solved) return outcome;
         double margin = infinity;
         if (guards.active) {
             for (int k = 1; k <= stages; ++k) {
@@ -775,15 +813,37 @@ class ConstrainedStepper {
             if (!(margin > 0.0)) return Outcome::fold;
         }
         advance(h, path);
+        outcome = end_on_constraints(h, state, !jets_wanted);
+        if (outcome != Outcome::solved) return outcome;
+        for (std::size_t d = 0; d < goal.size(); ++d) add_work(static_cast<int>(d), h, path);
+        outcome = energy_guard.accept(guards, tableau, path.energies, path.position, path.v, trial, true);
+        if (outcome != Outcome::solved) return outcome;
+        effort.branch_margin = std::min(effort.branch_margin, margin);
+        ++effort.substeps;
+        return move_to_end(state);
+    }
+
+    // Keep what kinematic inputs need of the beginning of a part.
+    void keep_start(const ConstrainedState& state) {
+        const PathState& path = state.path;
+        for (std::size_t d = 0; d < goal.size(); ++d) begun[d] = state.rate[mechanism.constraints.driven()[d].row];
+        if (!curved_paths) return;
+        for (int i = 0; i < n; ++i) from_q[i] = path.position[i].value.high;
+        std::copy(path.v.begin(), path.v.end(), from_v.begin());
+    }
+
+    // Find the basis at the end in `trial`, and the last impulse, which makes its momentum tangent. C at the end is
+    // that at the last Lobatto point if it was `visited` there.
+    Outcome end_on_constraints(double h, ConstrainedState& state, bool visited) {
+        const PathState& path = state.path;
         rate.assign(m, 0.0);
         for (std::size_t d = 0; d < goal.size(); ++d) {
             const DrivenRow& own = mechanism.constraints.driven()[d];
             rate[own.row] = rate_at(static_cast<int>(d), share, h, path.position[own.coordinate].value.high);
         }
         for (int i = 0; i < n; ++i) unit[i] = trial.position[i].value.high;
-        // The last Lobatto point is the end.
-        if (!jets_wanted) exchange(there.jet, point.back());
-        if (!find_basis(unit.data(), state.rank, there, !jets_wanted)) return Outcome::singular;
+        if (visited) exchange(there.jet, point.back());
+        if (!find_basis(unit.data(), state.rank, there, visited)) return Outcome::singular;
         if (!(there.least > near_toggle) && there.rank() > 0) {
             state.weakest = there.weakest;
             return Outcome::toggle;
@@ -795,11 +855,13 @@ class ConstrainedStepper {
             for (int c = 0; c < n; ++c) trial.p[c] = trial.p[c].plus(-across(there.jet, total.data(), c));
             for (int r = 0; r < m; ++r) last[r] += total[r];
         }
-        for (std::size_t d = 0; d < goal.size(); ++d) add_work(static_cast<int>(d), h, path);
-        const Outcome outcome = energy_guard.accept(guards, tableau, path.energies, path.position, path.v, trial, true);
-        if (outcome != Outcome::solved) return outcome;
-        effort.branch_margin = std::min(effort.branch_margin, margin);
-        ++effort.substeps;
+        return Outcome::solved;
+    }
+
+    // Move the path to the end of an accepted substep; `singular` where M is not positive definite after whole turns
+    // were removed.
+    Outcome move_to_end(ConstrainedState& state) {
+        PathState& path = state.path;
         for (int r = 0; r < m; ++r) {
             double sum = last[r];
             for (int k = 0; k < stages; ++k) sum += impulse[k * m + r];
@@ -828,13 +890,7 @@ class ConstrainedStepper {
     // with the jets and C at the root, else with those of the last iterate.
     Outcome solve(double h, const PathState& path, bool jets_wanted) {
         const Start start{path.position.data(), path.p.data(), force.data(), stride};
-        // In these units the entries of the matrix are of order 1.
-        for (int c = 0; c < n; ++c) scaled[c] = 1.0 / std::sqrt(mass_diagonal(c));
-        for (int r = 0; r < m; ++r) row_scale[r] = 1.0 / std::max(norm(&here.rows[r * n]), nothing);
-        for (int r = 0; r < m; ++r) {
-            if (std::find(here.order.begin(), here.order.end(), r) != here.order.end()) continue;
-            for (int k = 0; k < stages; ++k) impulse[k * m + r] = 0.0;
-        }
+        scale_unknowns();
         const int size = stages * (n + here.rank());
         double before = infinity, worst = infinity, worst_before = infinity;
         bool fresh = true;
@@ -853,10 +909,7 @@ class ConstrainedStepper {
                 assemble(h);
                 if (factor_lu_pivoting(saddle.data(), size, rows.data()) == 0) return Outcome::fold;
             }
-            solve_lu_pivoting(saddle.data(), size, rows.data(), right.data(), solution.data());
-            for (int i = 0; i < stages; ++i) {
-                for (int c = 0; c < n; ++c) equation.delta[i * n + c] = scaled[c] * solution[i * n + c];
-            }
+            find_correction();
             const double moved = equation.kinetic_size(equation.delta.data());
             // Impulses may be far from the root where velocities are not.
             if (!(moved <= 0.25 * before) && !(worst <= 0.25 * worst_before)) {
@@ -865,14 +918,7 @@ class ConstrainedStepper {
                 fresh = true;
                 continue;
             }
-            for (int k = 0; k < stages * n; ++k) equation.V[k] += equation.delta[k];
-            const int r = here.rank();
-            for (int k = 0; k < stages; ++k) {
-                for (int a = 0; a < r; ++a) {
-                    const int row = here.order[a];
-                    impulse[k * m + row] += row_scale[row] * solution[stages * n + k * r + a];
-                }
-            }
+            take_correction();
             ++effort.newton_iterations;
             // With one stage there is no impulse between the ends, so constraints add no curvature.
             double left = fresh && stages == 1 ? equation.left_by_bending(h, worst) : infinity;
@@ -898,6 +944,38 @@ class ConstrainedStepper {
         if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
         effort.residual = std::max(effort.residual, worst);
         return Outcome::solved;
+    }
+
+    // Units in which the entries of Newton's matrix are of order 1; rows that are left out have no impulse.
+    void scale_unknowns() {
+        for (int c = 0; c < n; ++c) scaled[c] = 1.0 / std::sqrt(mass_diagonal(c));
+        for (int r = 0; r < m; ++r) row_scale[r] = 1.0 / std::max(norm(&here.rows[r * n]), nothing);
+        for (int r = 0; r < m; ++r) {
+            if (std::find(here.order.begin(), here.order.end(), r) != here.order.end()) continue;
+            for (int k = 0; k < stages; ++k) impulse[k * m + r] = 0.0;
+        }
+    }
+
+    // Newton's correction from the factors: of the velocities in equation.delta, of the impulses at the end of
+    // `solution`.
+    void find_correction() {
+        const int size = stages * (n + here.rank());
+        solve_lu_pivoting(saddle.data(), size, rows.data(), right.data(), solution.data());
+        for (int i = 0; i < stages; ++i) {
+            for (int c = 0; c < n; ++c) equation.delta[i * n + c] = scaled[c] * solution[i * n + c];
+        }
+    }
+
+    // Add Newton's correction to the velocities and impulses.
+    void take_correction() {
+        for (int k = 0; k < stages * n; ++k) equation.V[k] += equation.delta[k];
+        const int r = here.rank();
+        for (int k = 0; k < stages; ++k) {
+            for (int a = 0; a < r; ++a) {
+                const int row = here.order[a];
+                impulse[k * m + row] += row_scale[row] * solution[stages * n + k * r + a];
+            }
+        }
     }
 
     // Interpolate a varying force to the stages of a part of the step.
@@ -966,7 +1044,8 @@ class ConstrainedStepper {
         }
     }
 
-    // Write the residuals of the stages to `right`, then -g / h; returns the largest in rounding units of its terms.
+    // Write the residuals of the stages, (H2), to `right`, then -g / h; returns the largest in rounding units of its
+    // terms.
     double residuals(double h, const Start& start) {
         double worst = 0.0;
         const int r = here.rank();

@@ -64,7 +64,7 @@ inline double quadratic(const double* W, const double* r, int size, double* Wr) 
     return total;
 }
 
-// The evaluation of costs at single samples, with work arrays.
+// The evaluation of costs, (O7) and (O8), at single samples, with work arrays.
 class CostSample {
   public:
     explicit CostSample(const CostTerms& costs)
@@ -320,7 +320,7 @@ class CostSample {
     }
 };
 
-// The cost weight . (u_k - u_(k-1))^2 of each change of controls.
+// The cost weight . (u_k - u_(k-1))^2 of each change of controls, (O5).
 class ChangeCost {
   public:
     // `before` (m) is the control before the first one, or empty if the first change has no cost.

@@ -329,7 +329,7 @@ class ForwardDynamics {
         own.force = own.inertia * own.acceleration + cross(here.velocity, here.momentum);
     }
 
-    // Contribution of the subtree of body j to the derivatives of inverse dynamics.
+    // Contribution of the subtree of body j to the derivatives of inverse dynamics, (X3) and (X4).
     void project_slopes(int j) {
         const Tree& tree = mechanism_->tree;
         const Body& link = tree.bodies[j];

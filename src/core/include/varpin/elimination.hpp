@@ -348,7 +348,8 @@ struct EliminatedBody {
     }
 };
 
-// The matrix of a midpoint step and its symmetric part, at consecutive (q, v).
+// The matrix of a midpoint step, (E1) and (E2), and its symmetric part, at consecutive (q, v): factored and solved with
+// by (E3).
 class Elimination {
   public:
     explicit Elimination(const Mechanism& mechanism)

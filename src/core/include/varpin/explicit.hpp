@@ -54,7 +54,7 @@ constexpr Nystroem nystroem_of(ExplicitMethod method) {
     return of;
 }
 
-// Explicit steps from any state, with derivatives in (q, v, force) if `derivatives`.
+// Explicit steps (X1) from any state, with derivatives (X2) in (q, v, force) if `derivatives`.
 class ExplicitStepper {
   public:
     ExplicitStepper(const Mechanism& mechanism, ExplicitMethod method, bool derivatives,

@@ -210,9 +210,9 @@ class EnergyGuard {
         }
     }
 
-    // The distance of the root from the fold where branches of solutions meet: 1 as h -> 0, <= 0 for a refused root. It
-    // is the smallest ratio of a pivot of M - (h/2) dF/dv + h skew (A + A') - h^2 reach (L_qq + dF/dq) / (1 - margin)
-    // to the same pivot of M, all averaged over the stages with b.
+    // The distance of the root from the fold where branches of solutions meet, (G1): 1 as h -> 0, <= 0 for a refused
+    // root. It is the smallest ratio of a pivot of M - (h/2) dF/dv + h skew (A + A') - h^2 reach (L_qq + dF/dq) / (1 -
+    // margin) to the same pivot of M, all averaged over the stages with b.
     template <class Stages>
     double branch_margin(double h, const Guards& guards, Collocation<Size, Stages>& step) {
         const Tableau& tableau = step.tableau;

@@ -235,8 +235,8 @@ template <class T, class Size>
     }
 }
 
-// Contribution of the subtree of body j to M, A and L_qq.
-template <class T, class Size>
+// Contribution of the subtree of body j to M and A, and if `curved` to L_qq.
+template <bool curved, class T, class Size>
 void project_second(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
     const Tree& tree = mechanism.tree;
     const Body& link = tree.bodies[j];
@@ -254,14 +254,16 @@ void project_second(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
         const double ratio = above.ratio * link.ratio;
         const auto of_F = there.columns.of(F), of_B = there.columns.of(B);
         const T mass = ratio * of_F.by_axis;
-        const T curvature = ratio * (of_B.by_rate - dot(there.axis.angular, turning));
         w.M[ci * n + cj] += mass;
-        w.Lqq[ci * n + cj] += curvature;
         w.A[ci * n + cj] += ratio * of_B.by_axis;
         if (i != j) {
             w.M[cj * n + ci] += mass;
-            w.Lqq[cj * n + ci] += curvature;
             w.A[cj * n + ci] += ratio * of_F.by_rate;
+        }
+        if constexpr (curved) {
+            const T curvature = ratio * (of_B.by_rate - dot(there.axis.angular, turning));
+            w.Lqq[ci * n + cj] += curvature;
+            if (i != j) w.Lqq[cj * n + ci] += curvature;
         }
     }
 }
@@ -377,7 +379,7 @@ void add_armature(const Tree& tree, const T* v, Jet<T, Size>& w) {
 
 }  // namespace detail
 
-// The whole jet at (q, v), into w.
+// The whole jet, (J1) and (J2), at (q, v) into w.
 template <class T, class Size>
 void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, Size>& w) {
     const Tree& tree = mechanism.tree;
@@ -397,7 +399,7 @@ void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, S
     for (int j = bodies - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];
         detail::project_first(mechanism, j, w);
-        detail::project_second(mechanism, j, w);
+        detail::project_second<true>(mechanism, j, w);
         if (link.parent >= 0) {
             detail::pass_momentum(link, j, w);
             detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, true);
@@ -407,6 +409,31 @@ void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, S
     detail::add_elements(mechanism, q, w, 2);
     for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += T(tree.armature[c]);
     detail::add_armature(tree, v, w);
+}
+
+// Only M and A at (q, v).
+template <class Size>
+void momentum_slopes(const Mechanism& mechanism, const double* q, const double* v, Jet<double, Size>& w) {
+    const Tree& tree = mechanism.tree;
+    const int bodies = bodies_of(tree, w.dof);
+    for (auto* matrix : {&w.M, &w.A}) detail::clear_blocks(tree, w.dof, *matrix);
+    for (int j = 0; j < bodies; ++j) {
+        const Body& link = tree.bodies[j];
+        auto& here = w.body[j];
+        detail::place_body(tree, j, q, w);
+        detail::move(tree, j, v, w);
+        here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
+        here.momentum = here.inertia * here.velocity;
+        here.columns = {here.axis, here.axis_rate};
+    }
+    for (int j = bodies - 1; j >= 0; --j) {
+        const Body& link = tree.bodies[j];
+        detail::project_second<false>(mechanism, j, w);
+        if (link.parent < 0) continue;
+        w.body[link.parent].momentum += w.body[j].momentum;
+        detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, true);
+    }
+    for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += tree.armature[c];
 }
 
 // Only L_q, L_v and the energies at (q, v). Moments of inertia stay in body axes.

@@ -44,17 +44,16 @@ class LinearStep {
         transposed_product(rates, J, x, speeds, n);
     }
 
-    // D, the derivative of (q, v) at a sample.
-    void expand(const Sample& sample) {
-        for (int half = 0; half < 2; ++half) {
-            const Sample::Sum& of = half == 0 ? sample.q : sample.v;
-            for (int i = 0; i < n; ++i) {
-                double* __restrict out = D[half * n + i];
-                const double* __restrict places = J[i];
-                const double* __restrict speed = speeds[i];
-                for (int c = 0; c < size; ++c) out[c] = of.q1 * places[c] + of.v1 * speed[c];
-                add_node(of.q0, of.v0, before, i, out);
-            }
+    // D, the derivative of (q, v) at a sample, in some rows.
+    void expand(const Sample& sample, Range rows) {
+        for (int row = rows.begin; row < rows.end; ++row) {
+            const Sample::Sum& of = row < n ? sample.q : sample.v;
+            const int i = row < n ? row : row - n;
+            double* __restrict out = D[row];
+            const double* __restrict places = J[i];
+            const double* __restrict speed = speeds[i];
+            for (int c = 0; c < size; ++c) out[c] = of.q1 * places[c] + of.v1 * speed[c];
+            add_node(of.q0, of.v0, before, i, out);
         }
     }
 

@@ -218,13 +218,39 @@ class VariationalLinearization {
         return both;
     }
 
-    // Add start' (z . d2(q1, p1)) start at the stepper's root, after part_derivatives; `start` (2n, 3n) may be null.
+    // Add start' (z . d2(q1, p1)) start, (L4), at the stepper's root, after part_derivatives; `start` (2n, 3n) may be
+    // null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
-        const Tableau& tableau = equation.tableau;
         const Mechanism& mechanism = stepper.mechanism;
         const int w = 3 * n;
-        // dphi/dV_m = h b_m (zq + (A_m + F_v,m) zp) + h^2 sum_i b_i a_im (L_qq,i + F_q,i) zp
+        write_slopes(h, z);
+        stepper.step_equation.solve_transposed(h, slope.data(), multiplier.data());
+        if (start != nullptr) bring_to_start(start);
+        for (int i = 0; i < stages; ++i) {
+            differentiate_along(h, i, z);
+            move_stage(h, i, start);
+            bend_stage(i);
+            if (mechanism.forces.any()) add_elements(h, i, z, H);
+            if (equation.coupled()) add_couplings(h, i, z);
+            for (int c = 0; c < n; ++c) {
+                const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
+                const double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
+                for (int r = 0; r < w; ++r) {
+                    double* row = H + r * w;
+                    for (int k = 0; k < w; ++k) row[k] += dq[r] * in_q[k] + dv[r] * in_v[k];
+                }
+            }
+        }
+        for (int r = 0; r < w; ++r) {
+            for (int k = 0; k < r; ++k) H[r * w + k] = H[k * w + r] = 0.5 * (H[r * w + k] + H[k * w + r]);
+        }
+    }
+
+    // dphi/dV_m = h b_m (zq + (A_m + F_v,m) zp) + h^2 sum_i b_i a_im (L_qq,i + F_q,i) zp into `slope`.
+    void write_slopes(double h, const double* z) {
+        const Collocation<Size, Stages>& equation = stepper.step_equation;
+        const Tableau& tableau = equation.tableau;
         for (int m = 0; m < stages; ++m) {
             for (int c = 0; c < n; ++c) {
                 double total = tableau.b[m] * (z[c] + equation.acting[m * n + c].by_v * z[n + c]);
@@ -241,50 +267,49 @@ class VariationalLinearization {
                 slope[m * n + c] = h * total;
             }
         }
-        stepper.step_equation.solve_transposed(h, slope.data(), multiplier.data());
-        if (start != nullptr) bring_to_start(start);
-        for (int i = 0; i < stages; ++i) {
-            for (int c = 0; c < n; ++c) {
-                double alpha = tableau.b[i] * z[n + c];
-                for (int j = 0; j < stages; ++j) alpha += tableau.gradient[j * stages + i] * multiplier[j * n + c];
-                at_q[c] = {equation.Q[i * n + c], h * alpha};
-                at_v[c] = {equation.V[i * n + c], -multiplier[i * n + c]};
-            }
-            lagrangian_jet(mechanism, at_q.data(), at_v.data(), direction);
-            for (int c = 0; c < n; ++c) {
-                for (int k = 0; k < w; ++k) {
-                    double total = start == nullptr ? (c == k ? 1.0 : 0.0) : start[c * w + k];
-                    for (int j = 0; j < stages; ++j) total += h * tableau.a[i * stages + j] * dV[(j * n + c) * w + k];
-                    dQ[c * w + k] = total;
-                }
-            }
-            // (psi_qq dQ + psi_qv dV; psi_vq dQ + psi_vv dV)
-            std::fill(inner.begin(), inner.end(), 0.0);
-            for (int r = 0; r < n; ++r) {
-                double *in_q = &inner[r * w], *in_v = &inner[(n + r) * w];
-                for (int j = 0; j < n; ++j) {
-                    const double qq = direction.Lqq[r * n + j].slope, vq = direction.A[r * n + j].slope;
-                    const double qv = direction.A[j * n + r].slope, vv = direction.M[r * n + j].slope;
-                    const double *dq = &dQ[j * w], *dv = &dV[(i * n + j) * w];
-                    for (int k = 0; k < w; ++k) {
-                        in_q[k] += qq * dq[k] + qv * dv[k];
-                        in_v[k] += vq * dq[k] + vv * dv[k];
-                    }
-                }
-            }
-            if (mechanism.forces.any()) add_elements(h, i, z, H);
-            if (equation.coupled()) add_couplings(h, i, z);
-            for (int c = 0; c < n; ++c) {
-                const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
-                const double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
-                for (int r = 0; r < w; ++r) {
-                    double* row = H + r * w;
-                    for (int k = 0; k < w; ++k) row[k] += dq[r] * in_q[k] + dv[r] * in_v[k];
-                }
+    }
+
+    // The jet at stage i and its derivative along (alpha, -multiplier), of which psi is the Lagrangian's share.
+    void differentiate_along(double h, int i, const double* z) {
+        const Collocation<Size, Stages>& equation = stepper.step_equation;
+        const Tableau& tableau = equation.tableau;
+        for (int c = 0; c < n; ++c) {
+            double alpha = tableau.b[i] * z[n + c];
+            for (int j = 0; j < stages; ++j) alpha += tableau.gradient[j * stages + i] * multiplier[j * n + c];
+            at_q[c] = {equation.Q[i * n + c], h * alpha};
+            at_v[c] = {equation.V[i * n + c], -multiplier[i * n + c]};
+        }
+        lagrangian_jet(stepper.mechanism, at_q.data(), at_v.data(), direction);
+    }
+
+    // Derivatives of Q at stage i into dQ.
+    void move_stage(double h, int i, const double* start) {
+        const Tableau& tableau = stepper.step_equation.tableau;
+        const int w = 3 * n;
+        for (int c = 0; c < n; ++c) {
+            for (int k = 0; k < w; ++k) {
+                double total = start == nullptr ? (c == k ? 1.0 : 0.0) : start[c * w + k];
+                for (int j = 0; j < stages; ++j) total += h * tableau.a[i * stages + j] * dV[(j * n + c) * w + k];
+                dQ[c * w + k] = total;
             }
         }
-        for (int r = 0; r < w; ++r) {
-            for (int k = 0; k < r; ++k) H[r * w + k] = H[k * w + r] = 0.5 * (H[r * w + k] + H[k * w + r]);
+    }
+
+    // (psi_qq dQ + psi_qv dV; psi_vq dQ + psi_vv dV) at stage i into `inner`.
+    void bend_stage(int i) {
+        const int w = 3 * n;
+        std::fill(inner.begin(), inner.end(), 0.0);
+        for (int r = 0; r < n; ++r) {
+            double *in_q = &inner[r * w], *in_v = &inner[(n + r) * w];
+            for (int j = 0; j < n; ++j) {
+                const double qq = direction.Lqq[r * n + j].slope, vq = direction.A[r * n + j].slope;
+                const double qv = direction.A[j * n + r].slope, vv = direction.M[r * n + j].slope;
+                const double *dq = &dQ[j * w], *dv = &dV[(i * n + j) * w];
+                for (int k = 0; k < w; ++k) {
+                    in_q[k] += qq * dq[k] + qv * dv[k];
+                    in_v[k] += vq * dq[k] + vv * dv[k];
+                }
+            }
         }
     }
 

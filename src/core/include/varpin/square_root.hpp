@@ -71,6 +71,7 @@ class RowStack {
     std::vector<double> values_, work_;
 };
 
+// The recursion of the backward pass on R and r of (O3), from the last step to the first.
 class RootPass {
   public:
     // Starts from the terminal cost in x (2n), and its gradient.
@@ -194,7 +195,7 @@ class RootPass {
             const Sample& at = steps.rule[sample];
             const double weight = h * at.weight, factor = std::sqrt(weight);
             const double* L = running.root_of(point, size);
-            step.expand(at);
+            step.expand(at, x);
             for (int i = 0; i < size; ++i) {
                 double* row = stack.push();
                 for (int j = 0; j < x; ++j) add_to_row(factor * L[i * size + j], step.D[j], row);
@@ -329,22 +330,36 @@ class RootPass {
     bool minimize(const double* slack, const double* ahead, int others, double* k) {
         std::fill_n(k, m, 0.0);
         std::fill_n(K.begin(), m * others, 0.0);
-        if (slack) {
-            for (int i = 0; i < m; ++i) {
-                if (firm[i][i] == 0.0) return false;
-                for (int j = 0; j < m; ++j) {
-                    H[i * m + j] = 0.0;
-                    for (int l = 0; l <= std::min(i, j); ++l) H[i * m + j] += firm[l][i] * firm[l][j];
-                }
-            }
-            pulled = Qu;
-            for (int i = 0; ahead && i < m; ++i) {
-                for (int l = 0; l <= i; ++l) {
-                    for (int c = 0; c < others; ++c) pulled[i] += stack[l][i] * stack[l][m + c] * ahead[c];
-                }
-            }
-            if (!box.solve(H.data(), pulled.data(), slack, slack + m, k)) return false;
+        if (slack && !solve_box(slack, ahead, others, k)) return false;
+        const int count = reduce_to_free(others, k);
+        if (!note_loss(count)) return false;
+        solve_free(count, others, k);
+        if (slack && !ahead) {
+            for (int i = 0; i < m; ++i) k[i] = std::min(std::max(k[i], slack[i]), slack[m + i]);
         }
+        return true;
+    }
+
+    // The minimum k within limits, of which `box` holds the controls at a limit; false if there is none.
+    bool solve_box(const double* slack, const double* ahead, int others, double* k) {
+        for (int i = 0; i < m; ++i) {
+            if (firm[i][i] == 0.0) return false;
+            for (int j = 0; j < m; ++j) {
+                H[i * m + j] = 0.0;
+                for (int l = 0; l <= std::min(i, j); ++l) H[i * m + j] += firm[l][i] * firm[l][j];
+            }
+        }
+        pulled = Qu;
+        for (int i = 0; ahead && i < m; ++i) {
+            for (int l = 0; l <= i; ++l) {
+                for (int c = 0; c < others; ++c) pulled[i] += stack[l][i] * stack[l][m + c] * ahead[c];
+            }
+        }
+        return box.solve(H.data(), pulled.data(), slack, slack + m, k);
+    }
+
+    // Write the firm rows of the controls that are free to U, with those at a limit in the shift; returns their number.
+    int reduce_to_free(int others, const double* k) {
         int count = 0;
         for (int i = 0; i < m; ++i) {
             if (!box.held[i]) free[count++] = i;
@@ -359,6 +374,11 @@ class RootPass {
             }
         }
         U.triangularize(count);
+        return count;
+    }
+
+    // Add the rounding errors of U to the loss; false where a free control has no minimum.
+    bool note_loss(int count) {
         for (int i = 0; i < count; ++i) {
             const double pivot = std::abs(U[i][i]);
             const int control = free[i];
@@ -367,10 +387,6 @@ class RootPass {
             if (!idle)
                 found.loss =
                     std::max(found.loss, epsilon * std::max(scale[x + control], control_norm[control]) / pivot);
-        }
-        solve_free(count, others, k);
-        if (slack && !ahead) {
-            for (int i = 0; i < m; ++i) k[i] = std::min(std::max(k[i], slack[i]), slack[m + i]);
         }
         return true;
     }

@@ -28,6 +28,7 @@
 
 namespace varpin {
 
+// The matrix of a step with several stages, the sum over stages of (E1) and (E2): factored and solved with by (E3).
 class StageElimination {
   public:
     static constexpr int most_stages = 16;
@@ -237,6 +238,7 @@ class StageElimination {
         matrix_.hand_on(j, link.parent);
     }
 
+    // Add the bodies of mimic joints that end at body j to X, and eliminate their coordinates, (E4).
     void eliminate_ties(int j, double* X) {
         for (const Ties::Tied& tied : ties().ending(j)) {
             if (sign_ == 0) return;

@@ -31,6 +31,14 @@ class TiledMatrix {
 
 enum class Part { all, upper };  // upper: the tiles on and above the diagonal
 
+// Rows begin .. end; of a number, that many leading rows.
+struct Range {
+    Range(int count) : end(count) {}
+    Range(int first, int last) : begin(first), end(last) {}
+
+    int begin = 0, end;
+};
+
 namespace detail {
 
 // One tile of out = a'b, or of out += a'b, over `depth` rows.
@@ -52,53 +60,54 @@ template <bool adds>
 }
 
 template <bool adds>
-[[gnu::always_inline]] inline void find_tiles(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out,
+[[gnu::always_inline]] inline void find_tiles(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out,
                                               int rows, Part part) {
-    const int columns = std::min(b.stride(), out.stride());
+    const int columns = std::min(b.stride(), out.stride()), depth = range.end - range.begin;
+    const double *top_a = a[range.begin], *top_b = b[range.begin];
     for (int i = 0; i < rows; i += tile) {
         for (int j = part == Part::upper ? i : 0; j < columns; j += tile)
-            find_tile<adds>(a[0] + i, a.stride(), b[0] + j, b.stride(), depth, out[i] + j, out.stride());
+            find_tile<adds>(top_a + i, a.stride(), top_b + j, b.stride(), depth, out[i] + j, out.stride());
     }
 }
 
 #if defined(__x86_64__) && defined(__GNUC__)
 // The same sums four at a time: no other bytes, and half the instructions.
 template <bool adds>
-[[gnu::target("avx2")]] void find_wide_tiles(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out,
+[[gnu::target("avx2")]] void find_wide_tiles(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out,
                                              int rows, Part part) {
-    find_tiles<adds>(a, b, depth, out, rows, part);
+    find_tiles<adds>(a, b, range, out, rows, part);
 }
 #endif
 
 }  // namespace detail
 
-// The leading `rows` rows of out += a'b, over the leading `depth` rows of a and b, for the columns that both have.
-inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out, int rows,
+// The leading `rows` rows of out += a'b, over the rows of a and b in `range`, for the columns that both have.
+inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out, int rows,
                                    Part part = Part::all) {
 #if defined(__x86_64__) && defined(__GNUC__)
-    if (has_wide()) return detail::find_wide_tiles<true>(a, b, depth, out, rows, part);
+    if (has_wide()) return detail::find_wide_tiles<true>(a, b, range, out, rows, part);
 #endif
-    detail::find_tiles<true>(a, b, depth, out, rows, part);
+    detail::find_tiles<true>(a, b, range, out, rows, part);
 }
 
 // The same of out = a'b: whatever was there is gone.
-inline void transposed_product(const TiledMatrix& a, const TiledMatrix& b, int depth, TiledMatrix& out, int rows,
+inline void transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out, int rows,
                                Part part = Part::all) {
 #if defined(__x86_64__) && defined(__GNUC__)
-    if (has_wide()) return detail::find_wide_tiles<false>(a, b, depth, out, rows, part);
+    if (has_wide()) return detail::find_wide_tiles<false>(a, b, range, out, rows, part);
 #endif
-    detail::find_tiles<false>(a, b, depth, out, rows, part);
+    detail::find_tiles<false>(a, b, range, out, rows, part);
 }
 
 namespace detail {
 
-[[gnu::always_inline]] inline void add_some_rows(const double* __restrict factor, const TiledMatrix& a, int rows,
+[[gnu::always_inline]] inline void add_some_rows(const double* __restrict factor, const TiledMatrix& a, Range range,
                                                  double* __restrict out, int columns) {
     for (int c = 0; c < columns; c += tile) {
         double sum[tile];
         for (int k = 0; k < tile; ++k) sum[k] = out[c + k];
-        const double* row = a[0] + c;
-        for (int i = 0; i < rows; ++i, row += a.stride()) {
+        const double* row = a[range.begin] + c;
+        for (int i = range.begin; i < range.end; ++i, row += a.stride()) {
             for (int k = 0; k < tile; ++k) sum[k] += factor[i] * row[k];
         }
         for (int k = 0; k < tile; ++k) out[c + k] = sum[k];
@@ -106,20 +115,20 @@ namespace detail {
 }
 
 #if defined(__x86_64__) && defined(__GNUC__)
-[[gnu::target("avx2")]] inline void add_wide_rows(const double* factor, const TiledMatrix& a, int rows, double* out,
+[[gnu::target("avx2")]] inline void add_wide_rows(const double* factor, const TiledMatrix& a, Range range, double* out,
                                                   int columns) {
-    add_some_rows(factor, a, rows, out, columns);
+    add_some_rows(factor, a, range, out, columns);
 }
 #endif
 
 }  // namespace detail
 
-// out += sum_i factor_i a_i over the leading `rows` rows of a, one after another; out has whole tiles.
-inline void add_rows(const double* factor, const TiledMatrix& a, int rows, double* out, int columns) {
+// out += sum_i factor_i a_i over the rows of a in `range`, one after another; out has whole tiles.
+inline void add_rows(const double* factor, const TiledMatrix& a, Range range, double* out, int columns) {
 #if defined(__x86_64__) && defined(__GNUC__)
-    if (has_wide()) return detail::add_wide_rows(factor, a, rows, out, columns);
+    if (has_wide()) return detail::add_wide_rows(factor, a, range, out, columns);
 #endif
-    detail::add_some_rows(factor, a, rows, out, columns);
+    detail::add_some_rows(factor, a, range, out, columns);
 }
 
 // Copy the upper triangle to the lower one.

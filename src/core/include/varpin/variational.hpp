@@ -304,7 +304,7 @@ class VariationalStepper {
         return Outcome::solved;
     }
 
-    // The node after the substep, and the work of forces in it, into `trial`.
+    // The node after the substep, (C2), and the work of forces in it, into `trial`.
     [[gnu::always_inline]] inline void advance(const int stages, double h, const PathState& state) {
         const auto& equation = step_equation;
         for (int c = 0; c < n; ++c) {
@@ -373,6 +373,7 @@ class VariationalStepper {
         state.known = std::min(state.known + 1, PathState::most_misses + 1);
     }
 
+    // The impulse of `part` of the increments dw, (N2).
     void noise_kick(double part, const double* u, const double* dw, PathState& state) {
         noise_impulse(mechanism, part, state.q.data(), state.center.data(), u, dw, bend.data());
         kick(bend.data(), state);

@@ -194,7 +194,7 @@ def _cell(task: Task, solution: Solution, seconds: float, sampled: tuple[float, 
 
 
 def _middle_gains(solution: Solution) -> Floats:
-    """The feedback gains on x, referred to the state in the middle of each step, at the times of ``GAIN_TIMES``.
+    """The feedback gains on x, referred to the state in the middle of each step, (O10), at ``GAIN_TIMES``.
 
     A held control reacts, on average, half a step late. Seen from the node where its step begins its gain therefore
     differs from the continuous one in first order, whatever the integrator; seen from the middle, in second.
