@@ -127,12 +127,11 @@ def swing(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     above, below = figure.subplots(2, 1, sharex=True)
     plots.plot_joints(motion, axes=above, robot=scene.robot)
     above.set_xlabel("")
-    above.set_title("angles, and the torque within its limits (dashed)", fontsize=10)
+    above.set_title("angles, and the torque", fontsize=10)
     plots.apply_style(below)
-    below.stairs(motion.u[:, 0], motion.t, baseline=None, color="0.2")
-    for bound in (-limit, limit):
-        below.axhline(bound, color="0.3", linestyle="--", linewidth=0.9)
-    _label(below, "torque [N m]", legend=False)
+    below.stairs(motion.u[:, 0], motion.t, baseline=None, color="0.2", label="torque")
+    below.hlines([-limit, limit], *motion.t[[0, -1]], color="0.3", linestyle="--", linewidth=0.9, label="limits")
+    _label(below, "torque [N m]")
 
 
 def closing(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:

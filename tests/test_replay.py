@@ -187,7 +187,7 @@ def test_the_key_names_what_has_a_colour_of_its_own(finger, tmp_path):
     words = [re.sub("<.*?>", "", line) for line in re.findall("<li>.*</li>", marked)]
     frame = finger.end_effector
     paths = [f"path of {frame}", f"path of {frame}, ghost"]
-    assert words == ["torque: none, half, all of the limit", "ghost", *paths, "reference: way", "target"]
+    assert words == ["torque: none, half, all of the limit", "ghost", *paths, "reference: way", "target: cup &lt;1&gt;"]
 
 
 def test_trajectory_and_its_array_give_the_same_animation(finger, motion, tmp_path):

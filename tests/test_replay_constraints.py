@@ -104,7 +104,7 @@ def test_obstacles_and_regions_have_their_sizes(browser, plan, tmp_path):
     # A pose, as software draws large translucent shapes slowly.
     visit(browser, replay(robot, plan.trajectory.q[:1], dt=1.0, constraints=plan.problem, html=tmp_path / "plan.html"))
     assert_no_errors(browser)
-    assert key(browser) == ["obstacle: post, crate, ball", "tip keeps out", "tip keeps in", "target"]
+    assert key(browser) == ["obstacle: post, crate, ball", "tip keeps out", "tip keeps in", "target: goal of tip"]
     found = {name: vertices(browser, ["notes", "regions", name]) for name in names(browser, ["notes", "regions"])}
     boxes = {name: (points.min(axis=0), points.max(axis=0)) for name, points in found.items()}
     for name, low, high in [

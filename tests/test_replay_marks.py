@@ -1,6 +1,7 @@
 """What a replay shows beside the robot: traces, targets, frames, torques, other robots."""
 
 import logging
+import re
 
 import numpy as np
 import pinocchio as pin
@@ -277,6 +278,27 @@ def test_targets_stand_or_move(browser, ur5, sweep, tmp_path):
     assert sorted(kinds["point"]) == ["ball"]
     assert sorted(kinds["turns"]) == ["axes", "ball"]
     assert all(f">{name}</text>" in plate for name, plate in plates.items())
+
+
+def test_one_target_is_named_in_the_key_and_several_have_labels_below_them(browser, ur5, sweep, tmp_path):
+    """Nothing is drawn over the tool at its target, and meshcat's own controls are out of view."""
+    for targets, labels in (({"cup": [0.3, 0.1, 0.5]}, 0), ({"cup": [0.3, 0.1, 0.5], "shelf": [0.1, 0.1, 0.5]}, 2)):
+        visit(browser, replay(ur5, sweep, dt=0.05, html=tmp_path / "page.html", targets=targets))
+        assert f"target: {', '.join(targets)}" in browser.find_element("id", "about").text
+        plates = browser.execute_script(
+            """
+            const found = [];
+            viewer.scene_tree.find(["meshcat", "notes", "targets"]).object.traverse(node => {
+                if (node.isSprite) found.push(atob(node.material.map.image.src.split(",")[1]));
+            });
+            return found;"""
+        )
+        assert len(plates) == labels
+        for plate in plates:
+            height = float(re.search(r'viewBox="0 0 \S+ (\S+)"', plate)[1])
+            assert float(re.search(r'<rect x="\S+" y="(\S+)"', plate)[1]) > 0.5 * height
+        hidden = "return getComputedStyle(document.querySelector('.dg.main')).display"
+        assert browser.execute_script(hidden) == "none"
 
 
 def link_colors(browser, figure="robot"):

@@ -392,7 +392,8 @@ def _draw_limits(axes: Axes, values: Floats, limits: tuple[Floats, Floats]) -> N
         return
     low, high = float(values.min()), float(values.max())
     near = 0.3 * (high - low)
-    look = {"transform": axes.get_yaxis_transform(), "linewidth": 0.9, "linestyle": (0, (1, 2)), "zorder": 1}
+    across, dots = axes.get_yaxis_transform(), (0, (1, 2))
+    look: dict[str, Any] = {"transform": across, "linewidth": 0.9, "linestyle": dots, "zorder": 1}
     drawn = False
     for k, style in enumerate(_styles(values.shape[1])):
         for limit in (limits[0][k], limits[1][k]):

@@ -15,8 +15,8 @@ from varpin.arrays import Floats, Integers
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
-# Thresholds of errors. Energy balance: share of the energy turned over. Position: share of the joint's way over a
-# period (the range that q covers), and of the way of the joint that goes furthest. Velocity: share of the joint's
+# Thresholds of errors. Energy balance: share of the energy turned over. Position: share of the joint's travel over a
+# period (the range that q covers), and of the largest joint travel. Velocity: share of the joint's
 # largest, with a larger threshold, for a small shift in time changes a peak of the velocity by much.
 WRONG_ENERGY = 0.1
 WRONG_POSITION, WRONG_MOTION, WRONG_VELOCITY = 0.1, 0.05, 0.25
@@ -30,13 +30,13 @@ VIOLENT, _SPREAD = 4, 3
 _JUMPS = 2
 # Error from which on more windows are examined, in units of its threshold; and the number of these windows.
 CLOSE, _BETWEEN = 0.4, 15
-# Steps after which a start is judged by its way so far. Before that a method of first order lags by half a step.
+# Steps after which a start is judged by the travel so far. Before that a method of first order lags by half a step.
 _SOON = (80, 160)
 # Growth of a disturbance from which on a motion counts as unpredictable; and the disturbance, relative to q and v.
 PREDICTABLE, DISTURBANCE = 10.0, 1e-7
 # A joint's errors are measured in units of its own motion. For a joint that hardly moves, the unit is at least the
-# smaller of two: LITTLE times the largest way or speed among joints of its kind, and LIGHT times the speed at which the
-# joint would have their energy.
+# smaller of two: LITTLE times the largest travel or speed among joints of its kind, and LIGHT times the speed at which
+# the joint would have their energy.
 LITTLE, LIGHT = 1e-2, 1e-2
 # Least unit of a joint's errors in one window, as a share of its motion up to there.
 _REST = 1e-3
@@ -53,9 +53,9 @@ class MotionError:
     Attributes:
         step: First node of the window.
         joint: The coordinate.
-        position: Error of q there over a period, in units of the joint's way over it.
+        position: Error of q there over a period, as a share of the joint's travel over it.
         velocity: Error of v, in units of the joint's largest.
-        motion: Error of q, in units of the way of the joint that goes furthest.
+        motion: Error of q, as a share of the largest joint travel.
         settled: Whether the estimate is accurate to about a tenth; else only to a factor of two.
     """
 
@@ -132,7 +132,7 @@ class Window:
     ) -> MotionError:
         """:meth:`error` from the first ``until`` steps."""
         here = np.minimum(self.judged, until)
-        # Unpredictable steps are no part of the way.
+        # Unpredictable steps are no part of the travel.
         end = np.minimum(self.span, until) if cut else self.span
         way, speed = _units(scene, trajectory, self.step, end, self.whole | (end < self.span), inertia)
         joints = np.arange(len(here))
@@ -289,7 +289,7 @@ def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.b
 def _units(
     scene: Scene, trajectory: Trajectory, step: int, span: Integers, whole: NDArray[np.bool_], inertia: Floats
 ) -> tuple[Floats, Floats]:
-    """Units of each joint's errors of q and v (n,): its way over a period, and its largest velocity."""
+    """Units of each joint's errors of q and v (n,): its travel over a period, and its largest velocity."""
     n = len(span)
     before = np.zeros(n, dtype=np.int64)
     if step:

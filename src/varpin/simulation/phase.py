@@ -26,7 +26,7 @@ Complexes = NDArray[np.complex128]
 
 # Number of nodes with a linearization, and the most joints of a robot that is examined.
 _NODES, _JOINTS = 9, 60
-# Error from which on a warning is given, as a share of the way of the joint that goes furthest.
+# Threshold of the warning, as a share of the largest joint travel.
 WARNED = 0.02
 # Least phase of an oscillation over the motion [rad]. Slower ones lose little; and a free joint has the eigenvalue zero
 # twice, which rounding splits into slow modes of any amplitude.
@@ -43,7 +43,7 @@ class Loss(NamedTuple):
     Attributes:
         joint: The coordinate with the largest error.
         off: The error [rad or m].
-        share: The same, in units of the way of the joint that goes furthest.
+        share: The error as a share of the largest joint travel.
         rate: Of the oscillation [rad/s].
         turned: The error of the oscillation, in units of its amplitude.
     """

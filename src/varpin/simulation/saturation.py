@@ -19,7 +19,7 @@ from varpin.trajectory import Trajectory
 
 # Most places with repeated steps, the steps of each, the parts of each step, and the stages of the method.
 _PLACES, _LENGTH, _PARTS, _STAGES = 12, 2, 16, 4
-# Error from which on a warning is given, as a share of the way of the joint that goes furthest.
+# Threshold of the warning, as a share of the largest joint travel.
 _WARNED = 0.003
 
 
@@ -29,7 +29,7 @@ class Bend(NamedTuple):
     Attributes:
         joint: The coordinate with the largest error.
         off: The estimated error [rad or m].
-        share: The same, in units of the way of the joint that goes furthest.
+        share: The error as a share of the largest joint travel.
         steps: Number of steps in which drives reach or leave their limit.
     """
 

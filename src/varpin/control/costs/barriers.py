@@ -47,7 +47,8 @@ class _Barrier(TaskCost):
         Args:
             robot: The robot.
             weight: One number, (n,), by joint name, or a matrix (n, n), positive semidefinite.
-            margin: One number, (n,) or by joint name, >= 0, as limits; of it, at most half the way from limit to limit.
+            margin: One number, (n,) or by joint name, >= 0, in the units of the limits. At most half the distance
+                between the limits of a joint is used.
             limits: (lower, upper), each one number or (n,), infinite where there is none; the robot's if left out
                 [rad or m; of velocities rad/s or m/s].
 
@@ -81,7 +82,7 @@ class JointLimitBarrier(_Barrier):
     """weight . (what q is beyond a limit less a margin)^2: keep joints within their limits.
 
     A penalty that begins ``margin`` before the limit and is zero farther inside; it is finite beyond the limit, so that
-    a search may begin there. ``Solution.violations`` says what is left.
+    a search may begin there. ``Solution.violations`` has the remaining excess.
     """
 
     in_velocity = False

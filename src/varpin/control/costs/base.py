@@ -1,8 +1,8 @@
 """Costs: integrals over time and terms at the end, which add up.
 
-A running cost l(t, q, v, u) stands for its integral over the motion, whatever the time step; ``Terminal`` makes it a
-term at the final time. Costs are evaluated and expanded at many points at once: varpin's own in the core, custom costs
-with NumPy, without compiled code.
+A running cost l(t, q, v, u) is integrated over the motion, so that its value does not depend on the time step;
+``Terminal`` evaluates it at the final time instead. Costs are evaluated and expanded at many points at once: varpin's
+own in the core, custom costs with NumPy, without compiled code.
 """
 
 from __future__ import annotations
@@ -396,7 +396,7 @@ def weight_matrix(name: str, weight: Floats, size: int) -> Floats:
 def sample(name: str, reference: Reference, points: Points, size: int, *, held: bool = False) -> Floats:
     """A reference at the points, (N, size), or (1, size) where it is constant.
 
-    ``held`` says that an array of it may also have one row for each step, constant over the step.
+    With ``held``, an array may also have one row for each step, constant over the step.
 
     Raises:
         InputError: Its shape does not fit.

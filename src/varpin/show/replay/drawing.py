@@ -59,17 +59,24 @@ class Stage:
     pictures: list[Picture]
 
 
-def draw(viewer: meshcat.Visualizer, script: Script) -> Stage:
-    """Send a script to a viewer."""
-    return _Drawing(viewer, script).draw()
+def draw(viewer: meshcat.Visualizer, script: Script, *, legend: bool = False) -> Stage:
+    """Send a script to a viewer.
+
+    Args:
+        viewer: The viewer.
+        script: The script.
+        legend: Whether a legend beside the picture names the targets: a single one then has no label.
+    """
+    return _Drawing(viewer, script, legend=legend).draw()
 
 
 class _Drawing:
     """The drawing of one script in one viewer."""
 
-    def __init__(self, viewer: meshcat.Visualizer, script: Script) -> None:
+    def __init__(self, viewer: meshcat.Visualizer, script: Script, *, legend: bool) -> None:
         self.viewer = viewer
         self.script = script
+        self.labelled = not legend or len(script.target_names) > 1
         self.loader = ShapeLoader(viewer)
         self.clips: dict[meshcat.path.Path, AnimationClip] = {}
         robots = {id(actor.robot): actor.robot for actor in script.actors}
@@ -139,9 +146,11 @@ class _Drawing:
         right = across(toward)
         up = np.cross(toward, right)
         for target in (*self.script.targets, *actor.goals):
-            half = 0.5 * marks.label_width(target.name) * _LABEL * size * right
-            top = (1.2 * _BALL + _LABEL) * size * up
-            found += [target.places + top - half, target.places + top + half, target.places - _BALL * size * up]
+            if self.labelled:
+                half = 0.5 * marks.label_width(target.name) * _LABEL * size * right
+                bottom = (1.2 * _BALL + _LABEL) * size * up
+                found += [target.places - bottom - half, target.places - bottom + half]
+            found += [target.places - _BALL * size * up, target.places + _BALL * size * up]
         for name in actor.frames:
             body, placement = self.pictures[id(actor.robot)].frame(name)
             tips = placement.translation + _TRIAD * size * placement.rotation.T
@@ -206,7 +215,10 @@ class _Drawing:
             self.viewer[f"{node}/ball"].set_object(marks.ball(_BALL * size, TARGET_COLOR))
             if target.turns is not None:
                 self.viewer[f"{node}/axes"].set_object(marks.triad(_TRIAD * size))
-            self.viewer[f"{node}/label"].set_object(marks.Label(target.name, _LABEL * size, 1.2 * _BALL * size))
+            # The tool comes to a target from above or from the side.
+            if self.labelled:
+                below = marks.Label(target.name, _LABEL * size, -1.2 * _BALL * size)
+                self.viewer[f"{node}/label"].set_object(below)
 
     def _outlooks(self, outlooks: Sequence[Outlook], root: str, size: float) -> None:
         """Draw the planned paths of frames as beads."""

@@ -55,8 +55,9 @@ def legend(script: Script) -> list[Entry]:
         names = dict.fromkeys(region.name for region in found if region.kind == kind)
         if names:
             entries.append(Entry(text.format(", ".join(names)), (f"#{REGION_COLORS[kind]:06x}",)))
-    if script.targets or any(actor.goals for actor in script.actors):
-        entries.append(Entry("target", (f"#{TARGET_COLOR:06x}",)))
+    if targets := script.target_names:
+        words = "target" if targets == ("target",) else f"target: {', '.join(targets)}"
+        entries.append(Entry(words, (f"#{TARGET_COLOR:06x}",)))
     return entries
 
 

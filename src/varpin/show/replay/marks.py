@@ -98,12 +98,12 @@ def label_width(text: str) -> float:
 
 
 class Label(Object):
-    """A text on a light plate above a point. It faces the camera and is in front of everything else.
+    """A text on a translucent plate above or below a point. It faces the camera and is in front of everything else.
 
     Args:
         text: The text.
         size: Height of the plate [m].
-        above: Distance from the point to the plate [m].
+        above: Distance from the point up to the plate [m]; negative for a plate below the point.
     """
 
     def __init__(self, text: str, size: float, above: float) -> None:
@@ -142,16 +142,17 @@ class Label(Object):
 def _plate(text: str, above: float) -> tuple[str, float, float]:
     """An image of the plate, whose centre is the labelled point: its URL, and its width and height in plate heights.
 
-    The lower half, and the part between point and plate, are empty.
+    The other half, and the part between point and plate, are empty.
     """
-    width, height = label_width(text), 2.0 * (1.0 + above)
+    width, height = label_width(text), 2.0 * (1.0 + abs(above))
+    top = 0.0 if above >= 0.0 else height - 1.0
     pixels = 64
     drawing = f"""\
 <svg xmlns="http://www.w3.org/2000/svg" width="{pixels * width:.0f}" height="{pixels * height:.0f}"
  viewBox="0 0 {width:.3f} {height:.3f}">
-<rect x="0.03" y="0.03" width="{width - 0.06:.3f}" height="0.94" rx="0.2"
- fill="#fff" fill-opacity="0.85" stroke="#1d2733" stroke-width="0.04"/>
-<text x="{width / 2.0:.3f}" y="0.73" font-family="sans-serif" font-size="0.7" fill="#1d2733"
+<rect x="0.03" y="{top + 0.03:.3f}" width="{width - 0.06:.3f}" height="0.94" rx="0.2"
+ fill="#fff" fill-opacity="0.7" stroke="#1d2733" stroke-opacity="0.5" stroke-width="0.04"/>
+<text x="{width / 2.0:.3f}" y="{top + 0.73:.3f}" font-family="sans-serif" font-size="0.7" fill="#1d2733"
  text-anchor="middle">{markup.escape(text)}</text>
 </svg>"""
     return f"data:image/svg+xml;base64,{base64.b64encode(drawing.encode()).decode()}", width, height

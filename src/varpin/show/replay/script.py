@@ -187,6 +187,12 @@ class Script:
     speed: float = 1.0
 
     @property
+    def target_names(self) -> tuple[str, ...]:
+        """The names of all targets and goals."""
+        every = (*self.targets, *(goal for actor in self.actors for goal in actor.goals))
+        return tuple(dict.fromkeys(target.name for target in every))
+
+    @property
     def title(self) -> str:
         """The names of the robots."""
         return ", ".join(dict.fromkeys(actor.robot.name for actor in self.actors))

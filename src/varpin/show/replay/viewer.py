@@ -32,7 +32,7 @@ def inline(script: Script, size: tuple[int, int]) -> Inline:
 
 def _page(script: Script) -> str:
     page = Page()
-    draw(meshcat.Visualizer(window=page), script)
+    draw(meshcat.Visualizer(window=page), script, legend=True)
     return page.html(script)
 
 

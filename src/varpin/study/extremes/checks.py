@@ -1,7 +1,7 @@
-"""Independent checks of a motion. None of them uses what the integrator that made it says of itself.
+"""Independent checks of a motion. None of them uses the integrator's own statistics.
 
-Each takes a trajectory, whoever made it, and returns a number that is small if the trajectory is right, NaN if the
-check does not apply. From the values in :data:`LEVELS` on an error is wrong, unless varpin warned.
+Each check takes a trajectory of any integrator. It returns a number that is small if the trajectory is right, and NaN
+if the check does not apply. An error of at least the value in :data:`LEVELS` is wrong, unless varpin warned.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def measures(scene: Scene, integrator: Integrator, trajectory: Trajectory, exact
         and exact.nodes[-1] < _STARTING
         and not trajectory.v[0].any()
     ):
-        # What starts from rest is behind by half a step: much of what can be told of it, little of its motion.
+        # A motion that starts from rest lags by half a step: much of its short exact part, little of the whole motion.
         exact = None
     with np.errstate(over="ignore", invalid="ignore"):
         A = linearized(scene, integrator, trajectory)

@@ -56,13 +56,13 @@ class Cell:
         period: Largest error over a period from any of many nodes of the whole motion, in units of what is wrong.
         energy: Largest error of the energy balance, in units of the energy there is to turn over.
         momentum: Largest change of the momentum that is to be conserved, in units of the largest one.
-        reversal: Distance in q from where the reversed motion is to end, in units of the way.
+        reversal: Distance in q from where the reversed motion is to end, as a share of the joint travel.
         symplecticity: Largest entry of A' J A - J, in units of the sum of magnitudes that cancel in it.
         record: Largest distance of recorded momenta and energies from Pinocchio's, in their own units.
-        said: What varpin said of it: warnings, or the error.
-        found: What the checks found wrong.
-        done: Steps done.
-        steps: Steps asked for.
+        said: varpin's warnings, or its error.
+        found: The failed checks.
+        done: Number of steps taken.
+        steps: Number of steps of a complete motion.
         seconds: Wall time, checks included [s].
         fingerprint: Of all it depends on.
     """
@@ -125,11 +125,11 @@ class Record:
         return {kind: sum(cell.kind is kind for cell in self.cells) for kind in Kind}
 
     def wrong(self) -> tuple[Cell, ...]:
-        """The cells that are wrong with nothing said."""
+        """The cells that are wrong without a warning."""
         return tuple(cell for cell in self.cells if cell.kind is Kind.WRONG)
 
     def needless(self) -> tuple[Cell, ...]:
-        """The cells that varpin warns of although every check passes: false alarms."""
+        """The cells with a warning although every check passes: false alarms."""
         return tuple(cell for cell in self.cells if cell.needless)
 
     def save(self, path: str | os.PathLike[str]) -> Path:

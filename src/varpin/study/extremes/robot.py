@@ -199,8 +199,14 @@ def _cell(motion: Motion, integrator: Integrator, patience: float) -> Cell:
 def judge(
     trajectory: Trajectory, error: VarpinError | None, wrong: tuple[str, ...]
 ) -> tuple[Kind, tuple[str, ...], tuple[str, ...]]:
-    """The kind of a motion that an error may have ended, what varpin said of it, and what the checks found wrong."""
-    # Neither is of the steps near by, which are judged.
+    """The kind of a motion, varpin's error and warnings, and the failed checks.
+
+    Args:
+        trajectory: The motion.
+        error: The error that ended it; None for a complete motion.
+        wrong: The failed checks.
+    """
+    # These warnings are not about the steps that the checks judge.
     elsewhere = (*limits.KINDS, growth.SAID)
     warnings = (warning for warning in trajectory.warnings if not warning.startswith(elsewhere))
     said = (*(() if error is None else (line_of(error),)), *warnings)

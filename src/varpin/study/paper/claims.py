@@ -131,13 +131,13 @@ def free_motions() -> dict[tuple[str, float], Trajectory]:
 Judgement = tuple[str, str]
 Judge = Callable[[Any], Judgement]
 
-# Sources, sentences and judgements, of motions and of cells: in the order of the report.
+# Source, sentence and judge of each claim about motions and about cells, in the order of the report.
 _OF_MOTIONS: list[tuple[str, str, Judge]] = []
 _OF_CELLS: list[tuple[str, str, Judge]] = []
 
 
 def _claim(source: str, sentence: str, among: list[tuple[str, str, Judge]] = _OF_CELLS) -> Callable[[Judge], Judge]:
-    """Make a claim of what judges it; its :class:`NotRunError` says that its cells were not run."""
+    """Register a judge of a claim; it raises :class:`NotRunError` where its cells were not run."""
 
     def keep(judge: Judge) -> Judge:
         among.append((source, sentence, judge))

@@ -1,4 +1,4 @@
-"""The runs: each cell of (setting, case, method, dt) once, and kept on disk: an interrupted reproduction goes on.
+"""The runs, one for each cell (setting, case, method, dt). They are kept on disk, to continue after an interruption.
 
 Equation (O10) of docs/mathematics.md.
 """
@@ -155,7 +155,7 @@ def _optimum(task: Task) -> Cell:
 
 
 def _under_noise(task: Task) -> Cell:
-    """A policy in the noisy scene, by Monte Carlo: of S-DDP, or of DDP that was told of no noise."""
+    """A policy in the noisy scene, by Monte Carlo: of S-DDP, or of DDP on the scene without noise."""
     problem = cases.problem(task.setting, task.case, "variational", task.dt)
     known = problem if task.method == STOCHASTIC else cases.problem(task.setting, None, "variational", task.dt)
     started = time.perf_counter()
@@ -196,8 +196,9 @@ def _cell(task: Task, solution: Solution, seconds: float, sampled: tuple[float, 
 def _middle_gains(solution: Solution) -> Floats:
     """The feedback gains on x, referred to the state in the middle of each step, (O10), at ``GAIN_TIMES``.
 
-    A held control reacts, on average, half a step late. Seen from the node where its step begins its gain therefore
-    differs from the continuous one in first order, whatever the integrator; seen from the middle, in second.
+    A held control reacts half a step late on average. Its gain on the state at the beginning of the step therefore
+    differs from the continuous gain in first order, for every integrator; its gain on the state in the middle differs
+    in second order.
     """
     problem = solution.problem
     lin = linearize(problem.scene, solution.trajectory, integrator=problem.integrator)

@@ -91,11 +91,11 @@ stages, running costs sampled at two points of each step.</p>
 Taken: no friction; first controls that hold the finger where it starts; search parameters {html.escape(str(SEARCH))},
 the tolerance relative to the cost; feedback in the line search, where the paper's forward pass is open loop; and</p>
 <ul>{settings}</ul><ul>{noises}</ul>
-<p>Nothing was tuned until a figure looked like the paper's. The optimizer's own cost is what the paper reports. The
-true cost is that of its controls on the continuous system, integrated by a fourth-order method with the substeps
-doubled until the cost stands still, open loop and with the plan's feedback; where one number stands for both it is the
-better of the two, what a user gets who chooses well. The optimum over held controls is computed with that
-method inside each interval: what it costs to decide only every dt, whatever the integrator.</p>
+<p>No setting was tuned to make a figure resemble the paper's. The paper reports the optimizer's own cost. The true cost
+is that of the plan's controls on the continuous system, with and without the plan's feedback; a fourth-order method
+integrates it, with substeps doubled until the cost no longer changes. Where there is one number for both, it is the
+smaller. The optimum over held controls is computed with the same method inside each interval: it is the least cost of
+controls that change only every dt, for any integrator.</p>
 <h2>Claim by claim</h2>
 <table><tr><th>source</th><th>sentence</th><th>measured</th><th>verdict</th></tr>
 {"".join(_claim_row(claim) for claim in claims)}</table>

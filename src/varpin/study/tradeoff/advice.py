@@ -26,9 +26,9 @@ from varpin.support.markup import facts, table
 # Headings of a choice's entries in a table.
 COLUMNS = ("integrator", "dt [s]", "steps", "predicted time [s]", "predicted error in q", "note")
 
-# Short runs are repeated for this long [s], at most so often: the first ones find caches cold.
+# Total time of the repetitions of a short run [s], and their largest number: the first ones find caches cold.
 _TIMING, _REPEATS = 0.02, 5
-# Runs shorter than this confirm a prediction, as nobody waits for them [s].
+# Longest predicted time of a run that confirms the prediction [s].
 _CHEAP = 0.5
 # Nodes at which the midpoint integrator's largest step is computed: a bound by samples, for information.
 _NODES = 32
@@ -143,8 +143,8 @@ def advise(
     """The cheapest integrator and step that meet an accuracy on a motion, or the most accurate in a time.
 
     What counts is the error in q at the end, the largest over the joints, on this scene from this state under these
-    controls. It takes some times as long as the motion itself will. A horizon of many oscillations of a chaotic motion
-    has no end that any method gets right; the advice then says that the wish is not reached.
+    controls. The search takes several times as long as the motion itself. The end of a chaotic motion over many
+    oscillations is beyond every method; the advice then reports that the tolerance is not reached.
 
     Main args:
         scene: Without noise.

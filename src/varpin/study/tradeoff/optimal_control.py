@@ -20,7 +20,7 @@ from varpin.study.tradeoff.runs import Progress, Run, Tradeoff, complete
 from varpin.study.tradeoff.setting import Setting, digest, fastest, integrators_of
 from varpin.support.checks import count, positive, writable
 
-# Options of solve that are told of a search and change nothing in it.
+# Options of solve that observe a search and do not change it.
 _ONLOOKERS = ("callback", "progress")
 
 HEADINGS = {

@@ -171,12 +171,12 @@ def work_precision(
         dts: Time steps [s], each rounded so that the controls' intervals hold whole numbers of steps.
 
     Other Args:
-        reference: What errors are measured against; its tolerance is varied to see how exact it is. Scenes with
+        reference: The reference of the errors; its own error is estimated with another tolerance. Scenes with
             constraints have ``Gauss(4)``, in steps that are halved until nothing changes.
-        repeats: Of each run; the fastest counts. One more goes before them where runs are short.
+        repeats: Number of repetitions of each run; the fastest counts. Short runs have one more, which is not timed.
         progress: Called with (runs done, runs in all).
-        save: Keep the record in this npz, run by run; runs that it holds already are kept, and not run again,
-            whatever other steps and integrators are asked for.
+        save: Save the record in this npz file after each run. Runs that the file already has are not repeated, also
+            if steps and integrators differ from those of before.
         executor: Any ``concurrent.futures.Executor`` that takes the runs, one at a time each; they follow each other
             here if left out. Errors are the same; wall times are those of its workers, and to be trusted where each
             has a core, and all have the same kind.

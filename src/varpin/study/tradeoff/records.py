@@ -22,9 +22,9 @@ MARGIN = 0.02
 
 
 class Record:
-    """A frozen dataclass of ``runs`` and of the facts that belong to them all, kept as npz and written as CSV.
+    """A frozen dataclass of ``runs`` and of the facts common to all of them, saved as npz and written as CSV.
 
-    A subclass says the format of its files, the headings of its columns, and which of them a notebook shows.
+    A subclass defines the format of its files, the headings of its columns, and the columns that a notebook shows.
     """
 
     runs: tuple[Any, ...]

@@ -76,7 +76,7 @@ class Setting(Frozen):
         scene: Without noise.
         q0: (n,) [rad or m].
         v0: (n,) [rad/s or m/s].
-        controls: (R, m), each row held over duration / R; joints that are moved by hand go to theirs in that time.
+        controls: (R, m), each row held over duration / R; kinematic inputs reach their positions in that time.
         duration: [s].
     """
 
@@ -90,7 +90,7 @@ class Setting(Frozen):
     def of(
         cls, scene: Scene, q0: JointValues, v0: JointValues, controls: JointValues | None, duration: float
     ) -> Setting:
-        """Checked; a start next to constraints is moved onto them, and the log says how far.
+        """The setting of checked arguments. A start near constraints is moved onto them; the log has the distance.
 
         Raises:
             InputError: Wrong shapes or values, a scene with noise, controls that are a function.
@@ -150,7 +150,7 @@ class Setting(Frozen):
         q, v = np.full((2, samples + 1, n), np.nan)
         q[0], v[0] = self.q0, self.v0
         nothing = np.zeros((0, 0, 0))
-        moved = self._moved_by_hand(steps) if self.scene.inputs else None
+        moved = self._of_inputs(steps) if self.scene.inputs else None
         tally, drift, failure = np.zeros(4, dtype=np.int64), 0.0, ""
         begin = time.perf_counter()
         state, (start,) = integrator.start(self.scene, self.q0[None], self.v0[None])
@@ -172,8 +172,8 @@ class Setting(Frozen):
         newton, jets, sweeps, split = (int(x) for x in tally)
         return Outcome(q, v, drift, seconds, newton, jets, sweeps, split, failure)
 
-    def _moved_by_hand(self, steps: int) -> Floats:
-        """Controls (steps, m) where joints are moved by hand."""
+    def _of_inputs(self, steps: int) -> Floats:
+        """Controls (steps, m) of a scene with kinematic inputs."""
         parts = len(self.controls)
         start = self.q0, self.v0
         return held_in_parts(self.scene, self.controls, *start, self.duration / parts, steps // parts)
@@ -199,7 +199,7 @@ def digest(part: Any) -> str:
     """SHA-256 over numbers, words, arrays, and tuples, mappings and dataclasses of them; the same in every process.
 
     Raises:
-        InputError: Something else is in it, of which only its address could be told.
+        InputError: It contains an object without a value of its own, known by its address alone.
     """
     total = hashlib.sha256()
     for array in _arrays(part):
