@@ -73,6 +73,8 @@ def polished(
 ) -> Polished:
     """The motion near a given one that satisfies its constraints, and the conditions of an optimum, most closely.
 
+    Newton steps on the KKT conditions, equation (P4).
+
     Args:
         problem: The problem with its constraints.
         motion: A nearly feasible and nearly optimal motion.
