@@ -567,12 +567,11 @@ class OptimalControlProblem(Frozen):
 
         ``compiled`` are values of the running terms that the core evaluates, at all samples (N s, terms).
         """
-        found = [compiled.ravel()]
+        weight = self.dt * self.rule[0, 0]
+        found = [weight * compiled.ravel()]
         if self.running.others:
             at = self.samples(q, v, u)
-            found += [part.value(*at) for part in self.running.others]
-        weight = self.dt * self.rule[0, 0]
-        found = [weight * values for values in found]
+            found += [weight * part.value(*at) for part in self.running.others]
         found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))

@@ -346,9 +346,9 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
 def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) -> Floats:
     """Forces of the controls plus a drift (N, n): (N, 1, n), or (N, s, n) for controls that change within steps."""
     drift = drift[:, None] if isinstance(drift, np.ndarray) else drift
-    if trajectory.u_stages.shape[1]:
-        return np.ascontiguousarray(trajectory.u_stages @ scene.actuation.T + drift)
-    return np.ascontiguousarray((trajectory.u @ scene.actuation.T)[:, None] + drift)
+    u = trajectory.u_stages if trajectory.u_stages.shape[1] else trajectory.u[:, None]
+    total = u if scene.direct else u @ scene.actuation.T
+    return np.ascontiguousarray(total + drift if isinstance(drift, np.ndarray) else total)
 
 
 def segments_of(

@@ -397,7 +397,7 @@ class Scene(Frozen):
             gear[servo.coordinate] = servo.values[0]
         return gear
 
-    @property
+    @cached_property
     def controls(self) -> int:
         """m, the number of controls."""
         return int(self.actuation.shape[1])
