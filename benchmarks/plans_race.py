@@ -159,10 +159,6 @@ def timed(run: Callable[[], Any]) -> tuple[Any, float]:
     return found, time.process_time() - began
 
 
-# The place of plain ``vp.solve`` among the times.
-PLAIN = -1
-
-
 class Race:
     """One task: its runs so far, and how each can be repeated."""
 
@@ -189,9 +185,11 @@ class Race:
         return true_cost(self.problem, policy, self.rate, planned)
 
     def off(self, k: int) -> float | None:
-        """The relative difference of SciPy's true cost of a run's controls; None where that would take long."""
+        """The difference of SciPy's true cost of good controls, relatively; None for bad ones, or of many nodes."""
         run = self.runs[k]
-        return None if run.N > CHECKED else by_scipy(self.problem, self.policies[k]) / run.alone - 1.0
+        if run.N > CHECKED or run.alone > (1.0 + WITHIN) * self.optimum:
+            return None
+        return by_scipy(self.problem, self.policies[k]) / run.alone - 1.0
 
     def climb(self, side: str, scheme: str, shape: str, prepared: Callable[[int], Callable[[], Any]]) -> None:
         """Up the ladder until the plans' costs no longer change."""
@@ -231,6 +229,20 @@ class Race:
             prepared = lambda N, own=scheme: by_crocoddyl(self.problem, self.dynamics.shooting(N, own), stop)  # noqa: E731
             self.climb("crocoddyl", scheme, "held", prepared)
 
+    def by_itself(self, shape: str) -> Callable[[], vp.Solution]:
+        """The plain way: a coarse step, the default integrator, and a true cost."""
+        at, steps = self.problem, round(self.problem.duration / COARSEST)
+        limits = tuple(at.control_limits)
+        coarse = vp.OptimalControlProblem(
+            at.scene, at.cost, at.q0, at.v0, dt=COARSEST, steps=steps, control_limits=limits, controls=shape
+        )
+        return lambda: vp.solve(coarse, true_cost=WITHIN, check=False)
+
+    def told(self, plan: vp.Solution) -> dict[str, Any]:
+        """What a plan made the plain way took, and what it loses to the optimum."""
+        lost = self.cost(policy_of(self.problem, plan), plan.cost) / self.optimum - 1.0
+        return {"met": plan.refinement.met, "N": plan.problem.steps, "tried": len(plan.refinement.tried), "loss": lost}
+
     def result(self) -> dict[str, Any]:
         """The optimum, all runs, the best of each side by either cost, and plain ``vp.solve(..., true_cost=...)``."""
         optimum = self.optimum
@@ -240,27 +252,26 @@ class Race:
             for way in ("alone", "feedback"):
                 own = [k for k, run in enumerate(self.runs) if run.side == side and getattr(run, way) <= good]
                 chosen[side, way] = sorted(own, key=lambda k: self.runs[k].seconds)[:CANDIDATES]
-        asked = self.problem.at(dt=COARSEST)
-        plain = lambda: vp.solve(asked, true_cost=WITHIN, check=False)  # noqa: E731
-        plan, once = timed(plain)
-        repeated = {k for own in chosen.values() for k in own}
-        times = {PLAIN: once} | {k: self.runs[k].seconds for k in repeated}
+        repeated = {k: self.again[k] for own in chosen.values() for k in own}
+        plain = {shape: self.by_itself(shape) for shape in ("held", "linear")}
+        times: dict[int | str, float] = dict.fromkeys((*repeated, *plain), np.inf)
         for turn in range(ROUNDS):
-            for k, run in {PLAIN: plain, **{k: self.again[k] for k in repeated}}.items():
+            for k, run in (repeated | plain).items():
                 if turn == 0 or turn * times[k] < ENOUGH:
                     times[k] = min(times[k], timed(run)[1])
         for k in repeated:
-            self.runs[k].seconds = times[k]
-        off = {k: self.off(k) for k in repeated}
+            self.runs[k].seconds = min(self.runs[k].seconds, times[k])
         best: dict[str, dict[str, Any]] = {"varpin": {}, "crocoddyl": {}}
         for (side, way), own in chosen.items():
             if own:
-                k = min(own, key=times.get)
-                best[side][way] = asdict(self.runs[k]) | {"scipy": off[k]}
-        refined = plan.refinement
-        told = {"seconds": times[PLAIN], "met": refined.met, "N": plan.problem.steps, "tried": len(refined.tried)}
-        told["loss"] = self.cost(policy_of(self.problem, plan), plan.cost) / optimum - 1.0
-        return {"optimum": optimum, "best": best, "plain": told, "runs": [asdict(run) for run in self.runs]}
+                k = min(own, key=lambda k: self.runs[k].seconds)
+                best[side][way] = asdict(self.runs[k]) | {"scipy": self.off(k)}
+        return {
+            "optimum": optimum,
+            "best": best,
+            "plain": {shape: self.told(run()) | {"seconds": times[shape]} for shape, run in plain.items()},
+            "runs": [asdict(run) for run in self.runs],
+        }
 
 
 def main() -> None:
@@ -277,16 +288,13 @@ def main() -> None:
         race.all()
         results[name] = race.result()
         asked.file.write_text(json.dumps(results, indent=1))
-        print(name)
+        print(name, flush=True)
         for side, ways in results[name]["best"].items():
             for way, best in ways.items():
                 how = f"{best['scheme']}, {best['controls']}, {best['N']} nodes"
                 print(f"  {side:9} {way:8} {1e3 * best['seconds']:9.2f} ms, {best['iterations']:3d} iterations: {how}")
-        plain = results[name]["plain"]
-        print(
-            f"  {'plain':9} {'':8} {1e3 * plain['seconds']:9.2f} ms, {plain['N']} nodes, {plain['loss']:+.2%}",
-            flush=True,
-        )
+        for shape, plain in results[name]["plain"].items():
+            print(f"  {'plain':9} {shape:8} {1e3 * plain['seconds']:9.2f} ms, {plain['N']} nodes, {plain['loss']:+.2%}")
 
 
 if __name__ == "__main__":
