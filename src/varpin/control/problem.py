@@ -61,8 +61,9 @@ _FUNCTION = re.compile(r"<(?:[^<>]|<[^<>]*>)* at 0x[0-9a-f]+>")
 Sampling = Literal["midpoint", "gauss", "start"]
 Shape = Literal["held", "linear"]
 
-# Greatest rate of dampers and dry friction, times the step, for a method that is not L-stable.
-_STIFF = 200.0
+# Greatest rate of dampers and dry friction, times the step, for a method that is not L-stable; and of servos, whose
+# commands jump: what a jump excites divides steps, and where another step is divided the cost is discontinuous.
+_STIFF, _STIFF_SERVO = 200.0, 100.0
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -101,7 +102,8 @@ class OptimalControlProblem(Frozen):
         dt: Time step [s].
         steps: N.
         integrator: Any of varpin's. If left out, ``Gauss(stages=4)``; ``Radau(stages=4)`` where dry friction or dampers
-            are more than 200 times as fast as the step at ``q0`` and rest, and the scene has no constraints.
+            are more than 200 times as fast as the step at ``q0`` and rest, with servos more than 100 times, and the
+            scene has no constraints.
         sampling: Where in each step running costs are sampled. ``"gauss"``, the default: at its two Gauss points, with
             a cubic motion between the nodes, of fourth order. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of
             second order; it is blind to velocities that alternate from node to node, as optimal ones often do.
@@ -114,6 +116,7 @@ class OptimalControlProblem(Frozen):
         constraints: Hard constraints on the motion (:class:`PlanConstraint`): joint limits, a frame's goal, regions,
             clearance. The constraints of a :class:`Scene` differ: they belong to the mechanism, and constraint forces
             maintain them in every motion.
+        integrator_by_default: Whether ``integrator`` was left out; :meth:`at` then chooses it anew.
         rate: Cost of changes of the controls: ``rate.weight`` (m, m) and ``rate.before``, the control before the
             horizon (m,) or None; None where changes cost nothing.
     """
@@ -135,6 +138,7 @@ class OptimalControlProblem(Frozen):
     rule: Floats = field(repr=False)
     rate: ControlRate | None = field(repr=False)
     controls: Shape
+    integrator_by_default: bool = field(repr=False)
     bound_constraints: tuple[BoundConstraint, ...] = field(repr=False)
 
     def __init__(
@@ -229,6 +233,7 @@ class OptimalControlProblem(Frozen):
             "rule": rule,
             "rate": rate,
             "controls": controls,
+            "integrator_by_default": integrator is None,
             "bound_constraints": _bind_constraints(given, scene, t0, dt, steps, hold, rate),
         }
         for name, value in values.items():
@@ -301,7 +306,8 @@ class OptimalControlProblem(Frozen):
     ) -> OptimalControlProblem:
         """The same problem with another discretization or initial state.
 
-        With ``dt`` alone the horizon stays, and the number of steps follows. ``before`` is the control applied before
+        With ``dt`` alone the horizon stays, and the number of steps follows. An integrator that was left out is chosen
+        anew for the step and the state. ``before`` is the control applied before
         the horizon, one number, (m,) or by joint name, for :class:`ControlRateCost` and :class:`WithinControlRate`.
 
         Raises:
@@ -326,7 +332,7 @@ class OptimalControlProblem(Frozen):
             self.v0 if v0 is None else v0,
             dt=self.dt if dt is None else dt,
             steps=self.steps if steps is None else steps,
-            integrator=self.integrator if integrator is None else integrator,
+            integrator=integrator if integrator is not None or self.integrator_by_default else self.integrator,
             sampling=self.sampling if sampling is None else sampling,
             hold=self.hold if hold is None else hold,
             t0=self.t0 if t0 is None else t0,
@@ -637,10 +643,12 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     """The integrator of a problem that gives none: the default, or the L-stable one of as many stages.
 
     A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4): for z above 200 hardly at
-    all. With constraints of the scene it is always the default, since Radau's methods do not support them.
+    all. Scenes with servos take the L-stable one from z = 100 on. With constraints of the scene it is always the
+    default, since Radau's methods do not support them.
     """
     stages = default_integrator().stages
-    if scene.constraints or not dt * rate_at_rest(scene, q0) > _STIFF:
+    most = _STIFF_SERVO if scene.servo_joints else _STIFF
+    if scene.constraints or not dt * rate_at_rest(scene, q0) > most:
         return default_integrator()
     return Radau(stages=stages)
 
