@@ -215,6 +215,46 @@ def test_dual_problems_are_those_of_scipy():
         assert values[0] <= values[1] + 1e-9 * abs(values[1])
 
 
+def test_first_penalties_on_given_states_are_light():
+    """They are those of a motion that stays on its states, and not of one that falls, as its weak drives let it."""
+    scene = vp.Scene(ROBOT)
+    held = np.clip(scene.holding_torque(np.zeros(2)), -4.0, 4.0)
+    assert (np.abs(held) == 4.0).any()
+    problem = vp.OptimalControlProblem(
+        scene,
+        vp.ControlCost(1e-3) + vp.TrackingCost([0.0, 0.0], 10.0),
+        [0, 0],
+        [0, 0],
+        dt=0.05,
+        steps=16,
+        control_limits=(-4.0, 4.0),
+        integrator=vp.Midpoint(),
+        constraints=[vp.WithinVelocityLimits(ROBOT, (-20.0, 20.0))],
+    )
+    plan = vp.solve(problem, states=np.zeros((17, 2)), max_iterations=0, check=False)
+    scale = problem.bound_constraints[0].scale
+    told = plan.multipliers.first_weights[0] * scale**2 * np.sqrt(16)
+    assert told == pytest.approx(0.8 * 1e-3 * held @ held, rel=1e-6)
+    assert told < 1e-2 * plan.cost
+
+
+def test_servos_within_velocity_limits():
+    """A stiff servo: in steps that the guard divides the search would find no plan, and call the limits infeasible."""
+    robot = vp.load_robot("ur5")
+    begin = np.array([0.0, -1.2, 1.2, -1.0, -1.5, 0.0])
+    end = begin + np.array([1.0, 0.4, -0.4, 0.5, 0.3, 0.2])
+    scene = vp.Scene(robot, forces=[vp.PositionServo(4000.0, 2.0 * np.sqrt(4000.0))])
+    cost = vp.TrackingCost(end) + vp.VelocityCost(1e-2) + vp.ControlCost(1e-3, end)
+    cost += vp.Terminal(vp.TrackingCost(end, 100.0) + vp.VelocityCost(10.0))
+    limits = vp.WithinVelocityLimits(robot, (-2.0, 2.0))
+    problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=0.02, steps=40, constraints=[limits])
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    assert len(plan.history) <= 30
+    assert plan.violation <= 1e-9
+    assert plan.constraints[0].active.any()
+
+
 def test_bounds_that_nothing_meets_change_nothing():
     free = vp.solve(two_links(), check=False)
     plan = vp.solve(two_links([vp.WithinVelocityLimits(ROBOT, (-50.0, 50.0))]), check=False)

@@ -8,7 +8,7 @@ from findings import about
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control.refinement import refine
+from varpin.control.refinement import _halved, refine
 
 
 def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
@@ -185,3 +185,17 @@ def test_interrupted_before_a_motion_is_made() -> None:
         found = refine(reach(3), search, 1e-12, lambda: np.inf)
         assert found.status is vp.Status.INTERRUPTED
         assert found.cost == coarse.cost
+
+
+def test_the_default_integrator_is_chosen_on_each_grid() -> None:
+    """A damper that is stiff for the first step only; an integrator that was given stays."""
+    robot = vp.planar_chain(1)
+    inertia = float(vp.lagrangian_jet(vp.Scene(robot), np.zeros(1), np.zeros(1)).Lvv[0, 0])
+    scene = vp.Scene(robot, damping=inertia * 3000.0)
+    cost = vp.TrackingCost([0.1], 1.0) + vp.ControlCost(1e-9)
+    for given, finer in ((None, vp.Gauss(4)), (vp.Radau(4), vp.Radau(4))):
+        problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.1, steps=10, integrator=given)
+        assert problem.integrator == vp.Radau(4)
+        assert problem.at(dt=0.05).integrator == finer
+        assert problem.at(dt=0.05, integrator=vp.Midpoint()).integrator == vp.Midpoint()
+        assert _halved(problem).integrator == finer

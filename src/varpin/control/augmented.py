@@ -28,7 +28,7 @@ from varpin.control.penalties import PenalizedProblem, flat, penalized
 from varpin.control.polish import deviations, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import refine
-from varpin.control.search import NOTHING, checked_time, require_reports
+from varpin.control.search import NOTHING, checked_time, closing_of, require_reports
 from varpin.control.solution import Solution
 from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
@@ -203,8 +203,11 @@ class _Rounds:
             states=self.states,
             **self.options,
         )
-        cost = abs(first.cost) or 1.0
-        weights = np.array([cost / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
+        cost = abs(first.cost)
+        if self.states is not None:
+            # Where the auxiliary forces are dropped at once, the motion may fall, and its cost says nothing.
+            cost = min(cost, abs(closing_of(plain, self.states, self.controls).motion.cost))
+        weights = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
         nothing = np.full(len(self.bound), np.inf)
         self.state = _State(zeros, weights, weights, zeros, nothing, _LOOSE)
         return first

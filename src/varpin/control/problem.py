@@ -116,6 +116,7 @@ class OptimalControlProblem(Frozen):
         constraints: Hard constraints on the motion (:class:`PlanConstraint`): joint limits, a frame's goal, regions,
             clearance. The constraints of a :class:`Scene` differ: they belong to the mechanism, and constraint forces
             maintain them in every motion.
+        integrator_by_default: Whether ``integrator`` was left out; :meth:`at` then chooses it anew.
         rate: Cost of changes of the controls: ``rate.weight`` (m, m) and ``rate.before``, the control before the
             horizon (m,) or None; None where changes cost nothing.
     """
@@ -137,6 +138,7 @@ class OptimalControlProblem(Frozen):
     rule: Floats = field(repr=False)
     rate: ControlRate | None = field(repr=False)
     controls: Shape
+    integrator_by_default: bool = field(repr=False)
     bound_constraints: tuple[BoundConstraint, ...] = field(repr=False)
 
     def __init__(
@@ -237,6 +239,7 @@ class OptimalControlProblem(Frozen):
             "rule": rule,
             "rate": rate,
             "controls": controls,
+            "integrator_by_default": integrator is None,
             "bound_constraints": _bind_constraints(given, scene, t0, dt, steps, hold, rate),
         }
         for name, value in values.items():
@@ -309,7 +312,8 @@ class OptimalControlProblem(Frozen):
     ) -> OptimalControlProblem:
         """The same problem with another discretization or initial state.
 
-        With ``dt`` alone the horizon stays, and the number of steps follows. ``before`` is the control applied before
+        With ``dt`` alone the horizon stays, and the number of steps follows. An integrator that was left out is chosen
+        anew for the step and the state. ``before`` is the control applied before
         the horizon, one number, (m,) or by joint name, for :class:`ControlRateCost` and :class:`WithinControlRate`.
 
         Raises:
@@ -334,7 +338,7 @@ class OptimalControlProblem(Frozen):
             self.v0 if v0 is None else v0,
             dt=self.dt if dt is None else dt,
             steps=self.steps if steps is None else steps,
-            integrator=self.integrator if integrator is None else integrator,
+            integrator=integrator if integrator is not None or self.integrator_by_default else self.integrator,
             sampling=self.sampling if sampling is None else sampling,
             hold=self.hold if hold is None else hold,
             t0=self.t0 if t0 is None else t0,

@@ -24,7 +24,7 @@ from varpin.control.costs import CostError
 from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
-from varpin.control.multiple_shooting import GapClosing, path_of
+from varpin.control.multiple_shooting import GapClosing, Path, path_of
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import refine
 from varpin.control.solution import Solution
@@ -251,7 +251,7 @@ def solve(
         search.resume(_search_of(problem, controls, resume))
     elif path is None:
         search.begin(first_commands(problem, controls))
-    closing = None if path is None else GapClosing(problem, path, controls_along(problem, controls))
+    closing = None if path is None else closing_of(problem, path, controls)
     try:
         if closing is not None:
             search.close(closing, max_iterations, deadline, report)
@@ -260,6 +260,12 @@ def solve(
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     solution = search.solution(status)
     return looked_at(solution)[0] if check else solution
+
+
+def closing_of(problem: OptimalControlProblem, states: object, controls: object) -> GapClosing:
+    """The start of a search on given states, as :func:`solve` takes them, with its first motion."""
+    path = states if isinstance(states, Path) else path_of(problem, states)
+    return GapClosing(problem, path, controls_along(problem, controls))
 
 
 def require_reports(callback: Any, progress: object) -> Report:
