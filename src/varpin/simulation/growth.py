@@ -1,8 +1,9 @@
-"""Growth of the errors of single steps over a whole motion.
+"""Errors of single steps that add up or grow over a whole motion.
 
-Where disturbances grow a thousandfold, steps that are right to five digits make a motion that is right to two. Repeated
-steps give the error of a step, and the fastest modes of the linearized motion bound its growth. Only where the product
-is large, the whole motion is repeated by a method of more stages.
+Where disturbances grow a thousandfold, steps that are right to five digits make a motion that is right to two. And a
+step in which a force has a kink is off by far more than its neighbours. Repeated steps give the error of a step, and
+the fastest modes of the linearized motion bound its growth. Only where the product is large, the whole motion is
+repeated by a method of more stages, in smaller steps at kinks.
 """
 
 from __future__ import annotations
@@ -12,15 +13,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
+from varpin.simulation.kinks import kinks
 from varpin.simulation.modes import first_order, rate_bounds
-from varpin.simulation.retaking import finer, taken_again
+from varpin.simulation.retaking import Finer, finer, shortest_parts, taken_again
 from varpin.trajectory import Trajectory
 
 # Begin of the warning.
@@ -30,8 +32,14 @@ SAID = "disturbances grow here"
 _PLACES, _LEAST, _JOINTS = 6, 40, 60
 # Number of further steps, those that change velocities most, as where controls jump.
 _VIOLENT = 4
-# Threshold of the warning, as a share of the largest joint travel; and the part of it from which a motion is repeated.
-WARNED, NEAR = 0.02, 0.3
+# Most steps with a kink that are repeated one by one, and their parts; also the parts of all of them in a repetition of
+# the whole motion.
+_KINKS, _PARTS = 12, 8
+# Thresholds of the warning, as shares of the largest joint travel, where errors grow and where kinks make them; and the
+# part of them from which a motion is repeated.
+WARNED, _BENT, NEAR = 0.02, 0.003, 0.3
+# A longest way below this counts as no motion [rad or m].
+_SHORTEST = 1e-8
 # The share of the fastest mode's exponent by which a disturbance grows: at most half in 60 motions of arms and chains,
 # because modes turn. The exponent is the integral of the rate, which is unsteady: of the nodes the mean counts. And the
 # largest exponent that is computed.
@@ -47,6 +55,8 @@ class Growth(NamedTuple):
         share: The error as a share of the largest joint travel.
         time: When the error reaches the threshold of the warning [s].
         step: The largest error of a single step [rad or m].
+        causes: What happens in steps with a kink, in words, if most of the error comes from them; else empty.
+        kinks: Number of steps with a kink.
     """
 
     joint: int
@@ -54,6 +64,8 @@ class Growth(NamedTuple):
     share: float
     time: float
     step: float
+    causes: tuple[str, ...] = ()
+    kinks: int = 0
 
 
 def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
@@ -71,59 +83,105 @@ def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
     return _factor(float(_modes(*slopes).max()), trajectory)
 
 
-def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Growth | None:
-    """The error of a motion after errors of its steps have grown; None below the threshold of the warning.
+def grown_error(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, *, predictable: bool = False
+) -> Growth | None:
+    """The error of a motion after errors of its steps have added up or grown; None below the threshold of the warning.
 
-    None, too, under noise and constraints, with forces in Python, and of an integrator that chooses its own steps.
+    If the motion is known to be ``predictable`` apart from kinks, only these are looked at. None, too, under noise and
+    constraints, with forces in Python, and of an integrator that chooses its own steps.
     """
-    if isinstance(integrator, Reference) or _unexamined(scene, trajectory):
+    if isinstance(integrator, Reference) or _hidden(scene, trajectory):
         return None
-    steps = trajectory.steps
+    bent = kinks(scene, trajectory)
+    even = not (predictable or trajectory.steps < _LEAST)
+    if not (even or len(bent.steps)):
+        return None
     other = finer(integrator, trajectory, damped=False, pulled=False)
-    q, v = trajectory.q, trajectory.v
+    way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
+    # Ways of rounding alone are no motion.
+    way = np.maximum(way, max(_SHORTEST, ROUNDING * (1.0 + float(np.abs(trajectory.q).max()))))
     at = _places(trajectory)
-    # A few violent steps may be off by more than all others together.
-    repeated = np.append(at, np.abs(np.diff(v, axis=0)).max(axis=1).argsort()[-_VIOLENT:])
-    forces = np.ascontiguousarray(trajectory.u[repeated] @ scene.actuation.T)
-    nothing = open_loop(np.zeros((1, scene.controls)))
-    once = other.method.motions(scene, q[repeated], v[repeated], nothing, forces[:, None], trajectory.dt)
-    if once is None:
+    by_steps, by_kinks, largest = 0.0, 0.0, 0.0
+    if even:
+        # A few violent steps may be off by more than all others together.
+        violent = np.abs(np.diff(trajectory.v, axis=0)).max(axis=1).argsort()[-_VIOLENT:]
+        off = _steps_off(scene, trajectory, other, np.append(at, violent), 1)
+        if off is None:
+            return None
+        shares = ((off[0] + off[1] * trajectory.dt) / way).max(axis=1)
+        by_steps = max(trajectory.steps * float(shares[: len(at)].max()), float(shares[len(at) :].sum()))
+        largest = float(off[0].max())
+    if len(bent.steps):
+        chosen = bent.steps[np.unique(np.linspace(0, len(bent.steps) - 1, _KINKS).astype(np.int64))]
+        off = _steps_off(scene, trajectory, other, chosen, _PARTS)
+        if off is None:
+            return None
+        # Errors of velocities may last to the end.
+        left = trajectory.dt * (trajectory.steps - chosen)[:, None]
+        by_kinks = len(bent.steps) * float(((off[0] + off[1] * left) / way).max(axis=1).mean())
+        largest = max(largest, float(off[0].max()))
+    # Errors of kinks grow, too.
+    small = NEAR * WARNED / max(by_steps + by_kinks, 1e-300)
+    add_up = by_kinks > NEAR * _BENT
+    if not add_up and (trajectory.steps < _LEAST or _grows_less(scene, trajectory, at, small)):
         return None
-    # Controls that change within a step do so for both, nearly.
-    in_q, in_v = np.abs(once[0][:, 0] - q[repeated + 1]), np.abs(once[1][:, 0] - v[repeated + 1])
-    way = largest_of_its_kind(scene, np.ptp(q, axis=0))
-    least = ROUNDING * (1.0 + np.abs(q).max())
-    begins = ((in_q + in_v * trajectory.dt) / np.maximum(way, least)).max(axis=1)
-    small = NEAR * WARNED / max(steps * float(begins[: len(at)].max()), float(begins[len(at) :].sum()), 1e-300)
-    if small > np.exp(_MOST):
-        return None
-    try:
-        slopes = _slopes(scene, trajectory, at)
-    except LinearizationError:
-        return None
-    # Eigenvalues take longer than all else: at half of the places.
-    aq, av = slopes
-    if small > _factor(float(rate_bounds(aq, av).mean()), trajectory):
-        return None
-    if small > _factor(float(_modes(aq[::2], av[::2]).mean()), trajectory):
-        return None
-    again = taken_again(scene, other.method, trajectory, integrator.stage_times, 0, steps, other.parts)
+    parts = other.parts * shortest_parts(trajectory)
+    parts[bent.steps] = np.maximum(parts[bent.steps], _PARTS)
+    again = taken_again(scene, other.method, trajectory, integrator.stage_times, 0, trajectory.steps, parts)
     if again is None:
         return None
-    off = np.nan_to_num(np.abs(again[0] - q))
-    shares = off / np.maximum(way, least)
+    # Unknown from where a step of the repetition fails.
+    apart = np.nan_to_num(np.abs(again[0] - trajectory.q))
+    shares = apart / way
     joint = int(shares.max(axis=0).argmax())
     share = float(shares[:, joint].max())
-    if share <= WARNED:
+    by_bends = by_kinks > by_steps
+    least = _BENT if by_bends else WARNED
+    if share <= least:
         return None
-    first = float(trajectory.t[(shares[:, joint] > WARNED).argmax()])
-    return Growth(joint, float(off[:, joint].max()), share, first, float(in_q.max()))
+    first = float(trajectory.t[(shares[:, joint] > least).argmax()])
+    causes = bent.causes if by_bends else ()
+    return Growth(joint, float(apart[:, joint].max()), share, first, largest, causes, len(bent.steps))
+
+
+def _steps_off(
+    scene: Scene, trajectory: Trajectory, other: Finer, at: Integers, parts: int
+) -> tuple[Floats, Floats] | None:
+    """The errors of q and v (K, n) after single steps, by a better method in some parts; None where it fails."""
+    forces = np.repeat((trajectory.u[at] @ scene.actuation.T)[:, None], parts, axis=1)
+    nothing = open_loop(np.zeros((parts, scene.controls)))
+    q, v = trajectory.q, trajectory.v
+    # Controls that change within a step do so for both, nearly.
+    once = other.method.motions(scene, q[at], v[at], nothing, forces, trajectory.dt / parts)
+    if once is None:
+        return None
+    return np.abs(once[0][:, -1] - q[at + 1]), np.abs(once[1][:, -1] - v[at + 1])
+
+
+def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], factor: float) -> bool:
+    """Whether disturbances grow by less than a factor over a motion, or by how much is unknown."""
+    if factor > np.exp(_MOST):
+        return True
+    try:
+        aq, av = _slopes(scene, trajectory, at)
+    except LinearizationError:
+        return True
+    # Eigenvalues take longer than all else: at half of the places.
+    if factor > _factor(float(rate_bounds(aq, av).mean()), trajectory):
+        return True
+    return factor > _factor(float(_modes(aq[::2], av[::2]).mean()), trajectory)
+
+
+def _hidden(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether errors of steps are unknown: under noise, constraints or Python forces, or for many joints."""
+    hidden = scene.custom is not None or scene.constraints or trajectory.dw.any() or not trajectory.steps
+    return bool(hidden or scene.robot.dof > _JOINTS)
 
 
 def _unexamined(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether growth is not examined: under noise, constraints or Python forces, and for few steps or many joints."""
-    hidden = scene.custom is not None or scene.constraints or trajectory.dw.any()
-    return bool(hidden or scene.robot.dof > _JOINTS or trajectory.steps < _LEAST)
+    """Whether growth is not examined: where errors of steps are unknown, and for few steps."""
+    return _hidden(scene, trajectory) or trajectory.steps < _LEAST
 
 
 def _places(trajectory: Trajectory) -> NDArray[np.int64]:

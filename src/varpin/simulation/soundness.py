@@ -51,7 +51,6 @@ from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.simulation.phase import phase_lost
 from varpin.simulation.retaking import Again, Finer, finer, shortest_parts, stopping, taken_again
-from varpin.simulation.saturation import bent
 from varpin.trajectory import Trajectory
 
 # Errors are in units of the thresholds WRONG_ENERGY, WRONG_POSITION, WRONG_MOTION and WRONG_VELOCITY.
@@ -274,36 +273,32 @@ def _accumulated(
 ) -> tuple[Finding, ...]:
     """Errors that add up or grow over a motion whose steps resolve each period."""
     phase = () if resolution.in_phase else _out_of_phase(scene, integrator, trajectory)
-    found = (*phase, *_at_limits_of_drives(scene, integrator, trajectory))
-    return found or (() if resolution.predictable else _growing(scene, integrator, trajectory))
+    return phase or _growing(scene, integrator, trajectory, resolution)
 
 
-def _growing(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """A warning if small errors of single steps grow to large ones over the motion."""
-    found = grown_error(scene, integrator, trajectory)
+def _growing(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, resolution: Resolution
+) -> tuple[Finding, ...]:
+    """A warning if errors of single steps add up or grow to large ones over the motion."""
+    found = grown_error(scene, integrator, trajectory, predictable=resolution.predictable)
     if found is None:
         return ()
+    off = (
+        f"joint {trajectory.joint_names[found.joint]!r} elsewhere by up to {found.off:.2g} rad or m, "
+        f"{100 * found.share:.2g}% of the longest way of a joint, from t = {found.time:.4g} s on"
+    )
+    if found.causes:
+        sentence = (
+            f"{' and '.join(found.causes)} in {found.kinks} steps: dt = {trajectory.dt:g} s is coarse for {integrator} "
+            f"there, and smaller steps put {off}"
+        )
+        return (Finding("kinks of forces", sentence, found.joint),)
     sentence = (
         f"{SAID}: single steps of dt = {trajectory.dt:g} s by {integrator} are off by about "
-        f"{found.step:.1g} rad or m, and a method of more stages puts joint {trajectory.joint_names[found.joint]!r} "
-        f"elsewhere by up to {found.off:.2g} rad or m, {100 * found.share:.2g}% of the longest way of a joint, from "
-        f"t = {found.time:.4g} s on; smaller steps or more stages keep the motion right for longer"
+        f"{found.step:.1g} rad or m, and a method of more stages puts {off}; "
+        "smaller steps or more stages keep the motion right for longer"
     )
     return (Finding("growing errors", sentence, found.joint),)
-
-
-def _at_limits_of_drives(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """A warning if servos reach or leave the limits of their drives in steps that are too long for it."""
-    found = bent(scene, integrator, trajectory)
-    if found is None:
-        return ()
-    sentence = (
-        f"servos come to the limits of their drives, or leave them, in {found.steps} steps: dt = {trajectory.dt:g} s "
-        f"is coarse for {integrator} there, and joint {trajectory.joint_names[found.joint]!r} may be off by "
-        f"{found.off:.2g} rad or m, {100 * found.share:.2g}% of the longest way of a joint; "
-        "smaller steps reduce the error"
-    )
-    return (Finding("servos at their limits", sentence, found.joint),)
 
 
 def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:

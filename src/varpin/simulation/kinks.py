@@ -1,0 +1,84 @@
+"""Steps in which a force has a kink: drives that come to their limits, joints that come to stops, dry friction at rest.
+
+Collocation of any order does not resolve a kink within a step.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.arrays import Integers
+from varpin.mechanics.forces import of_kind
+from varpin.mechanics.scene import Scene
+from varpin.trajectory import Trajectory
+
+# Least change of dry friction in a step that counts as a kink, as a share of its level.
+_TURNS = 0.5
+
+
+class Kinks(NamedTuple):
+    """Steps with a kink.
+
+    Attributes:
+        steps: Their indices (K,).
+        causes: What happens there, in words.
+    """
+
+    steps: Integers
+    causes: tuple[str, ...]
+
+
+def kinks(scene: Scene, trajectory: Trajectory) -> Kinks:
+    """The steps of a motion in which a force of a joint has a kink."""
+    found = np.zeros(trajectory.steps, dtype=np.bool_)
+    causes = []
+    for cause, look in (
+        ("servos come to the limits of their drives, or leave them", _saturating),
+        ("joints come to their stops, or leave them", _stopping),
+        ("dry friction changes sides", _turning),
+    ):
+        own = look(scene, trajectory)
+        if own.any():
+            causes.append(cause)
+        found |= own
+    return Kinks(np.flatnonzero(found), tuple(causes))
+
+
+def _saturating(scene: Scene, trajectory: Trajectory) -> NDArray[np.bool_]:
+    """Steps (N,) in which a drive reaches or leaves its limit."""
+    found = np.zeros(trajectory.steps, dtype=np.bool_)
+    servos = [own for own in of_kind(scene.elements, "PositionServo") if np.isfinite(own.values[2])]
+    if not servos:
+        return found
+    force = trajectory.u @ scene.actuation.T
+    for servo in servos:
+        c, (stiffness, damping, effort) = servo.coordinate, servo.values
+        pull = -stiffness * trajectory.q[:, c] - damping * trajectory.v[:, c]
+        before, after = (np.clip((force[:, c] + part) / effort, -1.0, 1.0) for part in (pull[:-1], pull[1:]))
+        found |= np.trunc(before) != np.trunc(after)
+    return found
+
+
+def _stopping(scene: Scene, trajectory: Trajectory) -> NDArray[np.bool_]:
+    """Steps (N,) in which a joint enters or leaves a stop or its transition, or may do both."""
+    found = np.zeros(trajectory.steps, dtype=np.bool_)
+    for stop in of_kind(scene.elements, "JointStop"):
+        c, (lower, upper, *_, width) = stop.coordinate, stop.values
+        q, reach = trajectory.q[:, c], np.abs(trajectory.v[:, c]) * trajectory.dt
+        for depth in (lower - q, q - upper):
+            place = np.clip(np.ceil(depth / width), 0.0, 2.0)
+            bounces = (depth[:-1] <= 0.0) & (depth[1:] <= 0.0) & (depth[:-1] + reach[:-1] > 0.0)
+            found |= (place[:-1] != place[1:]) | bounces
+    return found
+
+
+def _turning(scene: Scene, trajectory: Trajectory) -> NDArray[np.bool_]:
+    """Steps (N,) in which dry friction changes by much."""
+    found = np.zeros(trajectory.steps, dtype=np.bool_)
+    for friction in of_kind(scene.elements, "CoulombFriction"):
+        side = np.tanh(trajectory.v[:, friction.coordinate] / friction.values[1])
+        found |= np.abs(np.diff(side)) > _TURNS
+    return found
