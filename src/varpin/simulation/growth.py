@@ -16,10 +16,9 @@ from varpin.arrays import Floats
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator, Reference
 from varpin.integrators.base import open_loop
-from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
-from varpin.simulation.modes import first_order, rate_bounds
+from varpin.simulation.modes import first_order, linearized, rate_bounds
 from varpin.simulation.retaking import finer, taken_again
 from varpin.trajectory import Trajectory
 
@@ -67,13 +66,15 @@ def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
         slopes = _slopes(scene, trajectory, np.array([trajectory.steps // 3, 2 * trajectory.steps // 3]))
     except LinearizationError:
         return np.inf
+    if not slopes[0].shape[1]:
+        return 1.0
     return _factor(float(_modes(*slopes).max()), trajectory)
 
 
 def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Growth | None:
     """The error of a motion after errors of its steps have grown; None below the threshold of the warning.
 
-    None, too, under noise and constraints, with forces in Python, and of an integrator that chooses its own steps.
+    None, too, under noise and kinematic inputs, with forces in Python, and of an integrator that chooses its own steps.
     """
     if isinstance(integrator, Reference) or _unexamined(scene, trajectory):
         return None
@@ -100,6 +101,8 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
         slopes = _slopes(scene, trajectory, at)
     except LinearizationError:
         return None
+    if not slopes[0].shape[1]:
+        return None
     # Eigenvalues take longer than all else: at half of the places.
     aq, av = slopes
     if small > _factor(float(np.median(rate_bounds(aq, av))), trajectory):
@@ -120,9 +123,10 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
 
 
 def _unexamined(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether growth is not examined: under noise, constraints or Python forces, and for few steps or many joints."""
-    hidden = scene.custom is not None or scene.constraints or trajectory.dw.any()
-    return bool(hidden or scene.robot.dof > _JOINTS or trajectory.steps < _LEAST)
+    """Whether growth is not examined: under noise, inputs or Python forces, for few steps or many joints."""
+    hidden = scene.custom is not None or scene.inputs or trajectory.dw.any()
+    few = int(np.maximum(trajectory.statistics.substeps, 1).sum()) < _LEAST
+    return bool(hidden or few or scene.robot.dof > _JOINTS)
 
 
 def _places(trajectory: Trajectory) -> NDArray[np.int64]:
@@ -131,14 +135,14 @@ def _places(trajectory: Trajectory) -> NDArray[np.int64]:
 
 
 def _slopes(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Derivatives of the accelerations in q and in v (K, n, n).
+    """Derivatives of the accelerations in q and in v (K, n, n), under constraints on the tangent space (K, f, f).
 
     Raises:
         LinearizationError: There are none.
     """
     forces = np.ascontiguousarray(trajectory.u[at] @ scene.actuation.T)
-    _, aq, av, _ = accelerations(scene, trajectory.q[at], trajectory.v[at], forces)
-    return aq, av
+    found = linearized(scene, trajectory.q[at], trajectory.v[at], forces)
+    return found.aq, found.av
 
 
 def _modes(aq: Floats, av: Floats) -> Floats:
