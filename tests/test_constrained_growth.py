@@ -8,32 +8,22 @@ import varpin as vp
 from varpin.mechanics.assembly import along_constraints
 
 
-def five_bar(torque):
-    """Two motors pull at a five-bar in opposite ways."""
-    scene = vp.Scene(vp.planar_chain(4), constraints=vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz"))
-    q = vp.assemble(scene, [-1.0, 1.0, 1.0, 1.0])
-    return (
-        scene,
-        q,
-        along_constraints(scene, q, np.array([2.0, -1.0, 3.0, 1.0])),
-        torque * np.array([1.0, -1.0, 1.0, -1.0]),
-    )
-
-
-@pytest.mark.parametrize(("torque", "steps", "integrator"), [
-    (12.0, 20, vp.Gauss(2)), (12.0, 300, vp.Midpoint()), (0.0, 300, vp.Gauss(3)),
+@pytest.mark.parametrize(("steps", "integrator", "grows"), [
+    (20, vp.Gauss(2), True), (60, vp.Gauss(2), True), (1200, vp.Gauss(4), False),
 ], ids=str)  # fmt: skip
-def test_errors_that_grow_are_told(torque, steps, integrator):
-    scene, q, v, force = five_bar(torque)
-    motion = vp.simulate(scene, q, v, duration=2.0, steps=steps, controls=force, integrator=integrator)
+def test_errors_that_grow_are_told(steps, integrator, grows):
+    """A five-bar whose motors pull it round and round."""
+    scene = vp.Scene(vp.planar_chain(4), constraints=vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz"), damping=0.1)
+    q = vp.assemble(scene, [-1.0, 1.0, 1.0, 1.0])
+    rng = np.random.default_rng(2)
+    force = 3.0 * rng.normal(size=4)
+    v = along_constraints(scene, q, 3.0 * rng.normal(size=4))
+    motion = vp.simulate(scene, q, v, duration=1.0, steps=steps, controls=force, integrator=integrator)
     parts = 2400 // steps
-    fine = vp.simulate(
-        scene, q, v, duration=2.0, steps=steps * parts, controls=force, integrator=vp.Gauss(5), check=False
-    )
-    exact = fine.q[::parts]
-    off = np.abs(motion.q - exact).max() / np.ptp(exact, axis=0).max()
-    assert off > 0.05 or off < 1e-4
-    assert bool(motion.warnings) == (off > 0.05), (off, motion.warnings)
+    fine = vp.simulate(scene, q, v, duration=1.0, steps=2400, controls=force, integrator=vp.Gauss(5), check=False)
+    off = np.abs(motion.q - fine.q[::parts]).max() / np.ptp(fine.q, axis=0).max()
+    assert (off > 0.05) == grows
+    assert bool(about(motion.warnings, "growth")) == grows, (off, motion.warnings)
 
 
 def test_growth_without_freedom():

@@ -49,7 +49,10 @@ def linearized(scene: Scene, q: Floats, v: Floats, forces: Floats, of_inputs: Fl
         return Linearized(a, aq, av, af, unit, unit)
     C = scene.core.constraints(np.ascontiguousarray(q))[2]
     try:
-        at = [_onto_constraints(scene, *state, of_inputs) for state in zip(range(len(q)), q, v, C, a, af, strict=True)]
+        at = [
+            _onto_constraints(scene, q[k], v[k], C[k], a[k], af[k], None if of_inputs is None else of_inputs[k])
+            for k in range(len(q))
+        ]
     except np.linalg.LinAlgError:
         raise LinearizationError(0, 0.0, "the constraints cannot be linearized") from None
     if len({each.Z.shape for each in at}) > 1:
@@ -83,9 +86,9 @@ class _Node(NamedTuple):
 
 
 def _onto_constraints(
-    scene: Scene, k: int, q: Floats, v: Floats, C: Floats, a: Floats, af: Floats, of_inputs: Floats | None
+    scene: Scene, q: Floats, v: Floats, C: Floats, a: Floats, af: Floats, of_inputs: Floats | None
 ) -> _Node:
-    """The tangent space at state k, and the constraint forces beside the accelerations a (n,) without them."""
+    """The tangent space at a state, and the constraint forces beside the accelerations a (n,) without them."""
     root = np.linalg.cholesky(af)
     left, sizes, right = np.linalg.svd(C @ root)
     rank = int((sizes > _RANK * sizes.max(initial=0.0)).sum())
@@ -93,7 +96,7 @@ def _onto_constraints(
     bend = scene.core.constraint_curvature(q, np.zeros(len(C)), v)[1]
     wanted = -bend @ v
     for row, c in scene.inputs.items():
-        wanted[row] = 0.0 if of_inputs is None else of_inputs[k, c]
+        wanted[row] = 0.0 if of_inputs is None else of_inputs[c]
     lam = left @ ((left.T @ (wanted - C @ a)) / sizes**2)
     return _Node(lam, root @ right[rank:].T, root @ (right[:rank].T / sizes) @ left.T, bend)
 
