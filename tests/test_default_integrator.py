@@ -22,7 +22,7 @@ def jumps(*size):
 
 
 def off(scene, q0, v0, controls, motion):
-    """By how much q and v are off at the nodes, of the longest way and of the largest velocity."""
+    """By how much q and v are off at the nodes, of the largest joint travel and of the largest velocity."""
     fine = {"dt": DT / 32, "steps": 32 * STEPS, "controls": np.repeat(controls, 32, axis=0)}
     true = vp.simulate(scene, q0, v0, **fine, integrator=vp.Radau(3), check=False)
     q, v = true.q[::32], true.v[::32]

@@ -20,7 +20,7 @@ def jumping(robot, seed, steps, share):
 
 
 def off(scene, q0, motion):
-    """By how much a motion is off, of the longest way of a joint."""
+    """By how much a motion is off, of the largest joint travel."""
     fine = {"dt": motion.dt / 8, "steps": 8 * motion.steps, "controls": np.repeat(motion.u, 8, axis=0)}
     true = vp.simulate(scene, q0, motion.v[0], **fine, integrator=vp.Gauss(5), check=False).q[::8]
     return np.abs(motion.q - true).max() / np.ptp(true, axis=0).max()
@@ -46,7 +46,9 @@ def test_a_chain_that_falls(q0):
     wrong = off(scene, q0, motion)
     assert (wrong > 0.05) == bool(told)
     if told:
-        (percent,) = (float(part.split("%")[0]) for part in told[0].split(", ") if "% of the longest way" in part)
+        (percent,) = (
+            float(part.split("%")[0]) for part in told[0].split(", ") if "% of the largest joint travel" in part
+        )
         assert 0.3 * wrong < percent / 100.0 < 3.0 * wrong
 
 

@@ -11,7 +11,7 @@ import varpin as vp
 from varpin.simulation.kinks import kinks
 
 CHAIN = vp.planar_chain(2)
-OFTEN = "% of the longest way"
+OFTEN = "% of the largest joint travel"
 
 
 def said_of(motion, what):

@@ -114,7 +114,7 @@ def test_a_joint_that_nothing_holds_is_no_oscillation(seed):
         )
 
     motion, finer = moved(5e-3), moved(1.25e-3)
-    # The joint that was said to be off is right to a thousandth or so of the longest way.
+    # The joint that was said to be off is right to a thousandth or so of the largest joint travel.
     assert np.abs(motion.q - finer.q[::4])[:, 0].max() <= 2e-3 * np.ptp(finer.q, axis=0).max()
     assert phase_lost(scene, vp.Gauss(4), motion) is None
 

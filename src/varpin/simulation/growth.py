@@ -17,11 +17,10 @@ from varpin.arrays import Floats, Integers
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator, Reference
 from varpin.integrators.base import open_loop
-from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
 from varpin.simulation.kinks import kinks
-from varpin.simulation.modes import first_order, rate_bounds
+from varpin.simulation.modes import first_order, linearized, rate_bounds
 from varpin.simulation.retaking import Finer, finer, shortest_parts, taken_again
 from varpin.trajectory import Trajectory
 
@@ -38,7 +37,7 @@ _KINKS, _PARTS = 12, 8
 # Thresholds of the warning, as shares of the largest joint travel, where errors grow and where kinks make them; and the
 # part of them from which a motion is repeated.
 WARNED, _BENT, NEAR = 0.02, 0.003, 0.3
-# A longest way below this counts as no motion [rad or m].
+# A joint travel below this counts as no motion [rad or m].
 _SHORTEST = 1e-8
 # The share of the fastest mode's exponent by which a disturbance grows: at most half in 60 motions of arms and chains,
 # because modes turn. The exponent is the integral of the rate, which is unsteady: of the nodes the mean counts. And the
@@ -80,6 +79,8 @@ def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
         slopes = _slopes(scene, trajectory, np.array([trajectory.steps // 3, 2 * trajectory.steps // 3]))
     except LinearizationError:
         return np.inf
+    if not slopes[0].shape[1]:
+        return 1.0
     return _factor(float(_modes(*slopes).max()), trajectory)
 
 
@@ -89,12 +90,12 @@ def grown_error(
     """The error of a motion after errors of its steps have added up or grown; None below the threshold of the warning.
 
     If the motion is known to be ``predictable`` apart from kinks, only these are looked at. None, too, under noise and
-    constraints, with forces in Python, and of an integrator that chooses its own steps.
+    kinematic inputs, with forces in Python, and of an integrator that chooses its own steps.
     """
     if isinstance(integrator, Reference) or _hidden(scene, trajectory):
         return None
     bent = kinks(scene, trajectory)
-    even = not (predictable or trajectory.steps < _LEAST)
+    even = not (predictable or _few(trajectory))
     if not (even or len(bent.steps)):
         return None
     other = finer(integrator, trajectory, damped=False, pulled=False)
@@ -124,7 +125,7 @@ def grown_error(
     # Errors of kinks grow, too.
     small = NEAR * WARNED / max(by_steps + by_kinks, 1e-300)
     add_up = by_kinks > NEAR * _BENT
-    if not add_up and (trajectory.steps < _LEAST or _grows_less(scene, trajectory, at, small)):
+    if not add_up and (_few(trajectory) or _grows_less(scene, trajectory, at, small)):
         return None
     parts = other.parts * shortest_parts(trajectory)
     parts[bent.steps] = np.maximum(parts[bent.steps], _PARTS)
@@ -167,6 +168,8 @@ def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], fac
         aq, av = _slopes(scene, trajectory, at)
     except LinearizationError:
         return True
+    if not aq.shape[1]:
+        return True
     # Eigenvalues take longer than all else: at half of the places.
     if factor > _factor(float(rate_bounds(aq, av).mean()), trajectory):
         return True
@@ -174,14 +177,19 @@ def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], fac
 
 
 def _hidden(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether errors of steps are unknown: under noise, constraints or Python forces, or for many joints."""
-    hidden = scene.custom is not None or scene.constraints or trajectory.dw.any() or not trajectory.steps
+    """Whether errors of steps are unknown: under noise, inputs or Python forces, or for many joints."""
+    hidden = scene.custom is not None or scene.inputs or trajectory.dw.any() or not trajectory.steps
     return bool(hidden or scene.robot.dof > _JOINTS)
 
 
 def _unexamined(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether growth is not examined: where errors of steps are unknown, and for few steps."""
-    return _hidden(scene, trajectory) or trajectory.steps < _LEAST
+    return _hidden(scene, trajectory) or _few(trajectory)
+
+
+def _few(trajectory: Trajectory) -> bool:
+    """Whether a motion has too few steps, parts of divided ones included, for disturbances to grow."""
+    return int(np.maximum(trajectory.statistics.substeps, 1).sum()) < _LEAST
 
 
 def _places(trajectory: Trajectory) -> NDArray[np.int64]:
@@ -190,14 +198,14 @@ def _places(trajectory: Trajectory) -> NDArray[np.int64]:
 
 
 def _slopes(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Derivatives of the accelerations in q and in v (K, n, n).
+    """Derivatives of the accelerations in q and in v (K, n, n), under constraints on the tangent space (K, f, f).
 
     Raises:
         LinearizationError: There are none.
     """
     forces = np.ascontiguousarray(trajectory.u[at] @ scene.actuation.T)
-    _, aq, av, _ = accelerations(scene, trajectory.q[at], trajectory.v[at], forces)
-    return aq, av
+    found = linearized(scene, trajectory.q[at], trajectory.v[at], forces)
+    return found.aq, found.av
 
 
 def _modes(aq: Floats, av: Floats) -> Floats:

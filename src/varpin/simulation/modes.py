@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.errors import LinearizationError
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
 
@@ -40,37 +41,30 @@ def linearized(scene: Scene, q: Floats, v: Floats, forces: Floats, of_inputs: Fl
         of_inputs: Accelerations of the joints (K, n), of which those with kinematic inputs are read; zero if left out.
 
     Raises:
-        LinearizationError: A mass matrix is not positive definite.
+        LinearizationError: A mass matrix is not positive definite, or a matrix of the constraints is not finite.
     """
     a, aq, av, af = accelerations(scene, q, v, forces)
     if not scene.constraints:
         unit = np.broadcast_to(np.eye(q.shape[1]), aq.shape)
         return Linearized(a, aq, av, af, unit, unit)
-    pushed, bases, inverses, bends = [], [], [], []
     C = scene.core.constraints(np.ascontiguousarray(q))[2]
-    for k in range(len(q)):
-        root = np.linalg.cholesky(af[k])
-        left, sizes, right = np.linalg.svd(C[k] @ root)
-        rank = int((sizes > _RANK * sizes.max(initial=0.0)).sum())
-        # The acceleration and the velocity across the tangent space, by the least squares of all rows.
-        inverse = root @ (right[:rank].T / sizes[:rank]) @ left[:, :rank].T
-        bend = scene.core.constraint_curvature(q[k], np.zeros(len(C[k])), v[k])[1]
-        wanted = -bend @ v[k]
-        for row, c in scene.inputs.items():
-            wanted[row] = 0.0 if of_inputs is None else of_inputs[k, c]
-        impulse = left[:, :rank] @ ((left[:, :rank].T @ (wanted - C[k] @ a[k])) / sizes[:rank] ** 2)
-        pushed.append(impulse)
-        bases.append(root @ right[rank:].T)
-        inverses.append(inverse)
-        bends.append(bend)
-    lam = np.array(pushed)
+    try:
+        at = [
+            _onto_constraints(scene, q[k], v[k], C[k], a[k], af[k], None if of_inputs is None else of_inputs[k])
+            for k in range(len(q))
+        ]
+    except np.linalg.LinAlgError:
+        raise LinearizationError(0, 0.0, "the constraints cannot be linearized") from None
+    if len({each.Z.shape for each in at}) > 1:
+        raise LinearizationError(0, 0.0, "the constraints have another rank at each node")
+    lam = np.array([each.lam for each in at])
     a, aq, av, af = accelerations(scene, q, v, forces + np.einsum("kri,kr->ki", C, lam))
-    Z = np.array(bases)
+    Z = np.array([each.Z for each in at])
     M = np.linalg.inv(af)
     onto = np.swapaxes(Z, 1, 2) @ M
     curved = np.array([scene.core.constraint_curvature(x, y, x)[0] for x, y in zip(q, lam, strict=True)])
     # A velocity stays on the constraints: its part across them changes with y.
-    turned = -np.array(inverses) @ np.array(bends) @ Z
+    turned = -np.array([each.across @ each.bend for each in at]) @ Z
     by_place = onto @ (aq + af @ curved) @ Z + onto @ av @ turned
     return Linearized((onto @ a[:, :, None])[:, :, 0], by_place, onto @ av @ Z, onto @ af, Z, onto)
 
@@ -82,6 +76,29 @@ def first_order(aq: Floats, av: Floats) -> Floats:
     A[:, range(n), range(n, 2 * n)] = 1.0
     A[:, n:, :n], A[:, n:, n:] = aq, av
     return A
+
+
+class _Node(NamedTuple):
+    lam: Floats  # the constraint forces (c,)
+    Z: Floats  # (n, f)
+    across: Floats  # the velocity (n, c) across the tangent space for a velocity of each row
+    bend: Floats  # g_qq v (c, n)
+
+
+def _onto_constraints(
+    scene: Scene, q: Floats, v: Floats, C: Floats, a: Floats, af: Floats, of_inputs: Floats | None
+) -> _Node:
+    """The tangent space at a state, and the constraint forces beside the accelerations a (n,) without them."""
+    root = np.linalg.cholesky(af)
+    left, sizes, right = np.linalg.svd(C @ root)
+    rank = int((sizes > _RANK * sizes.max(initial=0.0)).sum())
+    left, sizes = left[:, :rank], sizes[:rank]
+    bend = scene.core.constraint_curvature(q, np.zeros(len(C)), v)[1]
+    wanted = -bend @ v
+    for row, c in scene.inputs.items():
+        wanted[row] = 0.0 if of_inputs is None else of_inputs[c]
+    lam = left @ ((left.T @ (wanted - C @ a)) / sizes**2)
+    return _Node(lam, root @ right[rank:].T, root @ (right[:rank].T / sizes) @ left.T, bend)
 
 
 def rate_bounds(aq: Floats, av: Floats) -> Floats:

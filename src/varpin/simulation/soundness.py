@@ -285,7 +285,7 @@ def _growing(
         return ()
     off = (
         f"joint {trajectory.joint_names[found.joint]!r} elsewhere by up to {found.off:.2g} rad or m, "
-        f"{100 * found.share:.2g}% of the longest way of a joint, from t = {found.time:.4g} s on"
+        f"{100 * found.share:.2g}% of the largest joint travel, from t = {found.time:.4g} s on"
     )
     if found.causes:
         sentence = (
@@ -310,7 +310,7 @@ def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         f"oscillations of {lost.rate / (2.0 * np.pi):.3g} Hz lose phase or height: over the motion, steps of "
         f"dt = {trajectory.dt:g} s by {integrator} put them off by about {100 * lost.turned:.2g}% of their height, "
         f"and joint {trajectory.joint_names[lost.joint]!r} by {lost.off:.2g} rad or m, {100 * lost.share:.2g}% of the "
-        "longest way of a joint; smaller steps or more stages keep them"
+        "largest joint travel; smaller steps or more stages keep them"
     )
     return (Finding("phase", sentence, lost.joint),)
 

@@ -134,7 +134,8 @@ def check_linearization(
         if method.variational:
             M = lagrangian_jet(scene, x[:n], np.zeros(n)).Lvv
             velocity = np.asarray(np.linalg.solve(M, x[n:]), dtype=np.float64)
-        return ends(x[:n], velocity, control, dw)[1]
+        after: Floats = ends(x[:n], velocity, control, dw)[1]
+        return after
 
     def along(y: Floats) -> Floats:
         at = nearest(scene, q + Z @ y[: Z.shape[1]])
@@ -181,11 +182,12 @@ def _compare(
 
 def _slope(function: Callable[[Floats], Floats], x: Floats, step: Floats | float) -> Floats:
     """The derivative of a function by differences; ``step`` is that of each variable, or of all."""
-    found = []
+    derivative = []
     for e in np.diag(np.broadcast_to(step, x.shape)):
         total = sum(w * (function(x + i * e) - function(x - i * e)) for i, w in _WEIGHTS.items())
-        found.append(total / e.max())
-    return np.array(found).T.reshape(-1, x.size)
+        derivative.append(total / e.max())
+    found: Floats = np.array(derivative, dtype=np.float64).T.reshape(-1, x.size)
+    return found
 
 
 def _largest(given: Floats, derivative: Floats, rows: Floats, columns: Floats) -> tuple[float, float]:
