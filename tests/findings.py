@@ -18,6 +18,8 @@ MARKS = {
     "period too long": "too fast for its period",
     "replay": "cannot be replayed",
     "between nodes": "between nodes",
+    "noise not drawn": "none was drawn",
+    "nothing random": "nothing is random",
     "noise left out": "least cost without noise",
     "growth": "disturbances grow",
     "steps in parts": "parts",
@@ -32,6 +34,7 @@ MARKS = {
     "outside limits": "outside its limits",
     "open loops": "are open",
     "one motion": "one and the same motion",
+    "not whole ticks": "no whole number of ticks",
     "no finite number": "no finite number",
     "computed again": "is computed again",
     "untrusted gains": "cannot be trusted",
@@ -45,6 +48,10 @@ MARKS = {
     "interruption": "interrupted",
     "unfinished plan": "the plan is unfinished",
     "runaway": "away",
+    "legend": "how to read it",
+    "right derivatives": "the derivatives are those of the step",
+    "wrong derivatives": "is not the derivative of the step",
+    "another difference": "another step=",
     "out of reach": "not within reach",
 }
 

@@ -595,16 +595,52 @@ def test_integrators_that_keep_no_constraints_refuse_them(integrator):
 
 def test_what_knows_no_constraints_refuses_them():
     scene, q, v = loop("four-bar")
-    tries = [
-        lambda: vp.check_linearization(scene, q, v, dt=1e-2),
-        lambda: vp.discrete_lagrangian(scene, q, q, 1e-2),
-    ]
-    for attempt in tries:
-        with refused(vp.InputError, "constraints"):
-            attempt()
+    with refused(vp.InputError, "constraints"):
+        vp.discrete_lagrangian(scene, q, q, 1e-2)
     noisy, *_ = loop("four-bar", noise=vp.AdditiveNoise(0.1))
     with refused(vp.InputError, "kick", "'split'", "constraints"):
         vp.simulate(noisy, q, v, dt=1e-2, steps=2, rng=0, integrator=vp.Midpoint(kick="split"))
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3)])
+def test_a_check_of_the_linearization(integrator, monkeypatch):
+    """It confirms A along the constraints, B and G; a wrong normal part is none, a wrong tangent part is told."""
+    scene, q, v = loop("five-bar", noise=vp.AdditiveNoise(0.1), damping=0.2)
+    options = {"dt": 1e-2, "integrator": integrator}
+    u = np.linspace(-1.0, 1.0, scene.controls)
+    assert vp.check_linearization(scene, q, v, u, **options).worst < 1e-8
+    away = q + 0.003  # moved onto the constraints, as by simulate
+    assert vp.check_linearization(scene, away, v, u, **options).worst < 1e-8
+    with refused(vp.InputError, "misses", "PointOnPoint"):
+        vp.check_linearization(scene, q + 0.5, v, u, **options)
+    exact = type(integrator).linearize
+    C = scene.constraint_values(q)[1]
+
+    def off(self, scene, trajectory, *, normal):
+        A, B, K = exact(self, scene, trajectory)
+        n = q.size
+        row = C[0] if normal else np.linalg.svd(C)[2][-1]
+        A[:, 0, :n] += 1e-4 * row
+        return A, B, K
+
+    monkeypatch.setattr(type(integrator), "linearize", lambda *a: off(*a, normal=True))
+    assert vp.check_linearization(scene, q, v, u, **options).holds
+    monkeypatch.setattr(type(integrator), "linearize", lambda *a: off(*a, normal=False))
+    assert not vp.check_linearization(scene, q, v, u, **options).holds
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_a_check_of_the_linearization_with_an_input(interpolation):
+    scene = vp.Scene(
+        vp.planar_chain(5),
+        constraints=[
+            vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz"),
+            vp.KinematicInput("joint1", interpolation),
+        ],
+    )
+    q = vp.assemble(scene, [-1.0, 1.0, 1.0, 1.0, 0.3])
+    found = vp.check_linearization(scene, q, [1.0, -2.0, 0.5, 0.3, 0.1], dt=1e-2, integrator=vp.Gauss(2))
+    assert found.worst < 1e-8
 
 
 def test_motions_keep_forces_and_the_constraints_they_were_made_under(tmp_path):

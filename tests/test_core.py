@@ -274,5 +274,5 @@ def test_matrices_beyond_the_range_of_indices_are_refused_before_there_is_room_f
         lambda: ForwardDynamics(chain, Solver.dense),
         lambda: chain.jet(still[0], still[0]),
     ):
-        with pytest.raises(ValueError, match=r"a matrix of \d+ by \d+ numbers is more than varpin can index"):
+        with refused(ValueError, "matrix"):
             dense()

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import varpin as vp
 from varpin import core
@@ -184,5 +185,5 @@ def test_a_scene_with_any_number_of_forces_is_written(surroundings, monkeypatch,
 def test_what_the_example_does_not_write_is_refused(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "cpp"))
     scene = vp.Scene(vp.load_robot("ur5"), forces=vp.FrameWrench("tool0", [0.0, 0.0, -1.0, 0.0, 0.0, 0.0]))
-    with pytest.raises(SystemExit, match="forces on frames are not written"):
+    with refused(SystemExit, "forces", "frames"):
         importlib.import_module("arm").header(scene)

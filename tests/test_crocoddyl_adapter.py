@@ -141,3 +141,24 @@ def test_the_page_on_crocoddyl_runs():
     page = (Path(__file__).parents[1] / "docs" / "crocoddyl.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
     exec(block, {"problem": PROBLEMS["midpoint"]()})
+
+
+def test_a_closed_loop():
+    """A five-bar: FDDP finds varpin's plan, from a motion that keeps the constraints."""
+    drives = np.zeros((4, 2))
+    drives[0, 0] = drives[3, 1] = 1.0
+    loop = vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")
+    scene = vp.Scene(vp.planar_chain(4), constraints=loop, actuation=drives, damping=0.1)
+    begin = vp.assemble(scene, [-1.0, 1.0, 1.0, 1.0])
+    goal = vp.assemble(scene, begin + np.array([0.3, 0.0, 0.0, 0.0]))
+    cost = vp.ControlCost(1e-3) + vp.VelocityCost(0.1)
+    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost(1.0))
+    problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(4), dt=0.02, steps=20)
+    plan = vp.solve(problem)
+    solver = crocoddyl.SolverFDDP(shooting_problem(problem))
+    solver.th_stop = 1e-12
+    assert solver.solve(*first_guess(problem), 200, True)
+    assert solver.cost == pytest.approx(plan.cost, rel=1e-5)
+    again = problem.simulate(policy_of(problem, solver))
+    assert problem.cost_of(again) == pytest.approx(solver.cost, rel=1e-9)
+    assert np.abs(scene.core.constraints(np.ascontiguousarray(again.q))[0]).max() < 1e-12

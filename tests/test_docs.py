@@ -63,8 +63,8 @@ def test_a_page_runs_from_top_to_bottom(page, tmp_path):
 @pytest.mark.parametrize("page", PAGES)
 def test_code_is_in_a_language_that_is_checked_and_fits_its_box(page):
     kinds = re.findall(r"^```(\S+)$", text_of(page), re.M)
-    assert set(kinds) <= {"python", "bash", "text", "toml", "{toctree}", "{eval-rst}", "{glossary}"}
-    for kind in ("python", "bash", "toml"):
+    assert set(kinds) <= {"python", "cpp", "bash", "text", "toml", "{toctree}", "{eval-rst}", "{glossary}"}
+    for kind in ("python", "cpp", "bash", "toml"):
         for block in blocks(page, kind):
             assert max(map(len, block.splitlines())) <= WIDEST, block
 

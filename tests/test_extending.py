@@ -1,6 +1,9 @@
 """What docs/extending.md says, done: a class of one's own, and nothing else, is enough."""
 
+import os
 import re
+import shutil
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +14,7 @@ from refusals import refused
 
 import varpin as vp
 from varpin.cli import command
-from varpin.core import pulls_fast
+from varpin.core import coupling_kinds, element_kinds, pulls_fast
 from varpin.core.arrays import Carried, ConstraintRows, Coupling, Diffusion, Element, Product, Tied
 from varpin.integrators import registry
 from varpin.integrators.collocation import Collocation
@@ -127,13 +130,61 @@ def test_a_noise_kicks_what_it_says():
     np.testing.assert_allclose(mine.q, theirs.q, atol=1e-14)
 
 
-def test_motions_keep_the_numbers_of_every_kind_of_force():
-    """Kinds of the core that no entry of a scene's values holds would be others in silence."""
-    text = (PAGE.parents[1] / "src" / "core" / "bindings" / "mechanism.cpp").read_text(encoding="utf-8")
-    kinds = set(re.findall(r'kind == "(\w+)"', text))
-    assert {"JointSpring", "JointStop", "FrameLoad"} <= kinds
-    assert kinds == {"JointSpring", "JointDamper", *OF_ELEMENTS, *OF_COUPLINGS}
-    assert kinds == set(forces._OF_ELEMENT) - {"Armature"} | set(forces._OF_COUPLING)
+def test_the_core_says_of_its_forces_what_they_have():
+    """Numbers, a potential, a force without one. Motions keep the numbers of all kinds."""
+    assert element_kinds() == {
+        "CoulombFriction": (4, False, True),
+        "JointDamper": (1, False, True),
+        "JointSpring": (2, True, False),
+        "JointStop": (5, True, True),
+        "PositionServo": (3, False, True),
+    }
+    assert coupling_kinds() == {
+        "FrameDamper": (3, False, True),
+        "FrameLengthSpring": (2, True, False),
+        "FrameLoad": (3, True, False),
+        "FrameSpring": (6, True, False),
+        "FrameTurnDamper": (3, False, True),
+        "FrameTurnSpring": (1, True, False),
+        "FrameWrench": (7, False, True),
+    }
+    assert set(OF_ELEMENTS) == set(element_kinds()) - {"JointSpring", "JointDamper"}
+    assert set(OF_COUPLINGS) == set(coupling_kinds())
+
+
+def blocks(language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.M | re.S)
+
+
+@pytest.mark.slow
+def test_a_force_of_the_core_is_a_struct_and_its_name(tmp_path):
+    """The page's struct and its list of kinds in the header, that core built, and the page's class on it."""
+    root = PAGE.parents[1]
+    for name in ("src", "models"):
+        shutil.copytree(root / name, tmp_path / name, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(root / name, tmp_path)
+    header = tmp_path / "src" / "core" / "include" / "varpin" / "forces.hpp"
+    before, listed, after = re.split(r"(^using Element =[^;]*;\n)", header.read_text(encoding="utf-8"), flags=re.M)
+    struct, kinds = blocks("cpp")
+    assert kinds.split() == listed.replace(">;", ", RubberBush>;").split(), "the page has another list of kinds"
+    header.write_text(before + struct + kinds + after, encoding="utf-8")
+    settings = {"build-type": "Plain", "define.CMAKE_UNITY_BUILD": "ON", "define.VARPIN_FEW_SIZES": "ON"}
+    options = [f"--config-settings=cmake.{key}={value}" for key, value in settings.items()]
+    pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
+    subprocess.run([*pip, "wheel", "--no-deps", *options, "-w", tmp_path / "wheel", tmp_path], check=True)
+    (wheel,) = (tmp_path / "wheel").iterdir()
+    shutil.unpack_archive(wheel, tmp_path / "built", "zip")
+    script = tmp_path / "page.py"
+    script.write_text("\n".join(blocks("python")) + (PAGE.parents[1] / "tests" / "added_force.py").read_text())
+    done = subprocess.run(
+        [sys.executable, script],
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "built")},
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def bound_to(base, returned):
@@ -196,7 +247,8 @@ def test_q0_takes_the_way_that_the_page_says(monkeypatch):
     """Its Python functions are called in its order, and the core is asked between the choice and the start."""
     listed = re.search(r"\*\*`q0` from(.*?)\*\*A torque", PAGE.read_text(encoding="utf-8"), re.S).group(1)
     way = re.findall(r"^\d+\. `([\w/]+\.\w+)`: (?:`(\w+)`)?", listed, re.M)
-    assert len({file for file, _ in way}) == 15
+    assert len({file for file, _ in way}) == 12
+    assert way[8] == ("jet.hpp", "lagrangian_jet")
     root, called = Path(vp.__file__).parent, []
 
     def note(frame, event, _):

@@ -149,13 +149,33 @@ def problem(width, dt=0.02):
 def test_problems_take_an_integrator_that_friction_is_not_too_fast_for():
     assert problem(0.1).integrator == vp.Gauss(4)
     rough = problem(1e-4)
-    assert rough.dt * rate_at_rest(rough.scene, rough.q0) > 200.0
+    assert rough.dt * rate_at_rest(rough.scene, rough.q0) > 10.0
     assert rough.integrator == vp.Radau(4)
     assert rough.at(dt=1e-4).integrator == vp.Radau(4)
     given = vp.OptimalControlProblem(
         rough.scene, rough.cost, rough.q0, rough.v0, dt=0.02, steps=30, integrator=vp.Gauss(2)
     )
     assert given.integrator == vp.Gauss(2)
+
+
+@pytest.mark.parametrize(
+    ("fast", "taken", "other"), [(5.0, vp.Gauss(4), vp.Radau(4)), (12.0, vp.Radau(4), vp.Gauss(4))]
+)
+def test_plans_of_damped_arms_hold_better_by_the_integrator_that_problems_take(fast, taken, other):
+    """``fast`` is the rate of the fastest damper times the step."""
+    free = vp.Scene(vp.planar_chain(2))
+    begin, rest = np.array([-1.0, 0.5]), np.zeros(2)
+    rate = np.abs(np.linalg.eigvals(np.linalg.inv(vp.lagrangian_jet(free, begin, rest).Lvv))).max()
+    scene = vp.Scene(vp.planar_chain(2), damping=fast / 0.05 / rate)
+    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1.0)
+    cost += vp.Terminal(vp.TrackingCost([0.0, 0.3], 1e4) + vp.VelocityCost(1e3))
+    problem = vp.OptimalControlProblem(scene, cost, begin, rest, dt=0.05, steps=20)
+    assert problem.integrator == taken
+    losses = [
+        abs(vp.solve(at, check=False).verify(tolerance=1e-3).open_loop_loss)
+        for at in (problem, problem.at(integrator=other))
+    ]
+    assert losses[0] < 0.5 * losses[1]
 
 
 def test_verification_under_friction_that_is_too_fast_for_explicit_steps():

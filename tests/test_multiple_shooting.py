@@ -179,5 +179,5 @@ def test_refused_beside_states():
     with refused(vp.InputError, "joints"):
         vp.solve(problem, states=other)
     slower = vp.simulate(problem.scene, problem.q0, [0.0, 0.0], dt=2.0 * problem.dt, steps=problem.steps)
-    with pytest.raises(vp.InputError, match="dt"):
+    with refused(vp.InputError, "dt"):
         vp.solve(problem, states=slower)

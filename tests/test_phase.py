@@ -142,3 +142,43 @@ def test_nothing_is_said_of_an_arm_that_is_held_at_rest(name):
         )  # fmt: skip
         assert np.ptp(motion.q, axis=0).max() <= 1e-12
         assert not about(motion.warnings, "phase")
+
+
+def _loop_on_springs(inputs=False):
+    """A loop of links on springs, displaced a little from its rest; with ``inputs`` its crank is held."""
+    robot = vp.planar_chain(5 if inputs else 4)
+    closed = vp.PointOnPoint("tip", (1.6, 0.0, 0.3), axes="xz")
+    constraints = [closed, *([vp.KinematicInput("joint1")] if inputs else [])]
+    scene = vp.Scene(robot, stiffness=1e3, constraints=constraints, actuation=["joint1"])
+    q0 = vp.assemble(scene, ([-1.0, 1.0, 1.0, 1.0, 0.4] if inputs else [-1.0, 1.0, 1.0, 1.0]))
+    sprung = vp.Scene(
+        robot,
+        stiffness=2e4 if inputs else 3e3,
+        rest=q0,
+        damping=0.02,
+        constraints=constraints,
+        actuation=["joint1"],
+        gravity=False,
+    )
+    moved = vp.assemble(sprung, q0 + 0.02 * np.arange(robot.dof))
+    return sprung, moved
+
+
+@pytest.mark.parametrize("inputs", [False, True], ids=["free", "held"])
+@pytest.mark.parametrize(("integrator", "dt", "told"), [
+    (vp.Midpoint(), 1e-3, True), (vp.Gauss(2), 4e-3, True), (vp.Gauss(3), 1e-3, False),
+], ids=str)  # fmt: skip
+def test_a_loop_on_springs_is_told_when_it_loses_phase(inputs, integrator, dt, told):
+    """Against the same loop by Gauss(4) in small steps."""
+    scene, q0 = _loop_on_springs(inputs)
+    given = {"duration": 2.0, "check": True}
+    motion = vp.simulate(scene, q0, np.zeros(q0.size), dt=dt, integrator=integrator, **given)
+    exact = vp.simulate(scene, q0, np.zeros(q0.size), dt=1e-3, integrator=vp.Gauss(4), duration=2.0, check=False)
+    off = np.abs(motion.q - exact.q[:: round(dt / 1e-3)]).max()
+    share = off / np.ptp(exact.q, axis=0).max()
+    lost = phase_lost(scene, integrator, motion)
+    assert (share > 0.02) == told
+    assert (lost is not None) == told
+    assert bool(about(motion.warnings, "phase")) == told
+    if told:
+        assert lost.off == pytest.approx(off, rel=0.35)

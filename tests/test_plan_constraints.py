@@ -1,5 +1,6 @@
 """Hard constraints of plans: against SciPy on the same grid, KKT conditions by differences, what is refused."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +9,11 @@ import pytest
 from findings import about
 from refusals import naming, refused, unnamed
 from scipy.integrate import solve_ivp
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear, minimize
 
 import varpin as vp
-from varpin.control import ViolationOnRobot
+from varpin.control import ViolationOnRobot, polish, search
+from varpin.control.augmented import within_constraints
 from varpin.control.backward import backward
 from varpin.control.hints import hints
 from varpin.control.hints import reach as hints_reach
@@ -114,37 +116,103 @@ def test_scipy_finds_no_less(name):
     assert plan.cost == pytest.approx(best.fun, rel=1e-4)
 
 
-def kkt_residual(problem, plan):
-    """The Lagrangian's gradient in the controls by differences, relative to the cost's; signs of the multipliers."""
-    R, m = problem.decisions, problem.scene.controls
+def kkt_residual(problem, plan, change=1e-5):
+    """The Lagrangian's slopes by differences, relative to the largest sum of its parts' slopes.
 
-    def lagrangian(u, on):
-        motion = problem.simulate(u)
-        total = problem.cost_of(motion)
-        for bound, report in zip(problem.bound_constraints, plan.constraints, strict=True):
-            c = bound.value(motion.q, motion.v, motion.u)
-            total += on * float((report.multipliers * c).sum())
-        return total
+    Controls change beside the plan's feedback: without it the differences of an unstable motion lose all digits. Also
+    the signs of the multipliers, and that those of inactive rows are zero.
+    """
+    u, hold = plan.controls, problem.hold
+    lower, upper = problem.control_limits
+    second = plan.trajectory.p if problem.integrator.variational else plan.trajectory.v
+    x = np.hstack([plan.trajectory.q, second])[:-1:hold]
+    on = "momentum" if problem.integrator.variational else "velocity"
+    size = np.maximum(np.abs(u).max(axis=0), 1e-3 * np.abs(u).max())
 
-    slopes = np.zeros((2, R, m))
-    for on in (0, 1):
-        for i in np.ndindex(R, m):
-            e = np.zeros((R, m))
-            e[i] = 1e-4
-            ahead, behind = lagrangian(plan.controls + e, on), lagrangian(plan.controls - e, on)
-            slopes[on][i] = (ahead - behind) / 2e-4
+    def parts(w):
+        policy = vp.LinearPolicy(u + w, plan.gains, x, hold=hold, on=on, period=problem.period)
+        grid = {"dt": problem.dt, "steps": problem.steps, "integrator": problem.integrator}
+        motion = vp.simulate(problem.scene, problem.q0, problem.v0, controls=policy, check=False, **grid)
+        pulls = [
+            (report.multipliers * bound.value(motion.q, motion.v, motion.u)).ravel()
+            for bound, report in zip(problem.bound_constraints, plan.constraints, strict=True)
+        ]
+        return np.concatenate([problem.shares(motion), *pulls])
+
+    slopes, sizes = np.zeros(u.shape), np.zeros(u.shape)
+    for i in np.ndindex(*u.shape):
+        w = np.zeros(u.shape)
+        w[i] = change * size[i[1]]
+        found = (parts(w) - parts(-w)) / (2.0 * change)
+        slopes[i], sizes[i] = found.sum(), np.abs(found).sum()
+    held = ((u <= lower) & (slopes > 0.0)) | ((u >= upper) & (slopes < 0.0))
     for report in plan.constraints:
         if not report.equality:
             assert (report.multipliers >= 0.0).all()
-            assert np.abs(report.multipliers * report.values).max() <= 1e-6 * abs(plan.cost)
-    return np.abs(slopes[1]).max() / np.abs(slopes[0]).max()
+            assert np.abs(report.multipliers * report.values).max() <= 1e-9 * abs(plan.cost)
+    return np.abs(np.where(held, 0.0, slopes)).max() / sizes.max()
 
 
 @pytest.mark.parametrize("name", ["velocities", "goal", "two", "out of a sphere"])
 def test_karush_kuhn_tucker(name):
     problem = two_links(FAMILIES[name])
-    plan = vp.solve(problem, tolerance=1e-10, check=False)
-    assert kkt_residual(problem, plan) <= 1e-3
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    assert kkt_residual(problem, plan) <= 1e-6
+
+
+def test_conditions_of_an_optimum_hold_after_the_last_step():
+    """A goal, and speeds at their limits: a last step with the least change of the controls would spoil the optimum."""
+    robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.0})
+    cost = vp.ControlCost(0.1 / robot.effort_limit**2) + vp.VelocityCost(0.1) + vp.Terminal(vp.VelocityCost(10.0))
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.1),
+        cost,
+        [-0.85, -0.88, -0.71, -1.45, -1.24, 0.85, 1.23],
+        np.zeros(7),
+        dt=1.0 / 60,
+        steps=24,
+        integrator=vp.RungeKutta4(),
+        constraints=[
+            vp.ReachFrame(robot, robot.end_effector, [-0.49, -0.19, 0.41]),
+            vp.WithinVelocityLimits(robot, (-1.0, 1.0)),
+        ],
+    )
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    assert plan.violation <= 1e-9
+    assert plan.constraints[1].active.any()
+    assert kkt_residual(problem, plan) <= 1e-6
+
+
+def test_a_search_that_ends_off_the_optimum_is_not_believed(monkeypatch):
+    """Where the conditions of an optimum do not hold, no plan is converged, whatever its last search says."""
+
+    @functools.wraps(search.solve)
+    def careless(problem, controls=None, *, tolerance=1e-7, **options):
+        return search.solve(problem, controls, tolerance=max(tolerance, 1e-3), **options)
+
+    monkeypatch.setattr(polish, "_STEPS", 0)
+    wide = two_links([vp.WithinVelocityLimits(ROBOT, (-50.0, 50.0))])
+    plan = within_constraints(careless)(wide, check=False)
+    assert plan.violation == 0.0
+    assert plan.status is vp.Status.STALLED
+    assert "would fall by" in plan.reason
+
+
+def test_dual_problems_are_those_of_scipy():
+    """With dependent rows, equalities, and guesses of the active rows that are all wrong."""
+    rng = np.random.default_rng(0)
+    for rows, rank in ((1, 1), (6, 6), (20, 12), (40, 7)):
+        B, d = rng.normal(size=(rank, rows)), rng.normal(size=rows)
+        # Bounded below: d is in the range of S.
+        S, d = B.T @ B, B.T @ (B @ d)
+        equal = rng.random(rows) < 0.2
+        best = lsq_linear(B, B @ np.linalg.lstsq(S, d)[0], (np.where(equal, -np.inf, 0.0), np.inf), tol=1e-14)
+        found = polish._least(S, d, equal, rng.random(rows) < 0.5)
+        assert (found[~equal] >= 0.0).all()
+        values = [0.5 * x @ S @ x - d @ x for x in (found, best.x)]
+        assert values[0] <= values[1] + 1e-9 * abs(values[1])
 
 
 def test_bounds_that_nothing_meets_change_nothing():

@@ -484,6 +484,10 @@ MISTAKES = {
         GOOD + '\n[[plan_constraint]]\ntype = "control_rate"\nlimit = [1.0, 2.0, 3.0, 4.0]',
         "plan_constraint[0]",
     ),
+    "limits of too many rates beside good ones": (
+        GOOD + "".join(f'\n[[plan_constraint]]\ntype = "control_rate"\nlimit = {most}' for most in (1.0, [1.0] * 3)),
+        "plan_constraint[1]",
+    ),
     "alpha out of range": (changed("alpha = 0.5", "alpha = 1.5"), "integrator.alpha"),
     "option of another integrator": (changed("alpha = 0.5", "stages = 2"), "integrator.stages"),
     "unknown cost": (changed('"tracking"', '"traking"'), "cost[0].type"),

@@ -13,7 +13,7 @@ from varpin.control import search
 from varpin.control.backward import backward
 from varpin.control.descent import at_stake
 from varpin.control.trials import Trials
-from varpin.core import Watch
+from varpin.core import Watch, stake_of
 from varpin.integrators.base import open_loop
 
 GOAL = [0.8, -0.5]
@@ -182,6 +182,32 @@ def test_what_is_at_stake_of_squares_is_their_value():
     more = reach(vp.ControlRateCost(0.1), constant(7.0), vp.Terminal(constant(-3.0)))
     model = backward(more, motion, 0.0).model
     assert at_stake(more, motion, model).free == pytest.approx(stake.free, rel=1e-12)
+
+
+def test_the_stake_of_any_models_is_that_of_the_definition():
+    """Equation (O9), point by point; one model has a minimum that a step misses, one has none."""
+    rng = np.random.default_rng(0)
+    root, g, z = rng.normal(size=(6, 4, 4)), rng.normal(size=(6, 4)), rng.normal(size=(6, 4))
+    H = root @ np.swapaxes(root, 1, 2)
+    H[1], g[1] = np.diag([2.0, 3.0, 0.0, 1.0]), [1.0, -1.0, 0.0, 2.0]
+    H[2] = -H[2]
+    H[3], g[3] = 0.0, 0.0
+    free, moved = [], []
+    for one, slope, displacement in zip(H, g, z, strict=True):
+        diagonal = np.diag(one)
+        curved = diagonal > 0.0
+        step = -np.divide(slope, diagonal, out=np.zeros(4), where=curved)
+        bound = max(0.5 * displacement @ one @ displacement, 0.0)
+        # The model along the step is least where its derivative is zero.
+        fall = 0.0 if slope @ step == 0.0 else 0.5 * (slope @ step) ** 2 / (step @ one @ step)
+        free.append(np.inf if (slope[~curved] != 0.0).any() else fall)
+        moved.append(min(free[-1], bound))
+    assert stake_of(g, H, z) == (np.inf, pytest.approx(sum(moved), rel=1e-12))
+    bounded = [0, 1, 3, 4, 5]
+    found = stake_of(g[bounded], H[bounded], z[bounded])
+    assert found == pytest.approx((sum(free[k] for k in bounded), sum(moved[k] for k in bounded)), rel=1e-12)
+    alone = [stake_of(g[k : k + 1], H[:1], z[k : k + 1]) for k in range(6)]
+    assert stake_of(g, H[:1], z) == pytest.approx(tuple(np.sum(alone, axis=0)), rel=1e-12)
 
 
 def test_a_target_out_of_reach_does_not_loosen_the_tolerance():

@@ -367,7 +367,7 @@ def test_verification_prints_a_table_with_the_loss_in_percent():
     assert fed.split() == ["with", "feedback", "2.020000e+00", "+1.00", "%", "2.50e-01"]
     assert "1.00e-03 rad or m" in rest[0]
     assert "good to 3e-11" in rest[0]
-    assert rest[1].startswith("how to read it: ")
+    assert about(rest[1], "legend")
     assert (found.open_loop_loss, found.closed_loop_loss) == (pytest.approx(0.25), pytest.approx(0.01))
     lost = vp.Verification(2.0, np.nan, np.nan, np.nan, np.nan, 1e-3, 8, np.inf)
     assert len(about(str(lost).splitlines(), "runaway")) == 3
@@ -380,7 +380,7 @@ def test_verification_prints_a_table_with_the_loss_in_percent():
 def test_monte_carlo_prints_how_far_it_is_from_the_prediction():
     text = str(vp.MonteCarlo(cost=1.1, standard_error=0.05, predicted=1.0, paths=197, failures=3))
     assert not unnamed(text, "1.100000e+00", "5.0e-02", "197", "3", "+10.00 %", "+2.0")
-    assert text.splitlines()[-1].startswith("how to read it: ")
+    assert about(text.splitlines()[-1], "legend")
     assert "standard errors)" not in str(vp.MonteCarlo(1.0, 0.0, 1.0, 2, 0))
 
 

@@ -467,8 +467,8 @@ def test_where_a_function_of_many_times_fails():
     options = {"dt": 0.01, "steps": 7, "integrator": vp.Gauss(2)}
     at = float(3 + vp.Gauss(2).stage_times[1]) * 0.01
 
-    def refused(f, words):
-        with pytest.raises(vp.ControlError, match=words) as info:
+    def failed(f, *facts):
+        with refused(vp.ControlError, facts) as info:
             vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=vp.OpenLoop(f, vectorized=True), **options)
         return info.value
 
@@ -478,17 +478,17 @@ def test_where_a_function_of_many_times_fails():
         return rising(t)
 
     for f, words in (
-        (raises, "raised RuntimeError"),
-        (lambda t: np.where((t >= at)[:, None], np.nan, rising(t)), r"\[0, 0\] is nan"),
+        (raises, "RuntimeError"),
+        (lambda t: np.where((t >= at)[:, None], np.nan, rising(t)), "[0, 0]"),
     ):
-        error = refused(f, words)
+        error = failed(f, words)
         assert (error.step, error.trajectory.steps) == (3, 3)
         assert error.time == pytest.approx(at, abs=1e-15)
-    assert refused(lambda t: rising(t).T, r"shape \(1, 3\), got \(3, 1\)").step == 0
-    assert refused(lambda t: rising(t[0]), r"shape \(1, 3\), got \(3,\)").step == 0
-    refused(lambda t: rising(t)[:3], "for none of them alone")
-    with pytest.raises(vp.InputError, match="vectorized"):
+    assert failed(lambda t: rising(t).T, "(1, 3)", "(3, 1)").step == 0
+    assert failed(lambda t: rising(t[0]), "(1, 3)", "(3,)").step == 0
+    failed(lambda t: rising(t)[:3], "times")
+    with refused(vp.InputError, "vectorized"):
         vp.OpenLoop(rising, vectorized="no")
     # As many times as controls: rows and columns look alike.
     options["steps"] = 2
-    refused(lambda t: rising(t).T, r"shape \(1, 3\), got \(3, 1\)")
+    failed(lambda t: rising(t).T, "(1, 3)", "(3, 1)")

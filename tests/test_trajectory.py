@@ -183,7 +183,7 @@ def test_robots_with_joints_of_the_same_names_are_told_apart(tmp_path):
 def test_numbers_that_no_motion_has(saved, name, change):
     members = dict(np.load(saved))
     np.savez(saved, **members | {name: change(members[name])})
-    with pytest.raises(vp.FileError, match=r"its times t are not dt = .* s apart|statistics.halvings"):
+    with refused(vp.FileError, name):
         vp.Trajectory.load(saved)
 
 

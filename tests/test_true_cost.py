@@ -37,6 +37,20 @@ def test_the_first_step_within_the_wish_is_taken(controls: str) -> None:
     assert plan.cost == pytest.approx(cold.cost, rel=1e-5)
 
 
+def test_halvings_go_on_until_they_resolve_the_dampers() -> None:
+    """Losses of held controls rise at first: 10, 25, 43, 34, 6 and 0.1 %."""
+    begin, rest = np.array([-1.0, 0.5]), np.zeros(2)
+    inertia = vp.lagrangian_jet(vp.Scene(vp.planar_chain(2)), begin, rest).Lvv
+    rate = np.abs(np.linalg.eigvals(np.linalg.inv(inertia))).max()
+    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1.0)
+    cost += vp.Terminal(vp.TrackingCost([0.0, 0.3], 1e4) + vp.VelocityCost(1e3))
+    scene = vp.Scene(vp.planar_chain(2), damping=1300.0 / rate)
+    found = vp.solve(vp.OptimalControlProblem(scene, cost, begin, rest, dt=0.1, steps=5), true_cost=0.01).refinement
+    losses = [row.loss for row in found.tried]
+    assert found.met
+    assert min(losses[1:4]) > losses[0]
+
+
 def test_a_warm_start_is_the_plan_before() -> None:
     """Half the step begins with the coarse plan's motion: it takes few iterations."""
     plan = vp.solve(reach(8), true_cost=1e-5, check=False)

@@ -25,7 +25,6 @@ from varpin.integrators.base import open_loop
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy
-from varpin.mechanics.scene import refuse_constraints
 from varpin.simulation.failures import StepFailure
 from varpin.simulation.record import rollout
 from varpin.trajectory import Trajectory
@@ -53,7 +52,6 @@ class StepModel(crocoddyl.ActionModelAbstract):
     def __init__(self, problem: OptimalControlProblem, step: int) -> None:
         if problem.constraints:
             raise InputError("hard constraints of a plan have no counterpart in crocoddyl: make them costs")
-        refuse_constraints(problem.scene, "The adapter for crocoddyl")
         n, m = problem.scene.robot.dof, problem.scene.controls
         super().__init__(crocoddyl.StateVector(2 * n), m, 0)
         self._problem = problem
@@ -161,7 +159,7 @@ def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProble
 
     Raises:
         InputError: Controls are held over several steps, are linear between nodes, or have a cost of their rate; or the
-            scene or the plan has constraints.
+            plan has constraints.
     """
     if problem.rate is not None:
         raise InputError("crocoddyl's actions do not have the previous control: leave the ControlRateCost out")

@@ -23,36 +23,28 @@ std::vector<double> places_of(const Tableau& tableau, In<2> places) {
     return {places.data(), places.data() + places.size()};
 }
 
-struct ConstrainedStepping : ConstrainedStepper {
-    using ConstrainedStepper::ConstrainedStepper;
-
-    void kick(const double* impulse, ConstrainedState& state) {
-        look_at(state);
-        ConstrainedStepper::kick(impulse, state);
-    }
-};
-
-class ConstrainedRollout : public Rollout<ConstrainedStepping, ConstrainedState> {
+class ConstrainedRollout : public Rollout<ConstrainedStepper, ConstrainedState> {
   public:
     ConstrainedRollout(const Mechanism& mechanism, const Tableau& tableau, In<2> places, double tolerance,
                        const Guards& guards, std::size_t paths)
-        : Rollout(mechanism, tableau, guards, paths,
-                  std::make_shared<ConstrainedStepping>(mechanism, tableau, places_of(tableau, places), tolerance,
-                                                        guards)) {}
+        : Rollout(
+              mechanism, tableau, guards, paths,
+              std::make_shared<ConstrainedStepper>(mechanism, tableau, places_of(tableau, places), tolerance, guards)) {
+    }
 
     ConstrainedRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
     void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes) {
         roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, nodes,
                    [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
-                       stepping_->guards = guards_;
-                       stepping_->roll(h, by, dw, more, states_, to);
+                       stepper_->guards = guards_;
+                       stepper_->roll(h, by, dw, more, states_, to);
                    });
     }
 
     // Impulses of the constraints in every step of a path's last roll (steps, m); C' times them act on the joints.
     Out impulses(std::size_t path) const {
-        const auto m = static_cast<std::size_t>(stepping_->m);
+        const auto m = static_cast<std::size_t>(stepper_->m);
         const std::vector<double>& all = state(path).impulses;
         return array_of(all.data(), {all.size() / m, m});
     }

@@ -1,15 +1,20 @@
 // The mechanism and its Lagrangian jet.
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/map.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <array>
 #include <limits>
+#include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <tuple>
+#include <type_traits>
 #include <utility>
+#include <variant>
 
 #include "arrays.hpp"
 #include "bodies.hpp"
@@ -28,59 +33,91 @@ std::vector<double> copied(const Array& array) {
     return {array.data(), array.data() + array.size()};
 }
 
+// Numbers of a member of an element or a coupling.
+template <class Member>
+constexpr std::size_t width = 1;
+template <>
+constexpr std::size_t width<Vec3<double>> = 3;
+
+const double* read(const double* from, double& to) { return to = *from, from + 1; }
+const double* read(const double* from, bool& to) { return to = *from != 0.0, from + 1; }
+const double* read(const double* from, Vec3<double>& to) { return to = {from[0], from[1], from[2]}, from + 3; }
+
+template <class Kind>
+constexpr std::size_t numbers_of() {
+    const auto sum = [](auto... member) { return (width<std::decay_t<decltype(Kind{}.*member)>> + ...); };
+    return std::apply(sum, Kind::numbers);
+}
+
+// Set the members that are a kind's numbers from the values behind the first `before`.
+template <class Kind>
+void take_numbers(Kind& kind, const std::vector<double>& values, std::size_t before = 0) {
+    const std::size_t count = before + numbers_of<Kind>();
+    if (values.size() != count)
+        throw std::invalid_argument("a force of kind " + std::string(Kind::name) + " has " + std::to_string(count) +
+                                    " numbers, not " + std::to_string(values.size()));
+    const double* from = values.data() + before;
+    std::apply([&](auto... member) { ((from = read(from, kind.*member)), ...); }, Kind::numbers);
+}
+
+// Calls visit with an instance of each kind of a variant.
+template <class... Kinds, class Visit>
+void each_kind(std::type_identity<std::variant<Kinds...>>, const Visit& visit) {
+    (visit(Kinds{}), ...);
+}
+
+// The instance of the kind with a name, after visit(instance).
+template <class Variant, class Visit>
+Variant one_of(const std::string& name, const Visit& visit) {
+    std::optional<Variant> found;
+    each_kind(std::type_identity<Variant>{}, [&](auto kind) {
+        if (name == kind.name) visit(kind), found = kind;
+    });
+    if (!found) throw std::invalid_argument("there is no force of kind " + name);
+    return *found;
+}
+
 // Elements: name of the kind, coordinate, numbers.
 using Named = std::vector<std::tuple<std::string, int, std::vector<double>>>;
 
-template <class Kind, class... Numbers>
-Element made(int coordinate, const std::vector<double>& values, Numbers Kind::*... members) {
-    if (values.size() != sizeof...(members))
-        throw std::invalid_argument("an element has " + std::to_string(sizeof...(members)) + " numbers, not " +
-                                    std::to_string(values.size()));
-    Kind element;
-    element.coordinate = coordinate;
-    auto value = values.begin();
-    ((element.*members = *value++), ...);
-    return element;
-}
-
-Element element_of(const std::string& kind, int coordinate, const std::vector<double>& values) {
-    using S = JointSpring;
-    using D = JointDamper;
-    using F = CoulombFriction;
-    using E = JointStop;
-    using P = PositionServo;
-    if (kind == "JointSpring") return made(coordinate, values, &S::stiffness, &S::rest);
-    if (kind == "JointDamper") return made(coordinate, values, &D::damping);
-    if (kind == "CoulombFriction")
-        return made(coordinate, values, &F::level, &F::width, &F::breakaway, &F::stribeck_velocity);
-    if (kind == "JointStop")
-        return made(coordinate, values, &E::lower, &E::upper, &E::stiffness, &E::damping, &E::width);
-    if (kind == "PositionServo") return made(coordinate, values, &P::stiffness, &P::damping, &P::effort);
-    throw std::invalid_argument("there is no element of kind " + kind);
+Element element_of(const std::string& name, int coordinate, const std::vector<double>& values) {
+    return one_of<Element>(name, [&](auto& element) {
+        element.coordinate = coordinate;
+        take_numbers(element, values);
+    });
 }
 
 // Couplings: name of the kind, bodies of both points (-1 for the world), numbers, from the positions of both points on.
 using NamedCouplings = std::vector<std::tuple<std::string, int, int, std::vector<double>>>;
 
-CoupledElement coupling_of(const std::string& kind, int a, int b, const std::vector<double>& values) {
-    const auto require_numbers = [&](std::size_t count) {
-        if (values.size() != 6 + count)
-            throw std::invalid_argument("a coupling of kind " + kind + " has " + std::to_string(6 + count) +
-                                        " numbers, not " + std::to_string(values.size()));
-    };
-    const auto vector = [&](std::size_t at) { return Vec3<double>{values[at], values[at + 1], values[at + 2]}; };
-    const bool direction = kind == "FrameTurnSpring";
-    const auto from = [&] { return Anchor{a, vector(0), direction}; };
-    const auto to = [&] { return Anchor{b, vector(3), direction}; };
-    if (kind == "FrameLoad") return require_numbers(3), FrameLoad{from(), to(), vector(6)};
-    if (kind == "FrameSpring") return require_numbers(6), FrameSpring{from(), to(), vector(6), vector(9)};
-    if (kind == "FrameLengthSpring") return require_numbers(2), FrameLengthSpring{from(), to(), values[6], values[7]};
-    if (kind == "FrameDamper") return require_numbers(3), FrameDamper{from(), to(), vector(6)};
-    if (kind == "FrameTurnSpring") return require_numbers(1), FrameTurnSpring{from(), to(), values[6]};
-    if (kind == "FrameTurnDamper") return require_numbers(3), FrameTurnDamper{from(), to(), vector(6)};
-    if (kind == "FrameWrench")
-        return require_numbers(7), FrameWrench{from(), to(), vector(6), vector(9), values[12] != 0.0};
-    throw std::invalid_argument("there is no coupling of kind " + kind);
+CoupledElement coupling_of(const std::string& name, int a, int b, const std::vector<double>& values) {
+    return one_of<CoupledElement>(name, [&](auto& coupling) {
+        take_numbers(coupling, values, 6);
+        constexpr bool directions = requires { coupling.directions; };
+        coupling.a = {a, {values[0], values[1], values[2]}, directions};
+        coupling.b = {b, {values[3], values[4], values[5]}, directions};
+    });
+}
+
+// By the name of each kind of element: how many numbers it has, whether it has a potential, and a force without one.
+std::map<std::string, std::tuple<std::size_t, bool, bool>> element_kinds() {
+    std::map<std::string, std::tuple<std::size_t, bool, bool>> found;
+    each_kind(std::type_identity<Element>{}, [&](auto element) {
+        const bool potential = requires { element.potential(0.0); };
+        const bool force = requires { element.force(0.0, 0.0); } || requires { element.force(0.0, 0.0, 0.0); };
+        found[element.name] = {numbers_of<decltype(element)>(), potential, force};
+    });
+    return found;
+}
+
+// The same of couplings, without the numbers of their points.
+std::map<std::string, std::tuple<std::size_t, bool, bool>> coupling_kinds() {
+    std::map<std::string, std::tuple<std::size_t, bool, bool>> found;
+    each_kind(std::type_identity<CoupledElement>{}, [&](auto coupling) {
+        const bool potential = requires { coupling.potential(Vec3<double>{}); };
+        found[coupling.name] = {numbers_of<decltype(coupling)>(), potential, !potential};
+    });
+    return found;
 }
 
 // Constraints: vectors fixed to bodies (body, whether it is a direction, coordinates), rows that are products (x, y,
@@ -446,6 +483,8 @@ std::tuple<Out, Out> constraint_curvature(const Mechanism& mechanism, In<1> q, I
 }  // namespace
 
 void register_mechanism(nb::module_& m) {
+    m.def("element_kinds", &element_kinds);
+    m.def("coupling_kinds", &coupling_kinds);
     nb::class_<Mechanism>(m, "Mechanism")
         .def_static("make", &mechanism_of, nb::kw_only(), "parent"_a, "prismatic"_a, "rotation"_a, "translation"_a,
                     "mass"_a, "center"_a, "inertia"_a, "coordinate"_a, "ratio"_a, "offset"_a, "origin"_a, "loads"_a,

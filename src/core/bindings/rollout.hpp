@@ -18,15 +18,15 @@
 
 namespace varpin::border {
 
-// P paths with the work arrays of a step, `stepping`. Forks share these arrays, so only one of them advances at a time.
-// A State is a PathState, or has one as its `path`.
-template <class Stepping, class State>
+// P paths with the work arrays of a step, the `stepper`. Forks share these arrays, so only one of them advances at a
+// time. A State is a PathState, or has one as its `path`.
+template <class Stepper, class State>
 class Rollout {
   public:
     Rollout(const Mechanism& mechanism, const Tableau& tableau, const Guards& guards, std::size_t paths,
-            std::shared_ptr<Stepping> stepping)
+            std::shared_ptr<Stepper> stepper)
         : mechanism_(&mechanism),
-          stepping_(std::move(stepping)),
+          stepper_(std::move(stepper)),
           guards_(guards),
           stages_(tableau.stages),
           states_(paths, State(mechanism, tableau.stages)) {}
@@ -38,7 +38,7 @@ class Rollout {
         require(v, "v", {states_.size(), n});
         nb::gil_scoped_release release;
         for (std::size_t i = 0; i < states_.size(); ++i) {
-            if (!stepping_->begin(q.data() + i * n, v.data() + i * n, states_[i])) return false;
+            if (!stepper_->begin(q.data() + i * n, v.data() + i * n, states_[i])) return false;
         }
         return true;
     }
@@ -46,7 +46,10 @@ class Rollout {
     // Add an impulse (P, n) to the momenta.
     void kick(In<2> impulse) {
         require(impulse, "impulse", {states_.size(), size()});
-        for (std::size_t i = 0; i < states_.size(); ++i) stepping_->kick(impulse.data() + i * size(), states_[i]);
+        for (std::size_t i = 0; i < states_.size(); ++i) {
+            stepper_->look_at(states_[i]);
+            stepper_->kick(impulse.data() + i * size(), states_[i]);
+        }
     }
 
     // Configurations, momenta, velocities (P, n) and energies (P).
@@ -70,7 +73,7 @@ class Rollout {
 
   protected:
     const Mechanism* mechanism_;
-    std::shared_ptr<Stepping> stepping_;
+    std::shared_ptr<Stepper> stepper_;
     Guards guards_;
     int stages_;
     std::vector<State> states_;

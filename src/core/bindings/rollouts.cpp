@@ -11,7 +11,7 @@
 #include "registrations.hpp"
 #include "rollout.hpp"
 #include "rollout_arrays.hpp"
-#include "stepping.hpp"
+#include "small_arms.hpp"
 #include "watched.hpp"
 
 namespace varpin::border {
@@ -42,19 +42,18 @@ Guards guards_of(bool active, double branch_margin, double energy_balance, doubl
     return {active, branch_margin, energy_balance, energy_budget, most_halvings};
 }
 
-// The step with sizes known at compile time, if there is one for the mechanism.
-std::shared_ptr<Stepping> stepping_of(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
-                                      const Guards& guards, double left, Solver solver) {
-    if (auto small = small_stepping(mechanism, tableau, tolerance, guards, left, solver)) return small;
-    return std::make_shared<SteppingOf<int, int>>(mechanism, tableau, tolerance, guards, left, solver);
+// The stepper with sizes known at compile time, if there is one for the mechanism.
+std::shared_ptr<Stepper> stepper_of(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
+                                    const Guards& guards, double left, Solver solver) {
+    if (auto small = small_stepper(mechanism, tableau, tolerance, guards, left, solver)) return small;
+    return std::make_shared<VariationalStepper<>>(mechanism, tableau, tolerance, guards, left, solver);
 }
 
-class VariationalRollout : public Rollout<Stepping, PathState> {
+class VariationalRollout : public Rollout<Stepper, PathState> {
   public:
     VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                        double left, std::size_t paths, Solver solver)
-        : Rollout(mechanism, tableau, guards, paths, stepping_of(mechanism, tableau, tolerance, guards, left, solver)) {
-    }
+        : Rollout(mechanism, tableau, guards, paths, stepper_of(mechanism, tableau, tolerance, guards, left, solver)) {}
 
     VariationalRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
@@ -64,7 +63,8 @@ class VariationalRollout : public Rollout<Stepping, PathState> {
         roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, nodes,
                    [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
                        Watch* watching = watch ? watch->of(to) : nullptr;
-                       stepping_->roll(guards_, h, by, dw, more, kicks, states_, to, watching);
+                       stepper_->guards = guards_;
+                       stepper_->roll(h, by, dw, more, kicks, states_, to, watching);
                    });
     }
 };
@@ -73,10 +73,12 @@ std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double h, In<2> q,
     In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, Solver solver) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    std::unique_ptr<Differentiation> work = small_differentiation(mechanism, tableau, tolerance, guards, solver);
-    if (!work) work = std::make_unique<DifferentiationOf<int, int>>(mechanism, tableau, tolerance, guards, solver);
+    std::unique_ptr<StepDerivatives> work = small_derivatives(mechanism, tableau, tolerance, guards, solver);
+    if (!work) work = std::make_unique<VariationalLinearization<>>(mechanism, tableau, tolerance, guards, solver);
+    work->varies = at.varies;
+    work->ramp = ramp;
     return derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
-        return work->first(h, at.q(s), at.p(s), next, at.force(s), at.varies, ramp, at.halvings(s), Jx, Jf, at.past(s));
+        return work->first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf, at.past(s));
     });
 }
 

@@ -1,5 +1,5 @@
 // Steps of arms with up to seven joints, whose number is known at compile time.
-#include "stepping.hpp"
+#include "small_arms.hpp"
 
 namespace varpin::border {
 
@@ -32,19 +32,21 @@ std::unique_ptr<Made> of_size(const Mechanism& mechanism, const Tableau& tableau
 
 }  // namespace
 
-std::unique_ptr<Stepping> small_stepping(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
-                                         const Guards& guards, double left, Solver solver) {
-    return of_size<Stepping>(mechanism, tableau, solver, [&]<class Size>(Size) -> std::unique_ptr<Stepping> {
-        return std::make_unique<SteppingOf<Size, Known<1>>>(mechanism, tableau, tolerance, guards, left, solver);
+std::unique_ptr<Stepper> small_stepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
+                                       const Guards& guards, double left, Solver solver) {
+    return of_size<Stepper>(mechanism, tableau, solver, [&]<class Size>(Size) -> std::unique_ptr<Stepper> {
+        return std::make_unique<VariationalStepper<Size, Known<1>>>(mechanism, tableau, tolerance, guards, left,
+                                                                    solver);
     });
 }
 
-std::unique_ptr<Differentiation> small_differentiation(const Mechanism& mechanism, const Tableau& tableau,
-                                                       double tolerance, const Guards& guards, Solver solver) {
-    return of_size<Differentiation>(
-        mechanism, tableau, solver, [&]<class Size>(Size) -> std::unique_ptr<Differentiation> {
-            return std::make_unique<DifferentiationOf<Size, Known<1>>>(mechanism, tableau, tolerance, guards, solver);
-        });
+std::unique_ptr<StepDerivatives> small_derivatives(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
+                                                   const Guards& guards, Solver solver) {
+    return of_size<StepDerivatives>(mechanism, tableau, solver,
+                                    [&]<class Size>(Size) -> std::unique_ptr<StepDerivatives> {
+                                        return std::make_unique<VariationalLinearization<Size, Known<1>>>(
+                                            mechanism, tableau, tolerance, guards, solver);
+                                    });
 }
 
 }  // namespace varpin::border

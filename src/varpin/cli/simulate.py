@@ -121,7 +121,7 @@ def _run(
             complaint = f"interrupted after {trajectory.steps}{of} steps, which are kept"
         except StepFailure as failure:
             trajectory, status = failure.trajectory, STEP_FAILED
-            complaint = str(failure).replace("is in error.trajectory", "is kept")
+            complaint = f"{failure.problem}. What came before is kept; {failure.advice}"
         wall_time = time.perf_counter() - begin
         writers = {output.path: partial(output.write, robot, trajectory) for output in outputs}
         written, trouble = write_all(errors, writers, request.interrupts)

@@ -25,10 +25,10 @@ from varpin.control.examination import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.multipliers import FEASIBLE, ConstraintReport, Multipliers, reports, split
 from varpin.control.penalties import PenalizedProblem, flat, penalized
-from varpin.control.polish import deviations, onto_constraints
+from varpin.control.polish import deviations, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import refine
-from varpin.control.search import checked_time, require_reports
+from varpin.control.search import NOTHING, checked_time, require_reports
 from varpin.control.solution import Solution
 from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
@@ -181,8 +181,8 @@ class _Rounds:
                 break
         if kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
             try:
-                kept, told = self._polished(kept, problem)
-                reason = f"{reason}; {told}"
+                kept, told = self._polished(replace(kept, status=status))
+                status, reason = kept.status, f"{reason}; {told}"
             except KeyboardInterrupt:
                 status = Status.INTERRUPTED
         plan = replace(kept, status=status, reason=reason)
@@ -338,19 +338,28 @@ class _Rounds:
         )
         return None, ""
 
-    def _polished(self, kept: Solution, problem: PenalizedProblem) -> tuple[Solution, str]:
-        """The plan moved onto its constraints, with matching gains, and the remaining violation in words."""
+    def _polished(self, kept: Solution) -> tuple[Solution, str]:
+        """The plan moved onto its constraints and to its optimum, with matching gains, and its residuals in words."""
         known = kept.multipliers
         assert known is not None
-        motion = onto_constraints(self.problem, kept, split(self.bound, known.values), split(self.bound, known.backoff))
-        plan = kept if motion is kept.trajectory else self._along(kept, motion, problem)
-        return plan, f"constraints hold to {plan.violation:.1e}"
-
-    def _along(self, kept: Solution, motion: Trajectory, problem: PenalizedProblem) -> Solution:
-        """The plan with a neighbouring motion and the results of a backward pass along it."""
-        moved = replace(kept, trajectory=motion, cost=self.problem.cost_of(motion))
+        values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
         try:
-            found = backward(problem, motion, 0.0)
+            found = polished(self.problem, kept.trajectory, values, known.weights, backoff)
+        except (CostError, NoiseFieldError, LinearizationError):
+            return kept, f"constraints hold to {kept.violation:.1e}"
+        plan = self._along(kept, found.motion, replace(known, values=flat(found.multipliers)))
+        told = f"constraints hold to {plan.violation:.1e}, and within them the cost would fall by {found.decrease:.1e}"
+        bound = self.tolerance * (found.stake + NOTHING * (0.0 if kept.search is None else kept.search.first))
+        if kept.status is Status.CONVERGED and not found.decrease <= bound:
+            plan = replace(plan, status=Status.STALLED)
+        return plan, told
+
+    def _along(self, kept: Solution, motion: Trajectory, multipliers: Multipliers) -> Solution:
+        """The plan with a neighbouring motion, its multipliers and the results of a backward pass along it."""
+        moved = replace(kept, trajectory=motion, cost=self.problem.cost_of(motion), multipliers=multipliers)
+        values, backoff = split(self.bound, multipliers.values), split(self.bound, multipliers.backoff)
+        try:
+            found = backward(penalized(self.problem, values, multipliers.weights, backoff), motion, 0.0)
         except (CostError, NoiseFieldError, LinearizationError):
             return moved
         if found is None:

@@ -502,7 +502,7 @@ class Along:
             return self.kept
         problem, part = self.problem, self.trajectory.part(begin, end)
         # dv/dx is needed where the cost samples velocities of nodes and x holds momenta.
-        nodes = problem.integrator.variational and bool(problem.model_rule[:, [2, 4, 6, 8]].any())
+        nodes = problem.integrator.variational and bool(problem.model_rule[:, 2::2].any())
         lin = _linearize(problem, part, begin)
         n = problem.scene.robot.dof
         velocity = velocity_at_nodes(problem.scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))
@@ -518,13 +518,15 @@ class Along:
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
         lin, velocity = self.linearized(begin, end)
-        count = problem.processes
+        G, Gx, Gu, count = lin.G, lin.Gx, lin.Gu, problem.processes
+        if count < G.shape[2]:
+            G, Gx, Gu = (np.ascontiguousarray(array[:, :, :count]) for array in (G, Gx, Gu))
         return core.ExpandedSteps(
             A=lin.A,
             B=lin.B,
-            G=np.ascontiguousarray(lin.G[:, :, :count]),
-            Gx=np.ascontiguousarray(lin.Gx[:, :, :count]),
-            Gu=np.ascontiguousarray(lin.Gu[:, :, :count]),
+            G=G,
+            Gx=Gx,
+            Gu=Gu,
             rule=problem.model_rule,
             gradient=self.slopes[points],
             hessian=hessian[points] if len(hessian) > 1 else hessian,

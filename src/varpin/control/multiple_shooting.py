@@ -488,7 +488,7 @@ def _inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Floa
     jets = [lagrangian_jet(scene, *at) for at in zip(q, v, strict=True)]
     needed = np.array([jet.Lvv @ a[k] + jet.Lvq @ v[k] - jet.Lq for k, jet in enumerate(jets)])
     # A servo commanded to its present position exerts no spring force.
-    still = np.array([scene.command_at(at) for at in q]) @ scene.actuation.T
+    still = q @ scene.holding.T @ scene.actuation.T
     needed += still - scene.core.forces(q, v, still)[0]
     if controls is None:
         controls = np.clip(needed @ np.linalg.pinv(scene.actuation).T, *problem.control_limits)

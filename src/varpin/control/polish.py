@@ -1,7 +1,7 @@
-"""The last step of a plan onto its active constraints: Newton's method on the exact linearization of its motion.
+"""The last step of a plan onto its constraints and to its optimum: Newton's method on the KKT conditions.
 
-Equation (P4) of docs/plan-constraints.md. After the projected Newton step of Howell, Jackson and Manchester (2019),
-with the least change of the controls.
+Equation (P4) of docs/plan-constraints.md. After the projected Newton step of Howell, Jackson and Manchester (2019), in
+the metric of the cost to go: a step onto the constraints then keeps to the optimum within them.
 """
 
 from __future__ import annotations
@@ -13,211 +13,256 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control.backward import states
-from varpin.control.constraints import BoundConstraint, BoundRate
+from varpin.control.closed_loop import ClosedLoop
+from varpin.control.constraints import BoundConstraint
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes
 from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
 from varpin.integrators.base import open_loop
-from varpin.linearization import Linearization, linearize_steps
 from varpin.trajectory import Trajectory
 
 Mask = NDArray[np.bool_]
 
-# Greatest number of Newton steps.
-_STEPS = 8
-# Greatest number of passes in a step that fix controls at their limits.
-_CLIPS = 6
-# Violation that counts as rounding error.
-_DONE = 1e-12
-# Regularization of the normal equations, relative to their diagonal, for linearly dependent rows.
-_LITTLE = 1e-13
+# Greatest number of Newton steps, and how many of them, the last ones, lead onto the constraints only.
+_STEPS, _LAST = 15, 3
+# Greatest number of passes in a step that determine the active rows and the controls at their limits.
+_PASSES = 12
+# Violation that counts as rounding error, and decrease of the cost, relative to the cost at stake, that does.
+_DONE, _FLAT = 1e-12, 1e-13
+# Lengths of the part of a step along the constraints: its model is without second derivatives of the dynamics and of
+# the constraints. The part onto the constraints is whole.
+_LENGTHS = (1.0, 0.5, 0.25, 0.0)
+# Violation that steps along the constraints may cause; the next one removes it.
+_TRANSIENT = 1e-9
+# Distance from its bound at which a row counts as met, relative to the constraint's scale.
+_NEAR = 1e-8
+# Regularization of the dual problem for linearly dependent rows, relative to its diagonal; and its rounding error.
+_LITTLE, _ROUNDED = 1e-13, 1e-12
+# Pivots of the dual problem: of whole blocks without progress before single ones, and least number in all.
+_TRIES, _PIVOTS = 3, 50
 
 
-def onto_constraints(
-    problem: OptimalControlProblem, plan: Solution, multipliers: list[Floats], backoff: list[Floats]
-) -> Trajectory:
-    """The motion near a plan's with the least violation of its constraints and controls within their limits.
+@dataclass(frozen=True, eq=False)
+class Polished:
+    """A motion and how far it is from the KKT conditions.
+
+    Attributes:
+        motion: The motion.
+        violation: The largest violation over all constraints, each in its own unit.
+        multipliers: For each constraint (K, rows), those of least residual.
+        decrease: Decrease of the cost that its quadratic model expects within the linearized active constraints and the
+            limits of the controls; zero at an optimum.
+        stake: The cost at stake along the motion.
+    """
+
+    motion: Trajectory
+    violation: float
+    multipliers: list[Floats]
+    decrease: float
+    stake: float
+
+
+def polished(
+    problem: OptimalControlProblem,
+    motion: Trajectory,
+    multipliers: list[Floats],
+    weights: Floats,
+    backoff: list[Floats],
+) -> Polished:
+    """The motion near a given one that satisfies its constraints, and the conditions of an optimum, most closely.
+
+    Newton steps on the KKT conditions, equation (P4).
 
     Args:
         problem: The problem with its constraints.
-        plan: A nearly feasible plan; its feedback stabilizes the motions of the Newton steps.
+        motion: A nearly feasible and nearly optimal motion.
         multipliers: For each constraint (K, rows); rows with positive multipliers are active.
+        weights: Weights of the penalties (C,), which count in the feedback along the motion.
         backoff: For each constraint (K, rows).
+
+    Raises:
+        LinearizationError: A step of the motion has no derivative.
+        CostError: An expansion of the cost is not finite.
     """
-    best, worst = plan.trajectory, _worst(problem, plan.trajectory, backoff)
-    trials, motion = Trials(problem), plan.trajectory
-    active = [
-        np.full(multiplier.shape, item.source.equality) | (multiplier > 0.0)
-        for item, multiplier in zip(problem.bound_constraints, multipliers, strict=True)
-    ]
-    for _ in range(_STEPS):
-        if worst <= _DONE:
-            break
-        values = [c + b for c, b in zip(_values(problem, motion), backoff, strict=True)]
-        # A row that a step violates becomes active and stays so: it may be next to an active one.
-        active = [rows | (c > 0.0) for rows, c in zip(active, values, strict=True)]
-        attempt = trials.attempt(_corrected(problem, plan, motion, values, active))
-        if not attempt.whole:
-            break
-        motion = attempt.trajectory()
-        now = _worst(problem, motion, backoff)
-        if now < worst:
-            best, worst = motion, now
-    return best
-
-
-def _worst(problem: OptimalControlProblem, motion: Trajectory, backoff: list[Floats]) -> float:
-    """The largest violation over all constraints, each in its own unit."""
-    values = [c + b for c, b in zip(_values(problem, motion), backoff, strict=True)]
-    parts = [
-        np.abs(c).max() if item.source.equality else c.max()
-        for item, c in zip(problem.bound_constraints, values, strict=True)
-    ]
-    return max(0.0, *map(float, parts))
-
-
-def _values(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats]:
-    return [item.value(motion.q, motion.v, motion.u) for item in problem.bound_constraints]
-
-
-def _corrected(
-    problem: OptimalControlProblem,
-    plan: Solution,
-    motion: Trajectory,
-    values: list[Floats],
-    active: list[Mask],
-) -> Commands:
-    """Commands with the least change of the controls that moves active rows onto their bounds, to first order, (P4)."""
-    R, m = problem.decisions, problem.scene.controls
-    u = motion.u[:: problem.hold]
+    trials = Trials(problem)
     lower, upper = problem.control_limits
-    free = (u > lower) & (u < upper)
-    # Changes are weighed relative to the size of each control.
-    size = np.abs(u).max(axis=0)
-    size = np.where(size > 0.0, size, max(float(size.max()), 1.0))
-    c = np.concatenate([value[rows] for value, rows in zip(values, active, strict=True)])
-    linear = linearize_steps(problem.scene, motion, problem.integrator, problem.q0)
-    ahead = np.zeros((R, m))
-    for _ in range(_CLIPS):
-        # Controls at a limit are fixed there, and the free ones make up for them.
-        around = _Around(problem, motion, linear, plan, free)
-        G = around.rows(active).reshape(-1, R, m)
-        left = c + np.einsum("aRm,Rm->a", G, np.where(free, 0.0, ahead))
-        ahead = np.where(free, _least_change((G * (free * size)).reshape(len(G), -1), left).reshape(R, m) * size, ahead)
-        response, change = around.response(ahead)
-        beyond = free & ((u + change < lower) | (u + change > upper))
-        if not beyond.any():
+    u = problem.decided(motion)
+    step = _Step(problem, motion, weights, backoff, multipliers, (u > lower) & (u < upper))
+    longest = 1.0
+    for left in reversed(range(_STEPS)):
+        if step.found.violation <= _DONE and step.found.decrease <= _FLAT * step.found.stake:
             break
-        free = free & ~beyond
-        change = np.clip(u + change, lower, upper) - u
-        ahead = np.where(beyond, change, ahead)
-    gains, reference = plan.gains, states(problem, motion) + response
-    reference = reference[: -1 : problem.hold]
-    if plan.previous_gains is not None:
-        before = np.vstack([u[:1], (u + change)[:-1]])
-        gains, reference = np.concatenate([gains, plan.previous_gains], axis=2), np.hstack([reference, before])
-    return open_loop(u + change)._replace(
-        hold=problem.hold,
-        limits=problem.control_limits.copy(),
-        gains=np.ascontiguousarray(gains),
-        reference=np.ascontiguousarray(reference),
-    )
+        step.settle()
+        # Where the model's curvature is too small, it is so in the next step, too.
+        for length in (item for item in _LENGTHS if item <= (longest if left >= _LAST else 0.0)):
+            attempt = trials.attempt(step.commands(length))
+            if not attempt.whole:
+                continue
+            after = _Step(problem, attempt.trajectory(), weights, backoff, step.multipliers, step.free)
+            if _closer(after.found, step.found, length):
+                step, longest = after, length or longest
+                break
+        else:
+            break
+    return step.found
 
 
-def _least_change(G: Floats, c: Floats) -> Floats:
-    """The shortest x with G x = -c, where rows of G may depend on each other."""
-    length = np.linalg.norm(G, axis=1)
-    length = np.where(length > 0.0, length, 1.0)
-    unit = G / length[:, None]
-    square = unit @ unit.T
-    square[np.diag_indices(len(square))] += _LITTLE * len(square)
-    found: Floats = -(unit.T @ np.linalg.solve(square, c / length))
-    return found
+def _closer(one: Polished, other: Polished, length: float) -> bool:
+    """Whether a motion is closer to the KKT conditions than another one, from which it is a step of given length."""
+    if length == 0.0:
+        return one.violation < other.violation
+    return one.decrease < other.decrease and one.violation <= max(other.violation, _TRANSIENT)
 
 
-@dataclass
-class _Around:
-    """The linearization of a motion, and of its constraints, under a plan's feedback.
+class _Step:
+    """A Newton step on the KKT conditions around a motion.
 
-    The feedback returns the motion to the plan after a correction. Without it an unstable motion would diverge.
+    Minimizes the cost's quadratic model in w within the linearized constraints G w <= -c: with W the inverse of its
+    Hessian and g its gradient, w = -W (g + G' lambda), where lambda minimizes the dual problem.
 
     Attributes:
-        problem: The problem with its constraints.
-        motion: The motion.
-        linear: Linearization of its steps.
-        plan: The plan with the feedback.
-        free: Controls (R, m) on which the feedback acts.
+        found: The motion and its residuals.
+        free: The controls (R, m) that are not fixed at their limits; after :meth:`commands` those of the step.
+        multipliers: For each constraint (K, rows), likewise.
     """
 
-    problem: OptimalControlProblem
-    motion: Trajectory
-    linear: Linearization
-    plan: Solution
-    free: Mask
+    def __init__(
+        self,
+        problem: OptimalControlProblem,
+        motion: Trajectory,
+        weights: Floats,
+        backoff: list[Floats],
+        multipliers: list[Floats],
+        free: Mask,
+    ) -> None:
+        self.problem, self.motion, self.free, self.multipliers = problem, motion, free, multipliers
+        self.bound = problem.bound_constraints
+        self.c = [item.value(motion.q, motion.v, motion.u) + b for item, b in zip(self.bound, backoff, strict=True)]
+        active = [values != 0.0 for values in multipliers]
+        # The rows that are met, or may be.
+        self.rows = [
+            rows | item.source.equality | (c > -_NEAR * item.scale)
+            for item, rows, c in zip(self.bound, active, self.c, strict=True)
+        ]
+        self.loop = ClosedLoop(problem, motion, weights, active)
+        self.loop.close(free)
+        self.found = self._judged()
 
-    def __post_init__(self) -> None:
-        previous, acts = self.plan.previous_gains, self.free[:, :, None]
-        self.gains = self.plan.gains * acts
-        self.previous = np.zeros((*self.free.shape, self.free.shape[1])) if previous is None else previous * acts
+    def _judged(self) -> Polished:
+        """The residuals of the motion with its best multipliers, without a step."""
+        problem, loop, motion = self.problem, self.loop, self.motion
+        multipliers, pull = self._dual([np.zeros_like(c) for c in self.c], np.zeros(self.free.shape))
+        self.tangent = -np.einsum("kij,kj->ki", loop.inverse, pull)
+        u, (lower, upper) = problem.decided(motion), problem.control_limits
+        # A control at its limit is free again where the cost decreases inwards.
+        self.inwards = ~self.free & (((u <= lower) & (pull < 0.0)) | ((u >= upper) & (pull > 0.0)))
+        steep = np.where(loop.curvature > 0.0, loop.curvature, np.inf)
+        decrease = float(np.einsum("ki,kij,kj->", pull, loop.inverse, pull) + (pull**2 / steep)[self.inwards].sum())
+        violation = max(0.0, *(_violation(item, c) for item, c in zip(self.bound, self.c, strict=True)))
+        return Polished(motion, violation, multipliers, 0.5 * decrease, loop.stake.moved)
 
-    def rows(self, active: list[Mask]) -> Floats:
-        """Derivatives (a, R m) of the active rows with respect to the feed-forward controls."""
-        problem, motion = self.problem, self.motion
-        n, R, m, hold = problem.scene.robot.dof, problem.decisions, problem.scene.controls, problem.hold
-        total = sum(int(rows.sum()) for rows in active)
-        G = np.zeros((total, R, m))
-        carried, node = np.zeros((total, 2 * n)), np.full(total, -1)
-        slopes = state_slopes(problem, motion)
-        begin = 0
-        for item, rows in zip(problem.bound_constraints, active, strict=True):
-            k, r = np.nonzero(rows)
-            part = slice(begin, begin + len(k))
-            begin += len(k)
-            if isinstance(item, BoundRate):
-                G[part] = _of_rate(item, k, r, R, m)
-            else:
-                places = item.places[k]
-                J = item.jacobian(motion.q, motion.v)[k, r]
-                carried[part] = np.einsum("ax,axy->ay", J, slopes[places])
-                node[part] = places
-        back = np.zeros_like(carried)
-        for j in reversed(range(problem.steps)):
-            own, here = j // hold, node == j + 1
-            back[here] += carried[here]
-            G[:, own] += back @ self.linear.B[j]
-            back = back @ self.linear.A[j]
-            if j % hold == 0:
-                # Through feedback the control depends on the state before it and on the previous control.
-                back += G[:, own] @ self.gains[own]
-                if own > 0:
-                    G[:, own - 1] += G[:, own] @ self.previous[own]
-        return G.reshape(total, R * m)
+    def _dual(self, values: list[Floats], ahead: Floats) -> tuple[list[Floats], Floats]:
+        """Multipliers (K, rows) of the step for constraints' ``values``, and the pull g + G' lambda (R, m).
 
-    def response(self, ahead: Floats) -> tuple[Floats, Floats]:
-        """Changes of the states (N + 1, 2n) and controls (R, m) for feed-forward changes ``ahead`` (R, m)."""
-        A, B, hold = self.linear.A, self.linear.B, self.problem.hold
-        found, change = np.zeros((len(A) + 1, A.shape[1])), ahead.copy()
-        for j in range(len(A)):
-            k = j // hold
-            if j % hold == 0:
-                change[k] += self.gains[k] @ found[j]
-                if k > 0:
-                    change[k] += self.previous[k] @ change[k - 1]
-            found[j + 1] = A[j] @ found[j] + B[j] @ change[k]
-        return found, change
+        ``ahead`` (R, m) are given changes of the controls that are not free.
+        """
+        loop = self.loop
+        G = loop.rows(self.rows)
+        c = np.concatenate([value[rows] for value, rows in zip(values, self.rows, strict=True)])
+        equal = np.concatenate(
+            [np.full(int(rows.sum()), item.source.equality) for item, rows in zip(self.bound, self.rows, strict=True)]
+        )
+        active = np.concatenate([lam[rows] != 0.0 for lam, rows in zip(self.multipliers, self.rows, strict=True)])
+        flat = G.reshape(len(G), loop.gradient.size)
+        weighed = np.einsum("akm,kmi->aki", G, loop.inverse).reshape(flat.shape)
+        found = _least(weighed @ flat.T, c + flat @ ahead.ravel() - weighed @ loop.gradient.ravel(), equal, active)
+        multipliers = [np.zeros(rows.shape) for rows in self.rows]
+        ends = np.cumsum([int(rows.sum()) for rows in self.rows])
+        for array, rows, part in zip(multipliers, self.rows, np.split(found, ends[:-1]), strict=True):
+            array[rows] = part
+        return multipliers, loop.gradient + np.einsum("akm,a->km", G, found)
+
+    def settle(self) -> None:
+        """Determine the step: the rows that it meets and the controls that it brings to their limits."""
+        problem, loop = self.problem, self.loop
+        lower, upper = problem.control_limits
+        u = problem.decided(self.motion)
+        self.ahead = np.zeros(u.shape)
+        if self.inwards.any():
+            self.free = self.free | self.inwards
+            loop.close(self.free)
+        for _ in range(_PASSES):
+            fixed = np.where(self.free, 0.0, self.ahead)
+            self.multipliers, pull = self._dual(self.c, fixed)
+            self.ahead = fixed - np.einsum("kij,kj->ki", loop.inverse, pull)
+            response, change = loop.response(self.ahead)
+            beyond = self.free & ((u + change < lower) | (u + change > upper))
+            if beyond.any():
+                # Controls at a limit are fixed there, and the free ones make up for them.
+                self.free = self.free & ~beyond
+                self.ahead = np.where(beyond, np.clip(u + change, lower, upper) - u, self.ahead)
+                loop.close(self.free)
+                continue
+            met = [rows | (c > _DONE) for rows, c in zip(self.rows, loop.moved(self.c, response, change), strict=True)]
+            if all(np.array_equal(a, b) for a, b in zip(met, self.rows, strict=True)):
+                break
+            self.rows = met
+
+    def commands(self, length: float) -> Commands:
+        """The commands of the motion after the step, ``length`` of its part along the constraints, with feedback."""
+        problem, loop = self.problem, self.loop
+        u = problem.decided(self.motion)
+        response, change = loop.response(self.ahead - (1.0 - length) * np.where(self.free, self.tangent, 0.0))
+        gains, reference = loop.gains, (states(problem, self.motion) + response)[: -1 : problem.hold]
+        if loop.previous.any():
+            before = np.vstack([u[:1], (u + change)[:-1]])
+            gains, reference = np.concatenate([gains, loop.previous], axis=2), np.hstack([reference, before])
+        return open_loop(u + change)._replace(
+            hold=problem.hold,
+            limits=problem.control_limits.copy(),
+            gains=np.ascontiguousarray(gains),
+            reference=np.ascontiguousarray(reference),
+        )
 
 
-def _of_rate(item: BoundRate, k: NDArray[np.int64], r: NDArray[np.int64], R: int, m: int) -> Floats:
-    """Derivatives (a, R, m) of rows of a rate limit with respect to the controls."""
-    rows, limited = np.zeros((len(k), R, m)), item.limited
-    signs, columns = np.where(r < len(limited), 1.0, -1.0), limited[r % len(limited)]
-    decisions, index = item.places[k], np.arange(len(k))
-    rows[index, decisions, columns] = signs / item.period
-    later = decisions > 0
-    rows[index[later], decisions[later] - 1, columns[later]] = -signs[later] / item.period
-    return rows
+def _violation(item: BoundConstraint, c: Floats) -> float:
+    """The largest violation of a constraint with the values ``c``, in its own unit."""
+    return float(np.abs(c).max() if item.source.equality else c.max())
+
+
+def _least(S: Floats, d: Floats, equal: Mask, active: Mask) -> Floats:
+    """The x (a,) of least x' S x / 2 - d' x, nonnegative where not ``equal``, for S positive semidefinite (a, a).
+
+    Block principal pivoting, after Portugal, Judice and Vicente, "A comparison of block pivoting and interior-point
+    algorithms for linear least squares problems with nonnegative variables" (1994). Begins with the ``active`` rows.
+    """
+    length = np.sqrt(np.maximum(np.diagonal(S), 0.0))
+    length = np.where(length > 0.0, length, 1.0)
+    S, d = S / np.outer(length, length), d / length
+    S[np.diag_indices(len(S))] += _LITTLE * len(S)
+    active, x = active | equal, np.zeros(len(d))
+    least, tries = len(d) + 1, _TRIES
+    for _ in range(_PIVOTS + 2 * len(d)):
+        x = np.zeros(len(d))
+        x[active] = np.linalg.solve(S[np.ix_(active, active)], d[active])
+        y = S @ x - d
+        rounding = _ROUNDED * max(np.abs(x).max(initial=0.0), np.abs(d).max(initial=0.0))
+        wrong = np.where(active, (x < -rounding) & ~equal, y < -rounding)
+        count = int(wrong.sum())
+        if not count:
+            break
+        if count < least:
+            least, tries = count, _TRIES
+        elif tries:
+            tries -= 1
+        else:
+            # One at a time, which ends surely.
+            wrong = np.arange(len(d)) == np.flatnonzero(wrong)[-1]
+        active = active ^ wrong
+    found: Floats = np.where(equal, x, np.maximum(x, 0.0)) / length
+    return found
 
 
 def deviations(problem: OptimalControlProblem, plan: Solution, bound: BoundConstraint) -> Floats:

@@ -17,6 +17,7 @@ from varpin.control.solution import Solution
 from varpin.control.verification import Verification
 from varpin.errors import InputError, VarpinError
 from varpin.mechanics.policy import LinearPolicy
+from varpin.simulation.friction import rate_at_rest
 from varpin.simulation.record import rollout
 
 Search = Callable[[OptimalControlProblem, LinearPolicy | None], Solution]
@@ -29,6 +30,8 @@ _KNOWN = 0.1
 _HALVINGS = 10
 # Number of halvings without a smaller loss, or of searches within it that have not converged, that end the refinement.
 _PATIENCE = 3
+# Greatest rate of dampers and dry friction, times the step, from where on halvings must lower the loss.
+_RESOLVED = 2.0
 
 
 def refine(problem: OptimalControlProblem, search: Search, wish: float, time_left: Callable[[], float]) -> Solution:
@@ -90,7 +93,8 @@ def _ended(
         return f"the time limit came after dt = {problem.dt:g} s"
     if len(tried) > _HALVINGS:
         return f"the step has been halved {_HALVINGS} times"
-    if len(tried) - 1 - chosen >= _PATIENCE:
+    resolved = problem.dt * rate_at_rest(problem.scene, problem.q0) <= _RESOLVED
+    if resolved and len(tried) - 1 - chosen >= _PATIENCE:
         return f"the last {_PATIENCE} halvings of the step have not lowered the loss"
     if _within(tried[-1], wish) and solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE):
         return f"the loss is within the wish, but the search ended {solution.status.name}"

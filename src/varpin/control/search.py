@@ -10,15 +10,16 @@ import contextlib
 import functools
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import is_dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.control.backward import Along, Plan, backward, noise_shares, states
+from varpin.control.backward import Along, Plan, backward, noise_shares
+from varpin.control.commands import controls_along, first_commands, shifted_commands, with_feedback
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
@@ -32,7 +33,6 @@ from varpin.core import Watch
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError
 from varpin.integrators import Integrator
-from varpin.integrators.base import open_line, open_loop
 from varpin.integrators.variational import Variational
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.noise import NoiseFieldError
@@ -41,10 +41,7 @@ from varpin.simulation.failures import StepFailure, named
 from varpin.simulation.record import located
 from varpin.support.checks import (
     JointValues,
-    as_floats,
-    control_array,
     count,
-    finite_array,
     fraction,
     is_one_of,
     positive,
@@ -77,7 +74,7 @@ _LOSSY = 1e-8
 # Iterations without significant decrease before the search stalls. The cost is discontinuous where guards cut steps.
 _PATIENCE = 15
 # Share of the first motion's cost at stake that is added to the current one: an optimum of cost zero has none.
-_NOTHING = 1e-9
+NOTHING = 1e-9
 # Approximate shortest step of a line search, and its greatest number of trials.
 _SHORTEST, _TRIALS = 1e-6, 40
 # Bounds on the substeps of a trial. A trial stops where a step needs more than _HALVINGS halvings and more than the
@@ -168,7 +165,8 @@ def solve(
             starting from the plan before, until :meth:`Solution.verify` confirms the accuracy. ``Solution.problem`` has
             the plan's step. ``Solution.refinement`` lists the steps tried, or why the accuracy cannot be reached; a
             warning reports that, too. Controls that are held over several steps keep their period. ``max_iterations``
-            is for each step, ``time_limit`` for all; Ctrl-C keeps the best plan so far.
+            is for each step, ``time_limit`` for all; Ctrl-C keeps the best plan so far. Where dampers are far faster
+            than the step, ``controls="linear"`` in the problem reaches the accuracy at much larger steps.
         noise: Gradient of the noise cost, where the noise's strength depends on the state or the control. ``"held"``:
             as in the paper, with the Hessian of the value function held; it neglects the derivatives of that Hessian,
             and ends next to the minimum of the expected cost. ``"whole"``: the search continues from there to that
@@ -252,8 +250,8 @@ def solve(
     if resume is not None:
         search.resume(_search_of(problem, controls, resume))
     elif path is None:
-        search.begin(_first_commands(problem, controls))
-    closing = None if path is None else GapClosing(problem, path, _controls_along(problem, controls))
+        search.begin(first_commands(problem, controls))
+    closing = None if path is None else GapClosing(problem, path, controls_along(problem, controls))
     try:
         if closing is not None:
             search.close(closing, max_iterations, deadline, report)
@@ -304,87 +302,12 @@ def replan(
     ``time.perf_counter``) if it took as long as the longest before. Other arguments and errors are as in :func:`solve`.
     """
     search = _Search(problem, second_order=False, anew=False)
-    search.begin(_shifted_commands(problem, previous, decisions))
+    search.begin(shifted_commands(problem, previous, decisions))
     try:
         status = search.run(tolerance, max_iterations, deadline, lambda *_: None)
     except KeyboardInterrupt:
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
     return search.solution(status)
-
-
-def _first_commands(problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None) -> Commands:
-    m, variational = problem.scene.controls, problem.integrator.variational
-    if isinstance(controls, Solution):
-        controls = controls.policy_on("momentum" if variational else "velocity")
-    if controls is None:
-        controls = problem.holding_policy()
-    if isinstance(controls, LinearPolicy):
-        if (hold := controls.hold_at(problem.dt)) != problem.hold:
-            raise InputError(f"the policy holds its controls over {hold} steps, the problem {problem.hold}")
-        if controls.linear != problem.linear:
-            policy, wanted = ("linear", "held") if controls.linear else ("held", "linear")
-            raise InputError(f"the policy's controls are {policy}, the problem's {wanted}")
-        commands = controls.commands(
-            problem.steps, m, problem.scene.robot.dof, variational, problem.dt, problem.integrator.stage_times
-        )
-        narrowed = np.clip(commands.limits, *problem.control_limits)
-        narrowed.setflags(write=False)
-        if problem.linear:
-            return commands._replace(limits=narrowed, before=np.clip(commands.before, *narrowed))
-        if problem.rate is not None and problem.rate.before is not None:
-            commands = commands._replace(before=problem.rate.before[None].copy())
-        return commands._replace(limits=narrowed)
-    return _held(_rows_of(problem, controls), problem)
-
-
-def _controls_along(problem: OptimalControlProblem, controls: object) -> Floats | None:
-    """Controls (R, m) along given states, clipped to their limits."""
-    if controls is None:
-        return None
-    if isinstance(controls, Solution | LinearPolicy):
-        raise InputError("controls beside states must be (R, m), (m,) or by joint name, without feedback")
-    u = _rows_of(problem, controls)
-    return np.asarray(np.clip(u, *problem.control_limits), dtype=np.float64)
-
-
-def _rows_of(problem: OptimalControlProblem, controls: Any) -> Floats:
-    """Given controls as rows (R, m)."""
-    R, m = problem.decisions, problem.scene.controls
-    if isinstance(controls, Mapping):
-        controls = control_array("controls", controls, problem.scene.control_joints)
-    rows = as_floats("controls", controls)
-    return np.broadcast_to(finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m)), (R, m))
-
-
-def _shifted_commands(problem: OptimalControlProblem, previous: Solution, decisions: int) -> Commands:
-    """The commands of :meth:`Solution.shifted`, with the problem's limits and its previous control."""
-    old, before = previous.problem, None if problem.rate is None else problem.rate.before
-    R, m = problem.decisions, problem.scene.controls
-    same = (
-        old.scene is problem.scene
-        and old.integrator == problem.integrator
-        and old.control_limits is problem.control_limits
-    )
-    if not (same and (old.dt, old.steps, old.hold) == (problem.dt, problem.steps, problem.hold)):
-        return _first_commands(problem, previous.shifted(decisions, before))
-    rows = np.minimum(np.arange(R) + decisions, R - 1)
-    u, gains, reference = previous.controls, previous.gains, states(old, previous.trajectory)[: -1 : old.hold]
-    if previous.previous_gains is not None:
-        start = None if old.rate is None else old.rate.before
-        expected = np.vstack([u[:1] if start is None else start, u[:-1]])[rows[:1]]
-        gains = np.concatenate([gains, previous.previous_gains], axis=2)
-        # A repeated control has itself as its previous one.
-        reference = np.hstack([reference[rows], np.vstack([expected, u[rows[:-1]]])])
-    else:
-        reference = reference[rows]
-    return Commands(
-        u=u[rows],
-        gains=gains[rows],
-        reference=reference,
-        hold=problem.hold,
-        limits=problem.control_limits,
-        before=np.zeros((0, m)) if before is None else before[None].copy(),
-    )
 
 
 def _search_of(problem: OptimalControlProblem, controls: object, resume: Solution) -> SearchState:
@@ -401,14 +324,6 @@ def _search_of(problem: OptimalControlProblem, controls: object, resume: Solutio
     if not abs(found - known) <= 1e-9 * max(abs(found), abs(known)):
         raise InputError(f"resume: the solution is of another cost: {known:.9g}, and here {found:.9g}")
     return resume.search
-
-
-def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
-    if problem.linear:
-        return open_line(np.clip(u, *problem.control_limits), problem.integrator.stage_times)._replace(
-            limits=problem.control_limits.copy()
-        )
-    return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())
 
 
 def _onto_limits(u: Floats, limits: Floats) -> Floats:
@@ -435,8 +350,7 @@ def _cut_less(integrator: Variational, halvings: int) -> Variational:
     return replace(integrator, guard=replace(guard, max_halvings=min(halvings, guard.max_halvings)))
 
 
-@dataclass(frozen=True)
-class _Bounds:
+class _Bounds(NamedTuple):
     """Bounds on the work of a trial of the line search.
 
     Attributes:
@@ -459,8 +373,7 @@ class _Here(NamedTuple):
     total: float  # the expected cost
 
 
-@dataclass(frozen=True, eq=False)
-class _Trial:
+class _Trial(NamedTuple):
     """A trial of the line search.
 
     Attributes:
@@ -478,8 +391,7 @@ class _Trial:
     cut: bool = False
 
 
-@dataclass(frozen=True)
-class _Step:
+class _Step(NamedTuple):
     """Result of a line search.
 
     Attributes:
@@ -534,9 +446,10 @@ class _Search:
         self.anew = anew  # whether the final motion gets a backward pass of its own
         self.followed = 0.0  # without one, the length of the last step
         self.steered = problem.steered
+        self.all_steered, self.any_steered = bool(self.steered.all()), bool(self.steered.any())
         # Whether the search ends with the whole gradient of the noise cost, and whether it has come to that. Within
         # limits the noise cost is discontinuous where a control meets one and loses its gains, so it has no gradient.
-        self.wants_whole = whole_noise and not (second_order or problem.limited) and bool(self.steered.any())
+        self.wants_whole = whole_noise and not (second_order or problem.limited) and self.any_steered
         self.whole = False
         # Prefix of each log line: it tells several problems, and a controller's ticks, apart.
         robot, begin = problem.scene.robot.name, problem.t0
@@ -566,7 +479,7 @@ class _Search:
             closing.run(most, deadline, report)
         finally:
             self.history = list(closing.history)
-            self.begin(_first_commands(self.problem, closing.policy()))
+            self.begin(first_commands(self.problem, closing.policy()))
             # The cost at stake is that of this motion, after however many iterations.
             self.first = UNKNOWN
             self.state = self._state()
@@ -637,7 +550,7 @@ class _Search:
             if step.length == 0.0 and self.exact:
                 passes += self._plan(exact=False)
                 more = self._line_search()
-                step = replace(more, trials=step.trials + more.trials, hidden=max(step.hidden, more.hidden))
+                step = more._replace(trials=step.trials + more.trials, hidden=max(step.hidden, more.hidden))
             self._note(report, started, passes, step)
             if step.length == 0.0 and self._decrease_at_most(step.hidden):
                 self.reason = f"{self._expected()}, and rounding hides {step.hidden:.1e} of the cost"
@@ -700,9 +613,9 @@ class _Search:
 
     def _noise(self, plan: Plan) -> float:
         """Noise cost of the processes that change plans."""
-        if self.steered.all():
+        if self.all_steered:
             return plan.noise
-        if not self.steered.any():
+        if not self.any_steered:
             return 0.0
         return float(noise_shares(self.problem, self.trajectory, plan, self.steered).sum())
 
@@ -715,14 +628,14 @@ class _Search:
 
     def _share(self, tolerance: float) -> float:
         """Tolerance on the expected decrease, in units of the cost."""
-        return tolerance * (self.along.stake.moved + _NOTHING * self.first)
+        return tolerance * (self.along.stake.moved + NOTHING * self.first)
 
     def _is_there(self, plan: Plan, tolerance: float) -> bool:
-        least = tolerance * _NOTHING * self.first
+        least = tolerance * NOTHING * self.first
         if self.problem.cost.nonnegative and plan.expected_decrease > tolerance * self.cost + least:
             # The value of a sum of squares bounds its cost at stake.
             return False
-        if not self.steered.any() and self.along.stake.free <= least:
+        if not self.any_steered and self.along.stake.free <= least:
             # The cost is at its lower bound. Without costs on the controls the model may have no minimum even there.
             self.plan = self._least_regularized()[0] or plan
             return True
@@ -850,7 +763,7 @@ class _Search:
         taken, length, tried, trials = _Trial(), 0.0, None, 0
         here = _Here(
             self.problem.decided(self.trajectory),
-            self._feedback(self.plan),
+            with_feedback(self.problem, self.trajectory, self.plan, closed=self.forward == "closed"),
             added,
             float(self.shares.sum() + added.sum()),
         )
@@ -943,32 +856,6 @@ class _Search:
             return np.inf
         shares, held = (noise_shares(self.problem, trial, each, self.steered).sum() for each in (found, plan))
         return float(shares - held)
-
-    def _feedback(self, plan: Plan) -> Commands:
-        """The commands of trials without their feed-forward part."""
-        problem, here = self.problem, self.trajectory
-        if self.forward == "open":
-            return _held(problem.decided(here), problem)
-        gains, reference = plan.feedback, states(problem, here)[: -1 : problem.hold]
-        if problem.linear and plan.previous is not None:
-            gains = np.concatenate([plan.feedback, plan.previous], axis=2)[1:]
-            reference = np.hstack([reference, here.u_nodes[:-1]])
-        elif plan.previous is not None:
-            before = here.u[: -problem.hold : problem.hold]
-            gains = np.concatenate([gains, plan.previous], axis=2)
-            # The control before the first one is given.
-            reference = np.hstack([reference, np.vstack([here.u[:1], before])])
-        if problem.linear:
-            commands = _held(problem.decided(here), problem)
-            return commands._replace(gains=gains, reference=np.ascontiguousarray(reference))
-        return Commands(
-            u=problem.decided(here),
-            gains=gains,
-            reference=np.ascontiguousarray(reference),
-            hold=problem.hold,
-            limits=problem.control_limits,
-            before=np.zeros((0, problem.scene.controls)),
-        )
 
     def _last_plan(self) -> Plan | None:
         if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):

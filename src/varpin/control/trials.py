@@ -6,7 +6,7 @@ any step of the search would accept.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,7 @@ from varpin.integrators.base import Failure, Lines, lines, statistics_of
 from varpin.trajectory import Trajectory
 
 
-@dataclass(frozen=True, eq=False)
-class Attempt:
+class Attempt(NamedTuple):
     """A trial motion.
 
     Attributes:

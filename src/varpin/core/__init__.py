@@ -24,6 +24,8 @@ from varpin.core._core import accelerations as accelerations
 from varpin.core._core import box_minimum as box_minimum
 from varpin.core._core import change_values as change_values
 from varpin.core._core import constrained_derivatives as constrained_derivatives
+from varpin.core._core import coupling_kinds as coupling_kinds
+from varpin.core._core import element_kinds as element_kinds
 from varpin.core._core import energy_turnover as energy_turnover
 from varpin.core._core import expand_changes as expand_changes
 from varpin.core._core import fastest_damping as fastest_damping

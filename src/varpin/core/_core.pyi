@@ -460,6 +460,12 @@ class ForwardDynamics:
     def node(self, x: Floats) -> tuple[Floats, float, bool]:
         """Momentum (n,) and energy [J] at x = (q, v) (2n,), and whether the mass matrix is positive definite."""
 
+def element_kinds() -> dict[str, tuple[int, bool, bool]]:
+    """Of each kind of element: how many parameters it has, whether it has a potential, and a force without one."""
+
+def coupling_kinds() -> dict[str, tuple[int, bool, bool]]:
+    """The same of couplings, without the positions of their two points."""
+
 def accelerations(
     mechanism: Mechanism, q: Floats, v: Floats, force: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, int]:

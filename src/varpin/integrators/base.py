@@ -321,16 +321,6 @@ def join(segments: Sequence[Segment]) -> Segment:
     return Segment(**nodes, statistics=statistics, failure=segments[-1].failure, impulses=impulses)
 
 
-def check_functions(scene: Scene, q0: Floats, v0: Floats) -> None:
-    """Compare derivatives of custom forces with differences, once for a scene, at the first start (P, n).
-
-    Raises:
-        CustomForceError: The derivatives are wrong.
-    """
-    if scene.custom is not None and len(q0):
-        scene.custom.check(q0[0], v0[0])
-
-
 def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
     """Diffusion fields F (n, k) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
 
@@ -356,9 +346,9 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
 def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) -> Floats:
     """Forces of the controls plus a drift (N, n): (N, 1, n), or (N, s, n) for controls that change within steps."""
     drift = drift[:, None] if isinstance(drift, np.ndarray) else drift
-    if trajectory.u_stages.shape[1]:
-        return np.ascontiguousarray(trajectory.u_stages @ scene.actuation.T + drift)
-    return np.ascontiguousarray((trajectory.u @ scene.actuation.T)[:, None] + drift)
+    u = trajectory.u_stages if trajectory.u_stages.shape[1] else trajectory.u[:, None]
+    total = u if scene.direct else u @ scene.actuation.T
+    return np.ascontiguousarray(total + drift if isinstance(drift, np.ndarray) else total)
 
 
 def segments_of(

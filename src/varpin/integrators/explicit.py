@@ -17,7 +17,6 @@ from varpin.integrators.base import (
     Failure,
     Integrator,
     Segment,
-    check_functions,
     contiguous,
     control_of,
     diffusion_and_drift,
@@ -62,7 +61,8 @@ class _Explicit(Integrator):
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ExplicitRun, list[Segment]]:
         """See :meth:`Integrator.start`."""
         refuse_constraints(scene, str(self))
-        check_functions(scene, q0, v0)
+        if scene.custom is not None:
+            scene.custom.check(q0, v0)
         paths, n = q0.shape
         run = ExplicitRun(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
         nodes = new_nodes(paths, 1, n, scene.controls)

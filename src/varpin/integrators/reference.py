@@ -16,7 +16,6 @@ from varpin.integrators.base import (
     Failure,
     Integrator,
     Segment,
-    check_functions,
     control_of,
     drifts,
     forces,
@@ -102,7 +101,8 @@ class Reference(Integrator):
         refuse_constraints(scene, str(self))
         if scene.processes:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
-        check_functions(scene, q0, v0)
+        if scene.custom is not None:
+            scene.custom.check(q0, v0)
         paths, n = q0.shape
         run = ReferenceRun(
             x=np.hstack([q0, v0]),

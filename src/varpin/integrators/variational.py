@@ -28,7 +28,6 @@ from varpin.integrators.base import (
     Failure,
     Integrator,
     Segment,
-    check_functions,
     contiguous,
     control_of,
     diffusion_and_drift,
@@ -201,7 +200,8 @@ class Variational(Integrator):
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[VariationalRun, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
-        check_functions(scene, q0, v0)
+        if scene.custom is not None:
+            scene.custom.check(q0, v0)
         run = self._begun(scene, q0, v0)
         return run, first_nodes(*run.paths.nodes(), scene.controls)
 

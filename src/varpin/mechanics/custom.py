@@ -248,15 +248,15 @@ class CustomForces(Frozen):
         return ", ".join(part.name for part in self.parts)
 
     def check(self, q: Floats, v: Floats) -> None:
-        """:meth:`CustomForce.check` of all forces, in the first call only.
+        """:meth:`CustomForce.check` of all forces at the first of the states q, v (P, n), in the first call only.
 
         Raises:
             CustomForceError: Derivatives are wrong.
         """
-        if self.checked:
+        if self.checked or not len(q):
             return
         for part in self.parts:
-            part.check(q, v)
+            part.check(q[0], v[0])
         self.checked.append(True)
 
     def __call__(self, q: Floats, v: Floats, derivatives: bool) -> tuple[Floats, Floats, Floats]:

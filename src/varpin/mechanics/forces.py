@@ -14,12 +14,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import MappingProxyType
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
+from varpin.core import coupling_kinds, element_kinds
 from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError, UnknownJoint
 from varpin.model import Robot
@@ -59,14 +60,17 @@ class Force(Frozen, ABC):
         """
 
 
-# Parameters that the core's kinds of elements and couplings have; a coupling has six more for its two points.
-_OF_ELEMENT = {
-    "Armature": 1, "CoulombFriction": 4, "JointDamper": 1, "JointSpring": 2, "JointStop": 5, "PositionServo": 3,
-}  # fmt: skip
-_OF_COUPLING = {
-    "FrameDamper": 3, "FrameLengthSpring": 2, "FrameLoad": 3, "FrameSpring": 6, "FrameTurnDamper": 3,
-    "FrameTurnSpring": 1, "FrameWrench": 7,
-}  # fmt: skip
+class Kind(NamedTuple):
+    """A kind of elements or couplings."""
+
+    numbers: int  # of its parameters; a coupling has six more for its two points
+    potential: bool
+    force: bool  # whether it has a force without potential
+
+
+# Armature is an element of a scene, and part of the tree in the core.
+ELEMENTS = {"Armature": Kind(1, False, False)} | {name: Kind(*facts) for name, facts in element_kinds().items()}
+COUPLINGS = {name: Kind(*facts) for name, facts in coupling_kinds().items()}
 
 
 def bound_force(force: Force, robot: Robot) -> tuple[Element | Coupling, ...]:
@@ -79,18 +83,19 @@ def bound_force(force: Force, robot: Robot) -> tuple[Element | Coupling, ...]:
     for each in bound:
         where = f"{type(force).__name__}.bind returned {each!r}"
         if isinstance(each, Element):
-            kinds, points = _OF_ELEMENT, 0
+            kinds, points = ELEMENTS, 0
             require_index(f"{where}: its coordinate", each.coordinate, 0, robot.dof)
         elif isinstance(each, Coupling):
-            kinds, points = _OF_COUPLING, 6
+            kinds, points = COUPLINGS, 6
             for end in (each.a, each.b):
                 require_index(f"{where}: its body", end, -1, len(robot.tree.parent))
         else:
             raise InputError(f"{where}, which is neither an Element nor a Coupling")
         if each.kind not in kinds:
             raise InputError(f"{where}, of an unknown kind; kinds: {', '.join(kinds)}")
-        if len(each.values) != points + kinds[each.kind] or np.isnan(as_floats("values", each.values)).any():
-            raise InputError(f"{where}, which must have {points + kinds[each.kind]} values, none of them NaN")
+        count = points + kinds[each.kind].numbers
+        if len(each.values) != count or np.isnan(as_floats("values", each.values)).any():
+            raise InputError(f"{where}, which must have {count} values, none of them NaN")
     return bound
 
 
@@ -502,15 +507,16 @@ def drive_forces(elements: Iterable[Element], q: Floats, v: Floats, force: Float
 
 
 def dissipates(element: Element | Coupling) -> bool:
-    """Whether an element or a coupling turns energy into heat."""
+    """Whether an element or a coupling may turn energy into heat."""
     if element.kind == "JointStop":
         return element.values[3] > 0.0
-    return element.kind in ("JointDamper", "CoulombFriction", "PositionServo", "FrameDamper", "FrameTurnDamper")
+    kinds = ELEMENTS if isinstance(element, Element) else COUPLINGS
+    return kinds[element.kind].force and element.kind != "FrameWrench"
 
 
 def keeps_energy(coupling: Coupling) -> bool:
     """Whether a coupling is part of the potential energy."""
-    return coupling.kind in ("FrameLoad", "FrameSpring", "FrameLengthSpring", "FrameTurnSpring")
+    return not COUPLINGS[coupling.kind].force
 
 
 def forces_of(given: Force | Sequence[Force]) -> tuple[Force, ...]:

@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.mechanics.forces import keeps_energy, of_kind
+from varpin.mechanics.forces import ELEMENTS, keeps_energy, of_kind
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.model.tree import joint_axis, z_to
 from varpin.support.checks import JointValues, fraction, joint_array, positive
@@ -57,7 +57,7 @@ def lagrangian_jet(
             the same together from Pinocchio's algorithms, slowly, as a reference.
 
     Raises:
-        InputError: Wrong shapes, values that are not finite, or an unknown backend.
+        InputError: Wrong shapes, values that are not finite, or an unknown backend, or a force that the backend lacks.
     """
     joints = require_scene(scene).robot.joint_names
     q, v = joint_array("q", q, joints), joint_array("v", v, joints)
@@ -73,6 +73,9 @@ def _compiled(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
 
 
 def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
+    missing = {each.kind for each in scene.elements if ELEMENTS[each.kind].potential} - {"JointSpring", "JointStop"}
+    if missing:
+        raise InputError(f"backend='pinocchio' has no {', '.join(sorted(missing))}; backend='compiled' has")
     robot = scene.robot
     model = robot.free_model.copy()
     model.gravity = pin.Motion(scene.gravity, np.zeros(3))

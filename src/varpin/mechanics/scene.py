@@ -29,6 +29,8 @@ from varpin.mechanics.constraints import (
 )
 from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.forces import (
+    COUPLINGS,
+    ELEMENTS,
     CoulombFriction,
     Force,
     JointDamper,
@@ -50,14 +52,11 @@ from varpin.support.weak import Weak
 
 logger = logging.getLogger(__name__)
 
-# Forces on joints among the values, a row (coordinate, numbers) for each element; and the message where they differ.
-OF_ELEMENTS = {
+# Messages where forces of these kinds differ, which have better names than their kinds.
+_NAMES = {
     "CoulombFriction": "dry friction differs",
     "JointStop": "joint stops differ",
     "PositionServo": "position servos differ",
-}
-# Forces on frames, a row (body a, body b, numbers) for each; left out where there are none.
-OF_COUPLINGS = {
     "FrameLoad": "forces on frames differ",
     "FrameWrench": "forces on frames differ",
     "FrameSpring": "springs between frames differ",
@@ -66,6 +65,13 @@ OF_COUPLINGS = {
     "FrameDamper": "dampers between frames differ",
     "FrameTurnDamper": "dampers between frames differ",
 }
+# Kinds of elements that are among the values as sums by joint.
+_SUMMED = ("Armature", "JointDamper", "JointSpring")
+# Other forces on joints among the values, a row (coordinate, numbers) for each element; and the message where they
+# differ.
+OF_ELEMENTS = {kind: _NAMES.get(kind, f"{kind} differs") for kind in ELEMENTS if kind not in _SUMMED}
+# Forces on frames, a row (body a, body b, numbers) for each; left out where there are none.
+OF_COUPLINGS = {kind: _NAMES.get(kind, f"{kind} differs") for kind in COUPLINGS}
 # Names of a scene's values, and the message where they differ; values by joint are also reported with numbers.
 VALUES = {
     "gravity": "gravity differs",
@@ -391,7 +397,7 @@ class Scene(Frozen):
             gear[servo.coordinate] = servo.values[0]
         return gear
 
-    @property
+    @cached_property
     def controls(self) -> int:
         """m, the number of controls."""
         return int(self.actuation.shape[1])
@@ -410,14 +416,18 @@ class Scene(Frozen):
         """The joints whose control is the target position of a servo."""
         return tuple(self.robot.joint_names[servo.coordinate] for servo in of_kind(self.elements, "PositionServo"))
 
+    @cached_property
+    def holding(self) -> Floats:
+        """Matrix (m, n) of the neutral controls at q, ``holding @ q``: see :meth:`command_at`."""
+        holding = np.zeros((self.controls, self.robot.dof))
+        for c in (*(servo.coordinate for servo in of_kind(self.elements, "PositionServo")), *self.inputs.values()):
+            holding[int(np.argmax(np.abs(self.actuation[c]))), c] = 1.0
+        return holding
+
     def command_at(self, q: Floats) -> Floats:
         """Neutral controls (m,) at q (n,): zero forces; servos and kinematic inputs hold their positions."""
-        command = np.zeros(self.controls)
-        for servo in of_kind(self.elements, "PositionServo"):
-            command[int(np.argmax(np.abs(self.actuation[servo.coordinate])))] = q[servo.coordinate]
-        for c in self.inputs.values():
-            command[int(np.argmax(self.actuation[c]))] = q[c]
-        return command
+        held: Floats = self.holding @ q
+        return held
 
     @property
     def processes(self) -> int:
@@ -746,8 +756,8 @@ def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> l
     if values:
         found += [
             f"{VALUES[name]} in the scene"
-            for name in (*OF_COUPLINGS, *OF_CONSTRAINTS, "functions")
-            if name in scene.values and name not in values
+            for name in (*OF_FORCES, "functions")
+            if name not in values and np.size(scene.values.get(name, ()))
         ]
     return list(dict.fromkeys(found))
 

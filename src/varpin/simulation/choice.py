@@ -97,7 +97,7 @@ def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float, *, ahead: b
     q = np.concatenate([np.tile(q0, (2, 1)), stops_ahead(scene, q0)]) if ahead else np.tile(q0, (2, 1))
     v = np.zeros_like(q)
     v[0] = v0
-    forces = np.tile(scene.actuation @ scene.command_at(q0), (len(q), 1))
+    forces = np.tile(scene.actuation @ scene.holding @ q0, (len(q), 1))
     return fastest_damping(scene.core, q, v, forces, rate) > 0.0
 
 
@@ -106,7 +106,5 @@ def _swings_faster(scene: Scene, q0: Floats, rate: float, *, ahead: bool) -> boo
     if scene.custom is not None or len(q0) > _MOST_JOINTS:
         return False
     q = np.concatenate([q0[None], stops_ahead(scene, q0)]) if ahead else q0[None]
-    forces = (scene.actuation @ scene.command_at(q0))[None]
-    if ahead:
-        forces = np.tile(forces, (len(q), 1))
+    forces = np.tile(scene.actuation @ scene.holding @ q0, (len(q), 1))
     return bool(pulls_fast(scene.core, q, np.zeros_like(q), forces, 1.0 / rate))

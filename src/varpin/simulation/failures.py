@@ -121,6 +121,8 @@ class StepFailure(VarpinError, RuntimeError):
         time: Its start [s].
         residual: The last residual, in units of the rounding error of its terms.
         reason: What stopped the last attempt.
+        problem: The step, the reason and the state, in words.
+        advice: The cause if one is known, or what to try.
         q: Configuration at the start of the step (n,) [rad or m].
         v: Velocity there (n,).
         p: Momentum there (n,).
@@ -135,12 +137,12 @@ class StepFailure(VarpinError, RuntimeError):
         self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
         self.trajectory = trajectory
         causes = [sentence for sentence in trajectory.warnings if not sentence.startswith(limits.KINDS)]
-        advice = causes[0] if causes else "a smaller dt may go further"
-        super().__init__(
+        self.advice = causes[0] if causes else "a smaller dt may go further"
+        self.problem = (
             f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
-            f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}. What came before is in error.trajectory; "
-            f"{advice}"
+            f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}"
         )
+        super().__init__(f"{self.problem}. What came before is in error.trajectory; {self.advice}")
 
 
 def named(scene: Scene, failure: Failure) -> Failure:

@@ -3,9 +3,9 @@
 There are two methods. By theory: where the motion determines the law, u = K (q, v) + c, with a share of gravity's
 torque if needed, the loop is linearized at the equilibrium next to the motion. With the plant's exact step under a held
 control, x' = A x + B u (Franklin, Powell and Workman 1998, section 4.3), it is stable if the spectral radius of A + B K
-is below one. By the record, for any other law: the controls do work and grow steadily, by orders of magnitude, or by
-less if they oscillate within some periods. Growth that the law would have in continuous time too, as in a pendulum that
-falls, gives no warning.
+is below one. Under constraints it is linearized on the tangent space. By the record, for any other law: the controls
+do work and grow steadily, by orders of magnitude, or by less if they oscillate within some periods. Growth that the law
+would have in continuous time too, as in a pendulum that falls, gives no warning.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ import scipy
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
-from varpin.errors import LinearizationError
+from varpin.errors import AssemblyError, LinearizationError, SingularMassMatrix
 from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
+from varpin.mechanics.assembly import nearest
 from varpin.mechanics.forces import drive_forces
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.chatter import RUN, alternation
-from varpin.simulation.modes import first_order
+from varpin.simulation.modes import first_order, linearized
 from varpin.simulation.soundness import Finding, examined, with_warnings
 from varpin.trajectory import Trajectory
 
@@ -62,6 +63,8 @@ _PUMPS = 0.7
 _CLIPPED_NODES = 400
 # Largest value that is squared.
 _HUGE = 1e120
+# Least part of a direction along the constraints, as a share of the largest, for the law to be known in it.
+_ALONG = 1e-6
 # Newton's iterations from one start, and halvings of one of its steps.
 _ITERATIONS, _HALVINGS = 30, 6
 # Least growth over the whole motion for a warning, and least excess of a spectral radius over one, beyond rounding.
@@ -114,11 +117,13 @@ class Loop:
     """A linearized plant with a law.
 
     Attributes:
-        A: Rate of (q, v) by (q, v) (2n, 2n) [1/s].
-        B: By u (2n, m).
-        K: The law (m, 2n).
-        span: Directions of (q, v) in which the law is known.
+        A: Rate of (y, y') by (y, y') (2f, 2f) [1/s], with y the f coordinates of the tangent space, q without
+            constraints.
+        B: By u (2f, m).
+        K: The law (m, 2f).
+        span: Directions of (y, y') in which the law is known.
         q: The configuration of the linearization (n,).
+        Z: Derivative of q in y (n, f).
     """
 
     A: Floats
@@ -126,6 +131,7 @@ class Loop:
     K: Floats
     span: Span
     q: Floats
+    Z: Floats
 
     def multiplier(self, period: float) -> complex:
         """The factor of a period [s] on deviations: the largest eigenvalue of the loop with a zero-order hold."""
@@ -158,7 +164,7 @@ def examined_in_loop(
     ``hold`` is the period of the loop in steps, None without feedback.
     """
     trajectory, found = examined(scene, integrator, trajectory)
-    if hold is not None and not scene.constraints:
+    if hold is not None:
         loop = unstable_loop(scene, trajectory, hold) or _flipping(scene, trajectory, hold)
         found = (*(loop or _cycling(scene, trajectory, hold)), *found)
     return with_warnings(trajectory, found), found
@@ -198,9 +204,9 @@ def _flipping(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding,
 def _cycling(scene: Scene, trajectory: Trajectory, hold: int) -> tuple[Finding, ...]:
     """A warning if a law with a fixed goal sends a control from limit to limit without calming down.
 
-    Only for laws that cannot be fitted, with too few nodes inside their limits.
+    Only for laws that cannot be fitted, with too few nodes inside their limits, and whose controls are forces.
     """
-    if trajectory.dw.any():
+    if trajectory.dw.any() or scene.inputs:
         return ()
     at = np.arange(0, trajectory.steps, hold)
     x, u = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at]
@@ -334,6 +340,8 @@ def _does_work(scene: Scene, trajectory: Trajectory) -> bool:
     ways, before = np.diff(trajectory.q, axis=0), trajectory.u @ scene.actuation.T
     middle = 0.5 * (trajectory.q[1:] + trajectory.q[:-1])
     force = drive_forces(scene.elements, middle, ways / trajectory.dt, before)
+    for row, c in scene.inputs.items():
+        force[:, c] = trajectory.constraint_forces[:, int(np.argmax(scene.constraint_order == row))]
     return bool(((force / np.abs(force).max()) * (ways / np.abs(ways).max())).sum() > 0.0)
 
 
@@ -391,7 +399,12 @@ def _by_last_changes(x: Floats, u: Floats, period: float) -> tuple[Finding, ...]
 
 
 def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Finding, ...]:
-    """A warning if the spectral radius of the loop exceeds one, where the record determines the law."""
+    """A warning if the spectral radius of the loop exceeds one, where the record determines the law.
+
+    Laws that give positions of kinematic inputs are left to the record.
+    """
+    if scene.inputs:
+        return ()
     law = _law_inside_limits(scene, x, u)
     if law is None:
         return ()
@@ -399,6 +412,8 @@ def _by_theory(scene: Scene, x: Floats, u: Floats, period: float) -> tuple[Findi
     rests = loop is not None
     if loop is None:
         loop = _linearized(scene, law, law.near)[0]
+    if not loop.span.directions.shape[1]:
+        return ()
     multiplier = loop.multiplier(period)
     growth = float(np.abs(multiplier))
     grows = growth > 1.0 + _ABOVE_ONE and len(u) * np.log(growth) > np.log(_GREW_IN_ALL)
@@ -542,12 +557,16 @@ def loop_at_rest(scene: Scene, law: Law) -> Loop | None:
 
     The goal is where the law gives no control. None if no equilibrium is found.
     """
-    n = scene.robot.dof
     goal = law.near - np.linalg.lstsq(law.Kq, law.Kq @ law.near + law.c, rcond=None)[0]
     for start in (law.near, goal):
-        loop, a, terms = _linearized(scene, law, start)
-        for _ in range(_ITERATIONS):
-            step = np.linalg.lstsq(loop.A[n:, :n] + loop.B[n:] @ loop.K[:, :n], -a, rcond=None)[0]
+        kept = _kept(scene, start)
+        if kept is None:
+            continue
+        loop, a, terms = _linearized(scene, law, kept)
+        f = loop.Z.shape[1]
+        for _ in range(_ITERATIONS if f else 0):
+            way = np.linalg.lstsq(loop.A[f:, :f] + loop.B[f:] @ loop.K[:, :f], -a, rcond=None)[0]
+            step = loop.Z @ way
             if np.abs(step).max() <= 1e-9 * max(1.0, np.abs(loop.q).max()):
                 # With a singular matrix a force may remain that no step removes.
                 if np.abs(a).max() > 1e-6 * terms:
@@ -556,24 +575,50 @@ def loop_at_rest(scene: Scene, law: Law) -> Loop | None:
             before, q = np.abs(a).max(), loop.q
             # Halve the step until the acceleration falls.
             for halved in range(_HALVINGS):
-                loop, a, terms = _linearized(scene, law, q + 0.5**halved * step)
+                kept = _kept(scene, q + 0.5**halved * step)
+                if kept is None:
+                    continue
+                loop, a, terms = _linearized(scene, law, kept)
                 if np.abs(a).max() < before:
                     break
+            if kept is None:
+                break
     return None
 
 
+def _kept(scene: Scene, q: Floats) -> Floats | None:
+    """The configuration next to q (n,) that keeps the constraints; None if there is none."""
+    if not scene.constraints:
+        return q
+    try:
+        return nearest(scene, q)
+    except (AssemblyError, SingularMassMatrix):
+        return None
+
+
 def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, Floats, float]:
-    """The loop at rest at q (n,); the acceleration there (n,), and the size of the terms that cancel in it."""
+    """The loop at rest at q (n,); the acceleration there (f,), and the size of the terms that cancel in it."""
     n = len(q)
     u, Kq = law.Kq @ q + law.c, law.Kq
     if law.S.any():
         jet = lagrangian_jet(scene, q, np.zeros(n))
         u, Kq = u + law.S @ jet.Lq, Kq + law.S @ jet.Lqq
     force = scene.actuation @ u
-    a, aq, av, af = accelerations(scene, q[None], np.zeros((1, n)), force[None])
-    pushed = af[0] @ scene.actuation
+    a, aq, av, af, Z, onto = (part[0] for part in linearized(scene, q[None], np.zeros((1, n)), force[None]))
+    pushed = af @ scene.actuation
     sizes = np.abs(law.Kq) @ (np.abs(q) + law.span.unit[:n]) + np.abs(law.c)
-    terms = np.abs(pushed) @ sizes + np.abs(a[0] - af[0] @ force)
+    terms = np.abs(pushed) @ sizes + np.abs(a - af @ force)
     B = np.concatenate([np.zeros_like(pushed), pushed])
-    gains = np.concatenate([Kq, law.Kv], axis=1)
-    return Loop(first_order(aq, av)[0], B, gains, law.span, q), a[0], float(terms.max())
+    gains = np.concatenate([Kq @ Z, law.Kv @ Z], axis=1)
+    span = _along(law.span, onto) if scene.constraints else law.span
+    return Loop(first_order(aq[None], av[None])[0], B, gains, span, q, Z), a, float(terms.max(initial=0.0))
+
+
+def _along(span: Span, onto: Floats) -> Span:
+    """Directions of (q, v) (2n,) as those of (y, y') on the tangent space, with y' = onto v."""
+    n = onto.shape[1]
+    there = span.directions * span.unit[:, None]
+    both = np.concatenate([onto @ there[:n], onto @ there[n:]])
+    left, sizes, _ = np.linalg.svd(both, full_matrices=False)
+    known = left[:, sizes > _ALONG * sizes.max(initial=0.0)]
+    return Span(known, np.ones(len(both)))

@@ -3,7 +3,8 @@
 Errors that are small over a period add up over many. On a linear system a step multiplies a mode exp(lambda t) by
 R(h lambda), R the method's stability function (Hairer and Wanner II, IV.3): the error of its exponent grows at the rate
 log(R(h lambda)) / h - lambda. The modes are those of the motion linearized at some of its nodes. Their amplitudes
-follow from velocities and accelerations there, to which slow motions add little.
+follow from velocities and accelerations there, to which slow motions add little. Under constraints they are those on
+the tangent space.
 """
 
 from __future__ import annotations
@@ -16,10 +17,9 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
-from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
-from varpin.simulation.modes import first_order, rate_bounds
+from varpin.simulation.modes import first_order, linearized, rate_bounds
 from varpin.trajectory import Trajectory
 
 Complexes = NDArray[np.complex128]
@@ -58,19 +58,21 @@ class Loss(NamedTuple):
 def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Loss | None:
     """The error by phase and amplitude of oscillations on springs, if it exceeds the threshold of the warning.
 
-    None, too, where it is unknown: under noise, constraints and forces in Python, and for methods without a stability
-    function.
+    None, too, where it is unknown: under noise and forces in Python, and for methods without a stability function.
     """
     if not _applies(scene, trajectory):
         return None
-    steps, n = trajectory.steps, scene.robot.dof
+    steps = trajectory.steps
     at = np.unique(np.linspace(0, steps, _NODES).astype(np.int64))
     q, v = trajectory.q[at], trajectory.v[at]
     forces = trajectory.u[np.minimum(at, steps - 1)] @ scene.actuation.T
     try:
-        a, aq, av, _ = accelerations(scene, q, v, forces)
-    except LinearizationError:
+        a, aq, av, _, Z, onto = linearized(scene, q, v, forces, _of_inputs(scene, trajectory, at))
+    except (LinearizationError, np.linalg.LinAlgError):
         return None
+    if not aq.shape[1]:
+        return None
+    speeds = (onto @ v[:, :, None])[:, :, 0]
     h = trajectory.dt / float(np.maximum(trajectory.statistics.substeps, 1).mean())
     # Upper bounds of the modes' rates. Slower modes lose less, as long as they turn by little in a step.
     bounds = rate_bounds(aq, av)
@@ -94,12 +96,12 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         node = at[k]
         try:
             rates, modes = np.linalg.eig(A[k])
-            parts = np.linalg.solve(modes, np.append(v[k], a[k]))
+            parts = np.linalg.solve(modes, np.append(speeds[k], a[k]))
         except np.linalg.LinAlgError:
             most = np.inf
             continue
         turns = rates.imag > _TURNS / trajectory.t[-1]
-        rates, modes, parts = rates[turns], modes[:n, turns], parts[turns]
+        rates, modes, parts = rates[turns], Z[k] @ modes[: a.shape[1], turns], parts[turns]
         heights = 2.0 * np.abs(modes * (parts / rates))
         drift = _drift(integrator, rates, h)
         if drift is None or not rates.size or not np.isfinite(drift).all():
@@ -125,7 +127,12 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
 
 
 def _damped_alike(scene: Scene, av: Floats) -> bool:
-    """Whether the joints' damping at nodes (K, n, n) is at least half of that at the ends, and there are no stops."""
+    """Whether the damping at nodes (K, n, n) is at least half of that at the ends, and there are no stops.
+
+    Not known under constraints, where coordinates differ from node to node.
+    """
+    if scene.constraints:
+        return False
     damped = -np.diagonal(av, axis1=1, axis2=2)
     ends = damped[[0, -1]].max(axis=0)
     stopped = any(element.kind == "JointStop" for element in scene.elements)
@@ -133,12 +140,22 @@ def _damped_alike(scene: Scene, av: Floats) -> bool:
 
 
 def _applies(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether there are springs, and no noise, constraints or forces in Python."""
-    if scene.custom is not None or scene.constraints or trajectory.dw.any() or scene.robot.dof > _JOINTS:
+    """Whether there are springs, and no noise or forces in Python."""
+    if scene.custom is not None or trajectory.dw.any() or scene.robot.dof > _JOINTS:
         return False
     kinds = [element.kind for element in scene.elements] + [coupling.kind for coupling in scene.couplings]
     sprung = scene.stiffness.any() or not set(_SPRINGS).isdisjoint(kinds)
     return bool(trajectory.steps and sprung)
+
+
+def _of_inputs(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> Floats:
+    """Mean accelerations (K, n) of joints with cubic kinematic inputs in the steps at nodes (K,); zero for others."""
+    step = np.minimum(at, trajectory.steps - 1)
+    found = np.zeros((len(at), scene.robot.dof))
+    for c, rate in zip(scene.inputs.values(), scene.rates, strict=True):
+        if rate >= 0:
+            found[:, c] = np.diff(trajectory.v[:, c])[step] / trajectory.dt
+    return found
 
 
 def _drift(integrator: Integrator, rates: Complexes, h: float) -> Complexes | None:

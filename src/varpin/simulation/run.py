@@ -285,7 +285,7 @@ def _step_failure(
         decided: Of a law the step of its last decision, and that decision (1, m).
     """
     node = record.trajectory()
-    if hold is not None and not record.scene.constraints:
+    if hold is not None:
         last, u = (node.steps, node.u[:0]) if decided is None else decided
         loop = unstable_loop(record.scene, node, hold)
         node = with_warnings(node, loop or outgrown(np.concatenate([node.u[:last:hold], u]), hold * record.dt))

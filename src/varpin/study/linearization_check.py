@@ -12,16 +12,20 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.integrators import Integrator
 from varpin.linearization import linearize
+from varpin.mechanics.assembly import along_constraints, nearest
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.mechanics.scene import Scene, require_scene
 from varpin.simulation.choice import usual_integrator
 from varpin.simulation.run import simulate
+from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
 
 # Central differences of eighth order.
 _WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 # Relative errors up to which derivatives are right, and above which they are wrong.
 _RIGHT, _NEAR = 1e-6, 1e-3
+# Rank tolerance of the constraints, relative to their largest singular value.
+_RANK = 1e-9
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,8 @@ class LinearizationCheck:
     """Errors of the derivatives of one step against differences of the step.
 
     Errors and norms are the largest entries, in units of the variables: 1 rad or m for positions, 1 / (M^-1)_ii for the
-    momentum of joint i, which moves it alone at 1 rad/s or m/s, and 1 for velocities, controls and increments.
+    momentum of joint i, which moves it alone at 1 rad/s or m/s, and 1 for velocities, controls and increments; dt for
+    positions of kinematic inputs. Under constraints the columns of A are velocities that these allow, of unit length.
 
     Attributes:
         A: Error and norm of dx1/dx0.
@@ -85,11 +90,13 @@ def check_linearization(
 ) -> LinearizationCheck:
     """Compare :func:`varpin.linearize` with eighth-order differences of the step from (q, v).
 
+    Under constraints A is compared along curves of states that keep them.
+
     Main args:
         scene: The scene.
         q: Configuration, (n,) or by joint name [rad or m].
         v: Velocity, (n,) or by joint name [rad/s or m/s].
-        u: Controls (m,); zero if left out.
+        u: Controls (m,); zero if left out, and the present position for a :class:`varpin.KinematicInput`.
         dt: Time step [s].
 
     Other Args:
@@ -100,16 +107,14 @@ def check_linearization(
         InputError: Wrong shapes, or values that are not finite.
         StepFailure: A step of the differences cannot be taken; a smaller ``step`` or ``dt`` may help.
     """
-    refuse_constraints(
-        require_scene(scene),
-        "check_linearization",
-        "varpin.linearize does; its A and B are derivatives along the constraints, so compare them with steps between "
-        "states that varpin.assemble has brought onto these",
-    )
     n, m, k = require_scene(scene).robot.dof, scene.controls, scene.processes
     q, v = joint_array("q", q, scene.robot.joint_names), joint_array("v", v, scene.robot.joint_names)
+    if u is None and scene.inputs:
+        u = scene.command_at(q)
     u = np.zeros(m) if u is None else finite_array("u", u, (m,))
     dt, step = positive("dt", dt, "s"), positive("step", step, "1")
+    if scene.constraints:
+        q, v, _ = on_constraints(scene, q, v)
     method = usual_integrator(scene, q, v, dt, noisy=k > 0) if integrator is None else integrator
     options: dict[str, Any] = {"dt": dt, "steps": 1, "integrator": method, "check": False}
     motion = simulate(scene, q, v, controls=u, increments=0.0, **options)
@@ -119,20 +124,45 @@ def check_linearization(
     size = 1.0 / np.diag(np.linalg.inv(mass)) if method.variational else np.ones(n)
     rows = np.concatenate([np.ones(n), size])
 
+    def ends(at: Floats, velocity: Floats, control: Floats, dw: Floats) -> Floats:
+        """The state at both ends of the step (2, 2n)."""
+        taken = simulate(scene, at, velocity, controls=control, increments=dw[None], **options)
+        return np.concatenate([taken.q, taken.p if method.variational else taken.v], axis=1)
+
     def take(x: Floats, control: Floats, dw: Floats) -> Floats:
         velocity = x[n:]
         if method.variational:
             M = lagrangian_jet(scene, x[:n], np.zeros(n)).Lvv
             velocity = np.asarray(np.linalg.solve(M, x[n:]), dtype=np.float64)
-        end = simulate(scene, x[:n], velocity, controls=control, increments=dw[None], **options)
-        return np.concatenate([end.q[1], end.p[1] if method.variational else end.v[1]])
+        return ends(x[:n], velocity, control, dw)[1]
+
+    def along(y: Floats) -> Floats:
+        at = nearest(scene, q + Z @ y[: Z.shape[1]])
+        return ends(at, along_constraints(scene, at, v + Z @ y[Z.shape[1] :]), u, zero)
 
     x, zero = np.concatenate([q, second]), np.zeros(k)
+    if scene.constraints:
+        Z = _kept_by_constraints(scene, q)
+        begins, after = np.split(_slope(lambda y: along(y).ravel(), np.zeros(2 * Z.shape[1]), step), 2)
+        A = _largest(lin.A[0] @ begins, after, rows, np.ones(2 * Z.shape[1]))
+    else:
+        A = _compare(lin.A[0], lambda y: take(y, u, zero), x, step, rows, rows)
+    # A position at the end of the step, in a unit that moves the joint at 1 rad/s or m/s.
+    of_controls = np.ones(m)
+    of_controls[scene.prescribed[: len(scene.inputs)]] = dt
     return LinearizationCheck(
-        A=_compare(lin.A[0], lambda y: take(y, u, zero), x, step, rows, rows),
-        B=_compare(lin.B[0], lambda y: take(x, y, zero), u, step, rows, np.ones(m)),
+        A=A,
+        B=_compare(lin.B[0], lambda y: take(x, y, zero), u, step, rows, of_controls),
         G=_compare(lin.G[0], lambda y: take(x, u, y), zero, step, rows, np.ones(k)),
     )
+
+
+def _kept_by_constraints(scene: Scene, q: Floats) -> Floats:
+    """An orthonormal basis (n, f) of the velocities at q (n,) that constraints allow, with kinematic inputs at will."""
+    C = np.delete(scene.core.constraints(np.ascontiguousarray(q[None]))[2][0], list(scene.inputs), axis=0)
+    _, sizes, basis = np.linalg.svd(C)
+    rank = int((sizes > _RANK * sizes.max(initial=0.0)).sum())
+    return np.ascontiguousarray(basis[rank:].T)
 
 
 def _relative(part: tuple[float, float]) -> float:
@@ -146,11 +176,22 @@ def _compare(
     """Largest error of a derivative and largest entry of the differences, in the units of rows and columns."""
     if not x.size:
         return 0.0, 0.0
-    derivative = np.zeros_like(given)
-    for j, size in enumerate(columns):
-        e = np.zeros_like(x)
-        e[j] = step * size
+    return _largest(given, _slope(function, x, step * columns), rows, columns)
+
+
+def _slope(function: Callable[[Floats], Floats], x: Floats, step: Floats | float) -> Floats:
+    """The derivative of a function by differences; ``step`` is that of each variable, or of all."""
+    found = []
+    for e in np.diag(np.broadcast_to(step, x.shape)):
         total = sum(w * (function(x + i * e) - function(x - i * e)) for i, w in _WEIGHTS.items())
-        derivative[:, j] = total / e[j]
+        found.append(total / e.max())
+    return np.array(found).T.reshape(-1, x.size)
+
+
+def _largest(given: Floats, derivative: Floats, rows: Floats, columns: Floats) -> tuple[float, float]:
+    """The largest error of a derivative, and its largest entry."""
     scale = columns[None, :] / rows[:, None]
-    return float(np.abs((given - derivative) * scale).max()), float(np.abs(derivative * scale).max())
+    return (
+        float(np.abs((given - derivative) * scale).max(initial=0.0)),
+        float(np.abs(derivative * scale).max(initial=0.0)),
+    )

@@ -64,6 +64,9 @@ struct FrameLoad {
     Anchor a, b;
     Vec3<double> force{};  // [N]
 
+    static constexpr const char* name = "FrameLoad";
+    static constexpr std::tuple numbers{&FrameLoad::force};
+
     template <class T>
     VectorPotential<T> potential(const Vec3<T>& d) const {
         return {-dot(force, d), {T(-force.x), T(-force.y), T(-force.z)}, {}};
@@ -77,6 +80,9 @@ struct FrameSpring {
     Anchor a, b;
     Vec3<double> stiffness{};  // [N/m]
     Vec3<double> rest{};       // [m]
+
+    static constexpr const char* name = "FrameSpring";
+    static constexpr std::tuple numbers{&FrameSpring::stiffness, &FrameSpring::rest};
 
     template <class T>
     VectorPotential<T> potential(const Vec3<T>& d) const {
@@ -92,6 +98,9 @@ struct FrameLengthSpring {
     Anchor a, b;
     double stiffness = 0.0;  // [N/m]
     double length = 0.0;     // [m]
+
+    static constexpr const char* name = "FrameLengthSpring";
+    static constexpr std::tuple numbers{&FrameLengthSpring::stiffness, &FrameLengthSpring::length};
 
     template <class T>
     VectorPotential<T> potential(const Vec3<T>& d) const {
@@ -118,6 +127,9 @@ struct FrameLengthSpring {
 struct FrameDamper {
     Anchor a, b;
     Vec3<double> damping{};  // [N s/m]
+
+    static constexpr const char* name = "FrameDamper";
+    static constexpr std::tuple numbers{&FrameDamper::damping};
 };
 
 // A spring between a direction of a's body and one of b's: V = stiffness (1 - cos angle). Three of them, for the axes
@@ -125,6 +137,10 @@ struct FrameDamper {
 struct FrameTurnSpring {
     Anchor a, b;
     double stiffness = 0.0;  // [N m]
+
+    static constexpr const char* name = "FrameTurnSpring";
+    static constexpr std::tuple numbers{&FrameTurnSpring::stiffness};
+    static constexpr bool directions = true;
 
     template <class T>
     VectorPotential<T> potential(const Vec3<T>& d) const {
@@ -138,6 +154,9 @@ struct FrameTurnSpring {
 struct FrameTurnDamper {
     Anchor a, b;
     Vec3<double> damping{};  // [N m s/rad]
+
+    static constexpr const char* name = "FrameTurnDamper";
+    static constexpr std::tuple numbers{&FrameTurnDamper::damping};
 };
 
 // A constant wrench at a; b is the world's origin.
@@ -146,6 +165,9 @@ struct FrameWrench {
     Vec3<double> force{};   // [N]
     Vec3<double> moment{};  // about a [N m]
     bool carried = false;   // in the axes of a's body instead of world axes
+
+    static constexpr const char* name = "FrameWrench";
+    static constexpr std::tuple numbers{&FrameWrench::force, &FrameWrench::moment, &FrameWrench::carried};
 };
 
 using CoupledElement =

@@ -1,7 +1,8 @@
-// Elements: forces on single joints besides inertia and gravity. docs/core.md, "Forces". docs/extending.md lists what a
-// new force touches besides its struct here.
+// Elements: forces on single joints besides inertia and gravity. docs/core.md, "Forces". docs/extending.md has an
+// example of a new one.
 //
-// An element acts on one coordinate and has one or both of
+// An element acts on one coordinate, has a `name` and `numbers`, its members in the order in which they are given, and
+// has one or both of
 //
 //     potential(q)    an energy V, part of the Lagrangian: -V' belongs to L_q, -V'' to the diagonal of L_qq
 //     force(q, v)     a force F without potential, besides L_q, with its derivatives and dissipated power;
@@ -61,6 +62,8 @@ struct JointSpring {
     double stiffness = 0.0;  // [N m/rad or N/m]
     double rest = 0.0;       // position without force [rad or m]
 
+    static constexpr const char* name = "JointSpring";
+    static constexpr std::tuple numbers{&JointSpring::stiffness, &JointSpring::rest};
     static constexpr bool anchored = true;
     static constexpr bool linear() { return true; }
 
@@ -77,6 +80,8 @@ struct JointDamper {
     int coordinate = 0;
     double damping = 0.0;  // [N m s/rad or N s/m]
 
+    static constexpr const char* name = "JointDamper";
+    static constexpr std::tuple numbers{&JointDamper::damping};
     static constexpr bool anchored = false;
     static constexpr bool linear() { return true; }
 
@@ -96,6 +101,9 @@ struct CoulombFriction {
     double breakaway = 0.0;          // [N m or N]
     double stribeck_velocity = 0.0;  // [rad/s or m/s]
 
+    static constexpr const char* name = "CoulombFriction";
+    static constexpr std::tuple numbers{&CoulombFriction::level, &CoulombFriction::width, &CoulombFriction::breakaway,
+                                        &CoulombFriction::stribeck_velocity};
     static constexpr bool anchored = false;
     static constexpr bool linear() { return true; }
 
@@ -129,6 +137,9 @@ struct JointStop {
     double damping = 0.0;             // [N m s/rad or N s/m]
     double width = 0.0;               // [rad or m]
 
+    static constexpr const char* name = "JointStop";
+    static constexpr std::tuple numbers{&JointStop::lower, &JointStop::upper, &JointStop::stiffness,
+                                        &JointStop::damping, &JointStop::width};
     static constexpr bool anchored = true;
     static constexpr bool linear() { return false; }
 
@@ -186,6 +197,8 @@ struct PositionServo {
     double damping = 0.0;    // [N m s/rad or N s/m]
     double effort = 0.0;     // infinite where there is no limit [N m or N]
 
+    static constexpr const char* name = "PositionServo";
+    static constexpr std::tuple numbers{&PositionServo::stiffness, &PositionServo::damping, &PositionServo::effort};
     static constexpr bool anchored = true;
     static constexpr double straight = 0.9;
     bool linear() const { return std::isinf(effort); }

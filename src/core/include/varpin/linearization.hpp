@@ -21,8 +21,22 @@
 
 namespace varpin {
 
+// First derivatives of steps, for any number of joints and stages.
+class StepDerivatives {
+  public:
+    virtual ~StepDerivatives() = default;
+
+    // varies: each step has forces (s, n) at its stages instead of a constant force (n). ramp: derivatives in f are
+    // those in a force that grows linearly from 0 at the start of the step to f at its end.
+    bool varies = false, ramp = false;
+
+    virtual Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
+                          std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past) = 0;
+};
+
+// Numbers of joints and stages may be known at compile time.
 template <class Size = int, class Stages = int>
-class VariationalLinearization {
+class VariationalLinearization final : public StepDerivatives {
   public:
     // With active guards, a part that they refuse is halved, since a step may need other parts without its noise.
     // Without them, the parts are exactly those given.
@@ -48,15 +62,11 @@ class VariationalLinearization {
           along_v(n),
           along_f(n) {}
 
-    // varies: each step has forces (s, n) at its stages instead of a constant force (n). ramp: derivatives in f are
-    // those in a force that grows linearly from 0 at the start of the step to f at its end.
-    bool varies = false, ramp = false;
-
     // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f. An undivided step
     // is solved again from a guess (s, n) close to its root; the arrays q, p and force have `past` earlier steps before
     // the pointers. A divided step has `halvings`: its parts are repeated, and their derivatives are multiplied.
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0) {
+                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0) override {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome == Outcome::solved) {

@@ -92,15 +92,33 @@ inline void record_node(const PathState& state, int n, const Nodes& nodes, std::
     nodes.quality[3 * row + 2] = state.energies.defect();
 }
 
+// A variational stepper for any number of joints and stages.
+class Stepper {
+  public:
+    explicit Stepper(const Guards& guards) : guards(guards) {}
+    Stepper(const Stepper&) = delete;
+    Stepper& operator=(const Stepper&) = delete;
+    virtual ~Stepper() = default;
+
+    Guards guards;
+
+    virtual bool begin(const double* q, const double* v, PathState& state) = 0;
+    virtual bool look_at(PathState& state) = 0;
+    virtual void kick(const double* impulse, PathState& state) = 0;
+    virtual void roll(double h, const Commands& commands, const double* increments, const double* drift,
+                      const double* impulses, std::vector<PathState>& states, const Nodes& nodes, Watch* watch) = 0;
+};
+
+// Numbers of joints and stages may be known at compile time.
 template <class Size = int, class Stages = int>
-class VariationalStepper {
+class VariationalStepper final : public Stepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                        double left, Solver solver = Solver::automatic)
-        : mechanism(mechanism),
+        : Stepper(guards),
+          mechanism(mechanism),
           tableau(tableau),
           tolerance(tolerance),
-          guards(guards),
           left(left),
           step_equation(mechanism, this->tableau, solver),
           energy_guard(mechanism, solver, !step_equation.eliminated()),
@@ -111,13 +129,10 @@ class VariationalStepper {
           guess(step_equation.stages * n),
           bend(2 * n),
           at(n) {}
-    VariationalStepper(const VariationalStepper&) = delete;
-    VariationalStepper& operator=(const VariationalStepper&) = delete;
 
     const Mechanism& mechanism;
     const Tableau tableau;
     double tolerance;
-    Guards guards;
     double left;  // share of each kick before the step; the rest acts after it
     Collocation<Size, Stages> step_equation;
     EnergyGuard<Size> energy_guard;
@@ -144,7 +159,7 @@ class VariationalStepper {
     }
 
     // Start a path at (q, v).
-    bool begin(const double* q, const double* v, PathState& state) {
+    bool begin(const double* q, const double* v, PathState& state) override {
         Jet<double, Size>& jet = step_equation.stage[0];
         first_order(mechanism, q, v, jet);
         if (!begin_at(q, jet.Lv.data(), state)) return false;
@@ -153,13 +168,13 @@ class VariationalStepper {
     }
 
     // Factor M at a path's node, for kicks and guesses.
-    bool look_at(PathState& state) {
+    bool look_at(PathState& state) override {
         for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
         return energy_guard.node(at.data(), state.momentum.data(), state.v.data());
     }
 
     // Add an impulse (n) to the momentum. Its change of the energy counts as work, not as an error.
-    void kick(const double* impulse, PathState& state) {
+    void kick(const double* impulse, PathState& state) override {
         for (int i = 0; i < n; ++i) {
             state.p[i] = state.p[i].plus(impulse[i]);
             state.momentum[i] = state.p[i].high;
@@ -220,7 +235,7 @@ class VariationalStepper {
     // `increments` of the Wiener processes (P, N, k), `drift`, a force in addition to the controls (P, N, n), and
     // `impulses` in addition to the noise, before and after each step (P, N, 2, n). A `watch` may stop a single path.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
-              std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) {
+              std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) override {
         const std::int64_t steps = nodes.steps;
         const int m = mechanism.controls, k = mechanism.diffusion.processes, stages = step_equation.stages;
         const bool noisy = increments != nullptr && k > 0;

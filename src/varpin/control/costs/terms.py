@@ -66,6 +66,8 @@ class Terms:
 
     def values(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """The value of each term (..., N, terms) at q (..., N, n), v (..., N, n) and u (..., N, m)."""
+        if q.ndim == 2:
+            return self._core.values(q, v, u)
         rows = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, v, u))
         found = self._core.values(*rows)
         return found.reshape(*q.shape[:-1], found.shape[1])

@@ -121,12 +121,13 @@ class SceneFile:
                 controls=spec.shape,  # type: ignore[arg-type]
                 constraints=constraints,
             )
-        except (InputError, CostError) as error:
-            for keys, made in zip(spec.plan_constraints, constraints, strict=True):
-                if str(error).startswith(made.label):
-                    raise keys.table.error("", str(error)) from None
-            where = "horizon.controls" if "linear controls" in str(error) else "cost"
-            raise spec.root.error(where, str(error)) from None
+        except CostError as error:
+            raise spec.root.error("cost", str(error)) from None
+        except InputError as error:
+            places = {f"constraints[{i}]": (keys.table, "") for i, keys in enumerate(spec.plan_constraints)}
+            places["controls"] = spec.root, "horizon.controls"
+            table, key = places.get(error.argument or "", (spec.root, "cost"))
+            raise table.error(key, str(error)) from None
 
     def controls(self) -> Floats | None:
         """Controls of a simulation, (N, m) or (m,), or None for none."""

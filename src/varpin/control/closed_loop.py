@@ -1,0 +1,245 @@
+"""The cost and the constraints of a plan around its motion, in changes of the controls beside an optimal feedback.
+
+Beside the feedback of the quadratic model's own backward pass the model's Hessian is block diagonal, one block for each
+decision. Without feedback it would be dense, and the changes of an unstable motion would have no bound.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.arrays import Floats
+from varpin.control.backward import Along
+from varpin.control.constraints import BoundRate
+from varpin.control.descent import Model, Stake, at_stake
+from varpin.control.linear_controls import at_samples
+from varpin.control.penalties import PenalizedRate, penalized
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.spread import state_slopes
+from varpin.trajectory import Trajectory
+
+Mask = NDArray[np.bool_]
+
+# Least eigenvalue of the Hessian in a decision's controls, relative to the greatest.
+_CONVEX = 1e-13
+
+
+class ClosedLoop:
+    """The quadratic model of a problem's cost and its linearized constraints around a motion.
+
+    The controls change by K dx + P du_before + w, with K and P the gains of the model in which the penalties of the
+    active rows count, too: on the linearized active constraints they are constant. Controls that are not free have no
+    feedback.
+
+    Attributes:
+        gains: K (R, m, 2n).
+        previous: P (R, m, m); zero unless changes of controls have a cost or a limit.
+        inverse: W (R, m, m), the inverse of the model's Hessian in w_k; zero in controls that are not free.
+        curvature: The Hessian's diagonal (R, m).
+        gradient: Gradient of the cost in w (R, m).
+    """
+
+    def __init__(
+        self,
+        problem: OptimalControlProblem,
+        motion: Trajectory,
+        weights: Floats,
+        active: list[Mask],
+    ) -> None:
+        """Expand the cost along a motion.
+
+        Args:
+            problem: The problem with its constraints.
+            motion: The motion.
+            weights: Weights of the penalties (C,).
+            active: The rows whose penalties count, for each constraint (K, rows).
+        """
+        self.problem, self.motion = problem, motion
+        zeros = [np.zeros(item.shape) for item in problem.bound_constraints]
+        goal = penalized(problem, zeros, weights, zeros)
+        self._along = Along(goal, motion)
+        self._linear, self._velocity = self._along.linearized(0, problem.steps)
+        self._active = active
+        self._goal = goal
+        self._expand()
+
+    def _expand(self) -> None:
+        """Gradients (N, 2n + m) and Hessians of the steps' costs in (x, u)."""
+        problem, motion, goal = self.problem, self.motion, self._goal
+        of_nodes = [
+            (item, rows)
+            for item, rows in zip(problem.bound_constraints, self._active, strict=True)
+            if not item.of_controls
+        ]
+        of_rates = [
+            rows for item, rows in zip(problem.bound_constraints, self._active, strict=True) if item.of_controls
+        ]
+        costs = goal.expand_cost(motion)
+        self._model = Model(costs, self._along.terminal.cost)
+        expansion = goal.with_held(
+            costs,
+            [np.zeros(item.shape) for item, _ in of_nodes],
+            [item.jacobian(motion.q, motion.v) if rows.any() else np.zeros(()) for item, rows in of_nodes],
+            [rows for _, rows in of_nodes],
+        )
+        lin, rule, N = self._linear, goal.model_rule, problem.steps
+        x, m = lin.A.shape[1], lin.B.shape[2]
+        gradient, hessian = np.zeros((N, x + m)), np.zeros((N, x + m, x + m))
+        samples = len(rule)
+        D = np.zeros((N, x + m, x + m))
+        D[:, x:, x:] = np.eye(m)
+        parts = at_samples(rule, np.concatenate([lin.A, lin.B], axis=2), self._velocity)
+        for s, (of_state, weight) in enumerate(zip(parts, problem.dt * rule[:, 0], strict=True)):
+            D[:, :x] = of_state
+            across = weight * np.swapaxes(D, 1, 2)
+            gradient += (across @ expansion.gradient[s::samples, :, None])[:, :, 0]
+            hessian += across @ expansion.hessian[s::samples] @ D
+        self._steps = gradient, hessian
+        R = problem.decisions
+        self._pull, self._rate = np.zeros((R, m)), np.zeros((0, m, m))
+        if goal.rate is not None:
+            u = problem.decided(motion)
+            pull, rate = goal.rate.expand(u, problem.period)
+            if isinstance(goal.rate, PenalizedRate):
+                pull, _ = goal.rate.plain.expand(u, problem.period)
+                _, rate = goal.rate.expand(u, problem.period, of_rates)
+            self._pull, self._rate = pull, rate
+
+    def close(self, free: Mask) -> None:
+        """Compute the feedback of the controls ``free`` (R, m), the model's Hessian beside it and the gradient."""
+        hold = self.problem.hold
+        lin, (_, hessian) = self._linear, self._steps
+        R, m = free.shape
+        x, remembers = lin.A.shape[1], len(self._rate) > 0
+        z = x + m
+        self.gains, self.previous = np.zeros((R, m, x)), np.zeros((R, m, m))
+        self.inverse, self.curvature = np.zeros((R, m, m)), np.zeros((R, m))
+        V, T = np.zeros((z, z)), np.eye(z)
+        V[:x, :x] = self._along.terminal.hessian
+        for k in reversed(range(R)):
+            for j in reversed(range(k * hold, (k + 1) * hold)):
+                T[:x, :x], T[:x, x:] = lin.A[j], lin.B[j]
+                V = T.T @ V @ T + hessian[j]
+            Q = np.zeros((z + m, z + m))
+            # In (x, previous control, control).
+            Q[:x, :x], Q[z:, z:] = V[:x, :x], V[x:, x:]
+            Q[:x, z:], Q[z:, :x] = V[:x, x:], V[x:, :x]
+            if remembers:
+                Q[x:z, x:z] += self._rate[k]
+                Q[z:, z:] += self._rate[k]
+                Q[x:z, z:] -= self._rate[k]
+                Q[z:, x:z] -= self._rate[k]
+            self.curvature[k] = np.diagonal(Q)[z:]
+            own = np.flatnonzero(free[k])
+            if own.size:
+                W = _inverse(Q[z + own[:, None], z + own])
+                self.inverse[k][own[:, None], own] = W
+                feedback = -W @ Q[z + own, :z]
+                self.gains[k, own], self.previous[k, own] = feedback[:, :x], feedback[:, x:]
+            through = np.vstack([np.eye(z), np.hstack([self.gains[k], self.previous[k]])])
+            V = through.T @ Q @ through
+            V = 0.5 * (V + V.T)
+        self.gradient = self._slope()
+
+    def _slope(self) -> Floats:
+        """The gradient of the cost in w (R, m)."""
+        hold, lin, (gradient, _) = self.problem.hold, self._linear, self._steps
+        R, m, x = self.gains.shape
+        found = np.zeros((R, m))
+        r = np.concatenate([self._along.terminal.gradient, np.zeros(m)])
+        for k in reversed(range(R)):
+            for j in reversed(range(k * hold, (k + 1) * hold)):
+                r = np.concatenate([lin.A[j].T @ r[:x], lin.B[j].T @ r[:x] + r[x:]]) + gradient[j]
+            found[k] = r[x:] + self._pull[k]
+            r = np.concatenate([r[:x] + self.gains[k].T @ found[k], self.previous[k].T @ found[k] - self._pull[k]])
+        return found
+
+    @property
+    def stake(self) -> Stake:
+        """The cost at stake along the motion."""
+        return at_stake(self.problem, self.motion, self._model)
+
+    @cached_property
+    def _slopes(self) -> Floats:
+        return state_slopes(self.problem, self.motion)
+
+    def rows(self, active: list[Mask]) -> Floats:
+        """Derivatives (a, R, m) of the active rows of all constraints in w."""
+        problem, motion = self.problem, self.motion
+        R, m, x = self.gains.shape
+        total, hold = sum(int(rows.sum()) for rows in active), problem.hold
+        G = np.zeros((total, R, m))
+        carried, node = np.zeros((total, x)), np.full(total, -1)
+        begin = 0
+        for item, rows in zip(problem.bound_constraints, active, strict=True):
+            k, r = np.nonzero(rows)
+            part = slice(begin, begin + len(k))
+            begin += len(k)
+            if isinstance(item, BoundRate):
+                G[part] = _of_rate(item, k, r, R, m)
+            elif len(k):
+                places = item.places[k]
+                J = item.jacobian(motion.q, motion.v)[k, r]
+                carried[part] = np.einsum("ax,axy->ay", J, self._slopes[places])
+                node[part] = places
+        back = np.zeros_like(carried)
+        for j in reversed(range(problem.steps)):
+            own, here = j // hold, node == j + 1
+            back[here] += carried[here]
+            G[:, own] += back @ self._linear.B[j]
+            back = back @ self._linear.A[j]
+            if j % hold == 0:
+                # Through feedback the control depends on the state before it and on the previous control.
+                back += G[:, own] @ self.gains[own]
+                if own > 0:
+                    G[:, own - 1] += G[:, own] @ self.previous[own]
+        return G
+
+    def response(self, ahead: Floats) -> tuple[Floats, Floats]:
+        """Changes of the states (N + 1, 2n) and controls (R, m) for w = ``ahead`` (R, m)."""
+        A, B, hold = self._linear.A, self._linear.B, self.problem.hold
+        found, change = np.zeros((len(A) + 1, A.shape[1])), ahead.copy()
+        for j in range(len(A)):
+            k = j // hold
+            if j % hold == 0:
+                change[k] += self.gains[k] @ found[j]
+                if k > 0:
+                    change[k] += self.previous[k] @ change[k - 1]
+            found[j + 1] = A[j] @ found[j] + B[j] @ change[k]
+        return found, change
+
+    def moved(self, values: list[Floats], response: Floats, change: Floats) -> list[Floats]:
+        """The constraints' values (K, rows) after changes of states and controls, to first order."""
+        problem, motion, found = self.problem, self.motion, []
+        for item, c in zip(problem.bound_constraints, values, strict=True):
+            if isinstance(item, BoundRate):
+                rate = np.diff(change, axis=0, prepend=np.zeros_like(change[:1])) / problem.period
+                rate = rate[item.places][:, item.limited]
+                found.append(c + np.concatenate([rate, -rate], axis=1))
+            else:
+                J = item.jacobian(motion.q, motion.v)
+                by_state = np.einsum("kxy,ky->kx", self._slopes[item.places], response[item.places])
+                found.append(c + np.einsum("krx,kx->kr", J, by_state))
+        return found
+
+
+def _inverse(matrix: Floats) -> Floats:
+    """The inverse of a symmetric matrix, made positive definite where it is not."""
+    values, vectors = np.linalg.eigh(matrix)
+    most = np.abs(values).max()
+    found: Floats = (vectors / np.maximum(np.abs(values), _CONVEX * most or 1.0)) @ vectors.T
+    return found
+
+
+def _of_rate(item: BoundRate, k: NDArray[np.int64], r: NDArray[np.int64], R: int, m: int) -> Floats:
+    """Derivatives (a, R, m) of rows of a rate limit in the controls."""
+    rows, limited = np.zeros((len(k), R, m)), item.limited
+    signs, columns = np.where(r < len(limited), 1.0, -1.0), limited[r % len(limited)]
+    decisions, index = item.places[k], np.arange(len(k))
+    rows[index, decisions, columns] = signs / item.period
+    later = decisions > 0
+    rows[index[later], decisions[later] - 1, columns[later]] = -signs[later] / item.period
+    return rows

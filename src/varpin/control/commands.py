@@ -1,0 +1,133 @@
+"""Commands of a search's motions: the first ones, those of an earlier plan, and those of trials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from varpin.arrays import Floats
+from varpin.control.backward import Plan, states
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.solution import Solution
+from varpin.core.arrays import Commands
+from varpin.errors import InputError
+from varpin.integrators.base import open_line, open_loop
+from varpin.mechanics.policy import LinearPolicy
+from varpin.support.checks import JointValues, as_floats, control_array, finite_array
+from varpin.trajectory import Trajectory
+
+
+def first_commands(problem: OptimalControlProblem, controls: JointValues | LinearPolicy | Solution | None) -> Commands:
+    """The commands of the first motion under given controls, within the problem's limits.
+
+    Raises:
+        InputError: Controls of a wrong shape, or of another hold or kind than the problem's.
+    """
+    m, variational = problem.scene.controls, problem.integrator.variational
+    if isinstance(controls, Solution):
+        controls = controls.policy_on("momentum" if variational else "velocity")
+    if controls is None:
+        controls = problem.holding_policy()
+    if isinstance(controls, LinearPolicy):
+        if (hold := controls.hold_at(problem.dt)) != problem.hold:
+            raise InputError(f"the policy holds its controls over {hold} steps, the problem {problem.hold}")
+        if controls.linear != problem.linear:
+            policy, wanted = ("linear", "held") if controls.linear else ("held", "linear")
+            raise InputError(f"the policy's controls are {policy}, the problem's {wanted}")
+        commands = controls.commands(
+            problem.steps, m, problem.scene.robot.dof, variational, problem.dt, problem.integrator.stage_times
+        )
+        narrowed = np.clip(commands.limits, *problem.control_limits)
+        narrowed.setflags(write=False)
+        if problem.linear:
+            return commands._replace(limits=narrowed, before=np.clip(commands.before, *narrowed))
+        if problem.rate is not None and problem.rate.before is not None:
+            commands = commands._replace(before=problem.rate.before[None].copy())
+        return commands._replace(limits=narrowed)
+    return _held(_rows_of(problem, controls), problem)
+
+
+def controls_along(problem: OptimalControlProblem, controls: object) -> Floats | None:
+    """Controls (R, m) along given states, clipped to their limits."""
+    if controls is None:
+        return None
+    if isinstance(controls, Solution | LinearPolicy):
+        raise InputError("controls beside states must be (R, m), (m,) or by joint name, without feedback")
+    u = _rows_of(problem, controls)
+    return np.asarray(np.clip(u, *problem.control_limits), dtype=np.float64)
+
+
+def _rows_of(problem: OptimalControlProblem, controls: Any) -> Floats:
+    """Given controls as rows (R, m)."""
+    R, m = problem.decisions, problem.scene.controls
+    if isinstance(controls, Mapping):
+        controls = control_array("controls", controls, problem.scene.control_joints)
+    rows = as_floats("controls", controls)
+    return np.broadcast_to(finite_array("controls", rows, (m,) if rows.ndim == 1 else (R, m)), (R, m))
+
+
+def shifted_commands(problem: OptimalControlProblem, previous: Solution, decisions: int) -> Commands:
+    """The commands of :meth:`Solution.shifted`, with the problem's limits and its previous control."""
+    old, before = previous.problem, None if problem.rate is None else problem.rate.before
+    R, m = problem.decisions, problem.scene.controls
+    same = (
+        old.scene is problem.scene
+        and old.integrator == problem.integrator
+        and old.control_limits is problem.control_limits
+    )
+    if not (same and (old.dt, old.steps, old.hold) == (problem.dt, problem.steps, problem.hold)):
+        return first_commands(problem, previous.shifted(decisions, before))
+    rows = np.minimum(np.arange(R) + decisions, R - 1)
+    u, gains, reference = previous.controls, previous.gains, states(old, previous.trajectory)[: -1 : old.hold]
+    if previous.previous_gains is not None:
+        start = None if old.rate is None else old.rate.before
+        expected = np.vstack([u[:1] if start is None else start, u[:-1]])[rows[:1]]
+        gains = np.concatenate([gains, previous.previous_gains], axis=2)
+        # A repeated control has itself as its previous one.
+        reference = np.hstack([reference[rows], np.vstack([expected, u[rows[:-1]]])])
+    else:
+        reference = reference[rows]
+    return Commands(
+        u=u[rows],
+        gains=gains[rows],
+        reference=reference,
+        hold=problem.hold,
+        limits=problem.control_limits,
+        before=np.zeros((0, m)) if before is None else before[None].copy(),
+    )
+
+
+def with_feedback(problem: OptimalControlProblem, here: Trajectory, plan: Plan, *, closed: bool) -> Commands:
+    """The controls of a motion, with a plan's feedback around it if ``closed``, without its feed-forward part."""
+    if not closed:
+        return _held(problem.decided(here), problem)
+    gains, reference = plan.feedback, states(problem, here)[: -1 : problem.hold]
+    if problem.linear and plan.previous is not None:
+        gains = np.concatenate([plan.feedback, plan.previous], axis=2)[1:]
+        reference = np.hstack([reference, here.u_nodes[:-1]])
+    elif plan.previous is not None:
+        before = here.u[: -problem.hold : problem.hold]
+        gains = np.concatenate([gains, plan.previous], axis=2)
+        # The control before the first one is given.
+        reference = np.hstack([reference, np.vstack([here.u[:1], before])])
+    if problem.linear:
+        commands = _held(problem.decided(here), problem)
+        return commands._replace(gains=gains, reference=np.ascontiguousarray(reference))
+    return Commands(
+        u=problem.decided(here),
+        gains=gains,
+        reference=np.ascontiguousarray(reference),
+        hold=problem.hold,
+        limits=problem.control_limits,
+        before=np.zeros((0, problem.scene.controls)),
+    )
+
+
+def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
+    if problem.linear:
+        return open_line(np.clip(u, *problem.control_limits), problem.integrator.stage_times)._replace(
+            limits=problem.control_limits.copy()
+        )
+    return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())
