@@ -40,7 +40,6 @@ def screenshot(page: Path, seconds: float, size: tuple[int, int] = (800, 640), a
             browser.get(page.as_uri())
             time.sleep(seconds)
             if at is not None:
-                browser.execute_script("document.querySelectorAll('.dg').forEach(e => e.remove())")
                 browser.execute_script("viewer.animator.pause(); viewer.animator.seek(arguments[0])", at)
                 time.sleep(1.0)
             return browser.get_screenshot_as_png()

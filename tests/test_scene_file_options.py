@@ -69,6 +69,13 @@ def test_dry_friction(arm, keys, given):
     ).any()
 
 
+def test_a_description_without_damping_and_friction_is_named(caplog):
+    with caplog.at_level(logging.WARNING):
+        scene = vp.Scene(vp.load_robot("ur10"), damping="robot", friction="robot")
+    assert not scene.forces
+    assert [unnamed(record.getMessage(), ("'ur10'", "='robot'", "none")) for record in caplog.records] == [[], []]
+
+
 def test_friction_is_short_for_a_force(arm):
     robot = vp.load_robot(arm)
     short, long = vp.Scene(robot, friction="robot"), vp.Scene(robot, forces=[vp.CoulombFriction(robot.friction)])
@@ -144,6 +151,12 @@ def test_postures_of_a_command(arm, tmp_path, capsys):
     ):
         assert main([*command, *words]) != 0
         assert not unnamed(capsys.readouterr().err, *facts)
+
+
+def test_a_summary_of_an_explicit_method_has_no_rows_of_a_solver(capsys):
+    for integrator, solver in (("RungeKutta4", False), ("Midpoint", True)):
+        assert main(["simulate", "finger", "--steps", "5", "--q0", "0.3", "--integrator", integrator]) == 0
+        assert ("branch margin" in capsys.readouterr().out) == solver
 
 
 def test_a_joint_with_several_axes_is_locked(tmp_path):

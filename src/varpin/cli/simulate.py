@@ -181,7 +181,8 @@ def _summary(trajectory: Trajectory, asked: int | None, wall_time: float, driven
             f"the search took {accuracy.search_steps} steps",
             style="" if accuracy.met else "bold yellow",
         )
-    if steps:
+    # Explicit methods solve no equations and have no branches.
+    if steps and statistics.branch_margin.any():
         newton, split = statistics.newton_iterations, statistics.split_steps
         add_row(table, "Newton iterations", f"{newton.mean():.2f} a step, {newton.max()} at most")
         if split:

@@ -801,6 +801,9 @@ def resistance(
         damped = damping is not None or any(isinstance(force, JointDamper) for force in forces)
         dry = friction is not None or any(isinstance(force, CoulombFriction) for force in forces)
         _log_left_out(robot, damped=damped, dry=dry)
+    for name, given, own in (("damping", damping, robot.damping), ("friction", friction, robot.friction)):
+        if isinstance(given, str) and not own.any():
+            logger.warning("robot %r: %s='robot' is none, because the description gives none", robot.name, name)
     given_damping = robot.damping if isinstance(damping, str) else 0.0 if damping is None else damping
     level = robot.friction if isinstance(friction, str) else 0.0 if friction is None else friction
     return not_negative("damping", given_damping, robot), not_negative("friction", level, robot)
