@@ -191,7 +191,7 @@ def test_the_default_integrator_is_chosen_on_each_grid() -> None:
     """A damper that is stiff for the first step only; an integrator that was given stays."""
     robot = vp.planar_chain(1)
     inertia = float(vp.lagrangian_jet(vp.Scene(robot), np.zeros(1), np.zeros(1)).Lvv[0, 0])
-    scene = vp.Scene(robot, damping=inertia * 3000.0)
+    scene = vp.Scene(robot, damping=inertia * 150.0)
     cost = vp.TrackingCost([0.1], 1.0) + vp.ControlCost(1e-9)
     for given, finer in ((None, vp.Gauss(4)), (vp.Radau(4), vp.Radau(4))):
         problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.1, steps=10, integrator=given)
