@@ -15,11 +15,12 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import Integrator, integrator_of
 from varpin.integrators.base import diffusion_and_drift, open_loop
+from varpin.integrators.same_scene import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.markup import facts, table
-from varpin.trajectory import Trajectory, require_motion, require_scene_of
+from varpin.trajectory import Trajectory
 
 # Number of steps that are repeated to check the scene of a motion without scene values, and tolerances as shares of
 # the largest change of velocity in the step and of the largest velocity.

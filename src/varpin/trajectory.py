@@ -17,7 +17,6 @@ from varpin._version import __version__
 from varpin.arrays import Floats, Integers
 from varpin.errors import FileError, InputError
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
-from varpin.mechanics.scene import OF_FORCES, VALUES, Scene, differences, same
 from varpin.model import Robot
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
@@ -377,9 +376,7 @@ class Trajectory(Frozen):
             FileError: As for :meth:`load`.
         """
         found = record_of(cls, _with_accuracy(members, prefix), source, prefix=prefix)
-        kept = {name: values for name, values in found.scene_values.items() if name in VALUES}
-        found = replace(found, scene_values=MappingProxyType(kept))
-        _require_scene_values(source, kept, len(found.joint_names))
+        _require_scene_values(source, found.scene_values, len(found.joint_names))
         # Energies and momenta overflow before q and v do; they may then be infinite.
         if not np.isfinite(found.p[np.isfinite(found.energy)]).all():
             raise FileError(f"{source}: p holds values that are not finite numbers")
@@ -414,12 +411,13 @@ def _require_scene_values(source: Path, values: Mapping[str, Floats], n: int) ->
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("damping", "stiffness", "rest", "armature"), (n,))
     shapes |= {"gravity": (3,), "actuation": (n, -1), "center": (-1, 3), "translation": (-1, 3)}
     shapes |= {"inertia": (-1, 6), "rotation": (-1, 3, 3)}
+    # Others may not be: a noise without a center has NaN there, and a one-sided stop an infinite end.
+    finite = {*shapes, "ratio", "offset", "functions", "noise.constant", "noise.control", "noise.quadratic"}
     for name, array in values.items():
         shape = shapes.get(name, array.shape)
         if array.ndim != len(shape) or any(b not in (-1, a) for a, b in zip(array.shape, shape, strict=True)):
             raise FileError(f"{source}: scene.{name} has shape {array.shape} instead of {shape}")
-        # A noise without a center has NaN there, and a one-sided stop an infinite end.
-        if name not in {"noise.center", *OF_FORCES} and not np.isfinite(array).all():
+        if name in finite and not np.isfinite(array).all():
             raise FileError(f"{source}: scene.{name} holds values that are not finite numbers")
 
 
@@ -477,38 +475,3 @@ def kinematic_input_rows(trajectory: Trajectory) -> Floats:
     ties = trajectory.scene_values.get("constraints.ties", np.zeros((0, 2)))
     # A file may have other shapes.
     return ties[ties[:, 0] == ties[:, 1]] if ties.ndim == 2 and ties.shape[1] > 1 else np.zeros((0, 2))
-
-
-def require_motion(scene: Scene, trajectory: Trajectory) -> None:
-    """Refuse anything but a trajectory of a scene's robot with the scene's number of controls.
-
-    Raises:
-        InputError: It is not one; the message tells the difference.
-    """
-    if not isinstance(trajectory, Trajectory):
-        raise InputError(f"the motion must be a varpin.Trajectory, got {type(trajectory).__name__}")
-    if trajectory.joint_names != scene.robot.joint_names:
-        raise InputError(
-            f"the trajectory is of joints {', '.join(trajectory.joint_names)}; "
-            f"the scene's robot has {', '.join(scene.robot.joint_names)}"
-        )
-    if trajectory.u.shape[1] != scene.controls:
-        raise InputError(f"the trajectory has {trajectory.u.shape[1]} controls, the scene {scene.controls}")
-
-
-def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
-    """Refuse a motion of a scene with other numbers, as far as the motion has them.
-
-    Noise is compared only if the motion has increments: a motion without noise does not depend on it.
-
-    Raises:
-        InputError: The scenes differ; the message tells where.
-    """
-    found = differences(scene, trajectory.scene_values, noise=bool(trajectory.dw.any()))
-    if not same(trajectory.masses, scene.robot.tree.mass):
-        found.insert(0, "the robot's masses are others in the scene")
-    if found:
-        raise InputError(
-            f"the trajectory was made in another scene than the one given: {'; '.join(found)}. Give the scene that "
-            "made it, or simulate again in this one"
-        )

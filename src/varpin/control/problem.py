@@ -32,6 +32,7 @@ from varpin.control.costs import (
 from varpin.core import sample_steps
 from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator, Radau
+from varpin.integrators.same_scene import require_motion
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
@@ -51,7 +52,7 @@ from varpin.support.checks import (
 )
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
-from varpin.trajectory import Trajectory, require_motion
+from varpin.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 

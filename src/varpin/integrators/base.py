@@ -66,9 +66,8 @@ class Segment:
     def part(self, steps: int) -> Segment:
         """The first steps, as views."""
         values = {name: getattr(self, name)[:steps] for name in _ARRAYS}
-        statistics = {item.name: getattr(self.statistics, item.name)[:steps] for item in fields(StepStatistics)}
         impulses = None if self.impulses is None else self.impulses[:steps]
-        return Segment(**values, statistics=StepStatistics(**statistics), failure=None, impulses=impulses)
+        return Segment(**values, statistics=self.statistics.part(0, steps), impulses=impulses)
 
 
 class Integrator(ABC):

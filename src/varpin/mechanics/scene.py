@@ -99,7 +99,6 @@ VALUES = {
 }
 # Constraints among the values; left out where there are none.
 OF_CONSTRAINTS = ("constraints.between", "constraints.ties", "constraints.custom")
-OF_FORCES = (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS)
 # Largest constraint residual of a given configuration, and of a start that is projected without request [m or rad].
 _OFF, CORRECTED = 1e-6, 0.02
 # Rank tolerance of the constraint Jacobian, relative to its largest singular value.
@@ -736,7 +735,8 @@ def same(one: Floats, other: Floats) -> bool:
 def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> list[str]:
     """Messages on how a scene differs from the one of these :attr:`Scene.values`, with ``noise`` or without."""
     found = []
-    for name, before in values.items():
+    # A file of another version may have other names.
+    for name, before in ((name, values[name]) for name in VALUES if name in values):
         now = scene.values.get(name)
         if name.startswith("noise.") and (not noise or now is None):
             continue
