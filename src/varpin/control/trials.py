@@ -18,6 +18,9 @@ from varpin.integrators import Integrator
 from varpin.integrators.base import Failure, Lines, lines, statistics_of
 from varpin.trajectory import Trajectory
 
+# Arrays that are the same for all whole motions of a problem under held controls, without constraints.
+_SHARED = ("t", "dw", "masses", "u_stages", "u_nodes", "constraint_forces")
+
 
 class Attempt(NamedTuple):
     """A trial motion.
@@ -60,7 +63,9 @@ class Attempt(NamedTuple):
         if known is not None and self.whole and self.line is None:
             # Checked once: all whole motions of a problem have the same shapes.
             q, v, p, energy = self.nodes
-            changed = {"q": q, "v": v, "p": p, "energy": energy, "u": self.u}
+            # Views of what does not change: the arrays of each motion are its own objects, pickled or not.
+            changed = {name: getattr(known, name)[:] for name in _SHARED}
+            changed |= {"q": q, "v": v, "p": p, "energy": energy, "u": self.u}
             if scene.constraints:
                 changed["constraint_forces"] = self.impulses / trials.problem.dt
             for array in (*changed.values(), *vars(statistics).values()):
