@@ -6,6 +6,7 @@ from findings import about
 
 import varpin as vp
 from varpin.mechanics.assembly import along_constraints
+from varpin.mechanics.inputs import held_in_parts
 
 
 @pytest.mark.parametrize(("steps", "integrator", "grows"), [
@@ -24,6 +25,25 @@ def test_errors_that_grow_are_told(steps, integrator, grows):
     off = np.abs(motion.q - fine.q[::parts]).max() / np.ptp(fine.q, axis=0).max()
     assert (off > 0.05) == grows
     assert bool(about(motion.warnings, "growth")) == grows, (off, motion.warnings)
+
+
+@pytest.mark.parametrize(("interpolation", "rate", "width"), [("cubic", 10.0, 0.6)])
+def test_errors_that_grow_are_told_where_a_joint_is_moved(interpolation, rate, width):
+    """Five links swing on a crank that is moved to and fro."""
+    loop, hand = vp.PointOnPoint("tip", (2.5, 0.0, 0.3), axes="xz"), vp.KinematicInput("joint1", interpolation)
+    scene = vp.Scene(vp.planar_chain(6), constraints=[loop, hand], actuation=["joint1"])
+    q, v = vp.assemble(scene, [-1.0, 0.8, 0.6, 0.6, 0.5, 0.4]), np.zeros(6)
+    t = np.linspace(0.0, 2.0, 1001)[1:]
+    turn = [q[0] + width * (1.0 - np.cos(rate * t)), width * rate * np.sin(rate * t)]
+    rows = np.stack(turn[: scene.controls], axis=1)
+    for integrator, fine, grows in ((vp.Gauss(2), 4, True), (vp.Gauss(5), 2, False)):
+        motion = vp.simulate(scene, q, v, dt=2e-3, steps=1000, controls=rows, integrator=integrator)
+        parts = held_in_parts(scene, rows, q, v, 2e-3, fine)
+        given = {"dt": 2e-3 / fine, "steps": 1000 * fine, "integrator": vp.Gauss(5)}
+        exact = vp.simulate(scene, q, v, controls=parts, check=False, **given).q[::fine]
+        off = np.abs(motion.q - exact).max() / np.ptp(exact, axis=0).max()
+        assert (off > 0.05) == grows
+        assert bool(about(motion.warnings, "growth")) == grows, off
 
 
 def test_growth_without_freedom():

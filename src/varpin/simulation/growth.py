@@ -20,7 +20,7 @@ from varpin.integrators.base import open_loop
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
 from varpin.simulation.kinks import kinks
-from varpin.simulation.modes import first_order, linearized, rate_bounds
+from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bounds
 from varpin.simulation.retaking import Finer, finer, shortest_parts, taken_again
 from varpin.trajectory import Trajectory
 
@@ -89,8 +89,8 @@ def grown_error(
 ) -> Growth | None:
     """The error of a motion after errors of its steps have added up or grown; None below the threshold of the warning.
 
-    If the motion is known to be ``predictable`` apart from kinks, only these are looked at. None, too, under noise and
-    kinematic inputs, with forces in Python, and of an integrator that chooses its own steps.
+    If the motion is known to be ``predictable`` apart from kinks, only these are looked at. None, too, under noise, with
+    forces in Python, and of an integrator that chooses its own steps.
     """
     if isinstance(integrator, Reference) or _hidden(scene, trajectory):
         return None
@@ -107,7 +107,7 @@ def grown_error(
     if even:
         # A few violent steps may be off by more than all others together.
         violent = np.abs(np.diff(trajectory.v, axis=0)).max(axis=1).argsort()[-_VIOLENT:]
-        off = _steps_off(scene, trajectory, other, np.append(at, violent), 1)
+        off = _steps_off(scene, integrator, trajectory, other, np.append(at, violent), 1)
         if off is None:
             return None
         shares = ((off[0] + off[1] * trajectory.dt) / way).max(axis=1)
@@ -115,7 +115,7 @@ def grown_error(
         largest = float(off[0].max())
     if len(bent.steps):
         chosen = bent.steps[np.unique(np.linspace(0, len(bent.steps) - 1, _KINKS).astype(np.int64))]
-        off = _steps_off(scene, trajectory, other, chosen, _PARTS)
+        off = _steps_off(scene, integrator, trajectory, other, chosen, _PARTS)
         if off is None:
             return None
         # Errors of velocities may last to the end.
@@ -147,17 +147,25 @@ def grown_error(
 
 
 def _steps_off(
-    scene: Scene, trajectory: Trajectory, other: Finer, at: Integers, parts: int
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, other: Finer, at: Integers, parts: int
 ) -> tuple[Floats, Floats] | None:
     """The errors of q and v (K, n) after single steps, by a better method in some parts; None where it fails."""
-    forces = np.repeat((trajectory.u[at] @ scene.actuation.T)[:, None], parts, axis=1)
-    nothing = open_loop(np.zeros((parts, scene.controls)))
     q, v = trajectory.q, trajectory.v
-    # Controls that change within a step do so for both, nearly.
-    once = other.method.motions(scene, q[at], v[at], nothing, forces, trajectory.dt / parts)
-    if once is None:
-        return None
-    return np.abs(once[0][:, -1] - q[at + 1]), np.abs(once[1][:, -1] - v[at + 1])
+    if scene.inputs:
+        again = [taken_again(scene, other.method, trajectory, integrator.stage_times, int(k), 1, parts) for k in at]
+        ends = [(each[0][1], each[1][1]) for each in again if each is not None]
+        if len(ends) < len(at):
+            return None
+        after_q, after_v = np.array([q for q, _ in ends]), np.array([v for _, v in ends])
+    else:
+        # Controls that change within a step do so for both, nearly.
+        forces = np.repeat((trajectory.u[at] @ scene.actuation.T)[:, None], parts, axis=1)
+        nothing = open_loop(np.zeros((parts, scene.controls)))
+        once = other.method.motions(scene, q[at], v[at], nothing, forces, trajectory.dt / parts)
+        if once is None:
+            return None
+        after_q, after_v = once[0][:, -1], once[1][:, -1]
+    return np.abs(after_q - q[at + 1]), np.abs(after_v - v[at + 1])
 
 
 def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], factor: float) -> bool:
@@ -170,16 +178,32 @@ def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], fac
         return True
     if not aq.shape[1]:
         return True
-    # Eigenvalues take longer than all else: at half of the places.
     if factor > _factor(float(rate_bounds(aq, av).mean()), trajectory):
         return True
-    return factor > _factor(float(_modes(aq[::2], av[::2]).mean()), trajectory)
+    # Eigenvalues take longer than all else: at half of the places, unless loops pass fast ones between them.
+    few = slice(None) if scene.constraints else slice(None, None, 2)
+    return factor > _factor(float(np.maximum(_modes(aq[few], av[few]), 0.0).mean()), trajectory)
 
 
 def _hidden(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether errors of steps are unknown: under noise, inputs or Python forces, or for many joints."""
-    hidden = scene.custom is not None or scene.inputs or trajectory.dw.any() or not trajectory.steps
+    """Whether errors of steps are unknown: under noise or Python forces, or for many joints."""
+    hidden = scene.custom is not None or trajectory.dw.any() or not trajectory.steps
     return bool(hidden or scene.robot.dof > _JOINTS)
+
+
+def _once_more(
+    scene: Scene, integrator: Integrator, method: Integrator, trajectory: Trajectory, steps: Integers
+) -> tuple[Floats, Floats] | None:
+    """Q and v (K, n) after each of some steps, repeated by another method; None where it fails."""
+    if scene.inputs:
+        again = [taken_again(scene, method, trajectory, integrator.stage_times, int(k), 1, 1) for k in steps]
+        ends = [(each[0][1], each[1][1]) for each in again if each is not None]
+        return (np.array([q for q, _ in ends]), np.array([v for _, v in ends])) if len(ends) == len(steps) else None
+    # Controls that change within a step do so for both, nearly.
+    forces = np.ascontiguousarray(trajectory.u[steps] @ scene.actuation.T)
+    nothing = open_loop(np.zeros((1, scene.controls)))
+    once = method.motions(scene, trajectory.q[steps], trajectory.v[steps], nothing, forces[:, None], trajectory.dt)
+    return None if once is None else (once[0][:, 0], once[1][:, 0])
 
 
 def _unexamined(scene: Scene, trajectory: Trajectory) -> bool:
@@ -204,7 +228,8 @@ def _slopes(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> tupl
         LinearizationError: There are none.
     """
     forces = np.ascontiguousarray(trajectory.u[at] @ scene.actuation.T)
-    found = linearized(scene, trajectory.q[at], trajectory.v[at], forces)
+    given = trajectory.q[at], trajectory.v[at], forces
+    found = linearized(scene, *given, of_inputs(scene, trajectory, at))
     return found.aq, found.av
 
 

@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.errors import LinearizationError
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
+from varpin.trajectory import Trajectory
 
 # Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
 _RANK = 1e-9
@@ -30,7 +31,7 @@ class Linearized(NamedTuple):
     onto: Floats  # the rate of y is onto @ v (K, f, n)
 
 
-def linearized(scene: Scene, q: Floats, v: Floats, forces: Floats, of_inputs: Floats | None = None) -> Linearized:
+def linearized(scene: Scene, q: Floats, v: Floats, forces: Floats, accelerated: Floats | None = None) -> Linearized:
     """Linearize the motions at states q, v (K, n) under constant forces (K, n).
 
     Args:
@@ -38,7 +39,7 @@ def linearized(scene: Scene, q: Floats, v: Floats, forces: Floats, of_inputs: Fl
         q: Configurations (K, n), on the constraints [rad or m].
         v: Velocities (K, n) that the constraints allow.
         forces: (K, n) [N m or N].
-        of_inputs: Accelerations of the joints (K, n), of which those with kinematic inputs are read; zero if left out.
+        accelerated: Accelerations of the joints (K, n), read for those with kinematic inputs; zero if left out.
 
     Raises:
         LinearizationError: A mass matrix is not positive definite, or a matrix of the constraints is not finite.
@@ -50,7 +51,7 @@ def linearized(scene: Scene, q: Floats, v: Floats, forces: Floats, of_inputs: Fl
     C = scene.core.constraints(np.ascontiguousarray(q))[2]
     try:
         at = [
-            _onto_constraints(scene, q[k], v[k], C[k], a[k], af[k], None if of_inputs is None else of_inputs[k])
+            _onto_constraints(scene, q[k], v[k], C[k], a[k], af[k], None if accelerated is None else accelerated[k])
             for k in range(len(q))
         ]
     except np.linalg.LinAlgError:
@@ -78,6 +79,16 @@ def first_order(aq: Floats, av: Floats) -> Floats:
     return A
 
 
+def of_inputs(scene: Scene, trajectory: Trajectory, at: Integers) -> Floats:
+    """Mean accelerations (K, n) of joints with cubic kinematic inputs in the steps at nodes (K,); zero for others."""
+    step = np.minimum(at, trajectory.steps - 1)
+    found = np.zeros((len(at), scene.robot.dof))
+    for c, rate in zip(scene.inputs.values(), scene.rates, strict=True):
+        if rate >= 0:
+            found[:, c] = np.diff(trajectory.v[:, c])[step] / trajectory.dt
+    return found
+
+
 class _Node(NamedTuple):
     lam: Floats  # the constraint forces (c,)
     Z: Floats  # (n, f)
@@ -86,7 +97,7 @@ class _Node(NamedTuple):
 
 
 def _onto_constraints(
-    scene: Scene, q: Floats, v: Floats, C: Floats, a: Floats, af: Floats, of_inputs: Floats | None
+    scene: Scene, q: Floats, v: Floats, C: Floats, a: Floats, af: Floats, accelerated: Floats | None
 ) -> _Node:
     """The tangent space at a state, and the constraint forces beside the accelerations a (n,) without them."""
     root = np.linalg.cholesky(af)
@@ -96,7 +107,7 @@ def _onto_constraints(
     bend = scene.core.constraint_curvature(q, np.zeros(len(C)), v)[1]
     wanted = -bend @ v
     for row, c in scene.inputs.items():
-        wanted[row] = 0.0 if of_inputs is None else of_inputs[c]
+        wanted[row] = 0.0 if accelerated is None else accelerated[c]
     lam = left @ ((left.T @ (wanted - C @ a)) / sizes**2)
     return _Node(lam, root @ right[rank:].T, root @ (right[:rank].T / sizes) @ left.T, bend)
 

@@ -19,7 +19,7 @@ from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
-from varpin.simulation.modes import first_order, linearized, rate_bounds
+from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bounds
 from varpin.trajectory import Trajectory
 
 Complexes = NDArray[np.complex128]
@@ -67,7 +67,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     q, v = trajectory.q[at], trajectory.v[at]
     forces = trajectory.u[np.minimum(at, steps - 1)] @ scene.actuation.T
     try:
-        a, aq, av, _, Z, onto = linearized(scene, q, v, forces, _of_inputs(scene, trajectory, at))
+        a, aq, av, _, Z, onto = linearized(scene, q, v, forces, of_inputs(scene, trajectory, at))
     except LinearizationError:
         return None
     if not aq.shape[1]:
@@ -146,16 +146,6 @@ def _applies(scene: Scene, trajectory: Trajectory) -> bool:
     kinds = [element.kind for element in scene.elements] + [coupling.kind for coupling in scene.couplings]
     sprung = scene.stiffness.any() or not set(_SPRINGS).isdisjoint(kinds)
     return bool(trajectory.steps and sprung)
-
-
-def _of_inputs(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> Floats:
-    """Mean accelerations (K, n) of joints with cubic kinematic inputs in the steps at nodes (K,); zero for others."""
-    step = np.minimum(at, trajectory.steps - 1)
-    found = np.zeros((len(at), scene.robot.dof))
-    for c, rate in zip(scene.inputs.values(), scene.rates, strict=True):
-        if rate >= 0:
-            found[:, c] = np.diff(trajectory.v[:, c])[step] / trajectory.dt
-    return found
 
 
 def _drift(integrator: Integrator, rates: Complexes, h: float) -> Complexes | None:
