@@ -756,7 +756,7 @@ def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> l
     if values:
         found += [
             f"{VALUES[name]} in the scene"
-            for name in (*OF_FORCES, "functions")
+            for name in (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS, "functions")
             if name not in values and np.size(scene.values.get(name, ()))
         ]
     return list(dict.fromkeys(found))

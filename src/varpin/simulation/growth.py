@@ -89,8 +89,8 @@ def grown_error(
 ) -> Growth | None:
     """The error of a motion after errors of its steps have added up or grown; None below the threshold of the warning.
 
-    If the motion is known to be ``predictable`` apart from kinks, only these are looked at. None, too, under noise, with
-    forces in Python, and of an integrator that chooses its own steps.
+    If the motion is known to be ``predictable`` apart from kinks, only these are looked at. None, too, under noise,
+    with forces in Python, and of an integrator that chooses its own steps.
     """
     if isinstance(integrator, Reference) or _hidden(scene, trajectory):
         return None
