@@ -214,7 +214,7 @@ class _Rows:
     def __init__(self, along: Along, problem: PenalizedProblem) -> None:
         self.whole, self.problem, motion = along, problem, along.trajectory
         # Linearized once, before the expansions are copied for each pass.
-        along.linearized(0, problem.steps)
+        _, velocity = along.linearized(0, problem.steps)
         q, v, u = motion.q, motion.v, motion.u
         self.of_nodes = problem.penalties
         self.of_rate = tuple(item for item in problem.all_penalties if item.bound.of_controls)
@@ -232,7 +232,7 @@ class _Rows:
         n = problem.scene.robot.dof
         slopes = np.tile(np.eye(2 * n), (len(q), 1, 1))
         if problem.integrator.variational:
-            slopes[:, n:] = velocity_at_nodes(problem.scene, q, v)
+            slopes[:, n:] = velocity
         self.by_state = [J @ slopes[item.bound.places] for item, J in zip(self.of_nodes, self.jacobians, strict=True)]
 
     def along(self, held: list[Mask]) -> Along:
