@@ -119,8 +119,10 @@ def draw(results: Results) -> Figure:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("file", type=Path)
-    results = json.loads(parser.parse_args().file.read_text(encoding="utf-8"))
+    parser.add_argument("files", type=Path, nargs="+", help="the results, of different tasks where they are several")
+    results: Results = {}
+    for file in parser.parse_args().files:
+        results |= json.loads(file.read_text(encoding="utf-8"))
     FigureCanvasAgg(draw(results)).print_png(DOCS / "images" / "plans_race.png")
     fill(DOCS / "crocoddyl.md", {"race": f"{summary(results)}\n\n{table(results)}"})
     print(summary(results))
