@@ -1,8 +1,9 @@
 """The tasks of plans.py raced against crocoddyl: the time to a plan that loses less than 1 % on the continuous robot.
 
     PYTHONPATH=src python benchmarks/plans_race.py race.json [words that a task's name has]
+    PYTHONPATH=src python benchmarks/plans_race_page.py race.json
 
-In the environment of crocoddyl_reference.py with ``cmeel-eigen==3.4.1``; about 10 minutes on an idle machine. Tasks
+In the environment of crocoddyl_reference.py with ``cmeel-eigen==3.4.1``; it takes some 20 minutes. Tasks
 that the file has are left out. Times are processor times, each side in one thread. crocoddyl (FDDP, within limits
 BoxFDDP) solves the same problems by its own compiled models (native.py) in Euler's and in two- and four-stage
 Runge-Kutta steps;
