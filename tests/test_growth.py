@@ -58,3 +58,12 @@ def test_one_violent_step(load):
     motion = vp.simulate(scene, q0, v0, dt=0.002, steps=1368, integrator=vp.RungeKutta4())
     assert off(scene, q0, motion) > 0.2
     assert any(sentence.startswith(SAID) for sentence in motion.warnings)
+
+
+@pytest.mark.parametrize(("name", "dt", "steps", "seed"), [("panda", 0.05, 35, 0), ("kinova", 0.02, 25, 0)])
+def test_short_motions_are_told_of_too(load, name, dt, steps, seed):
+    """Of a few steps, under torques that jump in each, with the default integrator."""
+    scene, q0, controls = jumping(load(name), seed, steps, 0.2)
+    motion = vp.simulate(scene, q0, np.zeros(len(q0)), dt=dt, steps=steps, controls=controls)
+    assert off(scene, q0, motion) > 0.02
+    assert any(sentence.startswith(SAID) or "coarse" in sentence for sentence in motion.warnings)

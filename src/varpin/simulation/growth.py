@@ -28,7 +28,7 @@ from varpin.trajectory import Trajectory
 SAID = "disturbances grow here"
 
 # Number of repeated steps; fewest steps and most joints of an examined motion.
-_PLACES, _LEAST, _JOINTS = 6, 40, 60
+_PLACES, _LEAST, _JOINTS = 6, 8, 60
 # Number of further steps, those that change velocities most, as where controls jump.
 _VIOLENT = 4
 # Most steps with a kink that are repeated one by one, and their parts; also the parts of all of them in a repetition of
@@ -95,7 +95,7 @@ def grown_error(
     if isinstance(integrator, Reference) or _hidden(scene, trajectory):
         return None
     bent = kinks(scene, trajectory)
-    even = not (predictable or _few(trajectory))
+    even = not (predictable or _few(trajectory) or len(bent.steps) == trajectory.steps)
     if not (even or len(bent.steps)):
         return None
     other = finer(integrator, trajectory, damped=False, pulled=False)
@@ -105,14 +105,19 @@ def grown_error(
     at = _places(trajectory)
     by_steps, by_kinks, largest = 0.0, 0.0, 0.0
     if even:
-        # A few violent steps may be off by more than all others together.
-        violent = np.abs(np.diff(trajectory.v, axis=0)).max(axis=1).argsort()[-_VIOLENT:]
-        off = _steps_off(scene, integrator, trajectory, other, np.append(at, violent), 1)
+        # A few violent steps may be off by more than all others together. Those with kinks are counted below.
+        change = np.abs(np.diff(trajectory.v, axis=0)).max(axis=1)
+        change[bent.steps] = -1.0
+        spread = np.setdiff1d(at, bent.steps)
+        violent = change.argsort()[-_VIOLENT:]
+        violent = violent[change[violent] >= 0.0]
+        off = _steps_off(scene, integrator, trajectory, other, np.append(spread, violent), 1)
         if off is None:
             return None
         shares = ((off[0] + off[1] * trajectory.dt) / way).max(axis=1)
-        by_steps = max(trajectory.steps * float(shares[: len(at)].max()), float(shares[len(at) :].sum()))
-        largest = float(off[0].max())
+        usual, rare = shares[: len(spread)], shares[len(spread) :]
+        by_steps = max(trajectory.steps * float(usual.max(initial=0.0)), float(rare.sum()))
+        largest = float(off[0].max(initial=0.0))
     if len(bent.steps):
         chosen = bent.steps[np.unique(np.linspace(0, len(bent.steps) - 1, _KINKS).astype(np.int64))]
         off = _steps_off(scene, integrator, trajectory, other, chosen, _PARTS)

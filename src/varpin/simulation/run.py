@@ -98,7 +98,7 @@ def simulate(
             :mod:`varpin.mechanics.wiener`. 0 gives the motion without noise and without the warning.
         check: Examine the finished motion for ``Trajectory.warnings`` and the log: does its energy balance close, do
             its steps resolve it, is its control loop stable? The check takes about half as long as the motion, and
-            0.1 ms (0.2 ms from 40 steps on); several times as long as the motion where its steps are coarse, and twice
+            0.1 ms (0.2 ms from 8 steps on); several times as long as the motion where its steps are coarse, and twice
             as long where small disturbances may grow.
         progress: Called now and then with (steps done, steps in all). A function with three required arguments, such
             as :class:`varpin.LiveView`, also gets a :class:`varpin.Nodes` with the nodes since the last call, whose
