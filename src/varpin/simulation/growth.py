@@ -104,11 +104,10 @@ def grown_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     aq, av = slopes
     if small > _factor(float(np.median(rate_bounds(aq, av))), trajectory):
         return None
+    typical = float(np.median(_modes(aq[::2], av[::2])))
     if scene.constraints:
         # Loops pass places where modes are much faster than elsewhere.
-        typical = float(np.maximum(_modes(aq, av), 0.0).mean())
-    else:
-        typical = float(np.median(_modes(aq[::2], av[::2])))
+        typical = max(typical, float(np.maximum(_modes(aq, av), 0.0).mean()))
     if small > _factor(typical, trajectory):
         return None
     again = taken_again(scene, other.method, trajectory, integrator.stage_times, 0, steps, other.parts)
