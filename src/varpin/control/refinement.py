@@ -51,23 +51,23 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
         solution: Solution | None = None
         try:
             solution = search(problem, start)
-            told = None if solution.status is Status.INTERRUPTED else solution.verify(tolerance=_KNOWN * wish)
+            verified = None if solution.status is Status.INTERRUPTED else solution.verify(tolerance=_KNOWN * wish)
         except KeyboardInterrupt:
             if solution is None:
                 if best is None:
                     raise
                 solution = best
-            solution, told = replace(solution, status=Status.INTERRUPTED), None
+            solution, verified = replace(solution, status=Status.INTERRUPTED), None
         except VarpinError as error:
             if best is None:
                 raise
             return _with(best, wish, tried, chosen, f"with dt = {problem.dt:g} s there is no plan: {error}")
-        if told is None:
+        if verified is None:
             ended = f"interrupted with dt = {problem.dt:g} s"
             if best is None:
                 return _with(solution, wish, tried, 0, ended)
             return _with(replace(best, status=Status.INTERRUPTED, reason=ended), wish, tried, chosen, ended)
-        tried.append(_row(solution, told, time.perf_counter() - began))
+        tried.append(_row(solution, verified, time.perf_counter() - began))
         logger.info("%s: true cost: %s", problem.scene.robot.name, tried[-1])
         if best is None or not abs(tried[-1].loss) >= abs(tried[chosen].loss):
             best, chosen = solution, len(tried) - 1
@@ -103,15 +103,15 @@ def _ended(
     return ""
 
 
-def _row(solution: Solution, told: Verification, seconds: float) -> Refined:
+def _row(solution: Solution, verified: Verification, seconds: float) -> Refined:
     problem = solution.problem
     return Refined(
         dt=problem.dt,
         steps=problem.steps,
         cost=solution.cost,
-        true_cost=told.closed_loop_cost,
-        open_loop_cost=told.open_loop_cost,
-        loss=told.closed_loop_loss if told.told else np.nan,
+        true_cost=verified.closed_loop_cost,
+        open_loop_cost=verified.open_loop_cost,
+        loss=verified.closed_loop_loss if verified.told else np.nan,
         iterations=solution.iterations,
         status=solution.status,
         seconds=seconds,
