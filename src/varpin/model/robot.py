@@ -19,7 +19,7 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoi
 from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
 from varpin.model.degrees import ADVICE, looks_like_degrees
 from varpin.model.inertia import faults
-from varpin.model.mimic import Tie, joint_index, rebuild, tied_model
+from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model
 from varpin.model.mjcf import build_mjcf_model, build_mjcf_shapes
 from varpin.model.payload import Payload, carry
 from varpin.model.sources import Description, describe, hang_shapes
@@ -500,10 +500,20 @@ def _lock(
         else:
             reference[kind.idx_q : kind.idx_q + kind.nq] = position
     joints = sorted(positions)
+    # pin.buildReducedModel looks frames up by name alone, where a link and a joint may have the same.
+    renamed = model.copy()
+    names: dict[str, str] = {}
+    for index in set(range(1, model.nframes)).difference(joint_frames(model)):
+        frame = renamed.frames[index]
+        names[f"{index} {frame.name}"] = frame.name
+        frame.name = f"{index} {frame.name}"
     if visuals is None:
-        reduced = pin.buildReducedModel(model, joints, reference)
+        reduced = pin.buildReducedModel(renamed, joints, reference)
     else:
-        reduced, visuals = pin.buildReducedModel(model, visuals, joints, reference)
+        reduced, visuals = pin.buildReducedModel(renamed, visuals, joints, reference)
+    for frame in reduced.frames:
+        frame.name = names.get(frame.name, frame.name)
+    if visuals is not None:
         hang_shapes(visuals, reduced, reduced)
     reduced.gravity = model.gravity
     left = joint_index(reduced)
