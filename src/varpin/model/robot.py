@@ -503,10 +503,10 @@ def _lock(
     # pin.buildReducedModel looks frames up by name alone, where a link and a joint may have the same.
     renamed = model.copy()
     names: dict[str, str] = {}
-    for index in set(range(1, model.nframes)).difference(joint_frames(model)):
-        frame = renamed.frames[index]
-        names[f"{index} {frame.name}"] = frame.name
-        frame.name = f"{index} {frame.name}"
+    for k in set(range(1, model.nframes)).difference(joint_frames(model)):
+        frame = renamed.frames[k]
+        names[f"{k} {frame.name}"] = frame.name
+        frame.name = f"{k} {frame.name}"
     if visuals is None:
         reduced = pin.buildReducedModel(renamed, joints, reference)
     else:
