@@ -20,7 +20,7 @@ from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotor
 from varpin.model.degrees import ADVICE, looks_like_degrees
 from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
-from varpin.model.mimic import Tie, joint_index, rebuild, tied_model
+from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model
 from varpin.model.mjcf import build_mjcf_model, build_mjcf_shapes
 from varpin.model.payload import Payload, carry
 from varpin.model.sources import Description, describe, hang_shapes
@@ -504,10 +504,20 @@ def _lock(
         else:
             reference[kind.idx_q : kind.idx_q + kind.nq] = position
     joints = sorted(positions)
+    # pin.buildReducedModel looks frames up by name alone, where a link and a joint may have the same.
+    renamed = model.copy()
+    names: dict[str, str] = {}
+    for k in set(range(1, model.nframes)).difference(joint_frames(model)):
+        frame = renamed.frames[k]
+        names[f"{k} {frame.name}"] = frame.name
+        frame.name = f"{k} {frame.name}"
     if visuals is None:
-        reduced = pin.buildReducedModel(model, joints, reference)
+        reduced = pin.buildReducedModel(renamed, joints, reference)
     else:
-        reduced, visuals = pin.buildReducedModel(model, visuals, joints, reference)
+        reduced, visuals = pin.buildReducedModel(renamed, visuals, joints, reference)
+    for frame in reduced.frames:
+        frame.name = names.get(frame.name, frame.name)
+    if visuals is not None:
         hang_shapes(visuals, reduced, reduced)
     reduced.gravity = model.gravity
     left = joint_index(reduced)

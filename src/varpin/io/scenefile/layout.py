@@ -22,6 +22,7 @@ from varpin.mechanics.forces import CoulombFriction, Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
 from varpin.mechanics.scene import Scene, closest_controls, given_constraints, resistance
 from varpin.model import Robot, combine, load_robot, looks_like_degrees
+from varpin.model.tree import frame_index
 
 if TYPE_CHECKING:
     from varpin.io.scenefile.tables import RobotKeys
@@ -260,7 +261,7 @@ def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:
     """Whether each coordinate (n,) moves a frame; all False if there is no such frame."""
     model, moving = robot.free_model, np.zeros(robot.dof, dtype=np.bool_)
     if model.existFrame(frame):
-        for joint in model.supports[model.frames[model.getFrameId(frame)].parentJoint]:
+        for joint in model.supports[model.frames[frame_index(model, frame, robot.name)].parentJoint]:
             if joint > 0:
                 moving[robot.tree.coordinate[joint - 1]] = True
     return moving
