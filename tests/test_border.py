@@ -10,7 +10,7 @@ from refusals import refused
 
 import varpin as vp
 from varpin import core
-from varpin.core.arrays import Commands, Nodes, new_nodes
+from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.integrators.tableau import gauss_coefficients, interpolation, lobatto_places
 
 N, P = 4, 2
@@ -73,7 +73,7 @@ def roll(rollout):
     def call(dt, increments, drift, **parts):
         commands, nodes = (
             kind(**{name: parts[f"{prefix}.{name}"] for name in kind._fields})
-            for kind, prefix in ((Commands, "commands"), (Nodes, "nodes"))
+            for kind, prefix in ((Commands, "commands"), (RolloutArrays, "nodes"))
         )
         path = rollout.copy() if isinstance(rollout, core.ExplicitRollout) else rollout.fork(core.Guards.make(**GUARDS))
         path.roll(dt, commands, increments, drift, nodes)

@@ -1,4 +1,4 @@
-// Input and output of a rollout at the border: the Python named tuples Commands and Nodes, checked and converted to
+// Input and output of a rollout at the border: the Python named tuples Commands and RolloutArrays, checked and converted to
 // those of policy.hpp and nodes.hpp. docs/core.md, "The map".
 #pragma once
 

@@ -13,7 +13,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem
 from varpin.core import Watch
-from varpin.core.arrays import Bytes, Commands, Nodes
+from varpin.core.arrays import Bytes, Commands, RolloutArrays
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure, Lines, lines, statistics_of
 from varpin.trajectory import Trajectory
@@ -33,7 +33,7 @@ class Attempt(NamedTuple):
     trials: Trials
     nodes: tuple[Floats, Floats, Floats, Floats]  # q, v, p and energy, the first node included
     u: Floats
-    written: Nodes
+    written: RolloutArrays
     halvings: Bytes
     values: Floats
     impulses: Floats  # of the constraints (N, c)
@@ -141,7 +141,7 @@ class Trials:
         energy, u = np.empty(N + 1), np.empty((N, m))
         first = self._first
         q[0], v[0], p[0], energy[0] = first.q[0], first.v[0], first.p[0], first.energy[0]
-        nodes = Nodes(
+        nodes = RolloutArrays(
             q=q[None, 1:],
             p=p[None, 1:],
             v=v[None, 1:],
@@ -164,7 +164,11 @@ class Trials:
         return Attempt(self, (q, v, p, energy), u, nodes, halvings, values, impulses, failure, watch.verdict)
 
     def _on_lines(
-        self, commands: Commands, integrator: Integrator, into: tuple[Floats, Floats, Floats, Floats], nodes: Nodes
+        self,
+        commands: Commands,
+        integrator: Integrator,
+        into: tuple[Floats, Floats, Floats, Floats],
+        nodes: RolloutArrays,
     ) -> Attempt:
         """Integrate the motion under controls that are linear between nodes, without early stops."""
         scene = self.problem.scene

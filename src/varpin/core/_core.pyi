@@ -6,7 +6,7 @@ from enum import Enum, IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.core.arrays import Commands, ConstraintRows, Nodes
+from varpin.core.arrays import Commands, ConstraintRows, RolloutArrays
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -201,7 +201,7 @@ class VariationalRollout(_Rollout):
         commands: Commands,
         increments: Floats,
         drift: Floats,
-        nodes: Nodes,
+        nodes: RolloutArrays,
         watch: Watch | None = None,
         impulses: Floats | None = None,
     ) -> None:
@@ -220,7 +220,7 @@ class ConstrainedRollout(_Rollout):
     def fork(self, guards: Guards) -> ConstrainedRollout:
         """An independent copy of the paths."""
 
-    def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: Nodes) -> None:
+    def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: RolloutArrays) -> None:
         """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays."""
 
     def impulses(self, path: int) -> Floats:
@@ -497,7 +497,7 @@ class ExplicitRollout:
         """Current velocities of the paths (P, n) [rad/s or m/s], writable."""
 
     def copy(self) -> ExplicitRollout: ...
-    def first_nodes(self, nodes: Nodes) -> bool:
+    def first_nodes(self, nodes: RolloutArrays) -> bool:
         """Write the state of each path as its node 0; False if a mass matrix is not positive definite."""
 
     def roll(
@@ -506,7 +506,7 @@ class ExplicitRollout:
         commands: Commands,
         increments: Floats,
         drift: Floats,
-        nodes: Nodes,
+        nodes: RolloutArrays,
         watch: Watch | None = None,
         impulses: Floats | None = None,
     ) -> None:

@@ -135,7 +135,7 @@ class Commands(NamedTuple):
     places: Floats = _NOWHERE
 
 
-class Nodes(NamedTuple):
+class RolloutArrays(NamedTuple):
     """Output of a rollout of P paths over N steps: the node after each step, and the work of the step."""
 
     q: Floats  # (P, N, n)
@@ -149,9 +149,9 @@ class Nodes(NamedTuple):
     done: Integers  # (P,) number of steps done
 
 
-def new_nodes(paths: int, steps: int, dof: int, controls: int) -> Nodes:
+def new_nodes(paths: int, steps: int, dof: int, controls: int) -> RolloutArrays:
     """Allocate the nodes of a rollout."""
-    return Nodes(
+    return RolloutArrays(
         q=np.empty((paths, steps, dof)),
         p=np.empty((paths, steps, dof)),
         v=np.empty((paths, steps, dof)),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.core import Watch
-from varpin.core.arrays import Commands, Nodes
+from varpin.core.arrays import Commands, RolloutArrays
 from varpin.errors import InputError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
@@ -175,7 +175,7 @@ class Integrator(ABC):
         state: Any,
         commands: Commands,
         dt: float,
-        nodes: Nodes,
+        nodes: RolloutArrays,
         watch: Watch,
         impulses: Floats | None = None,
     ) -> tuple[Failure | None, Bytes]:
@@ -351,7 +351,7 @@ def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) ->
 
 
 def segments_of(
-    nodes: Nodes, reasons: Mapping[int, str], halvings: Callable[[int], Bytes] | None = None
+    nodes: RolloutArrays, reasons: Mapping[int, str], halvings: Callable[[int], Bytes] | None = None
 ) -> list[Segment]:
     """A segment for each path, with views of the arrays that the core wrote.
 
@@ -375,7 +375,7 @@ def segments_of(
     return segments
 
 
-def statistics_of(nodes: Nodes, path: int, done: int, halvings: Bytes) -> StepStatistics:
+def statistics_of(nodes: RolloutArrays, path: int, done: int, halvings: Bytes) -> StepStatistics:
     """The statistics of a path's steps, as views."""
     tally, quality = nodes.tally[path, :done], nodes.quality[path, :done]
     return StepStatistics(
@@ -390,13 +390,13 @@ def statistics_of(nodes: Nodes, path: int, done: int, halvings: Bytes) -> StepSt
     )
 
 
-def parts_of(nodes: Nodes, path: int, done: int, halvings: Callable[[int], Bytes]) -> Bytes:
+def parts_of(nodes: RolloutArrays, path: int, done: int, halvings: Callable[[int], Bytes]) -> Bytes:
     """The halvings of a path's steps; ``halvings`` is called only if a step was divided."""
     split = done > 0 and nodes.tally[path, :done, 3].max() > 1
     return halvings(path) if split else np.zeros(0, dtype=np.uint8)
 
 
-def failure_of(nodes: Nodes, path: int, done: int, reasons: Mapping[int, str]) -> Failure | None:
+def failure_of(nodes: RolloutArrays, path: int, done: int, reasons: Mapping[int, str]) -> Failure | None:
     """Why a path stopped before its end, if it did."""
     ended = int(nodes.ended[path])
     return Failure(reasons[ended], float(nodes.quality[path, done, 0])) if ended in reasons else None

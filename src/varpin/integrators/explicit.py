@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from varpin import core
 from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, Outcome, Watch
-from varpin.core.arrays import Commands, Nodes, new_nodes
+from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.errors import LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Failure,
@@ -110,7 +110,7 @@ class _Explicit(Integrator):
         state: ExplicitRun,
         commands: Commands,
         dt: float,
-        nodes: Nodes,
+        nodes: RolloutArrays,
         watch: Watch,
         impulses: Floats | None = None,
     ) -> tuple[Failure | None, Bytes]:

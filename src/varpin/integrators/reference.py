@@ -10,7 +10,7 @@ import scipy
 
 from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
-from varpin.core.arrays import Commands, Nodes, new_nodes
+from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Failure,
@@ -144,7 +144,14 @@ class Reference(Integrator):
         ]
 
     def _path(
-        self, scene: Scene, state: ReferenceRun, commands: Commands, drift: Floats, dt: float, nodes: Nodes, i: int
+        self,
+        scene: Scene,
+        state: ReferenceRun,
+        commands: Commands,
+        drift: Floats,
+        dt: float,
+        nodes: RolloutArrays,
+        i: int,
     ) -> Failure | None:
         """Write the steps of path ``i`` to ``nodes``; return the failure, if any."""
         u = nodes.u[i]

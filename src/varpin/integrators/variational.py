@@ -22,7 +22,7 @@ from varpin.core import (
     variational_derivatives,
     variational_ends,
 )
-from varpin.core.arrays import Commands, Nodes, new_nodes
+from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Failure,
@@ -243,7 +243,7 @@ class Variational(Integrator):
         state: VariationalRun,
         commands: Commands,
         dt: float,
-        nodes: Nodes,
+        nodes: RolloutArrays,
         watch: Watch,
         impulses: Floats | None = None,
     ) -> tuple[Failure | None, Bytes]:
@@ -495,7 +495,7 @@ def _require_solved(trajectory: Trajectory, outcome: int, done: int) -> None:
 
 def _rolled(
     scene: Scene, state: VariationalRun, commands: Commands, increments: Floats, drift: Floats, dt: float
-) -> Nodes:
+) -> RolloutArrays:
     """Advance ``state`` by the steps of ``commands``; the nodes after them."""
     nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
     state.paths.roll(dt, commands, increments, drift, nodes)

@@ -16,7 +16,7 @@ from varpin.mechanics.inputs import in_parts_of_steps, prescribing
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene
 from varpin.simulation.functions import ControlLaw, decision, evaluated, sampled
-from varpin.simulation.record import Record, next_command
+from varpin.simulation.record import MotionRecord, next_command
 from varpin.support.checks import JointValues, as_floats, control_array, require_finite
 
 # All controls but a control law: known before the motion, or fed back by the core.
@@ -119,7 +119,9 @@ def _on_lines(u: Floats, times: Times) -> Commands:
     return changing((1.0 - share) * before + share * after, times)
 
 
-def next_block(controls: Controls | ControlLaw, commands: Commands, record: Record, most: int, left: int) -> Commands:
+def next_block(
+    controls: Controls | ControlLaw, commands: Commands, record: MotionRecord, most: int, left: int
+) -> Commands:
     """Commands of the next steps.
 
     Args:

@@ -19,7 +19,7 @@ from varpin.mechanics.inputs import as_moved, prescribing
 from varpin.mechanics.policy import FirstOrderHold, OpenLoop
 from varpin.mechanics.scene import Scene
 from varpin.simulation.failures import ControlError
-from varpin.simulation.record import Record
+from varpin.simulation.record import MotionRecord
 from varpin.simulation.soundness import Finding
 from varpin.support.checks import JointValues, control_values, finite_array, takes
 from varpin.trajectory import Trajectory
@@ -47,7 +47,7 @@ def require_law(law: ControlLaw) -> None:
     raise InputError("controls must be a function of (t, q, v): it cannot be called with three arguments")
 
 
-def decision(law: ControlLaw, record: Record) -> Floats:
+def decision(law: ControlLaw, record: MotionRecord) -> Floats:
     """The control (1, m) of the period that begins at the last node."""
     k = record.steps
     time = k * record.dt
@@ -55,7 +55,7 @@ def decision(law: ControlLaw, record: Record) -> Floats:
     return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
 
 
-def sampled(controls: OpenLoop, record: Record, steps: int) -> Commands:
+def sampled(controls: OpenLoop, record: MotionRecord, steps: int) -> Commands:
     """Controls of the next steps up to the first for which the function fails.
 
     Raises:
@@ -76,7 +76,7 @@ def evaluated(
     integrator: Integrator,
     dt: float,
     steps: Iterable[int],
-    record: Record | None = None,
+    record: MotionRecord | None = None,
 ) -> Commands:
     """Controls that are a function of time at the stages of some steps, or in their middles for one-stage methods."""
     times, numbers = integrator.stage_times, np.array(steps, dtype=np.int64)
@@ -97,7 +97,7 @@ def evaluated(
 
 
 def _at_times(
-    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: Record | None
+    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: MotionRecord | None
 ) -> Floats:
     """Controls (K, m) from a function of time at times (K,) [s] within ``steps`` (K,).
 
@@ -121,7 +121,7 @@ def _at_times(
 
 
 def _at_all_times(
-    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: Record | None
+    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: MotionRecord | None
 ) -> Floats:
     """:func:`_at_times` for a vectorized function.
 
@@ -205,7 +205,7 @@ def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floa
 
 
 def _called(
-    name: str, call: Callable[[], JointValues], scene: Scene, step: int, time: float, record: Record | None
+    name: str, call: Callable[[], JointValues], scene: Scene, step: int, time: float, record: MotionRecord | None
 ) -> Floats:
     """The control (m,) that a user's function returns.
 
@@ -219,7 +219,9 @@ def _called(
     return _control(name, value, scene, step, time, record)
 
 
-def _control(name: str, value: JointValues, scene: Scene, step: int, time: float, record: Record | None) -> Floats:
+def _control(
+    name: str, value: JointValues, scene: Scene, step: int, time: float, record: MotionRecord | None
+) -> Floats:
     """The value of a user's function as a control (m,).
 
     Raises:
@@ -231,11 +233,11 @@ def _control(name: str, value: JointValues, scene: Scene, step: int, time: float
         raise _control_error(step, time, str(error), record) from None
 
 
-def _error_raised(name: str, error: Exception, step: int, time: float, record: Record | None) -> ControlError:
+def _error_raised(name: str, error: Exception, step: int, time: float, record: MotionRecord | None) -> ControlError:
     """The error of a user's function that raised."""
     return _control_error(step, time, f"{name} raised {error!r}", record)
 
 
-def _control_error(step: int, time: float, problem: str, record: Record | None) -> ControlError:
+def _control_error(step: int, time: float, problem: str, record: MotionRecord | None) -> ControlError:
     """The error of a user's function, with the motion before it."""
     return ControlError(step, time, problem, None if record is None else record.trajectory())

@@ -22,7 +22,7 @@ from varpin.trajectory import Trajectory
 _PARTS = 256
 
 
-class Record:
+class MotionRecord:
     """The steps done so far.
 
     Attributes:
@@ -131,7 +131,7 @@ def _trajectory(
     )
 
 
-def function_error(error: CustomForceError | CustomConstraintError, record: Record, where: str = "") -> StepError:
+def function_error(error: CustomForceError | CustomConstraintError, record: MotionRecord, where: str = "") -> StepError:
     """The error of a user's function that failed in the step after the record."""
     now = record.trajectory()
     kind = ForceError if isinstance(error, CustomForceError) else ConstraintError
@@ -154,7 +154,7 @@ def located(
     """
     state, (first,) = integrator.start(scene, start[0][None], start[1][None])
     dw = np.zeros((0, scene.processes)) if increments is None else increments
-    record = Record(scene, integrator, dt, dw, first, commands if len(commands.places) else None)
+    record = MotionRecord(scene, integrator, dt, dw, first, commands if len(commands.places) else None)
     while record.steps < steps_of(commands):
         block = next_command(commands, record)
         drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
@@ -169,7 +169,7 @@ def located(
     return error
 
 
-def next_command(commands: Commands, record: Record) -> Commands:
+def next_command(commands: Commands, record: MotionRecord) -> Commands:
     """The command of the next step alone: a new decision, or the last control while it is held.
 
     In scenes with kinematic inputs it is that of all steps of a decision.

@@ -25,7 +25,7 @@ from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, nam
 from varpin.simulation.functions import ControlLaw, begins_elsewhere, require_law, undersampled
 from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
 from varpin.simulation.progress import Progress, Reporter
-from varpin.simulation.record import Record, function_error
+from varpin.simulation.record import MotionRecord, function_error
 from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
 from varpin.simulation.start import in_degrees, on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
@@ -203,7 +203,7 @@ class _Task(NamedTuple):
 
 def _integrated(
     task: _Task, integrator: Integrator, reporter: Reporter, *, replaceable: bool
-) -> tuple[Record, int | None, Integrator | None, bool]:
+) -> tuple[MotionRecord, int | None, Integrator | None, bool]:
     """Integrate a motion.
 
     Returns:
@@ -222,7 +222,7 @@ def _integrated(
         # The loop's check is for held controls.
         hold = None
     held = commands.hold > 1 and not callable(controls)
-    record = Record(scene, integrator, dt, task.dw, start, commands if linear else None, held=held)
+    record = MotionRecord(scene, integrator, dt, task.dw, start, commands if linear else None, held=held)
     # The cost of a sweep is linear in the number of joints, that of an elimination cubic.
     n = scene.robot.dof
     chunk = max(1, _CHUNK // (n + n**3 // 100))
@@ -247,7 +247,7 @@ def _integrated(
     return record, hold, None, False
 
 
-def _better_integrator(record: Record, segment: Segment, block: Commands) -> Integrator | None:
+def _better_integrator(record: MotionRecord, segment: Segment, block: Commands) -> Integrator | None:
     """The integrator that the steps of a segment after a record need, if it is not the record's."""
     q, v = (np.concatenate([getattr(record.last, name)[-1:], getattr(segment, name)]) for name in ("q", "v"))
     u = segment.u if len(segment.u) else block.u[:1]
@@ -255,7 +255,7 @@ def _better_integrator(record: Record, segment: Segment, block: Commands) -> Int
     return None if other.same_map(record.integrator) else other
 
 
-def _rolled_out(record: Record, state: object, block: Commands) -> Segment:
+def _rolled_out(record: MotionRecord, state: object, block: Commands) -> Segment:
     """The steps of a block.
 
     Raises:
@@ -274,7 +274,7 @@ def _rolled_out(record: Record, state: object, block: Commands) -> Segment:
 
 
 def _step_failure(
-    record: Record, failure: Failure, hold: int | None, decided: tuple[int, Floats] | None
+    record: MotionRecord, failure: Failure, hold: int | None, decided: tuple[int, Floats] | None
 ) -> StepFailure:
     """The error of a step that failed, its motion with a warning where an unstable control loop is the cause.
 

@@ -21,7 +21,7 @@ Row = TypeVar("Row")
 MARGIN = 0.02
 
 
-class Record:
+class RunTable:
     """A frozen dataclass of ``runs`` and of the facts common to all of them, saved as npz and written as CSV.
 
     A subclass defines the format of its files, the headings of its columns, and the columns that a notebook shows.

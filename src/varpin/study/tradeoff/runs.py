@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from varpin.study.tradeoff.records import Record
+from varpin.study.tradeoff.records import RunTable
 
 Job = TypeVar("Job")
 Key = TypeVar("Key", bound=Hashable)
@@ -55,7 +55,7 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False)
-class Tradeoff(Record):
+class Tradeoff(RunTable):
     """Runs of one motion or one problem.
 
     Attributes:
