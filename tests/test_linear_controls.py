@@ -190,10 +190,6 @@ def test_refusals() -> None:
     plan = vp.solve(problem, check=False)
     with refused(vp.InputError, "second_order"):
         vp.solve(links(integrator=vp.Midpoint()), second_order=True)
-    with refused(vp.InputError, "held"):
-        vp.Mpc(problem)
-    with refused(vp.InputError, "shifted"):
-        plan.shifted(1)
     with refused(vp.InputError, "linear"):
         vp.solve(problem.at(controls="held"), plan)
     with refused(vp.InputError, "before"):

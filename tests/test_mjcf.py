@@ -42,6 +42,8 @@ HINGE = '<joint name="ja" {}/>'
 MESH = '<asset><mesh name="tet" file="tet.obj"/></asset>'
 STANDS = body("s", BOX, 'pos="1 0 0" quat="0.8 0.3 0 0"', "")
 LEANING = 'pos="0 0 0.3" euler="0.4 -0.2 0.3"'
+EQUAL = "<equality>{}</equality>"
+INACTIVE = default('<equality active="false"/>')
 FRAME = '<frame pos="0 0 1" euler="0.1 0.2 0.3">{}</frame>'
 FILES = {
     "plain": one(),
@@ -169,7 +171,9 @@ def test_shapes_and_locked_joints(tmp_path):
         (one(MASS + TIP, '<option density="1.2" viscosity="0.01"/>'), "fluid"),
         (one(compiler='boundmass="0.1"'), "least masses"),
         (one(place='gravcomp="1"'), "gravity compensation"),
-        (one(MASS + TIP, '<equality><joint joint1="ja" joint2="jtip"/></equality>'), "equality constraints"),
+        (one(MASS + TIP, EQUAL.format('<joint joint1="ja" active="false"/>')), "inactive equality constraints"),
+        (one(MASS + TIP, INACTIVE, EQUAL.format('<connect body1="a"/>')), "inactive equality constraints"),
+        (one(MASS + TIP, EQUAL.format('<tendon tendon1="t"/>')), "equality constraints of kind tendon"),
         (one(MASS + TIP, '<tendon><fixed name="f"><joint joint="ja" coef="1"/></fixed></tendon>'), "tendons"),
     ],
 )
@@ -200,6 +204,11 @@ def test_what_is_left_out_is_told(tmp_path, caplog, text, facts):
         (one(MASS + body("b", joint=HINGE.format(""))), "'ja'"),
         (one(MASS + '<include file="arm.xml"/>'), ("arm.xml", "itself")),
         (one()[:-10] + "</mujoco>", "XML"),
+        (one(MASS + TIP, EQUAL.format('<connect body1="c" anchor="0 0 0"/>')), ("<connect> 'c'", "body 'c'")),
+        (one(MASS + TIP, EQUAL.format('<connect name="e" body1="a"/>')), ("<connect> 'e'", "anchor")),
+        (one(MASS + TIP, EQUAL.format('<weld name="e" site1="s" site2="t"/>')), ("<weld> 'e'", "site 's'")),
+        (one(MASS + TIP, EQUAL.format('<weld body1="a" relpose="1 0 0"/>')), ("relpose", "'1 0 0'", "7")),
+        (one(MASS + TIP, EQUAL.format('<joint name="e" joint1="ja" joint2="a"/>')), ("<joint> 'e'", "joint 'a'")),
         ("<mujoco/>", "joint"),
     ],
 )

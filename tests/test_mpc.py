@@ -427,3 +427,87 @@ def test_a_problem_at_another_time_and_state_is_that_of_its_grid(cost):
         own.at(q0=[0.1])
     with refused(vp.InputError, "t0"):
         own.at(t0="now")
+
+
+def test_a_shifted_plan_of_linear_controls_is_the_rest_of_it():
+    """Along the plan the shifted policy repeats its controls, and holds the last one beyond its end."""
+    plan = vp.solve(tracking(controls="linear").at(steps=8), tolerance=1e-10, check=False)
+    motion, N = plan.trajectory, 8
+    for by in (0, 3, N):
+        at = {"q0": motion.q[by], "v0": motion.v[by], "t0": by * 0.02}
+        again = plan.problem.at(**at).simulate(plan.shifted(by))
+        np.testing.assert_allclose(again.u_nodes[: N + 1 - by], plan.controls[by:], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(again.q[: N + 1 - by], motion.q[by:], rtol=0, atol=1e-11)
+    last = plan.shifted(N)
+    np.testing.assert_array_equal(last.u, np.tile(plan.controls[-1], (N, 1)))
+    np.testing.assert_array_equal(last.previous, np.tile(plan.controls[-1], (N, 1)))
+    np.testing.assert_array_equal(plan.shifted(2, before=[1.0, 2.0, 3.0]).before, [1.0, 2.0, 3.0])
+    with refused(vp.InputError, "decisions", "8"):
+        plan.shifted(N + 1)
+
+
+@pytest.mark.parametrize("rate", [False, True])
+def test_a_tick_with_linear_controls_is_its_problem_solved_anew(rate):
+    """Measured elsewhere than planned: enough iterations from the shifted plan end where a search from nothing does."""
+    problem = tracking(controls="linear", control_limits=(-15.0, 15.0)).at(steps=8)
+    if rate:
+        cost = problem.cost + vp.ControlRateCost(1e-6)
+        problem = vp.OptimalControlProblem(
+            problem.scene, cost, problem.q0, problem.v0, dt=0.02, steps=8, controls="linear"
+        )
+    mpc = vp.Mpc(problem, iterations=50, tolerance=1e-13)
+    first = mpc.plan(0.0, problem.q0, problem.v0)
+    q, v = first.trajectory.q[1] + 0.01, first.trajectory.v[1] - 0.02
+    tick = mpc.plan(0.02, q, v, previous=first)
+    before = first.controls[1] if rate else None
+    anew = vp.solve(problem.at(q0=q, v0=v, t0=0.02, before=before), tolerance=1e-13, check=False)
+    assert tick.status.converged
+    np.testing.assert_allclose(tick.controls, anew.controls, rtol=0, atol=1e-5)
+    assert tick.cost == pytest.approx(anew.cost, rel=1e-10)
+    # One iteration has one backward pass, and leaves a part of what the shifted plan has too much.
+    start = vp.solve(anew.problem, first.shifted(1, before), max_iterations=0, check=False)
+    quick = vp.Mpc(problem, iterations=1).plan(0.02, q, v, previous=first)
+    assert sum(item.backward_passes for item in quick.history) == quick.iterations == 1
+    assert anew.cost < quick.cost < anew.cost + 0.2 * (start.cost - anew.cost)
+
+
+def test_a_late_plan_of_linear_controls_leaves_the_one_before_to_act():
+    """The plant then moves as under the first plan's policy, whose lines are fed back at their begins."""
+    mpc = vp.Mpc(tracking(controls="linear"), budget=1e-9)
+    plant = vp.Plant(vp.Scene(vp.planar_chain(3), damping=0.35), vp.RungeKutta4())
+    run = mpc.run(plant, duration=0.4)
+    assert run.late[1:].all()
+    policy = run.plans[0].policy_on("velocity")
+    options = {"dt": 2e-3, "steps": 200, "controls": policy, "integrator": vp.RungeKutta4()}
+    alone = vp.simulate(plant.scene, np.zeros(3), np.zeros(3), **options)
+    np.testing.assert_allclose(run.motion.q, alone.q, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(run.motion.u, alone.u, rtol=0, atol=1e-7)
+
+
+def test_an_arm_follows_as_closely_with_linear_controls_as_with_held_ones():
+    """An arm with a payload, friction and noise that its controller does not know, at a tick of 50 ms."""
+    robot = vp.load_robot("z1")
+    begin = np.array([0.0, 1.2, -1.0, 0.3, 0.0, 0.0, -0.5])
+
+    def way(t):
+        return begin + 0.3 * np.sin(np.array([2.0, 1.5, 1.0, 2.0, 1.0, 1.0, 0.5]) * t)
+
+    scene = vp.Scene(robot, damping=0.1)
+    cost = vp.TrackingCost(way, 1e3) + vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
+    noise = vp.AdditiveNoise(0.02)
+    plant = vp.Plant(
+        vp.Scene(vp.load_robot("z1", payload=vp.Payload("link06", mass=0.2)), damping=0.15, noise=noise),
+        vp.Midpoint(),
+        substeps=4,
+    )
+    error = {}
+    for shape in ("held", "linear"):
+        problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(7), dt=0.05, steps=6, controls=shape)
+        mpc = vp.Mpc(problem, iterations=1)
+        for label, on, rng in (("alike", None, None), ("other", plant, 2)):
+            run = mpc.run(on, duration=1.0, rng=rng)
+            late = run.motion.t > 0.3
+            error[shape, label] = np.sqrt(((run.motion.q - [way(t) for t in run.motion.t])[late] ** 2).mean())
+    assert not about(run.warnings, "alternating ticks")
+    assert error["linear", "alike"] <= error["held", "alike"] < 0.01
+    assert error["linear", "other"] <= error["held", "other"] < 0.05

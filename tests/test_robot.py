@@ -274,6 +274,8 @@ class TestLocking:
             ("panda", {"panda_joint4": -1.4}),
             ("panda", {"panda_finger_joint1": 0.03}),
             ("talos_arm", {"arm_left_3_joint": 0.5}),
+            ("so100", {"wrist_roll": 0.2}),
+            ("z1", {"joint3": -0.2}),
             ("tiago_pro", {"torso_lift_joint": 0.2, "gripper_left_finger_joint": 0.3}),
         ],
     )
@@ -296,6 +298,21 @@ class TestLocking:
         assert (
             pytest.approx(shift, abs=1e-11) == jet_at(robot, elsewhere[keep], v[keep]).L - jet_at(whole, elsewhere, v).L
         )
+
+    @pytest.mark.parametrize("lock", [{}, {"wrist_roll": 0.2}, {"gripper": 0.3}])
+    def test_a_link_keeps_the_name_that_a_joint_elsewhere_has_too(self, tmp_path, lock):
+        robot = vp.load_robot("so100", lock=lock)
+        model = vp.load_robot("so100").model
+        q = np.array([lock.get(name, 0.3) for name in list(model.names)[1:]])
+        data = model.createData()
+        pin.framesForwardKinematics(model, data, q)
+        link = data.oMf[model.getFrameId("gripper", pin.FrameType.BODY)].translation
+        assert np.abs(link - data.oMf[model.getFrameId("gripper", pin.FrameType.JOINT)].translation).max() > 0.02
+        own = np.full(robot.dof, 0.3)
+        np.testing.assert_allclose(robot.frame_positions(own, "gripper"), link, atol=1e-14)
+        kinds = sorted(str(frame.type) for frame in robot.model.frames if frame.name == "gripper")
+        assert kinds == sorted(["BODY", "FIXED_JOINT" if "gripper" in lock else "JOINT"])
+        vp.replay(robot, own[None], dt=0.1, trace="gripper", html=tmp_path / "gripper.html")
 
     def test_of_a_leader_locks_its_followers(self, load):
         robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.03})

@@ -77,6 +77,8 @@ def shifted_commands(problem: OptimalControlProblem, previous: Solution, decisio
         and old.integrator == problem.integrator
         and old.control_limits is problem.control_limits
     )
+    if problem.linear:
+        return first_commands(problem, previous.shifted(decisions, before))
     if not (same and (old.dt, old.steps, old.hold) == (problem.dt, problem.steps, problem.hold)):
         return first_commands(problem, previous.shifted(decisions, before))
     rows = np.minimum(np.arange(R) + decisions, R - 1)

@@ -15,10 +15,12 @@ from varpin.arrays import Floats
 from varpin.control import Kept, OptimalControlProblem, Solution, kept, looked_at, replan, solve
 from varpin.control.costs import CostError
 from varpin.control.history import Status
+from varpin.control.solution import rest_of
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure
 from varpin.mechanics.inputs import in_parts_of_steps
+from varpin.mechanics.policy import FirstOrderHold
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.simulation.chatter import alternation
 from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
@@ -167,6 +169,10 @@ class Mpc:
     evaluated at the plant's time: the horizon recedes. Costs and limits of changes of the controls start from the last
     applied control.
 
+    Where the problem's controls are linear between nodes, they follow the plan's first line over the tick. The next
+    plan's line begins at a control of its own, which reacts to the measured state at once; a
+    :class:`ControlRateCost` makes the jump between the two small.
+
     Constraints hold along every horizon, and moving obstacles are predicted. Multipliers are kept from tick to tick,
     shifted with the plan. Each iteration of a tick is one of the augmented Lagrangian, so a plan satisfies its
     constraints to the accuracy of few iterations; ``MpcRun.constraints`` has it for every tick. A goal
@@ -195,8 +201,6 @@ class Mpc:
     def __post_init__(self) -> None:
         if not isinstance(self.problem, OptimalControlProblem):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
-        if self.problem.linear:
-            raise InputError("Mpc needs held controls: the problem's are linear between nodes")
         count("iterations", self.iterations, least=1)
         count("first_iterations", self.first_iterations, least=1)
         positive("tolerance", self.tolerance, "1")
@@ -213,7 +217,7 @@ class Mpc:
 
     @property
     def period(self) -> float:
-        """Time of a tick: how long a decision is held [s]."""
+        """Time of a tick: how long a decision is held, or the line between two decisions lasts [s]."""
         return self.problem.dt * self.problem.hold
 
     def plan(
@@ -235,8 +239,9 @@ class Mpc:
             v: (n,) or by joint name [rad/s or m/s].
             previous: The plan to start from; None in the first tick.
             decisions: Number of decisions since ``previous`` was made.
-            before: The last applied control, (m,) or by joint name, where changes of controls have a cost or a limit.
-                By default the control planned by ``previous``, and in the first tick that of the problem.
+            before: The last applied control, (m,) or by joint name, where changes of controls have a cost or a limit;
+                where controls are linear, the one at which the last line ended. By default the control planned by
+                ``previous``, and in the first tick that of the problem.
 
         Raises:
             InputError: q or v of a wrong shape, or not finite.
@@ -249,7 +254,9 @@ class Mpc:
         elif self.problem.remembers and previous is not None:
             before = previous.problem.before
             if decisions > 0:
-                before = previous.controls[min(decisions, len(previous.controls)) - 1]
+                # With linear controls the last line has ended at the control of this tick's own node.
+                last = decisions if self.problem.linear else decisions - 1
+                before = previous.controls[min(last, len(previous.controls) - 1)]
         problem = self.problem.at(q0=q, v0=v, t0=t, before=before)
         if previous is None:
             return self._first_plan(problem)[0]
@@ -278,8 +285,8 @@ class Mpc:
     ) -> MpcRun:
         """Control a simulated plant from the problem's initial state.
 
-        In each tick the first decision of the plan made from the state at its beginning acts. The first plan is made
-        before the run.
+        In each tick the first decision of the plan made from the state at its beginning acts, or, where controls are
+        linear between nodes, the line between its first two. The first plan is made before the run.
 
         Main args:
             plant: None for the problem's own scene, integrated more finely.
@@ -326,7 +333,7 @@ class Mpc:
         dt = self.period / plant.substeps
         generator = None if rng is None else np.random.default_rng(rng)
         q, v = problem.q0, problem.v0
-        before = problem.before
+        before = applied = problem.before
         (active, of_plan), age = self._first_plan(problem), 0
         method = _method(plant, active.trajectory, dt, noisy=generator is not None and plant.scene.processes > 0)
         parts: list[Trajectory] = []
@@ -346,10 +353,14 @@ class Mpc:
                     late[tick] = seconds[tick] > self.budget
                     active, age = (active, age + 1) if late[tick] else (fresh, 0)
                 plans.append(active)
-                u = _decision(active, age, q, v, before)
-                parts.append(_simulated(plant, method, dt, q, v, u, generator, parts))
+                begun = None
+                if problem.linear:
+                    # A fresh plan begins at the measured state; one that acts on, where the line before ended.
+                    begun = active.controls[0] if age == 0 or applied is None else applied
+                applied = _decision(active, age, q, v, before if begun is None else begun)
+                parts.append(_simulated(plant, method, dt, q, v, applied, generator, parts, begun))
                 q, v = parts[-1].q[-1], parts[-1].v[-1]
-                before = u if problem.remembers else None
+                before = applied if problem.remembers else None
                 if moving:
                     report(tick + 1, ticks, Nodes(tick * self.period + parts[-1].t, parts[-1].q, parts[-1].v))
                 elif report is not None:
@@ -467,12 +478,17 @@ def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
 
 
 def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None = None) -> Floats:
-    """Control (m,) of the plan's decision ``age`` with feedback at the state (q, v), after the control ``before``."""
-    policy, last = plan.policy_on("velocity"), len(plan.gains) - 1
+    """Control (m,) of the plan's decision ``age`` with feedback at the state (q, v), after the control ``before``.
+
+    Where controls are linear between nodes it is the control at the end of the tick, and ``before`` that at its begin.
+    """
+    policy, last, x = plan.policy_on("velocity"), len(plan.gains) - 1, np.concatenate([q, v])
+    if plan.problem.linear:
+        return rest_of(plan, policy, min(age, last)).control(0, x, before)
     if age > last and before is not None and policy.previous is not None:
         # The last decision is repeated, with itself as the previous control.
         before = before - policy.u[last] + policy.previous[last]
-    return policy.control(min(age, last), np.concatenate([q, v]), before)
+    return policy.control(min(age, last), x, before)
 
 
 def _unplanned(failure: StepFailure, motion: Trajectory) -> StepFailure:
@@ -507,10 +523,18 @@ def _simulated(
     u: Floats,
     rng: np.random.Generator | None,
     before: Sequence[Trajectory],
+    begun: Floats | None,
 ) -> Trajectory:
-    """The plant's motion in one tick; a failure holds the motion ``before``, too."""
-    # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
-    controls = in_parts_of_steps(plant.scene, u[None], q[None], v[None], dt * plant.substeps, plant.substeps)
+    """The plant's motion in one tick; a failure holds the motion ``before``, too.
+
+    Controls are linear in time from ``begun`` to ``u``, or hold ``u`` where ``begun`` is None.
+    """
+    controls: Floats | FirstOrderHold
+    if begun is None:
+        # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
+        controls = in_parts_of_steps(plant.scene, u[None], q[None], v[None], dt * plant.substeps, plant.substeps)
+    else:
+        controls = FirstOrderHold(np.vstack([begun, u])).refined(plant.substeps)
     options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": controls, "integrator": method}
     options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}
     try:

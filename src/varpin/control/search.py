@@ -62,9 +62,9 @@ ARMIJO, BACKTRACKING = 1e-5, 0.5
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it decreases after
-# long steps and increases after short ones.
+# long steps and increases after a very short one, or after two short ones in a row.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
-_LONG, _SHORT = 0.5, 0.01
+_LONG, _SHORT, _VERY_SHORT = 0.5, 0.1, 0.01
 # Errors that reject a trial.
 _TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
 # Greatest regularization with which a search may converge. Controls without effect or cost need some.
@@ -570,7 +570,7 @@ class _Search:
                 return ended
             if step.length >= _LONG:
                 self._relax()
-            elif step.length <= _SHORT and not self._stiffen() and not self._lift():
+            elif self._steps_short() and not self._stiffen() and not self._lift():
                 self.reason = "no step lowers the cost, whatever the regularization; "
                 self.reason += self._numbers(tolerance, afresh=True)
                 return Status.STALLED
@@ -712,6 +712,11 @@ class _Search:
         logger.info("%s: %s", self.label, item)
         report(item, self.trajectory)
 
+    def _steps_short(self) -> bool:
+        """Whether the last step is very short, or short like the one before it."""
+        lengths = [item.step for item in self.history[-2:]]
+        return lengths[-1] <= _VERY_SHORT or max(lengths) <= _SHORT and len(lengths) > 1
+
     def _relax(self) -> None:
         self.growth = min(1.0 / _GROWTH, self.growth / _GROWTH)
         self.regularization *= self.growth
@@ -792,7 +797,7 @@ class _Search:
                 elif trial.shares is not None:
                     tried = trial.shares
             left = [step for step in cut if step > length]
-            if not left or length > (_SHORT if bounds.parts == _PARTS else 0.0):
+            if not left or length > (_VERY_SHORT if bounds.parts == _PARTS else 0.0):
                 break
         hidden = 0.0
         if taken.motion is not None and taken.shares is not None:

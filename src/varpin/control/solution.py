@@ -236,36 +236,18 @@ class Solution(Frozen):
     def shifted(self, decisions: int, before: JointValues | None = None) -> LinearPolicy:
         """The policy from a later decision on, its last row repeated, to start the next horizon with.
 
-        ``before`` is the control before that decision, (m,) or by joint name; by default the plan's own.
+        Where controls are linear between nodes, the last control is held with the feedback of the plan's middle about
+        its last state: near the end of a plan the feedback of linear controls is no stable law.
+
+        ``before`` is the control before that decision, (m,) or by joint name; by default the plan's own. Where controls
+        are linear between nodes, it is the control of that decision itself, with which the first line begins.
 
         Raises:
-            InputError: ``decisions`` is not from 0 to R - 1, a control has a wrong shape, or controls are linear
-                between nodes.
+            InputError: ``decisions`` is not from 0 to R - 1, or a control has a wrong shape.
         """
-        if self.problem.linear:
-            raise InputError("a plan with linear controls is not shifted; plan with controls='held' for that")
         if not 0 <= count("decisions", decisions) < len(self.gains):
             raise InputError(f"decisions must be from 0 to {len(self.gains) - 1}, got {decisions}")
-        policy = self.policy
-        rows = np.minimum(np.arange(len(self.gains)) + decisions, len(self.gains) - 1)
-        u, previous_gains, previous = policy.u[rows], None, None
-        if policy.previous_gains is not None and policy.previous is not None:
-            # A repeated control has itself as its previous one.
-            previous_gains, previous = policy.previous_gains[rows], np.vstack([policy.previous[rows[:1]], u[:-1]])
-        return LinearPolicy(
-            u,
-            policy.gains[rows],
-            policy.reference[rows],
-            policy.hold,
-            policy.on,
-            (policy.limits[0], policy.limits[1]),
-            previous_gains=previous_gains,
-            previous=previous,
-            before=before,
-            period=policy.period,
-            joints=policy.joints,
-            servos=policy.servos,
-        )
+        return rest_of(self, self.policy, decisions, before)
 
     def policy_on(self, x: Literal["momentum", "velocity"], substeps: int = 1) -> LinearPolicy:
         """The policy on (q, p) or on (q, v), each control held over ``substeps`` times as many steps.
@@ -392,3 +374,37 @@ def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floa
     excess = [np.maximum(y - upper, lower - y).max(axis=0) for lower, upper in limits]
     most: Floats = np.maximum(0.0, np.max(excess, axis=0))
     return most
+
+
+def rest_of(plan: Solution, policy: LinearPolicy, decisions: int, before: JointValues | None = None) -> LinearPolicy:
+    """:meth:`Solution.shifted` of the plan's ``policy`` on (q, p) or (q, v)."""
+    N = len(policy.u)
+    later = np.arange(N) + decisions
+    rows, expected = np.minimum(later, N - 1), policy.u[:0]
+    u, reference = policy.u[rows], policy.reference[rows]
+    if plan.problem.linear:
+        beyond, motion = later > N - 1, plan.trajectory
+        second = motion.p if policy.on == "momentum" else motion.v
+        rows = np.where(beyond, N // 2, rows)
+        reference = np.where(beyond[:, None], np.append(motion.q[-1], second[-1]), reference)
+        expected = plan.controls[decisions, None]
+        before = expected[0] if before is None else before
+    elif policy.previous is not None:
+        expected = policy.previous[rows[:1]]
+    previous_gains = None if policy.previous_gains is None else policy.previous_gains[rows]
+    return LinearPolicy(
+        u,
+        policy.gains[rows],
+        reference,
+        policy.hold,
+        policy.on,
+        (policy.limits[0], policy.limits[1]),
+        previous_gains=previous_gains,
+        # A repeated control has itself as its previous one.
+        previous=None if previous_gains is None else np.vstack([expected, u[:-1]]),
+        before=before,
+        period=policy.period,
+        joints=policy.joints,
+        servos=policy.servos,
+        linear=policy.linear,
+    )

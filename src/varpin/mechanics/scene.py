@@ -23,11 +23,13 @@ from varpin.mechanics.constraints import (
     Bound,
     Constraint,
     CustomConstraint,
+    KinematicInput,
     bound_constraint,
     constraints_of,
     joined,
 )
 from varpin.mechanics.custom import CustomForce, CustomForces
+from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import (
     COUPLINGS,
     ELEMENTS,
@@ -45,7 +47,7 @@ from varpin.mechanics.forces import (
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
 from varpin.model import Robot, degrees_hint, require_sound
 from varpin.model.tree import block_ends, path_coordinates
-from varpin.support.checks import JointValues, as_floats, finite_array, joint_array
+from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 from varpin.support.weak import Weak
@@ -176,7 +178,7 @@ class Scene(Frozen):
         rest: JointValues = 0.0,
         actuation: ArrayLike | Sequence[str] | None = None,
         noise: Noise | Sequence[Noise] | None = None,
-        constraints: Constraint | Sequence[Constraint] = (),
+        constraints: Constraint | Sequence[Constraint | Literal["robot"]] | Literal["robot"] | None = None,
     ) -> None:
         """Describe a scene.
 
@@ -201,6 +203,9 @@ class Scene(Frozen):
             actuation: A matrix (n, m); or the names of the m actuated joints; every joint if left out.
             noise: A noise model, several of them, or their sum; see :mod:`varpin.mechanics.noise`.
             constraints: Constraints of the motion: closed loops, gears, rods, such as :class:`varpin.PointOnPoint`.
+                ``"robot"``, alone or among others, stands for the equality constraints of the robot's description
+                (:attr:`varpin.Robot.equalities`). If left out there are none, and the log warns if the description
+                gives some.
 
         Raises:
             InputError: A wrong shape; a value that is not finite; negative damping, friction or stiffness; a force,
@@ -221,7 +226,7 @@ class Scene(Frozen):
         values |= _forces(robot, forces, damping, friction, stiffness, rest)
         values["actuation"] = _served(robot, _actuation(robot, actuation), values["elements"])
         _refuse_noisy_servos(noise, values["elements"], robot)
-        values["constraints"] = constraints_of(constraints)
+        values["constraints"] = given_constraints(robot, constraints)
         bound, order = joined([bound_constraint(constraint, robot) for constraint in values["constraints"]])
         _require_positions(robot, values["actuation"], values["elements"], bound)
         values["actuation"], bound = _with_rates(values["actuation"], bound)
@@ -807,6 +812,38 @@ def resistance(
     given_damping = robot.damping if isinstance(damping, str) else 0.0 if damping is None else damping
     level = robot.friction if isinstance(friction, str) else 0.0 if friction is None else friction
     return not_negative("damping", given_damping, robot), not_negative("friction", level, robot)
+
+
+def given_constraints(
+    robot: Robot, given: Constraint | Sequence[Constraint | Literal["robot"]] | Literal["robot"] | None
+) -> tuple[Constraint, ...]:
+    """The constraints from the argument of a scene, with those of the robot's description in place of ``"robot"``.
+
+    Logs what the robot's description gives and the scene leaves out.
+    """
+    parts: Any = ("robot",) if is_one_of(given, ("robot",)) else () if given is None else given
+    words = sum(is_one_of(part, ("robot",)) for part in parts) if isinstance(parts, list | tuple) else 0
+    if not words:
+        found = constraints_of(parts)
+        undecided = given is None or (found and all(isinstance(part, KinematicInput) for part in found))
+        if undecided and robot.equalities:
+            named = [equality.name for equality in robot.equalities]
+            more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
+            logger.warning(
+                "robot %r: the scene leaves out what the description gives: equality constraints %s "
+                "(constraints='robot' takes them, constraints=() silences this message)",
+                robot.name,
+                ", ".join(named[:_NAMED]) + more,
+            )
+        return found
+    if words > 1:
+        raise InputError("constraints has the word 'robot' twice: it stands for all of the robot's description")
+    if not robot.equalities:
+        logger.warning("robot %r: constraints='robot' is none, because the description gives none", robot.name)
+    own = description_constraints(robot)
+    return constraints_of(
+        [each for part in parts for each in (own if is_one_of(part, ("robot",)) else (part,))],
+    )
 
 
 def _log_left_out(robot: Robot, *, damped: bool, dry: bool) -> None:

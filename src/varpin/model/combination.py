@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from varpin.errors import InputError
 from varpin.model.additions import on_base
+from varpin.model.equalities import prefixed
 from varpin.model.mimic import Tie, rebuild, tied_model
 from varpin.model.robot import Part, Robot
 from varpin.model.sources import Description
@@ -88,6 +89,7 @@ def combine(
         ),
         parts=tuple(parts),
         loops=tuple((word + a, word + b) for robot, word in pairs for a, b in robot.loops),
+        equalities=tuple(prefixed(each, word) for robot, word in pairs for each in robot.equalities),
     )
 
 

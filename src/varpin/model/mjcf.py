@@ -20,6 +20,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from varpin.errors import RobotError
+from varpin.model.equalities import Closure, End, Equality, Gear
 from varpin.model.urdf import captured_stderr, decoded, parsed
 
 logger = logging.getLogger(__name__)
@@ -41,7 +42,7 @@ _ROTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
 # Half the thickness of the plate that shows a plane [m].
 _PLATE = 5e-4
 # Elements with forces that the model leaves out.
-_LEFT_OUT = {"equality": "equality constraints", "tendon": "tendons", "deformable": "deformable bodies"}
+_LEFT_OUT = {"tendon": "tendons", "deformable": "deformable bodies"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +54,14 @@ class Mjcf:
         dynamics: The MJCF text from which Pinocchio builds the model.
         looks: The MJCF text from which Pinocchio builds the shapes; its mesh paths are absolute.
         remarks: What the model leaves out, in words.
+        equalities: Equality constraints as in the file, see :func:`varpin.model.equalities.at_reference`.
     """
 
     path: Path
     dynamics: str = field(repr=False)
     looks: str = field(repr=False)
     remarks: tuple[str, ...] = ()
+    equalities: tuple[Equality, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +192,7 @@ def read_mjcf(path: Path) -> Mjcf:
         reader.left_out["forces of a fluid"] += int(np.any(fluid))
     for tag, what in _LEFT_OUT.items():
         reader.left_out[what] += sum(len(part) for part in root.findall(tag))
+    equalities = _equalities(root, reader)
     texts = []
     try:
         for dynamics in (True, False):
@@ -203,7 +207,9 @@ def read_mjcf(path: Path) -> Mjcf:
                 if part.tag in _BODIES:
                     stand.append(_body(part, "main", reader, moving=False, dynamics=dynamics))
                 elif part.tag == "site":
-                    stand.append(reader.resolved(part, "main"))
+                    # Pinocchio drops sites of the world itself.
+                    around = ET.SubElement(stand, "body", {"name": f"world:{part.get('name', '')}"})
+                    around.append(reader.resolved(part, "main"))
                 elif part.tag == "geom" and not dynamics:
                     stand.extend(reader.look(part, "main"))
             keys = ET.SubElement(plain, "keyframe")
@@ -213,7 +219,7 @@ def read_mjcf(path: Path) -> Mjcf:
         raise reader.fault("its bodies are nested too deep") from None
     found = [f"{what} ({count})" for what, count in reader.left_out.items() if count]
     remarks = (f"{path} has {', '.join(found)}, which the model leaves out",) if found else ()
-    return Mjcf(path, texts[0], texts[1], remarks)
+    return Mjcf(path, texts[0], texts[1], remarks, equalities)
 
 
 def build_mjcf_model(path: Path, text: str) -> pin.Model:
@@ -304,6 +310,56 @@ def _classes(root: ET.Element, reader: _Reader) -> dict[str, dict[str, dict[str,
         read(top, "main", classes["main"])
         classes[top.get("class", "main")] = classes["main"]
     return classes
+
+
+def _equalities(root: ET.Element, reader: _Reader) -> tuple[Equality, ...]:
+    """The active equality constraints of bodies, sites and joints; the others are counted as left out."""
+    found: list[Equality] = []
+    for part in root.iterfind("equality/*"):
+        # Defaults are those of <equality>, whatever the kind.
+        plain = reader.resolved(ET.Element("equality", part.attrib), "main")
+        if plain.get("active") == "false":
+            reader.left_out["inactive equality constraints"] += 1
+        elif part.tag in ("connect", "weld"):
+            found.append(_closure(part, reader))
+        elif part.tag == "joint":
+            c = reader.numbers(part, "polycoef", (1, 2, 3, 4, 5)) if "polycoef" in part.attrib else np.array([0.0, 1.0])
+            # Left-out coefficients have their defaults, as in MuJoCo.
+            c = np.concatenate([c, np.array([0.0, 1.0, 0.0, 0.0, 0.0])[len(c) :]])
+            leader = part.get("joint2")
+            kept = c if leader else c[:1]
+            name, joint = _named(part, part.get("joint1", "")), part.get("joint1", "")
+            found.append(Gear(name, joint, leader, tuple(np.trim_zeros(kept, "b").tolist()) or (0.0,)))
+        else:
+            reader.left_out[f"equality constraints of kind {part.tag}"] += 1
+    return tuple(found)
+
+
+def _closure(part: ET.Element, reader: _Reader) -> Closure:
+    """A ``<connect>`` or a ``<weld>``."""
+    weld = part.tag == "weld"
+    turns = weld and ("torquescale" not in part.attrib or bool(reader.numbers(part, "torquescale", (1,)).any()))
+    if {"site1", "site2"} & set(part.attrib):
+        a, b = (End(part.get(key, ""), "site", pin.SE3.Identity()) for key in ("site1", "site2"))
+        return Closure(_named(part, a.frame), a, b, turns)
+    first, second = part.get("body1", ""), part.get("body2") or "world"
+    name = _named(part, first)
+    anchor = pin.SE3.Identity()
+    if "anchor" in part.attrib or not weld:
+        anchor.translation = reader.numbers(part, "anchor", (3,))
+    if not weld:
+        return Closure(name, End(first, "body", anchor), End(second, "body", None), turns)
+    given = reader.numbers(part, "relpose", (7,)) if "relpose" in part.attrib else np.zeros(7)
+    place = None
+    if given[3:].any():
+        w, x, y, z = given[3:] / np.linalg.norm(given[3:])
+        place = pin.SE3(pin.Quaternion(w, x, y, z).matrix(), given[:3])
+    return Closure(name, End(first, "body", place), End(second, "body", anchor), turns)
+
+
+def _named(part: ET.Element, of: str) -> str:
+    """An equality constraint in words: its name, or the body, site or joint that comes first."""
+    return f"<{part.tag}> {part.get('name', of)!r}"
 
 
 def _assets(root: ET.Element, reader: _Reader) -> ET.Element:

@@ -8,7 +8,8 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.errors import InputError, UnknownFrame
+from varpin.errors import InputError
+from varpin.model.tree import frame_index
 from varpin.support.checks import as_floats, finite_array, real, require_finite
 
 
@@ -71,10 +72,7 @@ def carry(model: pin.Model, payload: Sequence[Payload], robot: str) -> None:
     for part in payload:
         if not isinstance(part, Payload):
             raise InputError(f"payload must be a varpin.Payload or a sequence of them, got {type(part).__name__}")
-        names = [frame.name for frame in model.frames]
-        if part.frame not in names:
-            raise UnknownFrame(part.frame, names, robot)
-        frame = model.frames[names.index(part.frame)]
+        frame = model.frames[frame_index(model, part.frame, robot)]
         if frame.parentJoint == 0:
             raise InputError(
                 f"payload of robot {robot!r}: frame {part.frame!r} belongs to the base, which does not move"

@@ -18,8 +18,9 @@ from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
 from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
 from varpin.model.degrees import ADVICE, looks_like_degrees
+from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
-from varpin.model.mimic import Tie, joint_index, rebuild, tied_model
+from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model
 from varpin.model.mjcf import build_mjcf_model, build_mjcf_shapes
 from varpin.model.payload import Payload, carry
 from varpin.model.sources import Description, describe, hang_shapes
@@ -77,8 +78,9 @@ class Robot(Frozen):
         visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
         group_states: The postures that :meth:`posture` reads.
         parts: The robots of a combined robot, see :func:`combine`; empty for others.
-        loops: Pairs of frames that the description closes to loops (``<loop_joint>`` of a URDF file). The tree leaves
-            them open; constraints of a scene close them.
+        loops: Pairs of frames that the description closes to loops (``<loop_joint>`` of a URDF file, ``<connect>`` and
+            ``<weld>`` of an MJCF file). The tree leaves them open; constraints of a scene close them.
+        equalities: Equality constraints of an MJCF file; ``Scene(constraints="robot")`` takes them.
     """
 
     name: str
@@ -96,6 +98,7 @@ class Robot(Frozen):
     group_states: tuple[Posture, ...] = field(default=(), repr=False)
     parts: tuple[Part, ...] = field(default=(), repr=False)
     loops: tuple[tuple[str, str], ...] = ()
+    equalities: tuple[Equality, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
         locked = f", {len(self.locked)} locked" if self.locked else ""
@@ -462,6 +465,7 @@ def _built(
         visuals=visuals,
         group_states=of_joints(description.postures, description.model.names),
         loops=description.loops,
+        equalities=description.equalities,
     )
     return robot, description
 
@@ -500,10 +504,20 @@ def _lock(
         else:
             reference[kind.idx_q : kind.idx_q + kind.nq] = position
     joints = sorted(positions)
+    # pin.buildReducedModel looks frames up by name alone, where a link and a joint may have the same.
+    renamed = model.copy()
+    names: dict[str, str] = {}
+    for k in set(range(1, model.nframes)).difference(joint_frames(model)):
+        frame = renamed.frames[k]
+        names[f"{k} {frame.name}"] = frame.name
+        frame.name = f"{k} {frame.name}"
     if visuals is None:
-        reduced = pin.buildReducedModel(model, joints, reference)
+        reduced = pin.buildReducedModel(renamed, joints, reference)
     else:
-        reduced, visuals = pin.buildReducedModel(model, visuals, joints, reference)
+        reduced, visuals = pin.buildReducedModel(renamed, visuals, joints, reference)
+    for frame in reduced.frames:
+        frame.name = names.get(frame.name, frame.name)
+    if visuals is not None:
         hang_shapes(visuals, reduced, reduced)
     reduced.gravity = model.gravity
     left = joint_index(reduced)

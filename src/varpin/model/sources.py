@@ -11,6 +11,7 @@ import pinocchio as pin
 
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.model import example_robot_data, robot_descriptions
+from varpin.model.equalities import Closure, Equality, at_reference
 from varpin.model.mimic import (
     JOINT_PARAMETERS,
     Tie,
@@ -46,6 +47,7 @@ class Description:
         remarks: What the source leaves out, in words.
         postures: Postures of the joints of ``model``.
         loops: Pairs of frames that the source closes to loops, and the tree leaves open.
+        equalities: Equality constraints of the source.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Description:
     remarks: tuple[str, ...] = ()
     postures: tuple[Posture, ...] = ()
     loops: tuple[tuple[str, str], ...] = ()
+    equalities: tuple[Equality, ...] = ()
 
 
 def models_dir() -> Path:
@@ -287,7 +290,15 @@ def _of_file(
 def _of_mjcf(path: Path, name: str) -> Description:
     mjcf = read_mjcf(path)
     description = _of_model(build_mjcf_model(path, mjcf.dynamics), name, None)
-    return replace(description, mjcf=path, expanded=mjcf.looks, remarks=mjcf.remarks)
+    equalities = at_reference(mjcf.equalities, description.model, path)
+    return replace(
+        description,
+        mjcf=path,
+        expanded=mjcf.looks,
+        remarks=mjcf.remarks,
+        loops=tuple((each.a.frame, each.b.frame) for each in equalities if isinstance(each, Closure)),
+        equalities=equalities,
+    )
 
 
 def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:

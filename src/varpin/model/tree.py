@@ -138,7 +138,7 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
 
 
 def frame_index(model: pin.Model, frame: str, robot: str) -> int:
-    """Index of a frame by its name.
+    """Index of a frame by its name: the link's where a joint that may be elsewhere has the same.
 
     Raises:
         UnknownFrame: There is no such frame.
@@ -146,7 +146,8 @@ def frame_index(model: pin.Model, frame: str, robot: str) -> int:
     names = [item.name for item in model.frames]
     if not isinstance(frame, str) or frame not in names:
         raise UnknownFrame(str(frame), names, robot)
-    return names.index(frame)
+    found = [index for index, name in enumerate(names) if name == frame]
+    return next((index for index in found if model.frames[index].type == pin.FrameType.BODY), found[0])
 
 
 def frame_on_body(model: pin.Model, frame: str, robot: str) -> tuple[int, Floats, Floats]:

@@ -77,7 +77,7 @@ def inspect_robot(
         robot = source
     else:
         robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic, base=base, armature=armature)
-    scene = Scene(robot, gravity=gravity, damping=0.0)
+    scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
     velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
     with np.errstate(all="ignore"):
@@ -382,6 +382,9 @@ def _loop_warnings(robot: Robot) -> Iterator[str]:
     if robot.loops:
         pairs = ", ".join(f"{a!r} on {b!r}" for a, b in robot.loops)
         yield f"the description has loops, which the tree leaves open for a scene's constraints to close: {pairs}"
+    if robot.equalities:
+        named = ", ".join(equality.name for equality in robot.equalities)
+        yield f"the description has equality constraints, which a scene uses with constraints='robot': {named}"
 
 
 def _position(value: float | tuple[float, ...]) -> str:

@@ -35,6 +35,8 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
     if loops := scene.open_loops:
         (a, b), pairs = loops[0], ", ".join(f"{a!r} on {b!r}" for a, b in loops)
         closed = f"varpin.Scene(robot, constraints=[varpin.PointOnPoint({a!r}, {b!r}), ...])"
+        if scene.robot.equalities:
+            closed = "varpin.Scene(robot, constraints='robot')"
         yield LOOPS, f"{LOOPS}, and the motion is that of a tree: {pairs}; {closed} closes them"
     if not any(scene.bounded):
         return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,12 @@ from varpin.io.scenefile.spec import CostSpec, ForceSpec
 from varpin.io.scenefile.table import SceneFileError, Table, suggestion
 from varpin.io.scenefile.terms import Given
 from varpin.mechanics.constraints import Constraint, KinematicInput
+from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import CoulombFriction, Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
-from varpin.mechanics.scene import Scene, closest_controls, resistance
+from varpin.mechanics.scene import Scene, closest_controls, given_constraints, resistance
 from varpin.model import Robot, combine, load_robot, looks_like_degrees
+from varpin.model.tree import frame_index
 
 if TYPE_CHECKING:
     from varpin.io.scenefile.tables import RobotKeys
@@ -259,7 +261,7 @@ def joints_of_frame(robot: Robot, frame: str) -> NDArray[np.bool_]:
     """Whether each coordinate (n,) moves a frame; all False if there is no such frame."""
     model, moving = robot.free_model, np.zeros(robot.dof, dtype=np.bool_)
     if model.existFrame(frame):
-        for joint in model.supports[model.frames[model.getFrameId(frame)].parentJoint]:
+        for joint in model.supports[model.frames[frame_index(model, frame, robot.name)].parentJoint]:
             if joint > 0:
                 moving[robot.tree.coordinate[joint - 1]] = True
     return moving
@@ -374,7 +376,7 @@ def _on_robot(spec: SceneSpec, robot: Robot) -> Layout:
         rest=rest,
         forces=forces,
         frame_forces=tuple(_on_frames(read.force, read.table, robot) for read in spec.frame_forces),
-        constraints=tuple(_on_frames(read.constraint, read.table, robot) for read in spec.constraints),
+        constraints=_constraints(spec, robot),
         q0=q0,
         v0=initial.spread("v", spec.v0, names),
         actuated=actuated,
@@ -487,6 +489,21 @@ def _force(spec: ForceSpec, robot: Robot) -> JointForces:
     except InputError as error:
         raise spec.table.error("", str(error)) from None
     return found
+
+
+def _constraints(spec: SceneSpec, robot: Robot) -> tuple[Constraint, ...]:
+    """The constraints of a file, after a check that they fit the robot."""
+    given: list[Constraint | Literal["robot"]] = []
+    for read in spec.constraints:
+        if read.constraint is not None:
+            given.append(_on_frames(read.constraint, read.table, robot))
+            continue
+        try:
+            description_constraints(robot)
+        except InputError as error:
+            raise read.table.error("", str(error)) from None
+        given.append("robot")
+    return given_constraints(robot, given or None)
 
 
 def _on_frames(part: _OnFrames, table: Table, robot: Robot) -> _OnFrames:

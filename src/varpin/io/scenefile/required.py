@@ -119,7 +119,9 @@ def _resting(layout: Layout) -> Floats:
 
 def _pushed(layout: Layout, scene: Scene) -> Mask:
     """Joints (n,) on which springs, stops and forces on frames act in the initial configuration."""
-    floating = Scene(layout.robot, gravity=False, damping=0.0, forces=scene.forces, actuation=layout.actuation)
+    floating = Scene(
+        layout.robot, gravity=False, damping=0.0, forces=scene.forces, actuation=layout.actuation, constraints=()
+    )
     return np.asarray(floating.holding_torque(layout.q0) != 0.0)
 
 
@@ -128,7 +130,7 @@ def _weighed(layout: Layout) -> Mask:
     robot = layout.robot
     if layout.spec.gravity is False:
         return np.zeros(robot.dof, dtype=np.bool_)
-    bare = Scene(robot, gravity=layout.spec.gravity, damping=0.0)
+    bare = Scene(robot, gravity=layout.spec.gravity, damping=0.0, constraints=())
     rng = np.random.default_rng(0)
     samples = [layout.q0, *rng.uniform(-2.0, 2.0, (3, robot.dof))]
     torque = np.abs([lagrangian_jet(bare, q, np.zeros(robot.dof), backend="pinocchio").Lq for q in samples]).max(axis=0)

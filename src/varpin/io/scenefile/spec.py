@@ -93,11 +93,11 @@ class ConstraintSpec:
     """A constraint.
 
     Attributes:
-        constraint: The constraint.
+        constraint: The constraint; None for those of the robot's description.
         table: Its table, for messages.
     """
 
-    constraint: Constraint
+    constraint: Constraint | None
     table: Table
 
 

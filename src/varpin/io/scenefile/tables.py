@@ -487,7 +487,7 @@ FORCE_KEYS = {name: _force_keys(kind) for name, kind in FORCES.items()} | {
 CONSTRAINT_KEYS = {
     name: _keys_of_fields(kind, _OF_CONSTRAINTS | (dict.fromkeys("ab", TEXT) if kind is FrameOnFrame else {}))
     for name, kind in CONSTRAINTS.items()
-}
+} | {"robot": create_model("RobotConstraints", __base__=TypedKeys)}
 PLAN_CONSTRAINT_KEYS = {name: _plan_constraint_keys(name, kind) for name, kind in PLAN_CONSTRAINTS.items()}
 INTEGRATOR_KEYS = {name: _integrator_keys(kind) for name, kind in INTEGRATORS.items()}
 COST_KEYS = {name: _cost_keys(name, term) for name, term in TERMS.items()}
@@ -681,6 +681,8 @@ def _force(table: Table, keys: TypedKeys) -> ForceSpec | FrameForceSpec:
 
 
 def _constraint(table: Table, keys: TypedKeys) -> ConstraintSpec:
+    if keys.type not in CONSTRAINTS:
+        return ConstraintSpec(None, table)
     given = {name: _point(value) for name, value in _given(keys).items()}
     if "placement" in given:
         given["placement"] = [given["placement"][row : row + 4] for row in range(0, 16, 4)]

@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from varpin.arrays import Floats
 from varpin.model import Robot, readable_geometry
-from varpin.model.tree import joint_axis, z_to
+from varpin.model.tree import frame_index, joint_axis, z_to
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ class Picture:
     def frame(self, name: str) -> tuple[int, pin.SE3]:
         """The body of a frame, -1 for the base, and the frame's placement on it."""
         model = self.robot.free_model
-        frame = model.frames[model.getFrameId(name)]
+        frame = model.frames[frame_index(model, name, self.robot.name)]
         return frame.parentJoint - 1, _turns(self.robot)[frame.parentJoint] * frame.placement
 
     def moving_nodes(self, root: str) -> list[str]:

@@ -1,0 +1,177 @@
+"""Equality constraints of MJCF files are MuJoCo's: which configurations keep them, and motions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from battery.loops import Closure, Dynamics
+
+import varpin as vp
+
+mujoco = pytest.importorskip("mujoco")
+
+MASS = '<inertial pos="0.02 0.05 0.1" mass="1.3" diaginertia="0.02 0.03 0.025" quat="0.9 0.2 0.1 0"/>'
+PLACE = 'pos="0.1 0.02 0.2" quat="0.9 0.1 0.2 0.3"'
+SITE = '<site name="{}" pos="0.1 -0.05 0.02" euler="0.3 0.2 -0.4"/>'
+
+RAIL = '<site name="rail" type="capsule" size="0.01" fromto="0 0 0.1 0.2 0.1 0.4"/>'
+
+
+def joints(name, ref=0.0):
+    axes = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+    return "".join(f'<joint name="{name}{k}" axis="{axes[k]}" pos="0.03 0 0.05" ref="{ref}"/>' for k in axes)
+
+
+# Two branches of six and four joints; a joint, a body and a site have one name.
+ARM = (
+    f'<body name="a" {PLACE}>{joints("a", 0.2)}{MASS}{SITE.format("pad")}'
+    f'<body name="b" {PLACE}><joint name="a" type="slide" axis="0 1 1"/>{joints("b")}{MASS}{SITE.format("a")}</body>'
+    f'</body><body name="ay" pos="0.3 0.2 0.4">{joints("c", -0.1)}{MASS}{SITE.format("tool")}</body>'
+    f'<body name="stand" pos="0.5 0 0.3" euler="0.1 0.2 0.3">{SITE.format("post")}{RAIL}</body>{SITE.format("mark")}'
+)
+
+
+def document(equality, *sections, world=ARM, compiler='angle="radian"'):
+    inside = "".join(sections)
+    return (
+        f"<mujoco><compiler {compiler}/><option><flag contact='disable' limit='disable'/></option>{inside}<worldbody>"
+        f"{world}</worldbody><equality>{equality}</equality></mujoco>"
+    )
+
+
+RELPOSE = 'relpose="0.3 0.1 0.2 0.8 0.2 0.1 0.4"'
+KINDS = {
+    "connect to the world": '<connect body1="b" anchor="0.1 0.2 0.3"/>',
+    "connect of two bodies": '<connect body1="ay" body2="b" anchor="0.1 0.2 0.3"/>',
+    "connect to a body that stands": '<connect body1="stand" body2="b" anchor="0.1 0.2 0.3"/>',
+    "connect of two sites": '<connect site1="pad" site2="a"/>',
+    "connect to a site of a body that stands": '<connect site1="a" site2="post"/>',
+    "connect to a site between two points": '<connect site1="a" site2="rail"/>',
+    "connect to a site of the world": '<connect site1="mark" site2="a"/>',
+    "joint on joint": '<joint joint1="ax" joint2="bz"/>',
+    "joint on joint by a polynomial": '<joint joint1="ax" joint2="cz" polycoef="0.1 0.7 -0.3 0.2 0.05"/>',
+    "joint on joint, a line": '<joint joint1="ax" joint2="cz" polycoef="0.1 0.7"/>',
+    "joint on joint with an offset alone": '<joint joint1="ax" joint2="cz" polycoef="0.1"/>',
+    "slide on joint": '<joint joint1="a" joint2="az" polycoef="0 0.1 0 0 0"/>',
+    "joint alone": '<joint joint1="ay" polycoef="0.3 1 2 0 0"/>',
+}
+WELDS = {
+    "weld to the world": '<weld body1="b"/>',
+    "weld of two bodies": '<weld body1="ay" body2="b"/>',
+    "weld at an anchor": '<weld body1="ay" body2="b" anchor="0.1 0.2 0.3"/>',
+    "weld by a pose": f'<weld body1="ay" body2="b" {RELPOSE}/>',
+    "weld by a pose at an anchor": f'<weld body1="ay" body2="b" anchor="0.1 0.2 0.3" {RELPOSE}/>',
+    "weld of sites": '<weld site1="tool" site2="a"/>',
+    "weld of points": '<weld body1="ay" body2="b" anchor="0.1 0.2 0.3" torquescale="0"/>',
+}
+
+
+def both(folder, text):
+    """varpin's robot, and MuJoCo's model and data."""
+    path = folder / "arm.xml"
+    path.write_text(text)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    return vp.load_robot(path), model, mujoco.MjData(model)
+
+
+def rows(model, data, q):
+    """MuJoCo's residuals (c,) and Jacobian (c, n) of its equality constraints."""
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    equal = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+    return data.efc_pos[equal].copy(), data.efc_J.reshape(-1, model.nv)[equal].copy()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_residuals_are_mujoco_s(tmp_path, kind, caplog):
+    robot, model, data = both(tmp_path, document(KINDS[kind]))
+    scene = vp.Scene(robot, constraints="robot")
+    assert not caplog.records
+    for q in np.random.default_rng(0).uniform(-0.9, 0.9, (3, robot.dof)):
+        for mine, its in zip(scene.constraint_values(q), rows(model, data, q), strict=True):
+            np.testing.assert_allclose(mine, its, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", [*KINDS, *WELDS])
+def test_configurations_are_mujoco_s(tmp_path, kind):
+    robot, model, data = both(tmp_path, document((KINDS | WELDS)[kind]))
+    scene = vp.Scene(robot, constraints="robot")
+    rng = np.random.default_rng(1)
+    for _ in range(2):
+        q = vp.assemble(scene, model.qpos0 + rng.uniform(-0.3, 0.3, robot.dof))
+        g, C = rows(model, data, q)
+        np.testing.assert_allclose(g, 0.0, rtol=0, atol=1e-11)
+        mine = scene.constraint_values(q)[1]
+        # The same velocities keep them.
+        assert np.linalg.matrix_rank(C, 1e-9) == np.linalg.matrix_rank(mine, 1e-9) == len(mine)
+        np.testing.assert_allclose(C @ (np.eye(robot.dof) - np.linalg.pinv(mine) @ mine), 0.0, rtol=0, atol=1e-11)
+
+
+def rod(name, place, length, inside="", at="0 0 0"):
+    """A rod along its x axis that turns about y."""
+    return (
+        f'<body name="{name}" pos="{place}" euler="{at}"><joint name="{name}" axis="0 1 0" class="rod"/><geom '
+        f'type="capsule" fromto="0 0 0 {length} 0 0" size="0.01" mass="{length}"/>{inside}</body>'
+    )
+
+
+STIFF = (
+    '<default><equality solref="4e-4 1" solimp="0.9999 0.9999 0.001"/><default class="rod"><joint damping="0.002"/>'
+    "</default></default>"
+)
+PIN, HOLE = '<site name="pin" pos="0.4 0 0"/>', '<site name="hole" pos="0.35 0 0"/>'
+FOUR_BAR = document(
+    '<connect site1="pin" site2="hole"/>',
+    STIFF,
+    world=rod("crank", "0 0 0", 0.2, rod("coupler", "0.2 0 0", 0.4, PIN)) + rod("rocker", "0.5 0 0", 0.35, HOLE),
+)
+
+
+def finger(side, x, sign):
+    """Driver and coupler, and the two links that they keep parallel, as in Robotiq's 2F-85."""
+    coupler = rod(f"{side}_coupler", "0.04 0 0", 0.03, at=f"0 {sign * 0.9} 0")
+    follower = rod(f"{side}_follower", "0.05 0 0", 0.05, at=f"0 {-sign * 0.4} 0")
+    return rod(f"{side}_driver", f"{x} 0 0", 0.04, coupler, at=f"0 {-1.57 + sign * 0.7} 0") + rod(
+        f"{side}_spring_link", f"{0.4 * x} 0 0.01", 0.05, follower, at=f"0 {-1.57 + sign * 0.5} 0"
+    )
+
+
+GRIPPER = document(
+    '<connect body1="right_follower" body2="right_coupler" anchor="-0.01 0 0.02"/>'
+    '<connect body1="left_follower" body2="left_coupler" anchor="-0.01 0 0.02"/>'
+    '<joint joint1="right_driver" joint2="left_driver" polycoef="0 -1 0 0 0"/>',
+    STIFF,
+    world=finger("right", 0.03, 1.0) + finger("left", -0.03, -1.0),
+)
+
+
+def mujoco_motion(model, data, q, steps, dt):
+    """Positions (n,) of the joints after so many steps of MuJoCo, and the largest miss of its equality constraints."""
+    model.opt.timestep, model.opt.integrator = dt, mujoco.mjtIntegrator.mjINT_RK4
+    data.qpos[:], data.qvel[:] = q, 0.0
+    mujoco.mj_step(model, data, steps)
+    return data.qpos.copy(), np.abs(rows(model, data, data.qpos)[0]).max()
+
+
+@pytest.mark.parametrize(("text", "start"), [(FOUR_BAR, [-1.2, 1.0, -1.2]), (GRIPPER, np.zeros(8))])
+def test_motions_are_mujoco_s(tmp_path, text, start):
+    robot, model, data = both(tmp_path, text)
+    scene = vp.Scene(robot, constraints="robot", damping="robot")
+    q0 = vp.assemble(scene, start)
+    motion = vp.simulate(scene, q0, np.zeros(robot.dof), dt=0.01, steps=100, integrator=vp.Gauss(3))
+    its, miss = mujoco_motion(model, data, q0, 2500, 4e-4)
+    assert miss < 1e-7
+    assert np.abs(motion.q[-1] - q0).max() > 0.3
+    np.testing.assert_allclose(motion.q[-1], its, rtol=0, atol=1e-6)
+
+
+def test_the_four_bar_is_that_of_index_reduced_equations(tmp_path):
+    robot, *_ = both(tmp_path, FOUR_BAR)
+    scene = vp.Scene(robot, constraints="robot", damping="robot")
+    q0 = vp.assemble(scene, [-1.2, 1.0, -1.2])
+    motion = vp.simulate(scene, q0, np.zeros(3), dt=0.01, steps=50, integrator=vp.Gauss(4))
+    pinned = Closure("point", "pin", "hole", np.eye(3)[[0, 2]])
+    exact = Dynamics(robot.model, (pinned,), scene.gravity, lambda t, q, v: -scene.damping * v)
+    q, v = exact.motion(q0, np.zeros(3), motion.t[[0, -1]])
+    np.testing.assert_allclose(motion.q[-1], q[-1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.v[-1], v[-1], rtol=0, atol=1e-8)
