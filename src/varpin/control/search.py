@@ -715,7 +715,7 @@ class _Search:
     def _steps_short(self) -> bool:
         """Whether the last step is very short, or short like the one before it."""
         lengths = [item.step for item in self.history[-2:]]
-        return lengths[-1] <= _VERY_SHORT or max(lengths) <= _SHORT and len(lengths) > 1
+        return lengths[-1] <= _VERY_SHORT or (max(lengths) <= _SHORT and len(lengths) > 1)
 
     def _relax(self) -> None:
         self.growth = min(1.0 / _GROWTH, self.growth / _GROWTH)
