@@ -504,11 +504,24 @@ def _lock(
         else:
             reference[kind.idx_q : kind.idx_q + kind.nq] = position
     joints = sorted(positions)
+    # Pinocchio looks up the frames of joints by their names alone, which in MJCF files bodies and sites may have, too.
+    veiled = {
+        f"{frame.name}:{k}": k
+        for k, frame in enumerate(model.frames)
+        if frame.type != pin.FrameType.JOINT and frame.name in index
+    }
+    if veiled:
+        model = model.copy()
+        for name, k in veiled.items():
+            model.frames[k].name = name
     if visuals is None:
         reduced = pin.buildReducedModel(model, joints, reference)
     else:
         reduced, visuals = pin.buildReducedModel(model, visuals, joints, reference)
         hang_shapes(visuals, reduced, reduced)
+    for frame in reduced.frames:
+        if frame.name in veiled:
+            frame.name = frame.name.rpartition(":")[0]
     reduced.gravity = model.gravity
     left = joint_index(reduced)
     ties = tuple(
