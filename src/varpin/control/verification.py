@@ -308,14 +308,14 @@ def _violations(
     motions = [rollout(problem.scene, integrator, problem.q0, problem.v0, way, h) for way in ways]
     found = []
     for bound, whole in zip(fine, problem.bound_constraints, strict=True):
-        planned = _excess(whole, whole.value(plan.q, plan.v, plan.u))
+        planned = _excess(whole, whole.value(plan.q, plan.v, problem.control_rows(plan)))
         worst, where = [], ""
         for motion, failure in motions:
             if failure is not None:
                 worst.append(np.nan)
                 where = ""
                 continue
-            excess = _excess(bound, bound.value(motion.q, motion.v, motion.u))
+            excess = _excess(bound, bound.value(motion.q, motion.v, problem.control_rows(motion)))
             if not bound.of_controls and not bound.source.equality:
                 # The plan can change nothing before its first node.
                 excess[: substeps - 1] = 0.0
