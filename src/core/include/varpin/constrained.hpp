@@ -702,6 +702,10 @@ class ConstrainedStepper {
         return sum;
     }
     double norm(const double* a) const { return std::sqrt(inner(a, a)); }
+    // y += s x.
+    static void add_scaled(int size, double s, const double* x, double* y) {
+        detail::subtract_scaled(y, -s, x, 0, size);
+    }
 
     // Read the goals of kinematic inputs from the step's force.
     void take_goals() {
@@ -751,18 +755,18 @@ class ConstrainedStepper {
         PathState& path = state.path;
         for (int again = 0; again < 2; ++again) {
             find_impulse(here, path.momentum.data(), state.rate.data(), total.data());
+            across(here.jet, total.data(), y.data());
             for (int c = 0; c < n; ++c) {
-                path.p[c] = path.p[c].plus(-across(here.jet, total.data(), c));
+                path.p[c] = path.p[c].plus(-y[c]);
                 path.momentum[c] = path.p[c].high;
             }
         }
     }
 
-    // (C' Lam)_c.
-    double across(const ConstraintJet& jet, const double* Lam, int c) const {
-        double sum = 0.0;
-        for (int r = 0; r < m; ++r) sum += jet.C[r * n + c] * Lam[r];
-        return sum;
+    // C' Lam (n).
+    void across(const ConstraintJet& jet, const double* Lam, double* out) const {
+        std::fill(out, out + n, 0.0);
+        for (int r = 0; r < m; ++r) add_scaled(n, Lam[r], &jet.C[r * n], out);
     }
 
     const ConstraintJet& jet_at(int k) const { return k == 0 ? here.jet : point[k - 1]; }
@@ -852,7 +856,8 @@ class ConstrainedStepper {
         for (int again = 0; again < 2; ++again) {
             for (int i = 0; i < n; ++i) y[i] = trial.p[i].high;
             find_impulse(there, y.data(), rate.data(), total.data());
-            for (int c = 0; c < n; ++c) trial.p[c] = trial.p[c].plus(-across(there.jet, total.data(), c));
+            across(there.jet, total.data(), y.data());
+            for (int c = 0; c < n; ++c) trial.p[c] = trial.p[c].plus(-y[c]);
             for (int r = 0; r < m; ++r) last[r] += total[r];
         }
         return Outcome::solved;
@@ -1036,10 +1041,8 @@ class ConstrainedStepper {
             for (int a = 0; a < r; ++a) {
                 const int row = here.order[a];
                 const double own = impulse[k * m + row];
-                for (int c = 0; c < n; ++c) {
-                    pushed[k * n + c] += jet.C[row * n + c] * own;
-                    push_size[k * n + c] += std::abs(jet.size[row * n + c] * own);
-                }
+                add_scaled(n, own, &jet.C[row * n], &pushed[k * n]);
+                add_scaled(n, std::abs(own), &jet.size[row * n], &push_size[k * n]);
             }
         }
     }
@@ -1047,9 +1050,14 @@ class ConstrainedStepper {
     // Write the residuals of the stages, (H2), to `right`, then -g / h; returns the largest in rounding units of its
     // terms.
     double residuals(double h, const Start& start) {
+        return stages == 1 ? residuals_of(1, h, start) : residuals_of(stages, h, start);
+    }
+
+    // As Collocation's.
+    [[gnu::always_inline]] inline double residuals_of(const int stages, double h, const Start& start) {
         double worst = 0.0;
         const int r = here.rank();
-        right.assign(stages * (n + r), 0.0);
+        right.resize(stages * (n + r));
         solution.resize(right.size());
         push();
         unresolved = 0.0;
@@ -1110,16 +1118,23 @@ class ConstrainedStepper {
     void assemble(double h) {
         const int r = here.rank(), wide = stages * n, size = stages * (n + r);
         write_stages(h);
-        saddle.assign(size * size, 0.0);
+        saddle.resize(size * size);
         rows.resize(size);
-        for (int i = 0; i < wide; ++i) {
-            for (int j = 0; j < wide; ++j) saddle[i * size + j] = scaled[i % n] * block[i * wide + j] * scaled[j % n];
+        for (int i = 0; i < stages; ++i) {
+            for (int b = 0; b < n; ++b) {
+                const double* from = &block[(i * n + b) * wide];
+                double* to = &saddle[(i * n + b) * size];
+                for (int j = 0; j < wide; j += n) {
+                    for (int c = 0; c < n; ++c) to[j + c] = scaled[b] * from[j + c] * scaled[c];
+                }
+            }
         }
         for (int k = 0; k < stages; ++k) {
             for (int a = 0; a < r; ++a) {
                 const int row = here.order[a];
                 const double *behind = &jet_at(k).C[row * n], *ahead = &point[k].C[row * n];
                 const int border = wide + k * r + a;
+                std::fill_n(&saddle[border * size + wide], stages * r, 0.0);
                 for (int i = 0; i < stages; ++i) {
                     for (int c = 0; c < n; ++c) {
                         const double unit_entry = row_scale[row] * scaled[c];
@@ -1218,16 +1233,13 @@ class ConstrainedStepper {
         find_null();
         const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
         std::fill(mass.begin(), mass.end(), 0.0);
-        std::fill(curved.begin(), curved.end(), 0.0);
+        for (int s = 0; s < stages; ++s) add_scaled(n * n, tableau.b[s], equation.stage[s].M.data(), mass.data());
+        std::copy(mass.begin(), mass.end(), curved.begin());
+        for (int s = 0; s < stages; ++s)
+            add_scaled(n * n, -exaggerated * tableau.b[s], equation.stage[s].Lqq.data(), curved.data());
         for (int i = 0; i < n; ++i) {
-            for (int j = 0; j < n; ++j) {
-                for (int s = 0; s < stages; ++s) {
-                    mass[i * n + j] += tableau.b[s] * equation.stage[s].M[i * n + j];
-                    curved[i * n + j] -= exaggerated * tableau.b[s] * equation.stage[s].Lqq[i * n + j];
-                }
-                curved[i * n + j] += mass[i * n + j];
-                if (equation.coupled()) curved[i * n + j] += equation.coupled_stiffening(i, j, 0.5 * h, exaggerated);
-            }
+            for (int j = 0; j < n && equation.coupled(); ++j)
+                curved[i * n + j] += equation.coupled_stiffening(i, j, 0.5 * h, exaggerated);
             curved[i * n + i] += equation.stiffening(i, 0.5 * h, exaggerated);
         }
         for (int k = 1; k < stages; ++k)
@@ -1276,15 +1288,13 @@ class ConstrainedStepper {
         }
     }
 
+    // The lower triangle of Z' X Z for a symmetric X.
     void reduce(const std::vector<double>& full, int free, std::vector<double>& out) {
-        out.assign(free * free, 0.0);
+        out.resize(free * free);
         for (int b = 0; b < free; ++b) {
-            for (int i = 0; i < n; ++i) y[i] = inner(&full[i * n], &null[b * n]);
-            for (int a = 0; a < free; ++a) out[a * free + b] = inner(&null[a * n], y.data());
-        }
-        for (int a = 0; a < free; ++a) {
-            for (int b = 0; b < a; ++b)
-                out[a * free + b] = out[b * free + a] = 0.5 * (out[a * free + b] + out[b * free + a]);
+            std::fill(y.begin(), y.end(), 0.0);
+            for (int i = 0; i < n; ++i) add_scaled(n, null[b * n + i], &full[i * n], y.data());
+            for (int a = b; a < free; ++a) out[a * free + b] = inner(&null[a * n], y.data());
         }
     }
 
