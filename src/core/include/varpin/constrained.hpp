@@ -74,16 +74,34 @@ struct ConstrainedState {
     std::vector<double> impulses;      // (steps, m) impulses of the last roll
 };
 
-// Steps that make the action (H1) stationary.
-class ConstrainedStepper {
+// A stepper under constraints for any number of joints and stages.
+class AnyConstrainedStepper {
+  public:
+    explicit AnyConstrainedStepper(const Guards& guards) : guards(guards) {}
+    AnyConstrainedStepper(const AnyConstrainedStepper&) = delete;
+    AnyConstrainedStepper& operator=(const AnyConstrainedStepper&) = delete;
+    virtual ~AnyConstrainedStepper() = default;
+
+    Guards guards;
+
+    virtual bool begin(const double* q, const double* v, ConstrainedState& state) = 0;
+    virtual bool look_at(ConstrainedState& state) = 0;
+    virtual void kick(const double* push, ConstrainedState& state) = 0;
+    virtual void roll(double h, const Commands& commands, const double* increments, const double* drift,
+                      std::vector<ConstrainedState>& states, const Nodes& nodes) = 0;
+};
+
+// Steps that make the action (H1) stationary. Numbers of joints and stages may be known at compile time.
+template <class Size = int, class Stages = int>
+class ConstrainedStepper final : public AnyConstrainedStepper {
   public:
     // `places` is t_kj (s + 1, s).
     ConstrainedStepper(const Mechanism& mechanism, const Tableau& tableau, const std::vector<double>& places,
                        double tolerance, const Guards& guards)
-        : mechanism(mechanism),
+        : AnyConstrainedStepper(guards),
+          mechanism(mechanism),
           tableau(tableau),
           tolerance(tolerance),
-          guards(guards),
           equation(mechanism, this->tableau, Solver::dense),
           energy_guard(mechanism, Solver::dense, true),
           n(mechanism.dof()),
@@ -126,16 +144,15 @@ class ConstrainedStepper {
         curved_paths = std::any_of(driven.begin(), driven.end(), [](const DrivenRow& own) { return own.rate >= 0; });
         if (curved_paths) from_q.resize(n), from_v.resize(n);
     }
-    ConstrainedStepper(const ConstrainedStepper&) = delete;
-    ConstrainedStepper& operator=(const ConstrainedStepper&) = delete;
 
     const Mechanism& mechanism;
     const Tableau tableau;
     double tolerance;
-    Guards guards;
-    Collocation<> equation;
-    EnergyGuard<> energy_guard;
-    int n, m, stages;
+    Collocation<Size, Stages> equation;
+    EnergyGuard<Size> energy_guard;
+    [[no_unique_address]] Size n;
+    int m;
+    [[no_unique_address]] Stages stages;
     std::vector<double> force;           // (n) constant over the step; (s, n) at its stages, or those of a part of it
     int stride = 0;                      // from one row of `force` to the next
     Effort effort;                       // work of the last step
@@ -170,15 +187,15 @@ class ConstrainedStepper {
     }
 
     // Set a path's state to (q, v).
-    bool begin(const double* q, const double* v, ConstrainedState& state) {
-        Jet<double>& jet = equation.stage[0];
+    bool begin(const double* q, const double* v, ConstrainedState& state) override {
+        Jet<double, Size>& jet = equation.stage[0];
         first_order(mechanism, q, v, jet);
         const std::vector<double> p = jet.Lv;
         return begin_at(q, p.data(), state);
     }
 
     // The constraints and the factors of M at a path's node.
-    bool look_at(ConstrainedState& state) {
+    bool look_at(ConstrainedState& state) override {
         for (int i = 0; i < n; ++i) unit[i] = state.path.position[i].value.high;
         if (!find_basis(unit.data(), state.rank, here)) return false;
         energy_guard.velocity(state.path.momentum.data(), state.path.v.data());
@@ -186,7 +203,7 @@ class ConstrainedStepper {
     }
 
     // Add an impulse (n) to the momentum; constraints absorb its normal part.
-    void kick(const double* push, ConstrainedState& state) {
+    void kick(const double* push, ConstrainedState& state) override {
         PathState& path = state.path;
         for (int i = 0; i < n; ++i) {
             path.p[i] = path.p[i].plus(push[i]);
@@ -203,7 +220,7 @@ class ConstrainedStepper {
     // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`. The entry of a driven
     // joint is its goal, at all stages.
     void take_force(const double* own, bool varies) {
-        stride = varies ? n : 0;
+        stride = varies ? static_cast<int>(n) : 0;
         std::copy(own, own + n, force.begin());
         take_goals();
         if (varies) take_stages(own);
@@ -262,7 +279,7 @@ class ConstrainedStepper {
     }
 
     void roll(double h, const Commands& commands, const double* increments, const double* drift,
-              std::vector<ConstrainedState>& states, const Nodes& nodes) {
+              std::vector<ConstrainedState>& states, const Nodes& nodes) override {
         const std::int64_t steps = nodes.steps;
         const int controls = mechanism.controls, k = mechanism.diffusion.processes;
         const bool noisy = increments != nullptr && k > 0;
@@ -289,7 +306,7 @@ class ConstrainedStepper {
                 }
                 const double* extra = drift ? drift + row * n : nullptr;
                 const double* within = stage_controls(commands, p, s, stages, u, line);
-                stride = within ? n : 0;
+                stride = within ? static_cast<int>(n) : 0;
                 constant_force(mechanism, extra, u + s * controls, force.data());
                 take_goals();
                 if (within) {
@@ -547,7 +564,7 @@ class ConstrainedStepper {
         const auto end = [&](int row, int c) -> double& { return entry(Jx, Jf, row, c); };
         const int r = here.rank();
         for (int i = 0; i < n; ++i) unit[i] = path.position[i].value.high;
-        Jet<double>& jet = equation.stage[0];
+        Jet<double, Size>& jet = equation.stage[0];
         lagrangian_jet(mechanism, unit.data(), path.v.data(), jet);
         std::vector<double> bend(m * n), curvature(n * n), z(n), along(r), dq(n), turned(n);
         mechanism.constraints.bend(path.v.data(), here.jet, bend.data());
@@ -645,7 +662,7 @@ class ConstrainedStepper {
         basis.Q.clear();
         basis.least = 1.0;
         basis.weakest = 0;
-        const int most = rank < 0 ? std::min(m, n) : rank;
+        const int most = rank < 0 ? std::min<int>(m, n) : rank;
         for (int k = 0; k <= most && k < m; ++k) {
             const auto [best, farthest] = farthest_row(basis);
             if (k == most) return farthest;
@@ -1368,7 +1385,7 @@ class ConstrainedLinearization {
     bool varies = false, ramp = false;
 
   private:
-    ConstrainedStepper stepper;
+    ConstrainedStepper<> stepper;
     int n;
     ConstrainedState state;
     ChainedDerivatives chained;
