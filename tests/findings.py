@@ -52,6 +52,7 @@ MARKS = {
     "right derivatives": "the derivatives are those of the step",
     "wrong derivatives": "is not the derivative of the step",
     "another difference": "another step=",
+    "left out of the description": "leaves out what the description gives",
     "out of reach": "not within reach",
 }
 

@@ -7,12 +7,11 @@ import logging
 import numpy as np
 import pinocchio as pin
 import pytest
+from findings import about
 from mechanisms import joint, link, mimic, write_urdf
 from refusals import refused, unnamed
 
 import varpin as vp
-
-TOLD = "the scene leaves out what the description gives"
 
 
 @pytest.fixture
@@ -31,7 +30,7 @@ def arm(tmp_path):
 
 
 def said(caplog):
-    return [record.getMessage() for record in caplog.records if TOLD in record.getMessage()]
+    return about((record.getMessage() for record in caplog.records), "left out of the description")
 
 
 def test_a_scene_that_leaves_dampers_out_says_so_once(arm, caplog):

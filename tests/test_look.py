@@ -140,7 +140,7 @@ def test_energy_that_is_turned_over_is_no_number_where_the_motion_is_none(scene,
     assert np.isnan(turned).tolist() == [False, False, True, False, False]
 
 
-def agreement(scene, q, v, begins, length, dt, again, way, velocity):
+def agreement(scene, q, v, begins, length, dt, again, travel, velocity):
     """The largest error in units of what is allowed."""
     tree = scene.robot.tree
     slides = np.isin(np.arange(q.shape[1]), tree.coordinate[tree.prismatic > 0])
@@ -150,7 +150,7 @@ def agreement(scene, q, v, begins, length, dt, again, way, velocity):
     light = LIGHT * (root * [changed(part) for part in v]).max(axis=1)[:, None] / root
     found = []
     for own, other, unit, least, part in (
-        (q, again[0], np.ptp(q, axis=1), light * length * dt, way),
+        (q, again[0], np.ptp(q, axis=1), light * length * dt, travel),
         (v, again[1], np.abs(v).max(axis=1), light, velocity),
     ):
         for kind in (slides, ~slides):
@@ -162,7 +162,7 @@ def agreement(scene, q, v, begins, length, dt, again, way, velocity):
 
 
 @pytest.mark.parametrize("every", [1, 2])
-@pytest.mark.parametrize("which", ["way", "velocity"])
+@pytest.mark.parametrize("which", ["travel", "velocity"])
 def test_windows_agree_up_to_what_is_allowed(scene, motion, rng, which, every):
     length, begins = 8, np.array([0, 11, 32])
     nodes = begins[:, None] + np.arange(every, length + 1, every)
@@ -170,7 +170,7 @@ def test_windows_agree_up_to_what_is_allowed(scene, motion, rng, which, every):
     # What hardly moves is measured by others.
     q, v = motion.q.copy(), motion.v.copy()
     q[:, 1], v[:, 1] = q[0, 1], 1e-7 * v[:, 1]
-    parts = {"way": 0.1, "velocity": 0.1} | {which: 1e-4}
+    parts = {"travel": 0.1, "velocity": 0.1} | {which: 1e-4}
     worst = agreement(scene, q, v, begins, length, motion.dt, again, **parts)
     for scale, agrees in ((1.001, True), (0.999, False)):
         allowed = {name: scale * worst * part for name, part in parts.items()}
@@ -181,7 +181,7 @@ def test_windows_agree_up_to_what_is_allowed(scene, motion, rng, which, every):
 
 def test_windows_that_are_no_numbers_do_not_agree(scene, motion):
     again = [values[None, 2:9:2].copy() for values in (motion.q, motion.v)]
-    limits = {"way": 1.0, "velocity": 1.0, "little": LITTLE, "light": LIGHT, "even": EVEN}
+    limits = {"travel": 1.0, "velocity": 1.0, "little": LITTLE, "light": LIGHT, "even": EVEN}
     begins = np.zeros(1, dtype=np.int64)
     assert windows_agree(scene.core, motion.q, motion.v, begins, 8, motion.dt, *again, **limits)
     again[1][0, 2, 3] = np.nan

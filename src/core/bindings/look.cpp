@@ -70,7 +70,7 @@ std::tuple<double, bool, bool, bool> glance_at(const Mechanism& mechanism, In<2>
 }
 
 bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> begins, std::size_t length, double dt,
-                   In<3> again_q, In<3> again_v, double way, double velocity, double little, double light,
+                   In<3> again_q, In<3> again_v, double travel, double velocity, double little, double light,
                    double even) {
     const auto n = static_cast<std::size_t>(mechanism.dof());
     const std::size_t nodes = q.shape(0), windows = begins.shape(0), looks = again_q.shape(1);
@@ -84,7 +84,7 @@ bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> beg
     }
     nb::gil_scoped_release release;
     return agree_in_windows(mechanism, q.data(), v.data(), begins.data(), windows, length, dt, again_q.data(),
-                            again_v.data(), looks, {way, velocity, little, light, even});
+                            again_v.data(), looks, {travel, velocity, little, light, even});
 }
 
 std::tuple<std::int64_t, std::int64_t, std::int64_t> alternation(In<2> v, std::optional<In<2>> u, double counts,
@@ -107,7 +107,7 @@ void register_look(nb::module_& m) {
     m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "dt"_a, nb::kw_only(),
           "even"_a, "looks"_a);
     m.def("windows_agree", &windows_agree, "mechanism"_a, "q"_a, "v"_a, "begins"_a, "length"_a, "dt"_a, "again_q"_a,
-          "again_v"_a, nb::kw_only(), "way"_a, "velocity"_a, "little"_a, "light"_a, "even"_a);
+          "again_v"_a, nb::kw_only(), "travel"_a, "velocity"_a, "little"_a, "light"_a, "even"_a);
 }
 
 }  // namespace varpin::border

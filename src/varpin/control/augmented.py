@@ -134,7 +134,7 @@ class _Rounds:
         self.tolerance = self.options.pop("tolerance", 1e-7)
         self.most = count("max_iterations", self.options.pop("max_iterations", _MOST_ITERATIONS))
         self.limit = checked_time(self.options.pop("time_limit", np.inf))
-        self.tell = require_reports(self.options.pop("callback", None), self.progress)
+        self.report_all = require_reports(self.options.pop("callback", None), self.progress)
         self.label = f"{problem.scene.robot.name}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
         self.history: list[Iteration] = []
         self.noisy = bool(problem.scene.processes) and any(item.source.margin > 0.0 for item in self.bound)
@@ -181,8 +181,8 @@ class _Rounds:
                 break
         if kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
             try:
-                kept, told = self._polished(replace(kept, status=status))
-                status, reason = kept.status, f"{reason}; {told}"
+                kept, closing = self._polished(replace(kept, status=status))
+                status, reason = kept.status, f"{reason}; {closing}"
             except KeyboardInterrupt:
                 status = Status.INTERRUPTED
         plan = replace(kept, status=status, reason=reason)
@@ -250,7 +250,7 @@ class _Rounds:
 
     def _report(self, known: int, last: int, item: Iteration, motion: Trajectory) -> None:
         item = replace(item, index=item.index + known)
-        self.tell(item, motion)
+        self.report_all(item, motion)
         if self.progress is not None:
             self.progress(min(item.index + 1, last), last)
 
@@ -293,9 +293,9 @@ class _Rounds:
         """Status and reason if the rounds end; else update multipliers and weights for the next round, (P3)."""
         known = kept.multipliers
         assert known is not None
-        told = reports(self.problem, kept.trajectory, known)
-        violation = np.array([item.violation for item in told])
-        worst = max(told, key=lambda item: item.violation)
+        constraints = reports(self.problem, kept.trajectory, known)
+        violation = np.array([item.violation for item in constraints])
+        worst = max(constraints, key=lambda item: item.violation)
         state = f"round {begun.round}: {worst.label} is violated by {worst.violation:.1e} {worst.unit}"
         logger.info("%s: %s", self.label, state)
         if found.status is Status.INTERRUPTED or found.status is Status.OUT_OF_TIME:
@@ -351,11 +351,13 @@ class _Rounds:
         except (CostError, NoiseFieldError, LinearizationError):
             return kept, f"constraints hold to {kept.violation:.1e}"
         plan = self._along(kept, found.motion, replace(known, values=flat(found.multipliers)))
-        told = f"constraints hold to {plan.violation:.1e}, and within them the cost would fall by {found.decrease:.1e}"
+        closing = (
+            f"constraints hold to {plan.violation:.1e}, and within them the cost would fall by {found.decrease:.1e}"
+        )
         bound = self.tolerance * (found.stake + NOTHING * (0.0 if kept.search is None else kept.search.first))
         if kept.status is Status.CONVERGED and not found.decrease <= bound:
             plan = replace(plan, status=Status.STALLED)
-        return plan, told
+        return plan, closing
 
     def _along(self, kept: Solution, motion: Trajectory, multipliers: Multipliers) -> Solution:
         """The plan with a neighbouring motion, its multipliers and the results of a backward pass along it."""

@@ -235,7 +235,7 @@ class ClosedLoop:
             found[j + 1] = A[j] @ found[j] + B[j] @ change[k]
         return found[self._before :, : self._linear.A.shape[1]], change
 
-    def moved(self, values: list[Floats], response: Floats, change: Floats) -> list[Floats]:
+    def values_after(self, values: list[Floats], response: Floats, change: Floats) -> list[Floats]:
         """The constraints' values (K, rows) after changes of states and controls, to first order."""
         problem, motion, found = self.problem, self.motion, []
         for item, c in zip(problem.bound_constraints, values, strict=True):

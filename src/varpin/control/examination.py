@@ -11,7 +11,7 @@ from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
-from varpin.control.multipliers import FEASIBLE, TOLD
+from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes
@@ -78,11 +78,11 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     """Findings about a plan: its energy balance, velocities, constraints, convergence and cost in finer steps."""
     problem, motion = solution.problem, solution.trajectory
     _, found = examined(problem.scene, problem.integrator, motion)
-    told = foreseen(problem)
-    told += [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
+    warnings = foreseen(problem)
+    warnings += [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
     if solution.refinement is not None and not solution.refinement.met:
-        told.append(Finding("true cost", solution.refinement.reason))
-    told += (
+        warnings.append(Finding("true cost", solution.refinement.reason))
+    warnings += (
         _unfinished(solution)
         + _noise_left_out(solution)
         + _friction_under_noise(solution)
@@ -93,14 +93,14 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
         replay = replayed(solution)
     except VarpinError as error:
         steps = f"{1.0 / PARTS:g} dt"
-        return *told, Finding("replay", f"the plan cannot be replayed in steps of {steps}: {error}")
+        return *warnings, Finding("replay", f"the plan cannot be replayed in steps of {steps}: {error}")
     if replay.holds:
-        return tuple(told)
-    told.append(Finding("replay", _sentence(problem, replay)))
+        return tuple(warnings)
+    warnings.append(Finding("replay", _sentence(problem, replay)))
     reasons = [finding for finding in found if finding.kind in _OF_STEPS]
     # Findings about steps that are negligible for the motion may explain the plan's loss.
     record = findings_from_record(problem.scene, problem.integrator, motion)
-    return *told, *(reasons or [finding for finding in record if finding.kind in _OF_STEPS])
+    return *warnings, *(reasons or [finding for finding in record if finding.kind in _OF_STEPS])
 
 
 def replayed(solution: Solution) -> Replay:
@@ -188,7 +188,7 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
         if c is None:
             continue
         row = int(np.argmax(c))
-        if c[row] > TOLD * bound.scale:
+        if c[row] > REPORTED * bound.scale:
             found.append(
                 Finding(
                     "start outside constraints",
@@ -290,13 +290,13 @@ def _between(solution: Solution) -> list[Finding]:
         if outside is not None:
             # A row that is violated at the start cannot hold before the first node, so it is not reported there.
             c[: PARTS - 1, outside > 0.0] = -np.inf
-        place, row = np.unravel_index(int(np.argmax(c)), c.shape)
-        if c[place, row] > TOLD * bound.scale:
+        sample, row = np.unravel_index(int(np.argmax(c)), c.shape)
+        if c[sample, row] > REPORTED * bound.scale:
             found.append(
                 Finding(
                     "constraints between nodes",
                     f"{record.label} holds at the nodes, but between nodes {bound.rows[row]} is violated by "
-                    f"{c[place, row]:.2g} {bound.unit} at t = {bound.times[place]:.4g} s: make the bound narrower by "
+                    f"{c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: make the bound narrower by "
                     "that much, or dt smaller",
                 )
             )

@@ -102,15 +102,15 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _targets(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Constant targets of costs on a frame's position that look like millimetres."""
-    robot, told = problem.scene.robot, set()
+    robot, named = problem.scene.robot, set()
     for term in _parts(problem.cost):
         if not isinstance(term, FramePositionCost) or callable(term.target) or np.ndim(term.target) != 1:
             continue
         frame = frame_kinematics(robot, term.frame)
         most = reach(robot, frame)
         away = float(np.linalg.norm(np.asarray(term.target) - frame.links.translation[0]))
-        if away > _AFAR * most and term.frame not in told:
-            told.add(term.frame)
+        if away > _AFAR * most and term.frame not in named:
+            named.add(term.frame)
             yield Finding(
                 "goal in millimetres",
                 f"FramePositionCost({term.frame!r}) has its target {away:.4g} m from the first joint, and the frame "

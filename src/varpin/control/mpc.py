@@ -149,16 +149,16 @@ class MpcRun(Frozen):
             ("planning took", self._planning),
             ("late", self._within),
             ("plant", self.motion),
-            *(("constraint", told) for told in self.constraints),
+            *(("constraint", report) for report in self.constraints),
             *(("warning", sentence) for sentence in self.warnings),
         ]
         return facts(f"Run of a controller of {self.motion.robot}", rows)
 
     def __str__(self) -> str:
         ticks = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms"
-        told = f"{ticks}: planning took {self._planning}; {self._within}"
+        summary = f"{ticks}: planning took {self._planning}; {self._within}"
         warned = (f"warning: {sentence}" for sentence in self.warnings)
-        return "\n".join([told, *map(str, self.constraints), *warned])
+        return "\n".join([summary, *map(str, self.constraints), *warned])
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ class Mpc:
             Interrupted: Ctrl-C; holds the plant's motion so far.
         """
         problem = self.problem
-        tell: Any = progress
+        report: Any = progress
         moving = told_motion("progress", progress, "ticks done, ticks in all", "nodes")
         plant = Plant(problem.scene) if plant is None else plant
         if not isinstance(plant, Plant):
@@ -325,8 +325,10 @@ class Mpc:
         for kind in ("linear", "cubic"):
             inputs = [_inputs(scene, cubic=kind == "cubic") for scene in (plant.scene, problem.scene)]
             if inputs[0] != inputs[1]:
-                told = (", ".join(names) or "no joints" for names in inputs)
-                raise InputError(f"the plant has {kind} KinematicInputs on {next(told)}; the problem on {next(told)}")
+                names_of = (", ".join(names) or "no joints" for names in inputs)
+                raise InputError(
+                    f"the plant has {kind} KinematicInputs on {next(names_of)}; the problem on {next(names_of)}"
+                )
         ticks = max(1, round(positive("duration", duration, "s") / self.period))
         dt = self.period / plant.substeps
         generator = None if rng is None else np.random.default_rng(rng)
@@ -360,9 +362,9 @@ class Mpc:
                 q, v = parts[-1].q[-1], parts[-1].v[-1]
                 before = applied if problem.remembers else None
                 if moving:
-                    tell(tick + 1, ticks, Nodes(tick * self.period + parts[-1].t, parts[-1].q, parts[-1].v))
-                elif tell is not None:
-                    tell(tick + 1, ticks)
+                    report(tick + 1, ticks, Nodes(tick * self.period + parts[-1].t, parts[-1].q, parts[-1].v))
+                elif report is not None:
+                    report(tick + 1, ticks)
         except KeyboardInterrupt:
             if not parts:
                 raise

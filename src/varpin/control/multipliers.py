@@ -18,7 +18,7 @@ from varpin.trajectory import Trajectory
 # Greatest violation of a constraint at its places in a feasible plan, in its own unit.
 FEASIBLE = 1e-6
 # Greatest violation between its places, or by a controller, without a warning, relative to a tenth of its range.
-TOLD = 1e-2
+REPORTED = 1e-2
 
 
 @dataclass(frozen=True, eq=False)

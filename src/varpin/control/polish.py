@@ -97,7 +97,7 @@ def polished(
     for left in reversed(range(_STEPS)):
         if step.found.violation <= _DONE and step.found.decrease <= _FLAT * step.found.stake:
             break
-        step.settle()
+        step.solve()
         # Where the model's curvature is too small, it is so in the next step, too.
         for length in (item for item in _LENGTHS if item <= (longest if left >= _LAST else 0.0)):
             attempt = trials.attempt(step.commands(length))
@@ -188,8 +188,8 @@ class _Step:
             array[rows] = part
         return multipliers, loop.gradient + np.einsum("akm,a->km", G, found)
 
-    def settle(self) -> None:
-        """Determine the step: the rows that it meets and the controls that it brings to their limits."""
+    def solve(self) -> None:
+        """Solve for the step, its active rows and the controls that it brings to their limits."""
         problem, loop = self.problem, self.loop
         lower, upper = problem.control_limits
         u = problem.decided(self.motion)
@@ -209,7 +209,10 @@ class _Step:
                 self.ahead = np.where(beyond, np.clip(u + change, lower, upper) - u, self.ahead)
                 loop.close(self.free)
                 continue
-            met = [rows | (c > _DONE) for rows, c in zip(self.rows, loop.moved(self.c, response, change), strict=True)]
+            met = [
+                rows | (c > _DONE)
+                for rows, c in zip(self.rows, loop.values_after(self.c, response, change), strict=True)
+            ]
             if all(np.array_equal(a, b) for a, b in zip(met, self.rows, strict=True)):
                 break
             self.rows = met

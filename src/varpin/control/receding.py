@@ -16,7 +16,7 @@ from varpin.arrays import Floats
 from varpin.control import search
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Iteration, Status
-from varpin.control.multipliers import FEASIBLE, TOLD, Multipliers, split
+from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers, split
 from varpin.control.penalties import flat, penalized
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
@@ -127,17 +127,17 @@ def _judged(plan: Solution, before: Multipliers) -> Solution:
     """The plan of a tick with the penalty weights of the next one; INFEASIBLE where violations persist."""
     known = plan.multipliers
     assert known is not None
-    bound, told = plan.problem.bound_constraints, plan.constraints
-    violation = np.array([item.violation for item in told])
+    bound, found = plan.problem.bound_constraints, plan.constraints
+    violation = np.array([item.violation for item in found])
     scale = np.array([item.scale for item in bound])
-    stays = violation > np.maximum(TOLD * scale, _LOWERED * before.worst)
+    stays = violation > np.maximum(REPORTED * scale, _LOWERED * before.worst)
     heavier = violation > np.maximum(_SMALL * scale, _ENOUGH * before.worst)
     weights = np.where(heavier, np.minimum(_GROWTH * known.weights, _HEAVIEST * known.first_weights), known.weights)
     stuck = before.stuck + 1 if stays.any() else 0
     plan = replace(plan, multipliers=replace(known, weights=weights, worst=violation, stuck=stuck))
     if stuck < _STUCK or plan.status is Status.INTERRUPTED:
         return plan
-    worst = told[int(np.argmax(np.where(stays, violation / scale, -np.inf)))]
+    worst = found[int(np.argmax(np.where(stays, violation / scale, -np.inf)))]
     reason = (
         f"{worst.label} is violated by {worst.violation:.3g} {worst.unit}, {worst.where}, and {stuck} ticks in a row "
         "have not lowered that"
@@ -175,12 +175,12 @@ class Kept(Frozen):
 
     def __str__(self) -> str:
         plans = int((self.planned > self.tolerance).sum())
-        told = f"violated by {self.planned.max():.1e} {self.unit} at most in plans, in {plans} of {len(self.planned)} "
-        told += f"ticks by more than {self.tolerance:.1g}"
+        text = f"violated by {self.planned.max():.1e} {self.unit} at most in plans, in {plans} of {len(self.planned)} "
+        text += f"ticks by more than {self.tolerance:.1g}"
         if self.moved.size:
             where = f" at t = {self.t[int(np.argmax(self.moved))]:.4g} s" if self.worst > self.tolerance else ""
-            told += f"; by {self.worst:.1e} at most in the plant's motion{where}"
-        return f"{self.label}: {told}"
+            text += f"; by {self.worst:.1e} at most in the plant's motion{where}"
+        return f"{self.label}: {text}"
 
     __repr__ = __str__
 
@@ -202,7 +202,7 @@ def kept(
         if not bound.source.equality:
             c = bound.value(motion.q, motion.v, motion.u)
             violated, t = np.maximum(c, 0.0).max(axis=1), bound.times
-        tolerance = TOLD * bound.scale
+        tolerance = REPORTED * bound.scale
         failed = infeasible & (planned > tolerance)
         found.append(Kept(bound.source.label, bound.unit, tolerance, planned, violated, t, failed))
     return tuple(found)

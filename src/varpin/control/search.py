@@ -203,7 +203,7 @@ def solve(
         raise InputError(f"regularization must be >= 0, got {regularization}")
     if not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held' or 'whole', got {noise!r}")
-    tell = require_reports(callback, progress)
+    report_all = require_reports(callback, progress)
     if problem.linear and second_order:
         raise InputError("second_order is for held controls; the problem's are linear between nodes")
     positive("tolerance", tolerance, "1")
@@ -216,7 +216,7 @@ def solve(
     known = len(resume.search.history) if isinstance(resume, Solution) and resume.search is not None else 0
 
     def report(item: Iteration, motion: Trajectory) -> None:
-        tell(item, motion)
+        report_all(item, motion)
         if progress is not None:
             # A converged search reports once more after its last iteration.
             progress(min(item.index + 1 - known, max_iterations), max_iterations)
@@ -283,13 +283,13 @@ def require_reports(callback: Any, progress: object) -> Report:
     if progress is not None and not (callable(progress) and takes(progress, 2)):
         raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
 
-    def tell(item: Iteration, motion: Trajectory) -> None:
+    def report_all(item: Iteration, motion: Trajectory) -> None:
         if both:
             callback(item, motion)
         elif callback is not None:
             callback(item)
 
-    return tell
+    return report_all
 
 
 def checked_time(limit: object) -> float:

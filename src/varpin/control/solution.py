@@ -192,7 +192,7 @@ class Solution(Frozen):
                 rows.append((f"{what} beyond limits [{unit}]", listed(over)))
         if beyond.control.any():
             rows.append(("controls beyond limits", f"{beyond.control.max():.3g} at most"))
-        rows += [("constraint", told) for told in self.constraints]
+        rows += [("constraint", report) for report in self.constraints]
         rows += [("warning", warning) for warning in self.warnings]
         most = np.abs(problem.control_rows(motion)).max(axis=0, initial=0.0)
         rows.append(("largest controls", listed(f"{value:.4g}" for value in most)))

@@ -27,7 +27,7 @@ from varpin.trajectory import Trajectory
 logger = logging.getLogger(__name__)
 
 # Relative accuracy of the costs above which nothing can be concluded about the plan.
-_UNTOLD = 0.01
+_UNKNOWN = 0.01
 # Integrators of the continuous system, without and with fast damping.
 _USUAL, _FAST = RungeKutta4(), Radau(3)
 # Damping is fast if its rate times the plan's step exceeds _FASTER at one of _NODES nodes.
@@ -65,8 +65,8 @@ class ViolationOnRobot:
 
     def __str__(self) -> str:
         ways = [("planned", self.planned), ("controls alone", self.open_loop), ("with feedback", self.closed_loop)]
-        told = ", ".join(f"{name} {x:.1e}" if np.isfinite(x) else f"{name} runs away" for name, x in ways)
-        return f"{self.label} is violated by [{self.unit}]: {told}{f' ({self.where})' if self.where else ''}"
+        violations = ", ".join(f"{name} {x:.1e}" if np.isfinite(x) else f"{name} runs away" for name, x in ways)
+        return f"{self.label} is violated by [{self.unit}]: {violations}{f' ({self.where})' if self.where else ''}"
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Verification:
     @property
     def told(self) -> bool:
         """Whether the costs are known to a percent; if not, nothing can be concluded about the plan."""
-        return self._diverges or self.accuracy <= _UNTOLD
+        return self._diverges or self.accuracy <= _UNKNOWN
 
     @property
     def _diverges(self) -> bool:
@@ -134,7 +134,7 @@ class Verification:
         return excess(self.closed_loop_cost, self.planned_cost)
 
     @property
-    def _untold(self) -> str:
+    def _why_unknown(self) -> str:
         finer = f"give max_substeps of {2 * self.substeps} or more"
         if np.isinf(self.accuracy):
             return (
@@ -159,9 +159,9 @@ class Verification:
         rows = [row if np.isfinite(row[1]) else (row[0], "runs away", "", "") for row in self._rows]
         head = ("", "cost", "loss", "end off by [rad or m]")
         facts_ = [
-            ("how to read it", _READING if self.told else self._untold),
+            ("how to read it", _READING if self.told else self._why_unknown),
             ("a step is off by", f"{self.defect:.2e} rad or m"),
-            *(("constraint", told) for told in self.constraints),
+            *(("constraint", report) for report in self.constraints),
             *([] if self.status.converged else [("the plan is unfinished", self.status.value)]),
         ]
         return facts("Verification on the continuous system", facts_, table(head, rows))
@@ -180,7 +180,7 @@ class Verification:
                 *lines,
                 f"a step is off by {self.defect:.2e} rad or m at most; {good} "
                 f"({self.substeps} substeps a step, {self.integrator})",
-                f"how to read it: {_READING}" if self.told else self._untold,
+                f"how to read it: {_READING}" if self.told else self._why_unknown,
                 *map(str, self.constraints),
                 *([] if self.status.converged else [f"the plan is unfinished, {self.status.value}"]),
             ]
@@ -232,7 +232,7 @@ def verify(
         if found.told or not problem.scene.dissipates:
             break
     if not found.told:
-        logger.warning("%s", found._untold)
+        logger.warning("%s", found._why_unknown)
     return found
 
 
@@ -369,7 +369,7 @@ def _true_costs(
 def _violations(
     problem: OptimalControlProblem,
     plan: Trajectory,
-    ways: tuple[Commands, Commands],
+    laws: tuple[Commands, Commands],
     substeps: int,
     integrator: Integrator,
 ) -> tuple[ViolationOnRobot, ...]:
@@ -378,7 +378,7 @@ def _violations(
         return ()
     h = problem.dt / substeps
     fine = problem.constraints_on(h, problem.steps * substeps, problem.hold * substeps)
-    motions = [rollout(problem.scene, integrator, problem.q0, problem.v0, way, h) for way in ways]
+    motions = [rollout(problem.scene, integrator, problem.q0, problem.v0, law, h) for law in laws]
     found = []
     for bound, whole in zip(fine, problem.bound_constraints, strict=True):
         planned = _excess(whole, whole.value(plan.q, plan.v, problem.control_rows(plan)))
@@ -392,9 +392,9 @@ def _violations(
             if not bound.of_controls and not bound.source.equality:
                 # The plan can change nothing before its first node.
                 excess[: substeps - 1] = 0.0
-            place, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
-            worst.append(float(excess[place, row]))
-            where = f"{bound.rows[row]} at t = {bound.times[place]:.4g} s" if worst[-1] > 0.0 else ""
+            sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
+            worst.append(float(excess[sample, row]))
+            where = f"{bound.rows[row]} at t = {bound.times[sample]:.4g} s" if worst[-1] > 0.0 else ""
         label, unit = bound.source.label, bound.unit
         opened, closed = worst
         found.append(ViolationOnRobot(label, unit, float(planned.max(initial=0.0)), opened, closed, where))

@@ -561,7 +561,7 @@ def windows_agree(
     again_q: Floats,
     again_v: Floats,
     *,
-    way: float,
+    travel: float,
     velocity: float,
     little: float,
     light: float,
@@ -569,7 +569,7 @@ def windows_agree(
 ) -> bool:
     """Whether windows of a motion (N + 1, n) agree with the results (K, looks, n) of other steps.
 
-    Errors may reach the share ``way`` of the travel of each coordinate in the window, and ``velocity`` of its largest
+    Errors may reach the share ``travel`` of each coordinate's travel in the window, and ``velocity`` of its largest
     velocity. The results are at ``looks`` evenly spaced nodes of each window.
     """
 

@@ -134,7 +134,7 @@ class Window:
         here = np.minimum(self.judged, until)
         # Unpredictable steps are no part of the travel.
         end = np.minimum(self.span, until) if cut else self.span
-        way, speed = _units(scene, trajectory, self.step, end, self.whole | (end < self.span), inertia)
+        travel, speed = _units(scene, trajectory, self.step, end, self.whole | (end < self.span), inertia)
         joints = np.arange(len(here))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             far, fast = (np.maximum.accumulate(part, axis=0)[here, joints] for part in off)
@@ -142,13 +142,13 @@ class Window:
             growth = np.where(so_far > 0.0, self.varied[self.judged - 1, joints] / so_far, np.inf)
             growth = np.maximum(np.minimum(growth, self.judged / here), 1.0)
             rounding = ROUNDING * (1.0 + np.abs(trajectory.q[self.step]).max())
-            position = np.where(far <= rounding, 0.0, far * (1.0 if cut else growth) / way)
+            position = np.where(far <= rounding, 0.0, far * (1.0 if cut else growth) / travel)
             # Rounding of the largest momentum goes into the velocities of joints at rest.
             root = np.sqrt(inertia)
             fastest = np.abs(trajectory.v[self.step : self.step + until + 1]).max(axis=0)
             rounding = np.maximum(rounding / (trajectory.dt * here), ROUNDING * (root * fastest).max() / root)
             velocity = np.where(fast <= np.maximum(rounding, 1e-9 * speed), 0.0, fast / speed)
-            motion = position * way / way.max()
+            motion = position * travel / travel.max()
             shares = np.array([position / WRONG_POSITION, velocity / WRONG_VELOCITY, motion / WRONG_MOTION])
         joint = int(np.argmax(np.where(np.isnan(shares), np.inf, shares).max(axis=0)))
         return MotionError(self.step, joint, float(position[joint]), float(velocity[joint]), float(motion[joint]))
@@ -166,8 +166,8 @@ def disturbance(trajectory: Trajectory, step: int, count: int) -> tuple[float, f
     nodes = trajectory.q[step : step + count + 1]
     shift = DISTURBANCE * max(1.0, float(np.abs(trajectory.q[step]).max()))
     # In v, relative to the velocities of the same steps.
-    way = max(float(np.ptp(nodes, axis=0).max()), shift)
-    return shift, DISTURBANCE * float(np.abs(trajectory.v[step : step + count + 1]).max()) / max(1.0, way)
+    travel = max(float(np.ptp(nodes, axis=0).max()), shift)
+    return shift, DISTURBANCE * float(np.abs(trajectory.v[step : step + count + 1]).max()) / max(1.0, travel)
 
 
 def examined_nodes(scene: Scene, trajectory: Trajectory) -> Integers:
@@ -238,14 +238,14 @@ def changed(v: Floats) -> Floats:
     return change
 
 
-def noticed(scene: Scene, way: Floats, speed: Floats, light: Floats, duration: Floats) -> tuple[Floats, Floats]:
-    """Ways and largest velocities (..., n) as units of errors; those of the other joints bound them from below.
+def noticed(scene: Scene, travel: Floats, speed: Floats, light: Floats, duration: Floats) -> tuple[Floats, Floats]:
+    """Travels and largest velocities (..., n) as units of errors; those of the other joints bound them from below.
 
     ``light`` are the velocities of :func:`light_speed` (..., n), ``duration`` the time in which they are judged [s].
     """
     least = np.minimum(LITTLE * largest_of_its_kind(scene, speed), light)
-    least_way = np.minimum(LITTLE * largest_of_its_kind(scene, way), light * duration)
-    return np.maximum(way, least_way), np.maximum(speed, least)
+    least_travel = np.minimum(LITTLE * largest_of_its_kind(scene, travel), light * duration)
+    return np.maximum(travel, least_travel), np.maximum(speed, least)
 
 
 def light_speed(inertia: Floats, change: Floats) -> Floats:
@@ -297,15 +297,15 @@ def _units(
         before = _periods(scene, trajectory.q[behind][::-1], trajectory.v[behind][::-1])[0]
     # Where the motion ends within a period, the steps before complete it.
     begin = step - np.where(whole, 0, before)
-    way, speed, change = np.empty(n), np.empty(n), np.empty(n)
+    travel, speed, change = np.empty(n), np.empty(n), np.empty(n)
     end = step + span + 1
     # Joints with the same nodes together: all of them in short motions.
     for first, last in set(zip(begin.tolist(), end.tolist(), strict=True)):
         alike = (begin == first) & (end == last)
         q, v = trajectory.q[:last, alike], trajectory.v[:last, alike]
-        way[alike] = np.maximum(np.ptp(q[first:], axis=0), _REST * np.ptp(q, axis=0))
+        travel[alike] = np.maximum(np.ptp(q[first:], axis=0), _REST * np.ptp(q, axis=0))
         speed[alike] = np.maximum(np.abs(v[first:]).max(axis=0), _REST * np.abs(v).max(axis=0))
         change[alike] = changed(v[first:])
-    way, speed = noticed(scene, way, speed, light_speed(inertia, change), trajectory.dt * span.astype(np.float64))
+    travel, speed = noticed(scene, travel, speed, light_speed(inertia, change), trajectory.dt * span.astype(np.float64))
     tiny = np.finfo(np.float64).tiny
-    return np.maximum(way, tiny), np.maximum(speed, tiny)
+    return np.maximum(travel, tiny), np.maximum(speed, tiny)

@@ -11,7 +11,6 @@ from varpin.arrays import Floats
 from varpin.errors import VarpinError
 from varpin.integrators.base import Failure
 from varpin.mechanics.scene import Scene
-from varpin.simulation import limits
 from varpin.trajectory import Trajectory
 
 
@@ -129,15 +128,14 @@ class StepFailure(VarpinError, RuntimeError):
         trajectory: The motion before, with a warning if its control loop is unstable.
     """
 
-    def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory) -> None:
+    def __init__(self, step: int, time: float, failure: Failure, trajectory: Trajectory, cause: str = "") -> None:
         self.step = step
         self.time = float(time)
         self.residual = failure.residual
         self.reason = failure.reason
         self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
         self.trajectory = trajectory
-        causes = [sentence for sentence in trajectory.warnings if not sentence.startswith(limits.KINDS)]
-        self.advice = causes[0] if causes else "a smaller dt may go further"
+        self.advice = cause or "a smaller dt may go further"
         self.problem = (
             f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
             f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}"

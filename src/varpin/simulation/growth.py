@@ -99,9 +99,9 @@ def grown_error(
     if not (even or len(bent.steps)):
         return None
     other = finer(integrator, trajectory, damped=False, pulled=False)
-    way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
+    travel = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
     # Ways of rounding alone are no motion.
-    way = np.maximum(way, max(_SHORTEST, ROUNDING * (1.0 + float(np.abs(trajectory.q).max()))))
+    travel = np.maximum(travel, max(_SHORTEST, ROUNDING * (1.0 + float(np.abs(trajectory.q).max()))))
     at = _places(trajectory)
     by_steps, by_kinks, largest = 0.0, 0.0, 0.0
     if even:
@@ -114,7 +114,7 @@ def grown_error(
         off = _steps_off(scene, integrator, trajectory, other, np.append(spread, violent), 1)
         if off is None:
             return None
-        shares = ((off[0] + off[1] * trajectory.dt) / way).max(axis=1)
+        shares = ((off[0] + off[1] * trajectory.dt) / travel).max(axis=1)
         usual, rare = shares[: len(spread)], shares[len(spread) :]
         by_steps = max(trajectory.steps * float(usual.max(initial=0.0)), float(rare.sum()))
         largest = float(off[0].max(initial=0.0))
@@ -125,7 +125,7 @@ def grown_error(
             return None
         # Errors of velocities may last to the end.
         left = trajectory.dt * (trajectory.steps - chosen)[:, None]
-        by_kinks = len(bent.steps) * float(((off[0] + off[1] * left) / way).max(axis=1).mean())
+        by_kinks = len(bent.steps) * float(((off[0] + off[1] * left) / travel).max(axis=1).mean())
         largest = max(largest, float(off[0].max()))
     # Errors of kinks grow, too.
     small = NEAR * WARNED / max(by_steps + by_kinks, 1e-300)
@@ -139,7 +139,7 @@ def grown_error(
         return None
     # Unknown from where a step of the repetition fails.
     apart = np.nan_to_num(np.abs(again[0] - trajectory.q))
-    shares = apart / way
+    shares = apart / travel
     joint = int(shares.max(axis=0).argmax())
     share = float(shares[:, joint].max())
     by_bends = by_kinks > by_steps

@@ -80,7 +80,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     drift = _drift(integrator, np.array([1j * fastest]), h)
     if drift is None or (h * fastest < 1.0 and abs(drift[0]) * trajectory.t[-1] < WARNED):
         return None
-    way = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
+    travel = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
     # In equilibrium accelerations and amplitudes are rounding.
     rounding = ROUNDING * (1.0 + np.abs(q).max())
     worst, most, ends = None, 0.0, (0, len(at) - 1)
@@ -118,7 +118,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         rates, heights, left, turned = rates[swings], heights[:, swings], left[swings], turned[swings]
         off = heights * (left * turned)
         with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.where(off > rounding, off / way[:, None], 0.0)
+            shares = np.where(off > rounding, off / travel[:, None], 0.0)
         joint, mode = np.unravel_index(int(shares.argmax()), shares.shape)
         share = float(shares[joint, mode])
         if share >= WARNED and (worst is None or share > worst.share):

@@ -284,12 +284,14 @@ def _step_failure(
         hold: Steps between two decisions of the control loop; None to leave the loop unchecked.
         decided: Of a law the step of its last decision, and that decision (1, m).
     """
-    node = record.trajectory()
+    node, cause = record.trajectory(), ""
     if hold is not None:
         last, u = (node.steps, node.u[:0]) if decided is None else decided
         loop = unstable_loop(record.scene, node, hold)
-        node = with_warnings(node, loop or outgrown(np.concatenate([node.u[:last:hold], u]), hold * record.dt))
-    return StepFailure(node.steps, node.t[-1], named(record.scene, failure), node)
+        found = loop or outgrown(np.concatenate([node.u[:last:hold], u]), hold * record.dt)
+        if found:
+            node, cause = with_warnings(node, found), found[0].sentence
+    return StepFailure(node.steps, node.t[-1], named(record.scene, failure), node, cause)
 
 
 def _checked(

@@ -235,7 +235,7 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         dt, start = trajectory.dt, trajectory.t[error.step]
         off = (
             f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
-            f"{100 * error.position:.3g}% of its way over a period, and its velocity by {100 * error.velocity:.3g}%"
+            f"{100 * error.position:.3g}% of its travel over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
         fast = Fast(0.0) if integrator.l_stable else _fast_damping(scene, trajectory)
         if fast.rate:
@@ -463,20 +463,20 @@ def _works(
     """
     h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
     with np.errstate(over="ignore", invalid="ignore"):
-        way = np.diff(trajectory.q, axis=0)
+        displacement = np.diff(trajectory.q, axis=0)
         force = _applied(scene, trajectory)
-        work = force * way
+        work = force * displacement
         if trajectory.u_stages.shape[1]:
             c = np.array(integrator.stage_times)[:, None]
             rest = (trajectory.u_stages - trajectory.u[:, None]) @ scene.actuation.T
             speed = (1.0 - c) * (1.0 - 3.0 * c) * before[:, None] + c * (3.0 * c - 2.0) * after[:, None]
-            speed = speed + 6.0 * c * (1.0 - c) * (way / h)[:, None]
+            speed = speed + 6.0 * c * (1.0 - c) * (displacement / h)[:, None]
             work = work + h * np.einsum("s,ksn->kn", shares(integrator.stage_times), rest * speed)
-        even = (way / h) ** 2
+        even = (displacement / h) ** 2
         heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
         if scene.dissipates or scene.couplings:
             middle = 0.5 * (trajectory.q[1:] + trajectory.q[:-1])
-            heat -= scene.core.forces(middle, way / h, force)[0] * way + h * even * scene.damping
+            heat -= scene.core.forces(middle, displacement / h, force)[0] * displacement + h * even * scene.damping
     return work, heat
 
 
@@ -649,7 +649,7 @@ def _agree(
         length,
         dt,
         *again,
-        way=gain * WRONG_MOTION,
+        travel=gain * WRONG_MOTION,
         velocity=gain_of_velocity * WRONG_VELOCITY,
         little=LITTLE,
         light=LIGHT,

@@ -236,7 +236,7 @@ inline Glance glance(const Mechanism& mechanism, const Record& record, const std
 // largest velocity. Lower bounds of these units are the share `little` of the travel of other joints of the same kind,
 // and the share `light` of the velocity that would have their energy.
 struct Allowed {
-    double way = 0.0;
+    double travel = 0.0;
     double velocity = 0.0;
     double little = 0.0;
     double light = 0.0;
@@ -300,7 +300,7 @@ inline bool agree_in_windows(const Mechanism& mechanism, const double* q, const 
             if (off_q[c] <= rounding) off_q[c] = 0.0;
             unit[c] = position[c].width();
         }
-        if (!within(off_q, allowed.way, energy, static_cast<double>(length) * h)) return false;
+        if (!within(off_q, allowed.travel, energy, static_cast<double>(length) * h)) return false;
         for (int c = 0; c < n; ++c) unit[c] = speed[c].magnitude;
         if (!within(off_v, allowed.velocity, energy, 1.0)) return false;
     }

@@ -124,11 +124,11 @@ class PlanConstraint(Frozen, ABC):
     def __repr__(self) -> str:
         """All parameters to the last digit, for comparison with other constraints."""
         values = {name: value for name, value in vars(self).items() if not isinstance(value, Robot) and name[0] != "_"}
-        told = (f"{name}={_told(value)}" for name, value in values.items() if name != "kinematics")
-        return f"{type(self).__name__}({', '.join(told)})"
+        arguments = (f"{name}={_argument(value)}" for name, value in values.items() if name != "kinematics")
+        return f"{type(self).__name__}({', '.join(arguments)})"
 
 
-def _told(value: object) -> str:
+def _argument(value: object) -> str:
     return repr(value.tolist() if isinstance(value, np.ndarray) else value)
 
 
