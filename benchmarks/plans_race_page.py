@@ -122,7 +122,11 @@ def main() -> None:
     parser.add_argument("files", type=Path, nargs="+", help="the results, of different tasks where they are several")
     results: Results = {}
     for file in parser.parse_args().files:
-        results |= json.loads(file.read_text(encoding="utf-8"))
+        found = json.loads(file.read_text(encoding="utf-8"))
+        results |= {name: task for name, task in found.items() if "error" not in task}
+        failed = [name for name, task in found.items() if "error" in task]
+        if failed:
+            print(f"{file} has no results of {', '.join(failed)}")
     FigureCanvasAgg(draw(results)).print_png(DOCS / "images" / "plans_race.png")
     fill(DOCS / "crocoddyl.md", {"race": f"{summary(results)}\n\n{table(results)}"})
     print(summary(results))

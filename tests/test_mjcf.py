@@ -162,6 +162,22 @@ def test_shapes_and_locked_joints(tmp_path):
     assert vp.load_robot(path).dof == 2
 
 
+def test_joints_with_the_name_of_a_body_are_locked(tmp_path):
+    joint = '<joint name="{}" axis="0 1 0"/>'
+    tip = body("tip", MASS + '<site name="a" pos="0 0 0.1"/>', joint=joint.format("tip"))
+    path = written(tmp_path, one(MASS + tip, joint=joint.format("a")))
+    q = np.array([0.3, -0.2])
+    robot = vp.load_robot(path)
+    other = vp.load_robot(written(tmp_path, one(MASS + tip, joint=joint.format("b"))), lock={"b": 0.3})
+    written(tmp_path, one(MASS + tip, joint=joint.format("a")))
+    locked = vp.load_robot(path, lock={"a": 0.3})
+    np.testing.assert_allclose(locked.frame_positions(q[1:]), robot.frame_positions(q), rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(vp.Scene(locked).holding_torque(q[1:]), vp.Scene(other).holding_torque(q[1:]))
+    kinds = [(frame.name, frame.type) for frame in locked.free_model.frames]
+    assert [kinds.count(("a", kind)) for kind in (pin.FrameType.BODY, pin.FrameType.OP_FRAME)] == [1, 1]
+    assert vp.load_robot(path, lock={"tip": 0.3}).joint_names == ("a",)
+
+
 @pytest.mark.parametrize(
     ("text", "facts"),
     [

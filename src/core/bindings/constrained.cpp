@@ -10,6 +10,7 @@
 #include "arrays.hpp"
 #include "registrations.hpp"
 #include "rollout.hpp"
+#include "small_arms.hpp"
 
 namespace varpin::border {
 
@@ -23,14 +24,20 @@ std::vector<double> places_of(const Tableau& tableau, In<2> places) {
     return {places.data(), places.data() + places.size()};
 }
 
-class ConstrainedRollout : public Rollout<ConstrainedStepper, ConstrainedState> {
+// The stepper with sizes known at compile time, if there is one for the mechanism.
+std::shared_ptr<AnyConstrainedStepper> stepper_of(const Mechanism& mechanism, const Tableau& tableau,
+                                                  const std::vector<double>& places, double tolerance,
+                                                  const Guards& guards) {
+    if (auto small = small_constrained_stepper(mechanism, tableau, places, tolerance, guards)) return small;
+    return std::make_shared<ConstrainedStepper<>>(mechanism, tableau, places, tolerance, guards);
+}
+
+class ConstrainedRollout : public Rollout<AnyConstrainedStepper, ConstrainedState> {
   public:
     ConstrainedRollout(const Mechanism& mechanism, const Tableau& tableau, In<2> places, double tolerance,
                        const Guards& guards, std::size_t paths)
-        : Rollout(
-              mechanism, tableau, guards, paths,
-              std::make_shared<ConstrainedStepper>(mechanism, tableau, places_of(tableau, places), tolerance, guards)) {
-    }
+        : Rollout(mechanism, tableau, guards, paths,
+                  stepper_of(mechanism, tableau, places_of(tableau, places), tolerance, guards)) {}
 
     ConstrainedRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
@@ -44,7 +51,7 @@ class ConstrainedRollout : public Rollout<ConstrainedStepper, ConstrainedState> 
 
     // Impulses of the constraints in every step of a path's last roll (steps, m); C' times them act on the joints.
     Out impulses(std::size_t path) const {
-        const auto m = static_cast<std::size_t>(stepper_->m);
+        const auto m = static_cast<std::size_t>(mechanism_->constraints.rows());
         const std::vector<double>& all = state(path).impulses;
         return array_of(all.data(), {all.size() / m, m});
     }

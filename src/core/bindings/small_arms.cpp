@@ -49,4 +49,13 @@ std::unique_ptr<StepDerivatives> small_derivatives(const Mechanism& mechanism, c
                                     });
 }
 
+std::unique_ptr<AnyConstrainedStepper> small_constrained_stepper(const Mechanism& mechanism, const Tableau& tableau,
+                                                                 const std::vector<double>& places, double tolerance,
+                                                                 const Guards& guards) {
+    return of_size<AnyConstrainedStepper>(
+        mechanism, tableau, Solver::dense, [&]<class Size>(Size) -> std::unique_ptr<AnyConstrainedStepper> {
+            return std::make_unique<ConstrainedStepper<Size, Known<1>>>(mechanism, tableau, places, tolerance, guards);
+        });
+}
+
 }  // namespace varpin::border

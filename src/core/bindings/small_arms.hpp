@@ -3,7 +3,9 @@
 #pragma once
 
 #include <memory>
+#include <vector>
 
+#include "varpin/constrained.hpp"
 #include "varpin/linearization.hpp"
 #include "varpin/variational.hpp"
 
@@ -14,5 +16,8 @@ std::unique_ptr<Stepper> small_stepper(const Mechanism& mechanism, const Tableau
                                        const Guards& guards, double left, Solver solver);
 std::unique_ptr<StepDerivatives> small_derivatives(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
                                                    const Guards& guards, Solver solver);
+std::unique_ptr<AnyConstrainedStepper> small_constrained_stepper(const Mechanism& mechanism, const Tableau& tableau,
+                                                                 const std::vector<double>& places, double tolerance,
+                                                                 const Guards& guards);
 
 }  // namespace varpin::border

@@ -86,6 +86,8 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     add_vector(surroundings, "friction", text, _number_or_robot)
     add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
     add_vector(surroundings, "rest", "rest positions of the springs [rad or m]; default: 0")
+    text = "'robot' for the equality constraints of the robot's MJCF file; default: none"
+    surroundings.add_argument("--constraints", choices=["robot"], help=text)
     add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
 
 
@@ -168,6 +170,7 @@ def simulate_words(request: argparse.Namespace, integrator: Integrator, dt: floa
     for option in ("armature", "q0", "v0", "damping", "friction", "stiffness", "rest", "torque"):
         if (given := getattr(request, option)) is not None:
             words += [f"--{option}", *(_text(item) for item in given)]
+    words += ["--constraints", request.constraints] if request.constraints is not None else []
     if request.gravity is False:
         words.append("--no-gravity")
     elif request.gravity is not True:
@@ -296,6 +299,7 @@ def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike,
         friction=_resistance("friction", request, robot),
         stiffness=_vector("stiffness", request.stiffness, robot),
         rest=_vector("rest", request.rest, robot),
+        constraints=request.constraints,
     )
     q0 = _configuration("q0", request.q0, robot)
     v0, torque = (_vector(name, getattr(request, name), robot) for name in ("v0", "torque"))

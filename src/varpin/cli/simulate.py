@@ -44,7 +44,7 @@ DT = 1e-3
 # Options that exclude a scene file.
 _OF_MOTIONS = (
     *(*ROBOT_OPTIONS, "dt", "tolerance", "duration", "steps", "integrator", "alpha", "stages"),
-    *("q0", "srdf", "v0", "gravity", "damping", "friction", "stiffness", "rest", "torque"),
+    *("q0", "srdf", "v0", "gravity", "damping", "friction", "stiffness", "rest", "constraints", "torque"),
 )
 
 

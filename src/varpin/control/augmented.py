@@ -258,7 +258,7 @@ class _Rounds:
         """The result of a round as a solution of the constrained problem, with updated multipliers."""
         motion = found.trajectory
         values = [
-            part.updated(item.value(motion.q, motion.v, motion.u))
+            part.updated(item.value(motion.q, motion.v, self.problem.control_rows(motion)))
             for item, part in zip(self.bound, problem.all_penalties, strict=True)
         ]
         multipliers = Multipliers(

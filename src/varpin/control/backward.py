@@ -214,8 +214,8 @@ class _Rows:
     def __init__(self, along: Along, problem: PenalizedProblem) -> None:
         self.whole, self.problem, motion = along, problem, along.trajectory
         # Linearized once, before the expansions are copied for each pass.
-        _, velocity = along.linearized(0, problem.steps)
-        q, v, u = motion.q, motion.v, motion.u
+        velocity = along.of_lines.velocity if problem.linear else along.linearized(0, problem.steps)[1]
+        q, v, u = motion.q, motion.v, problem.control_rows(motion)
         self.of_nodes = problem.penalties
         self.of_rate = tuple(item for item in problem.all_penalties if item.bound.of_controls)
         self.penalties = (*self.of_nodes, *self.of_rate)
@@ -238,29 +238,32 @@ class _Rows:
     def along(self, held: list[Mask]) -> Along:
         """Expansions for a pass with the active rows ``held``."""
         passing = copy(self.whole)
-        vars(passing).pop("model", None)
+        for name in ("model", "line"):
+            vars(passing).pop(name, None)
         count = len(self.of_nodes)
         passing.running = self.problem.with_held(self.unpenalized, self.signed[:count], self.jacobians, held[:count])
         rate = self.problem.rate
         if isinstance(rate, PenalizedRate):
-            u = self.whole.trajectory.u[:: self.problem.hold]
+            u = self.problem.decided(self.whole.trajectory)
             passing.pull, passing.rate = rate.expand(u, self.problem.period, held[count:])
         return passing
 
     def ahead(self, passing: Along, plan: Plan) -> list[Floats]:
         """The penalties' shifted values on the linearized motion under a plan."""
-        problem, (lin, _) = self.problem, passing.linearized(0, self.problem.steps)
-        N, hold = problem.steps, problem.hold
+        problem, hold = self.problem, self.problem.hold
+        (A, B), x = passing.maps, self.states.shape[1]
         slack = passing.slack
-        states, moves = np.zeros((N + 1, lin.A.shape[1])), np.zeros(plan.feedforward.shape)
-        for j in range(N):
+        states, moves = np.zeros((len(A) + 1, A.shape[1])), np.zeros(plan.feedforward.shape)
+        for j in range(len(A)):
             k = j // hold
             if j % hold == 0:
-                move = plan.feedforward[k] + plan.feedback[k] @ states[j]
+                move = plan.feedforward[k] + plan.feedback[k] @ states[j, :x]
                 if plan.previous is not None and k > 0:
                     move = move + plan.previous[k] @ moves[k - 1]
                 moves[k] = np.clip(move, slack[k, 0], slack[k, 1]) if slack.size else move
-            states[j + 1] = lin.A[j] @ states[j] + lin.B[j] @ moves[k]
+            states[j + 1] = A[j] @ states[j] + B[j] @ moves[k]
+        # With linear controls the first step is the one that sets the first control.
+        states = states[len(A) - problem.steps :, :x]
         self.ahead_of = states, moves
         found = [
             s + np.einsum("krx,kx->kr", J, states[item.bound.places])
@@ -318,6 +321,9 @@ class _Rows:
     def there(self, plan: Plan) -> Plan:
         """A plan that leads to the present point of the steps, with the feedback of ``plan``."""
         at = self.states[: -1 : self.problem.hold]
+        if self.problem.linear:
+            # A line is decided at its beginning, and so is the first control.
+            at = np.concatenate([self.states[:1], at])
         ahead = self.moves - np.einsum("kmx,kx->km", plan.feedback, at)
         if plan.previous is not None:
             ahead[1:] -= np.einsum("kmi,ki->km", plan.previous[1:], self.moves[:-1])
@@ -490,11 +496,24 @@ class Along:
     @cached_property
     def line(self) -> LinearSteps:
         """The steps with the control in the state, where controls are linear between nodes."""
-        problem, running = self.problem, self.running
+        found = self.running
+        return linear_steps(self.problem, self.of_lines, found.gradient, found.hessian, self.rate, self.pull)
+
+    @cached_property
+    def of_lines(self) -> Derivatives:
+        """Derivatives of the steps whose controls are linear between nodes."""
+        problem = self.problem
         lin, velocity = self.linearized(0, problem.steps)
         ramp = problem.integrator.ramps(problem.scene, self.trajectory) @ problem.scene.transmission
-        found = Derivatives(lin.A, lin.B - ramp, ramp, velocity)
-        return linear_steps(problem, found, running.gradient, running.hessian, self.rate, self.pull)
+        return Derivatives(lin.A, lin.B - ramp, ramp, velocity)
+
+    @property
+    def maps(self) -> tuple[Floats, Floats]:
+        """A and B of all steps of a pass whose motion is one block, with the control in the state if it is linear."""
+        if self.problem.linear:
+            return self.line.A, self.line.B
+        lin, _ = self.linearized(0, self.problem.steps)
+        return lin.A, lin.B
 
     def linearized(self, begin: int, end: int) -> tuple[Linearization, Floats]:
         """A block of steps, and dv/dx at its nodes where they are needed."""

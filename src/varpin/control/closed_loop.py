@@ -15,7 +15,7 @@ from varpin.arrays import Floats
 from varpin.control.backward import Along
 from varpin.control.constraints import BoundRate
 from varpin.control.descent import Model, Stake, at_stake
-from varpin.control.linear_controls import at_samples
+from varpin.control.linear_controls import at_samples, linear_steps
 from varpin.control.penalties import PenalizedRate, penalized
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.spread import state_slopes
@@ -35,7 +35,7 @@ class ClosedLoop:
     feedback.
 
     Attributes:
-        gains: K (R, m, 2n).
+        gains: K (R, m, 2n); (R, m, X) of the states X of :mod:`varpin.control.linear_controls` with linear controls.
         previous: P (R, m, m); zero unless changes of controls have a cost or a limit.
         inverse: W (R, m, m), the inverse of the model's Hessian in w_k; zero in controls that are not free.
         curvature: The Hessian's diagonal (R, m).
@@ -65,6 +65,13 @@ class ClosedLoop:
         self._active = active
         self._goal = goal
         self._expand()
+        # With linear controls the state contains the control, and a first step sets the first one.
+        x = self._A.shape[1]
+        self._before = len(self._A) - problem.steps
+        terminal = self._along.terminal
+        states = len(terminal.gradient)
+        self._end = np.zeros(x), np.zeros((x, x))
+        self._end[0][:states], self._end[1][:states, :states] = terminal.gradient, terminal.hessian
 
     def _expand(self) -> None:
         """Gradients (N, 2n + m) and Hessians of the steps' costs in (x, u)."""
@@ -86,6 +93,16 @@ class ClosedLoop:
             [rows for _, rows in of_nodes],
         )
         lin, rule, N = self._linear, goal.model_rule, problem.steps
+        rate = self._expand_rate(of_rates)
+        if problem.linear:
+            steps = linear_steps(goal, self._along.of_lines, expansion.gradient, expansion.hessian, rate[1], rate[0])
+            self._A, self._B = steps.A, steps.B
+            self._steps = problem.dt * steps.gradient, problem.dt * steps.hessian
+            R, m = problem.decisions, problem.scene.controls
+            self._pull, self._rate = np.zeros((R, m)), np.zeros((0, m, m))
+            return
+        self._A, self._B = lin.A, lin.B
+        self._pull, self._rate = rate
         x, m = lin.A.shape[1], lin.B.shape[2]
         gradient, hessian = np.zeros((N, x + m)), np.zeros((N, x + m, x + m))
         samples = len(rule)
@@ -98,30 +115,34 @@ class ClosedLoop:
             gradient += (across @ expansion.gradient[s::samples, :, None])[:, :, 0]
             hessian += across @ expansion.hessian[s::samples] @ D
         self._steps = gradient, hessian
-        R = problem.decisions
-        self._pull, self._rate = np.zeros((R, m)), np.zeros((0, m, m))
-        if goal.rate is not None:
-            u = problem.decided(motion)
-            pull, rate = goal.rate.expand(u, problem.period)
-            if isinstance(goal.rate, PenalizedRate):
-                pull, _ = goal.rate.plain.expand(u, problem.period)
-                _, rate = goal.rate.expand(u, problem.period, of_rates)
-            self._pull, self._rate = pull, rate
+
+    def _expand_rate(self, active: list[Mask]) -> tuple[Floats, Floats]:
+        """Gradients (R, m) of the cost of control changes, and Hessians (R, m, m) with ``active`` rows' penalties."""
+        problem, rate = self.problem, self._goal.rate
+        R, m = problem.decisions, problem.scene.controls
+        if rate is None:
+            return np.zeros((R, m)), np.zeros((0, m, m))
+        u = problem.decided(self.motion)
+        pull, curved = rate.expand(u, problem.period)
+        if isinstance(rate, PenalizedRate):
+            pull, _ = rate.plain.expand(u, problem.period)
+            _, curved = rate.expand(u, problem.period, active)
+        return pull, curved
 
     def close(self, free: Mask) -> None:
         """Compute the feedback of the controls ``free`` (R, m), the model's Hessian beside it and the gradient."""
         hold = self.problem.hold
-        lin, (_, hessian) = self._linear, self._steps
+        A, B, (_, hessian) = self._A, self._B, self._steps
         R, m = free.shape
-        x, remembers = lin.A.shape[1], len(self._rate) > 0
+        x, remembers = A.shape[1], len(self._rate) > 0
         z = x + m
         self.gains, self.previous = np.zeros((R, m, x)), np.zeros((R, m, m))
         self.inverse, self.curvature = np.zeros((R, m, m)), np.zeros((R, m))
         V, T = np.zeros((z, z)), np.eye(z)
-        V[:x, :x] = self._along.terminal.hessian
+        V[:x, :x] = self._end[1]
         for k in reversed(range(R)):
             for j in reversed(range(k * hold, (k + 1) * hold)):
-                T[:x, :x], T[:x, x:] = lin.A[j], lin.B[j]
+                T[:x, :x], T[:x, x:] = A[j], B[j]
                 V = T.T @ V @ T + hessian[j]
             Q = np.zeros((z + m, z + m))
             # In (x, previous control, control).
@@ -146,13 +167,13 @@ class ClosedLoop:
 
     def _slope(self) -> Floats:
         """The gradient of the cost in w (R, m)."""
-        hold, lin, (gradient, _) = self.problem.hold, self._linear, self._steps
+        hold, A, B, (gradient, _) = self.problem.hold, self._A, self._B, self._steps
         R, m, x = self.gains.shape
         found = np.zeros((R, m))
-        r = np.concatenate([self._along.terminal.gradient, np.zeros(m)])
+        r = np.concatenate([self._end[0], np.zeros(m)])
         for k in reversed(range(R)):
             for j in reversed(range(k * hold, (k + 1) * hold)):
-                r = np.concatenate([lin.A[j].T @ r[:x], lin.B[j].T @ r[:x] + r[x:]]) + gradient[j]
+                r = np.concatenate([A[j].T @ r[:x], B[j].T @ r[:x] + r[x:]]) + gradient[j]
             found[k] = r[x:] + self._pull[k]
             r = np.concatenate([r[:x] + self.gains[k].T @ found[k], self.previous[k].T @ found[k] - self._pull[k]])
         return found
@@ -183,24 +204,27 @@ class ClosedLoop:
             elif len(k):
                 places = item.places[k]
                 J = item.jacobian(motion.q, motion.v)[k, r]
-                carried[part] = np.einsum("ax,axy->ay", J, self._slopes[places])
-                node[part] = places
+                carried[part, : J.shape[1]] = np.einsum("ax,axy->ay", J, self._slopes[places])
+                node[part] = places + self._before
         back = np.zeros_like(carried)
-        for j in reversed(range(problem.steps)):
+        for j in reversed(range(len(self._A))):
             own, here = j // hold, node == j + 1
             back[here] += carried[here]
-            G[:, own] += back @ self._linear.B[j]
-            back = back @ self._linear.A[j]
+            G[:, own] += back @ self._B[j]
+            back = back @ self._A[j]
             if j % hold == 0:
                 # Through feedback the control depends on the state before it and on the previous control.
                 back += G[:, own] @ self.gains[own]
                 if own > 0:
                     G[:, own - 1] += G[:, own] @ self.previous[own]
+        given = problem.begin
+        if given is not None:
+            G[:, 0, ~np.isnan(given)] = 0.0
         return G
 
     def response(self, ahead: Floats) -> tuple[Floats, Floats]:
         """Changes of the states (N + 1, 2n) and controls (R, m) for w = ``ahead`` (R, m)."""
-        A, B, hold = self._linear.A, self._linear.B, self.problem.hold
+        A, B, hold = self._A, self._B, self.problem.hold
         found, change = np.zeros((len(A) + 1, A.shape[1])), ahead.copy()
         for j in range(len(A)):
             k = j // hold
@@ -209,7 +233,7 @@ class ClosedLoop:
                 if k > 0:
                     change[k] += self.previous[k] @ change[k - 1]
             found[j + 1] = A[j] @ found[j] + B[j] @ change[k]
-        return found, change
+        return found[self._before :, : self._linear.A.shape[1]], change
 
     def values_after(self, values: list[Floats], response: Floats, change: Floats) -> list[Floats]:
         """The constraints' values (K, rows) after changes of states and controls, to first order."""

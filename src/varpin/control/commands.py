@@ -42,7 +42,7 @@ def first_commands(problem: OptimalControlProblem, controls: JointValues | Linea
         narrowed = np.clip(commands.limits, *problem.control_limits)
         narrowed.setflags(write=False)
         if problem.linear:
-            return commands._replace(limits=narrowed, before=np.clip(commands.before, *narrowed))
+            return commands._replace(limits=narrowed, before=problem.begun(np.clip(commands.before, *narrowed)))
         if problem.rate is not None and problem.rate.before is not None:
             commands = commands._replace(before=problem.rate.before[None].copy())
         return commands._replace(limits=narrowed)
@@ -129,7 +129,6 @@ def with_feedback(problem: OptimalControlProblem, here: Trajectory, plan: Plan, 
 
 def _held(u: Floats, problem: OptimalControlProblem) -> Commands:
     if problem.linear:
-        return open_line(np.clip(u, *problem.control_limits), problem.integrator.stage_times)._replace(
-            limits=problem.control_limits.copy()
-        )
+        within = problem.begun(np.clip(u, *problem.control_limits))
+        return open_line(within, problem.integrator.stage_times)._replace(limits=problem.control_limits.copy())
     return open_loop(u)._replace(hold=problem.hold, limits=problem.control_limits.copy())

@@ -279,14 +279,13 @@ def _between(solution: Solution) -> list[Finding]:
     motion = kept
     found = []
     fine = problem.constraints_on(dt, problem.steps * PARTS, problem.hold * PARTS)
+    plan = solution.trajectory
     for bound, whole, record in zip(fine, problem.bound_constraints, solution.constraints, strict=True):
         if bound.of_controls or bound.source.equality:
             continue
-        c = bound.value(motion.q, motion.v, motion.u)
+        c = bound.value(motion.q, motion.v, problem.control_rows(motion))
         # The margin is that of the plan's node at the end of the step.
-        c = c + (
-            record.values - whole.value(solution.trajectory.q, solution.trajectory.v, solution.trajectory.u)
-        ).repeat(PARTS, axis=0)
+        c = c + (record.values - whole.value(plan.q, plan.v, problem.control_rows(plan))).repeat(PARTS, axis=0)
         outside = _at_start(problem, whole)
         if outside is not None:
             # A row that is violated at the start cannot hold before the first node, so it is not reported there.

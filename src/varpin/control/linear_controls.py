@@ -64,9 +64,9 @@ def linear_steps(
     B[:, x : x + m] = np.eye(m)
     # In (x, w, u); X may have a zero state between w and u.
     g, H = np.zeros((N + 1, x + 2 * m)), np.zeros((N + 1, x + 2 * m, x + 2 * m))
-    samples = len(problem.rule)
+    samples = len(problem.model_rule)
     of_sample = hessian.reshape(-1, samples, x + m, x + m) if len(hessian) > 1 else hessian[:, None]
-    for s, (D, weight) in enumerate(zip(_sampled(problem, found), problem.rule[:, 0], strict=True)):
+    for s, (D, weight) in enumerate(zip(_sampled(problem, found), problem.model_rule[:, 0], strict=True)):
         curvature = of_sample[:, s if of_sample.shape[1] > 1 else 0]
         across = weight * np.swapaxes(D, 1, 2)
         g[1:] += (across @ gradient[s::samples, :, None])[:, :, 0]
@@ -77,6 +77,12 @@ def linear_steps(
         across = np.swapaxes(change, 1, 2) / h
         g += (across @ pull[:, :, None])[:, :, 0]
         H += across @ (rate @ change)
+    begin = problem.begin
+    if begin is not None:
+        # A given first control is no decision: it changes nothing and has its own minimum.
+        given = np.flatnonzero(~np.isnan(begin))
+        B[0][:, given], g[0, x + m + given], H[0][:, x + m + given], H[0][x + m + given] = 0.0, 0.0, 0.0, 0.0
+        H[0, x + m + given, x + m + given] = 1.0
     kept = np.r_[0 : x + m, X : X + m]
     wide_g, wide_H = np.zeros((N + 1, X + m)), np.zeros((N + 1, X + m, X + m))
     wide_g[:, kept] = g
@@ -89,7 +95,7 @@ def _sampled(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]
     m, x = problem.scene.controls, 2 * problem.scene.robot.dof
     after = np.concatenate([found.A, found.begin, found.end], axis=2)
     parts = []
-    for D, share in zip(at_samples(problem.rule, after, found.velocity), problem.places, strict=True):
+    for D, share in zip(at_samples(problem.model_rule, after, found.velocity), problem.model_places, strict=True):
         of_controls = np.zeros((len(D), m, x + 2 * m))
         of_controls[:, :, x : x + m], of_controls[:, :, x + m :] = (1.0 - share) * np.eye(m), share * np.eye(m)
         parts.append(np.concatenate([D, of_controls], axis=1))

@@ -125,7 +125,7 @@ def reports(
     for item, backoff, values in zip(
         bound, split(bound, multipliers.backoff), split(bound, multipliers.values), strict=True
     ):
-        c = item.value(motion.q, motion.v, motion.u) + backoff
+        c = item.value(motion.q, motion.v, problem.control_rows(motion)) + backoff
         found.append(
             ConstraintReport(item.source.label, item.rows, item.unit, item.times, c, values, item.source.equality)
         )

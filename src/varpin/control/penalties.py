@@ -149,12 +149,19 @@ class PenalizedProblem(OptimalControlProblem):
         all_penalties: Penalties of all constraints, in the problem's order.
         quiet: Whether plans leave the scene's noise out: otherwise stiff penalties would add to the noise cost.
         passes: Greatest number of passes that determine the active rows; 0 keeps those of the nominal motion.
+        given: The given first controls, where controls are linear between nodes.
     """
 
     penalties: tuple[Penalty, ...]
     all_penalties: tuple[Penalty, ...]
     quiet: bool
     passes: int
+    given: Floats | None
+
+    @property
+    def begin(self) -> Floats | None:
+        """See :attr:`OptimalControlProblem.begin`."""
+        return self.given
 
     @property
     def processes(self) -> int:
@@ -173,10 +180,15 @@ class PenalizedProblem(OptimalControlProblem):
         node = [self.rule[0, 0], 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
         return np.vstack([self.rule, node])
 
+    @property
+    def model_places(self) -> Floats:
+        """See :attr:`OptimalControlProblem.model_places`."""
+        return np.append(self.places, 1.0)
+
     def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """See :meth:`OptimalControlProblem.model_samples`."""
         samples = self.samples(q, v, u)
-        nodes = (q[1:], v[1:], u)
+        nodes = (q[1:], v[1:], u[1:] if self.linear else u)
         steps = self.steps
         joined = [
             np.concatenate([x.reshape(steps, -1, x.shape[-1]), y[:, None]], axis=1)
@@ -192,7 +204,7 @@ class PenalizedProblem(OptimalControlProblem):
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
         """See :meth:`OptimalControlProblem.expand_running`; penalties have Gauss-Newton Hessians."""
-        q, v, u = trajectory.q, trajectory.v, trajectory.u
+        q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
         s = [penalty.signed(penalty.bound.value(q, v, u)) for penalty in self.penalties]
         held = [penalty.held(signed) for penalty, signed in zip(self.penalties, s, strict=True)]
         J = [
@@ -266,6 +278,7 @@ def penalized(
             m = problem.scene.controls
             rate = ControlRate(np.zeros((m, m)), _rate_of(on_rate[0]).before)
         changes["rate"] = PenalizedRate(rate, on_rate)
+    changes["given"] = problem.begin
     # The dataclass is frozen: attributes are set in its dictionary.
     vars(made).update(vars(problem) | changes)
     return made

@@ -20,7 +20,7 @@ from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes
 from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
-from varpin.integrators.base import open_loop
+from varpin.integrators.base import open_line, open_loop
 from varpin.trajectory import Trajectory
 
 Mask = NDArray[np.bool_]
@@ -89,7 +89,10 @@ def polished(
     trials = Trials(problem)
     lower, upper = problem.control_limits
     u = problem.decided(motion)
-    step = _Step(problem, motion, weights, backoff, multipliers, (u > lower) & (u < upper))
+    free = (u > lower) & (u < upper)
+    if problem.begin is not None:
+        free[0] &= np.isnan(problem.begin)
+    step = _Step(problem, motion, weights, backoff, multipliers, free)
     longest = 1.0
     for left in reversed(range(_STEPS)):
         if step.found.violation <= _DONE and step.found.decrease <= _FLAT * step.found.stake:
@@ -139,7 +142,8 @@ class _Step:
     ) -> None:
         self.problem, self.motion, self.free, self.multipliers = problem, motion, free, multipliers
         self.bound = problem.bound_constraints
-        self.c = [item.value(motion.q, motion.v, motion.u) + b for item, b in zip(self.bound, backoff, strict=True)]
+        u = problem.control_rows(motion)
+        self.c = [item.value(motion.q, motion.v, u) + b for item, b in zip(self.bound, backoff, strict=True)]
         active = [values != 0.0 for values in multipliers]
         # The rows that are met, or may be.
         self.rows = [
@@ -219,10 +223,19 @@ class _Step:
         u = problem.decided(self.motion)
         response, change = loop.response(self.ahead - (1.0 - length) * np.where(self.free, self.tangent, 0.0))
         gains, reference = loop.gains, (states(problem, self.motion) + response)[: -1 : problem.hold]
+        after = u + change
+        if problem.linear:
+            m, x = change.shape[1], reference.shape[1]
+            within = problem.begun(np.clip(after, *problem.control_limits))
+            return open_line(within, problem.integrator.stage_times)._replace(
+                limits=problem.control_limits.copy(),
+                gains=np.ascontiguousarray(gains[1:, :, : x + m]),
+                reference=np.hstack([reference, after[:-1]]),
+            )
         if loop.previous.any():
-            before = np.vstack([u[:1], (u + change)[:-1]])
+            before = np.vstack([u[:1], after[:-1]])
             gains, reference = np.concatenate([gains, loop.previous], axis=2), np.hstack([reference, before])
-        return open_loop(u + change)._replace(
+        return open_loop(after)._replace(
             hold=problem.hold,
             limits=problem.control_limits.copy(),
             gains=np.ascontiguousarray(gains),

@@ -168,7 +168,7 @@ class OptimalControlProblem(Frozen):
             UnknownJoint: An unknown joint name, or one of a joint that is not driven, for controls.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or a lower limit above the upper one; linear controls
-                with ``hold``, in a scene with noise or with constraints; ``hold`` or linear controls with a
+                with ``hold`` or in a scene with noise; ``hold`` or linear controls with a
                 :class:`KinematicInput`; another ``sampling`` than "gauss" with a cubic one; constraints that are no
                 plan constraints or of another robot.
             CostError: A reference function fails.
@@ -220,8 +220,6 @@ class OptimalControlProblem(Frozen):
             announce(logger, scene, dt, moved)
         rate = control_rate(cost, m, scene.control_joints)
         given = _constraints(constraints)
-        if given and controls == "linear":
-            raise InputError("plans with linear controls take no constraints: use controls='held'", "controls")
         values = {
             "scene": scene,
             "cost": cost,
@@ -241,7 +239,9 @@ class OptimalControlProblem(Frozen):
             "rate": rate,
             "controls": controls,
             "integrator_by_default": integrator is None,
-            "bound_constraints": _bind_constraints(given, scene, t0, dt, steps, hold, rate),
+            "bound_constraints": _bind_constraints(
+                given, scene, t0, dt, steps, hold, rate, linear=controls == "linear"
+            ),
         }
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -281,6 +281,28 @@ class OptimalControlProblem(Frozen):
         known = None if self.rate is None else self.rate.before
         limits = (item.before for item in self.bound_constraints if isinstance(item, BoundRate))
         return next((before for before in (known, *limits) if before is not None), None)
+
+    @property
+    def begin(self) -> Floats | None:
+        """The first control (m,) where controls are linear between nodes, NaN where it is free; None if all are.
+
+        It is given where a limit of the rate begins with a control before the horizon: lines do not jump.
+        """
+        found = None
+        for item in self.bound_constraints if self.linear else ():
+            if isinstance(item, BoundRate) and item.before is not None:
+                found = np.full(self.scene.controls, np.nan) if found is None else found
+                found[item.limited] = np.clip(item.before, *self.control_limits)[item.limited]
+        return found
+
+    def begun(self, u: Floats) -> Floats:
+        """Controls of decisions (R, m) whose first one is :attr:`begin` where that is given."""
+        given = self.begin
+        if given is None:
+            return u
+        u = np.array(u)
+        u[0] = np.where(np.isnan(given), u[0], given)
+        return u
 
     @property
     def decisions(self) -> int:
@@ -382,7 +404,7 @@ class OptimalControlProblem(Frozen):
             rate, t0 = changed.get("rate", self.rate), changed.get("t0", self.t0)
             grid = (t0, self.dt, self.steps, self.hold)
             constraints = changed.get("constraints", self.constraints)
-            changed["bound_constraints"] = _bind_constraints(constraints, scene, *grid, rate)
+            changed["bound_constraints"] = _bind_constraints(constraints, scene, *grid, rate, linear=self.linear)
         problem = object.__new__(type(self))
         # The dataclass is frozen: attributes are set in its dictionary.
         vars(problem).update(vars(self) | changed)
@@ -411,9 +433,12 @@ class OptimalControlProblem(Frozen):
             return "other constraints"
         return next(iter(differences(self.scene, other.scene.values, noise=True)), "")
 
-    def constraints_on(self, dt: float, steps: int, hold: int) -> tuple[BoundConstraint, ...]:
-        """The constraints on another grid."""
-        return _bind_constraints(self.constraints, self.scene, self.t0, dt, steps, hold, self.rate)
+    def constraints_on(
+        self, dt: float, steps: int, hold: int, *, linear: bool | None = None
+    ) -> tuple[BoundConstraint, ...]:
+        """The constraints on another grid, and for controls that are ``linear`` between nodes or held."""
+        lines = self.linear if linear is None else linear
+        return _bind_constraints(self.constraints, self.scene, self.t0, dt, steps, hold, self.rate, linear=lines)
 
     @property
     def described_constraints(self) -> str:
@@ -444,6 +469,11 @@ class OptimalControlProblem(Frozen):
         if fields is None or not self.integrator.variational:
             return np.ones(self.scene.processes, dtype=np.bool_)
         return np.array(fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0), dtype=np.bool_)
+
+    @property
+    def model_places(self) -> Floats:
+        """Where the sample points :attr:`model_rule` are in a step of unit length (s,)."""
+        return self.places
 
     @property
     def model_rule(self) -> Floats:
@@ -688,13 +718,15 @@ def _bind_constraints(
     steps: int,
     hold: int,
     rate: ControlRate | None,
+    *,
+    linear: bool,
 ) -> tuple[BoundConstraint, ...]:
     """Bind constraints to a grid."""
     if not constraints:
         return ()
     times = t0 + np.arange(steps + 1, dtype=np.float64) * dt
     before = None if rate is None else rate.before
-    horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before)
+    horizon = Horizon(times, scene.robot, scene.controls, hold, scene.control_joints, before, linear)
     bound = []
     for i, item in enumerate(constraints):
         try:

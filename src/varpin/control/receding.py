@@ -89,7 +89,8 @@ def replan(
         )
         history += [replace(item, index=len(history)) for item in found.history]
         motion = found.trajectory
-        c = [item.value(motion.q, motion.v, motion.u) for item in new]
+        u = problem.control_rows(motion)
+        c = [item.value(motion.q, motion.v, u) for item in new]
         most = [_LARGEST * w * item.scale for item, w in zip(new, first_weights, strict=True)]
         multipliers = [
             np.clip(part.updated(values), -limit, limit)
@@ -190,7 +191,9 @@ def kept(
     """Violations of each constraint by the plans of a run and by the plant's motion in ``substeps`` per tick."""
     if not problem.constraints:
         return ()
-    fine = problem.constraints_on(motion.dt, motion.steps, substeps)
+    # A plant's motion has the means of lines over its steps.
+    hold = 1 if problem.linear else substeps
+    fine = problem.constraints_on(motion.dt, motion.steps, hold, linear=False)
     infeasible = np.array([plan.status is Status.INFEASIBLE for plan in plans])
     found = []
     for i, bound in enumerate(fine):

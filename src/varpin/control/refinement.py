@@ -14,7 +14,7 @@ from varpin.control.history import Status
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refined import Refined, Refinement, part
 from varpin.control.solution import Solution
-from varpin.control.verification import Verification
+from varpin.control.verification import excess, true_costs
 from varpin.errors import InputError, VarpinError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.friction import rate_at_rest
@@ -24,6 +24,8 @@ Search = Callable[[OptimalControlProblem, LinearPolicy | None], Solution]
 
 logger = logging.getLogger(__name__)
 
+# Tolerance of the searches, relative to the allowed loss.
+SUFFICIENT = 0.01
 # Accuracy of true costs, relative to the allowed loss.
 _KNOWN = 0.1
 # Greatest number of halvings of the step.
@@ -51,7 +53,7 @@ def refine(problem: OptimalControlProblem, search: Search, wish: float, time_lef
         solution: Solution | None = None
         try:
             solution = search(problem, start)
-            verified = None if solution.status is Status.INTERRUPTED else solution.verify(tolerance=_KNOWN * wish)
+            told = None if solution.status is Status.INTERRUPTED else _true_costs(solution, wish)
         except KeyboardInterrupt:
             if solution is None:
                 if best is None:
@@ -103,15 +105,22 @@ def _ended(
     return ""
 
 
-def _row(solution: Solution, verified: Verification, seconds: float) -> Refined:
+def _true_costs(solution: Solution, wish: float) -> tuple[float, float, bool]:
+    accuracy = _KNOWN * wish
+    plan = (solution.problem, solution.trajectory, solution.cost, solution.policy_on)
+    return true_costs(*plan, wish=wish, accuracy=accuracy)
+
+
+def _row(solution: Solution, costs: tuple[float, float, bool], seconds: float) -> Refined:
     problem = solution.problem
+    opened, closed, told = costs
     return Refined(
         dt=problem.dt,
         steps=problem.steps,
         cost=solution.cost,
-        true_cost=verified.closed_loop_cost,
-        open_loop_cost=verified.open_loop_cost,
-        loss=verified.closed_loop_loss if verified.told else np.nan,
+        true_cost=closed,
+        open_loop_cost=opened,
+        loss=excess(closed, solution.cost) if told else np.nan,
         iterations=solution.iterations,
         status=solution.status,
         seconds=seconds,

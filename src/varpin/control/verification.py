@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,8 @@ _READING = (
     "where feedback loses less than a percent, the plan holds; where it loses more, dt is too coarse (controls alone "
     "also lose much where a motion is unstable)"
 )
+# A loss is far above a wish from this multiple of it on.
+_FAR = 2.0
 # Stability limit of the Runge-Kutta method: greatest product of rate and step.
 _STABLE = 2.78
 
@@ -215,9 +217,7 @@ def verify(
     The substeps double until the relative change of both costs is at most ``tolerance``. Where the explicit method does
     not reach that because of fast dampers or dry friction, the L-stable one repeats the comparison.
     """
-    fast = _fast(problem, plan) or problem.dt * rate_at_rest(problem.scene, problem.q0) >= _STABLE * max_substeps
-    members = (accurate(problem),) if problem.scene.constraints else (_FAST,) if fast else (_USUAL, _FAST)
-    for integrator in members:
+    for integrator in _members(problem, plan, max_substeps):
         found = _against(
             problem,
             plan,
@@ -249,8 +249,93 @@ def _against(
     progress: Callable[[int, int], None] | None,
 ) -> Verification:
     """:func:`verify` by one integrator."""
+    found = _true_costs(
+        problem, plan, policy, integrator, tolerance=tolerance, max_substeps=max_substeps, progress=progress
+    )
+    end = plan.q[-1]
+    return Verification(
+        planned_cost=planned_cost,
+        open_loop_cost=found.opened[0],
+        closed_loop_cost=found.closed[0],
+        open_loop_gap=float(np.abs(found.opened[1] - end).max()),
+        closed_loop_gap=float(np.abs(found.closed[1] - end).max()),
+        defect=_defect(problem, plan, found.substeps, integrator),
+        substeps=found.substeps,
+        accuracy=found.accuracy,
+        status=status,
+        integrator=str(integrator),
+        constraints=_violations(problem, plan, found.ways, found.substeps, integrator),
+    )
+
+
+def true_costs(
+    problem: OptimalControlProblem,
+    plan: Trajectory,
+    planned_cost: float,
+    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
+    *,
+    wish: float,
+    accuracy: float,
+    max_substeps: int = 1024,
+) -> tuple[float, float, bool]:
+    """The true costs under a plan's controls alone and with feedback, and whether they decide on a wish.
+
+    Where the loss with feedback exceeds the wish by far, they are rough.
+
+    Args:
+        wish: Greatest allowed loss with feedback, relative to ``planned_cost``.
+        accuracy: Relative accuracy of costs within the wish.
+    """
+    for integrator in _members(problem, plan, max_substeps):
+        found = _true_costs(
+            problem,
+            plan,
+            policy,
+            integrator,
+            tolerance=accuracy,
+            max_substeps=max_substeps,
+            above=planned_cost + _FAR * wish * abs(planned_cost),
+        )
+        opened, closed = found.opened[0], found.closed[0]
+        told = found.accuracy <= _UNTOLD or found.decided or not np.isfinite([opened, closed]).any()
+        if told or not problem.scene.dissipates:
+            break
+    return opened, closed, told
+
+
+class _TrueCosts(NamedTuple):
+    """True costs and ends (n,) under the controls alone and with feedback, and how they were found."""
+
+    opened: tuple[float, Floats]
+    closed: tuple[float, Floats]
+    ways: tuple[Commands, Commands]
+    substeps: int
+    accuracy: float
+    decided: bool
+
+
+def _members(problem: OptimalControlProblem, plan: Trajectory, max_substeps: int) -> tuple[Integrator, ...]:
+    """The integrators of the continuous system, in the order in which they are tried."""
+    if problem.scene.constraints:
+        return (accurate(problem),)
+    fast = _fast(problem, plan) or problem.dt * rate_at_rest(problem.scene, problem.q0) >= _STABLE * max_substeps
+    return (_FAST,) if fast else (_USUAL, _FAST)
+
+
+def _true_costs(
+    problem: OptimalControlProblem,
+    plan: Trajectory,
+    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
+    integrator: Integrator,
+    *,
+    tolerance: float,
+    max_substeps: int,
+    progress: Callable[[int, int], None] | None = None,
+    above: float = np.inf,
+) -> _TrueCosts:
+    """True costs by one integrator, also where the one with feedback is surely greater than ``above``."""
     state: Literal["momentum", "velocity"] = "momentum" if integrator.variational else "velocity"
-    substeps, before = 2, (np.nan, np.nan)
+    substeps, before, decided = 2, (np.nan, np.nan), False
     times = integrator.stage_times
     blind = open_line(problem.decided(plan), times) if problem.linear else open_loop(problem.decided(plan))
     while True:
@@ -271,26 +356,14 @@ def _against(
             for now, then in zip((opened, closed), before, strict=True)
             if np.isfinite(now[0]) and np.isfinite(then)
         ]
+        decided = closed[0] - above > abs(closed[0] - before[1])
         before = opened[0], closed[0]
         accuracy = max(changes, default=np.inf)
-        if accuracy <= tolerance or 2 * substeps > max_substeps:
+        if decided or accuracy <= tolerance or 2 * substeps > max_substeps:
             break
         substeps *= 2
-    end = plan.q[-1]
     blind = blind._replace(hold=problem.hold * substeps)
-    return Verification(
-        planned_cost=planned_cost,
-        open_loop_cost=opened[0],
-        closed_loop_cost=closed[0],
-        open_loop_gap=float(np.abs(opened[1] - end).max()),
-        closed_loop_gap=float(np.abs(closed[1] - end).max()),
-        defect=_defect(problem, plan, substeps, integrator),
-        substeps=substeps,
-        accuracy=accuracy,
-        status=status,
-        integrator=str(integrator),
-        constraints=_violations(problem, plan, (blind, feedback), substeps, integrator),
-    )
+    return _TrueCosts(opened, closed, (blind, feedback), substeps, accuracy, bool(decided))
 
 
 def _violations(
@@ -308,14 +381,14 @@ def _violations(
     motions = [rollout(problem.scene, integrator, problem.q0, problem.v0, law, h) for law in laws]
     found = []
     for bound, whole in zip(fine, problem.bound_constraints, strict=True):
-        planned = _excess(whole, whole.value(plan.q, plan.v, plan.u))
+        planned = _excess(whole, whole.value(plan.q, plan.v, problem.control_rows(plan)))
         worst, where = [], ""
         for motion, failure in motions:
             if failure is not None:
                 worst.append(np.nan)
                 where = ""
                 continue
-            excess = _excess(bound, bound.value(motion.q, motion.v, motion.u))
+            excess = _excess(bound, bound.value(motion.q, motion.v, problem.control_rows(motion)))
             if not bound.of_controls and not bound.source.equality:
                 # The plan can change nothing before its first node.
                 excess[: substeps - 1] = 0.0

@@ -1,10 +1,10 @@
 """Robots: finding and parsing their files, locking joints, and the flat tree that the core runs on."""
 
+from varpin.model.angles import ADVICE as ADVICE
+from varpin.model.angles import looks_like_degrees as looks_like_degrees
 from varpin.model.chain import planar_chain as planar_chain
 from varpin.model.combination import combine as combine
-from varpin.model.degrees import ADVICE as ADVICE
 from varpin.model.degrees import degrees_hint as degrees_hint
-from varpin.model.degrees import looks_like_degrees as looks_like_degrees
 from varpin.model.payload import Payload as Payload
 from varpin.model.robot import Robot as Robot
 from varpin.model.robot import build_robot as build_robot

@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
+from varpin.model.angles import ADVICE, looks_like_degrees
+from varpin.model.robot import Robot
 
-if TYPE_CHECKING:
-    from varpin.model.robot import Robot
-
-# Largest plausible angle [rad]: two turns.
-_TURNS = 4.0 * math.pi
 # Largest plausible angle in degrees.
 _DEGREES = 1e6
-ADVICE = "angles are in radians, np.deg2rad makes them of degrees"
-
-
-def looks_like_degrees(angle: float) -> bool:
-    """Whether an angle [rad] is larger than two turns."""
-    return abs(angle) > _TURNS
 
 
 def degrees_hint(robot: Robot, name: str, q: Floats) -> str:

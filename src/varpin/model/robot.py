@@ -17,7 +17,7 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
 from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
-from varpin.model.degrees import ADVICE, looks_like_degrees
+from varpin.model.angles import ADVICE, looks_like_degrees
 from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
 from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model

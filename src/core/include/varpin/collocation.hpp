@@ -277,6 +277,7 @@ class Collocation {
     double by_momentum(double h, int c) const { return h * (weight[0] * tableau.force[0] + changed(0, c)); }
 
   private:
+    template <class, class>
     friend class ConstrainedStepper;  // adds rows and columns of constraints to the matrix
 
     template <class Solve>

@@ -74,16 +74,34 @@ struct ConstrainedState {
     std::vector<double> impulses;      // (steps, m) impulses of the last roll
 };
 
-// Steps that make the action (H1) stationary.
-class ConstrainedStepper {
+// A stepper under constraints for any number of joints and stages.
+class AnyConstrainedStepper {
+  public:
+    explicit AnyConstrainedStepper(const Guards& guards) : guards(guards) {}
+    AnyConstrainedStepper(const AnyConstrainedStepper&) = delete;
+    AnyConstrainedStepper& operator=(const AnyConstrainedStepper&) = delete;
+    virtual ~AnyConstrainedStepper() = default;
+
+    Guards guards;
+
+    virtual bool begin(const double* q, const double* v, ConstrainedState& state) = 0;
+    virtual bool look_at(ConstrainedState& state) = 0;
+    virtual void kick(const double* push, ConstrainedState& state) = 0;
+    virtual void roll(double h, const Commands& commands, const double* increments, const double* drift,
+                      std::vector<ConstrainedState>& states, const Nodes& nodes) = 0;
+};
+
+// Steps that make the action (H1) stationary. Numbers of joints and stages may be known at compile time.
+template <class Size = int, class Stages = int>
+class ConstrainedStepper final : public AnyConstrainedStepper {
   public:
     // `places` is t_kj (s + 1, s).
     ConstrainedStepper(const Mechanism& mechanism, const Tableau& tableau, const std::vector<double>& places,
                        double tolerance, const Guards& guards)
-        : mechanism(mechanism),
+        : AnyConstrainedStepper(guards),
+          mechanism(mechanism),
           tableau(tableau),
           tolerance(tolerance),
-          guards(guards),
           equation(mechanism, this->tableau, Solver::dense),
           energy_guard(mechanism, Solver::dense, true),
           n(mechanism.dof()),
@@ -126,16 +144,15 @@ class ConstrainedStepper {
         curved_paths = std::any_of(driven.begin(), driven.end(), [](const DrivenRow& own) { return own.rate >= 0; });
         if (curved_paths) from_q.resize(n), from_v.resize(n);
     }
-    ConstrainedStepper(const ConstrainedStepper&) = delete;
-    ConstrainedStepper& operator=(const ConstrainedStepper&) = delete;
 
     const Mechanism& mechanism;
     const Tableau tableau;
     double tolerance;
-    Guards guards;
-    Collocation<> equation;
-    EnergyGuard<> energy_guard;
-    int n, m, stages;
+    Collocation<Size, Stages> equation;
+    EnergyGuard<Size> energy_guard;
+    [[no_unique_address]] Size n;
+    int m;
+    [[no_unique_address]] Stages stages;
     std::vector<double> force;           // (n) constant over the step; (s, n) at its stages, or those of a part of it
     int stride = 0;                      // from one row of `force` to the next
     Effort effort;                       // work of the last step
@@ -170,15 +187,15 @@ class ConstrainedStepper {
     }
 
     // Set a path's state to (q, v).
-    bool begin(const double* q, const double* v, ConstrainedState& state) {
-        Jet<double>& jet = equation.stage[0];
+    bool begin(const double* q, const double* v, ConstrainedState& state) override {
+        Jet<double, Size>& jet = equation.stage[0];
         first_order(mechanism, q, v, jet);
         const std::vector<double> p = jet.Lv;
         return begin_at(q, p.data(), state);
     }
 
     // The constraints and the factors of M at a path's node.
-    bool look_at(ConstrainedState& state) {
+    bool look_at(ConstrainedState& state) override {
         for (int i = 0; i < n; ++i) unit[i] = state.path.position[i].value.high;
         if (!find_basis(unit.data(), state.rank, here)) return false;
         energy_guard.velocity(state.path.momentum.data(), state.path.v.data());
@@ -186,7 +203,7 @@ class ConstrainedStepper {
     }
 
     // Add an impulse (n) to the momentum; constraints absorb its normal part.
-    void kick(const double* push, ConstrainedState& state) {
+    void kick(const double* push, ConstrainedState& state) override {
         PathState& path = state.path;
         for (int i = 0; i < n; ++i) {
             path.p[i] = path.p[i].plus(push[i]);
@@ -203,7 +220,7 @@ class ConstrainedStepper {
     // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`. The entry of a driven
     // joint is its goal, at all stages.
     void take_force(const double* own, bool varies) {
-        stride = varies ? n : 0;
+        stride = varies ? static_cast<int>(n) : 0;
         std::copy(own, own + n, force.begin());
         take_goals();
         if (varies) take_stages(own);
@@ -262,7 +279,7 @@ class ConstrainedStepper {
     }
 
     void roll(double h, const Commands& commands, const double* increments, const double* drift,
-              std::vector<ConstrainedState>& states, const Nodes& nodes) {
+              std::vector<ConstrainedState>& states, const Nodes& nodes) override {
         const std::int64_t steps = nodes.steps;
         const int controls = mechanism.controls, k = mechanism.diffusion.processes;
         const bool noisy = increments != nullptr && k > 0;
@@ -289,7 +306,7 @@ class ConstrainedStepper {
                 }
                 const double* extra = drift ? drift + row * n : nullptr;
                 const double* within = stage_controls(commands, p, s, stages, u, line);
-                stride = within ? n : 0;
+                stride = within ? static_cast<int>(n) : 0;
                 constant_force(mechanism, extra, u + s * controls, force.data());
                 take_goals();
                 if (within) {
@@ -547,7 +564,7 @@ class ConstrainedStepper {
         const auto end = [&](int row, int c) -> double& { return entry(Jx, Jf, row, c); };
         const int r = here.rank();
         for (int i = 0; i < n; ++i) unit[i] = path.position[i].value.high;
-        Jet<double>& jet = equation.stage[0];
+        Jet<double, Size>& jet = equation.stage[0];
         lagrangian_jet(mechanism, unit.data(), path.v.data(), jet);
         std::vector<double> bend(m * n), curvature(n * n), z(n), along(r), dq(n), turned(n);
         mechanism.constraints.bend(path.v.data(), here.jet, bend.data());
@@ -645,7 +662,7 @@ class ConstrainedStepper {
         basis.Q.clear();
         basis.least = 1.0;
         basis.weakest = 0;
-        const int most = rank < 0 ? std::min(m, n) : rank;
+        const int most = rank < 0 ? std::min<int>(m, n) : rank;
         for (int k = 0; k <= most && k < m; ++k) {
             const auto [best, farthest] = farthest_row(basis);
             if (k == most) return farthest;
@@ -702,6 +719,10 @@ class ConstrainedStepper {
         return sum;
     }
     double norm(const double* a) const { return std::sqrt(inner(a, a)); }
+    // y += s x.
+    static void add_scaled(int size, double s, const double* x, double* y) {
+        detail::subtract_scaled(y, -s, x, 0, size);
+    }
 
     // Read the goals of kinematic inputs from the step's force.
     void take_goals() {
@@ -751,18 +772,18 @@ class ConstrainedStepper {
         PathState& path = state.path;
         for (int again = 0; again < 2; ++again) {
             find_impulse(here, path.momentum.data(), state.rate.data(), total.data());
+            across(here.jet, total.data(), y.data());
             for (int c = 0; c < n; ++c) {
-                path.p[c] = path.p[c].plus(-across(here.jet, total.data(), c));
+                path.p[c] = path.p[c].plus(-y[c]);
                 path.momentum[c] = path.p[c].high;
             }
         }
     }
 
-    // (C' Lam)_c.
-    double across(const ConstraintJet& jet, const double* Lam, int c) const {
-        double sum = 0.0;
-        for (int r = 0; r < m; ++r) sum += jet.C[r * n + c] * Lam[r];
-        return sum;
+    // C' Lam (n).
+    void across(const ConstraintJet& jet, const double* Lam, double* out) const {
+        std::fill(out, out + n, 0.0);
+        for (int r = 0; r < m; ++r) add_scaled(n, Lam[r], &jet.C[r * n], out);
     }
 
     const ConstraintJet& jet_at(int k) const { return k == 0 ? here.jet : point[k - 1]; }
@@ -852,7 +873,8 @@ class ConstrainedStepper {
         for (int again = 0; again < 2; ++again) {
             for (int i = 0; i < n; ++i) y[i] = trial.p[i].high;
             find_impulse(there, y.data(), rate.data(), total.data());
-            for (int c = 0; c < n; ++c) trial.p[c] = trial.p[c].plus(-across(there.jet, total.data(), c));
+            across(there.jet, total.data(), y.data());
+            for (int c = 0; c < n; ++c) trial.p[c] = trial.p[c].plus(-y[c]);
             for (int r = 0; r < m; ++r) last[r] += total[r];
         }
         return Outcome::solved;
@@ -1036,10 +1058,8 @@ class ConstrainedStepper {
             for (int a = 0; a < r; ++a) {
                 const int row = here.order[a];
                 const double own = impulse[k * m + row];
-                for (int c = 0; c < n; ++c) {
-                    pushed[k * n + c] += jet.C[row * n + c] * own;
-                    push_size[k * n + c] += std::abs(jet.size[row * n + c] * own);
-                }
+                add_scaled(n, own, &jet.C[row * n], &pushed[k * n]);
+                add_scaled(n, std::abs(own), &jet.size[row * n], &push_size[k * n]);
             }
         }
     }
@@ -1047,9 +1067,14 @@ class ConstrainedStepper {
     // Write the residuals of the stages, (H2), to `right`, then -g / h; returns the largest in rounding units of its
     // terms.
     double residuals(double h, const Start& start) {
+        return stages == 1 ? residuals_of(1, h, start) : residuals_of(stages, h, start);
+    }
+
+    // As Collocation's.
+    [[gnu::always_inline]] inline double residuals_of(const int stages, double h, const Start& start) {
         double worst = 0.0;
         const int r = here.rank();
-        right.assign(stages * (n + r), 0.0);
+        right.resize(stages * (n + r));
         solution.resize(right.size());
         push();
         unresolved = 0.0;
@@ -1110,16 +1135,23 @@ class ConstrainedStepper {
     void assemble(double h) {
         const int r = here.rank(), wide = stages * n, size = stages * (n + r);
         write_stages(h);
-        saddle.assign(size * size, 0.0);
+        saddle.resize(size * size);
         rows.resize(size);
-        for (int i = 0; i < wide; ++i) {
-            for (int j = 0; j < wide; ++j) saddle[i * size + j] = scaled[i % n] * block[i * wide + j] * scaled[j % n];
+        for (int i = 0; i < stages; ++i) {
+            for (int b = 0; b < n; ++b) {
+                const double* from = &block[(i * n + b) * wide];
+                double* to = &saddle[(i * n + b) * size];
+                for (int j = 0; j < wide; j += n) {
+                    for (int c = 0; c < n; ++c) to[j + c] = scaled[b] * from[j + c] * scaled[c];
+                }
+            }
         }
         for (int k = 0; k < stages; ++k) {
             for (int a = 0; a < r; ++a) {
                 const int row = here.order[a];
                 const double *behind = &jet_at(k).C[row * n], *ahead = &point[k].C[row * n];
                 const int border = wide + k * r + a;
+                std::fill_n(&saddle[border * size + wide], stages * r, 0.0);
                 for (int i = 0; i < stages; ++i) {
                     for (int c = 0; c < n; ++c) {
                         const double unit_entry = row_scale[row] * scaled[c];
@@ -1218,16 +1250,13 @@ class ConstrainedStepper {
         find_null();
         const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
         std::fill(mass.begin(), mass.end(), 0.0);
-        std::fill(curved.begin(), curved.end(), 0.0);
+        for (int s = 0; s < stages; ++s) add_scaled(n * n, tableau.b[s], equation.stage[s].M.data(), mass.data());
+        std::copy(mass.begin(), mass.end(), curved.begin());
+        for (int s = 0; s < stages; ++s)
+            add_scaled(n * n, -exaggerated * tableau.b[s], equation.stage[s].Lqq.data(), curved.data());
         for (int i = 0; i < n; ++i) {
-            for (int j = 0; j < n; ++j) {
-                for (int s = 0; s < stages; ++s) {
-                    mass[i * n + j] += tableau.b[s] * equation.stage[s].M[i * n + j];
-                    curved[i * n + j] -= exaggerated * tableau.b[s] * equation.stage[s].Lqq[i * n + j];
-                }
-                curved[i * n + j] += mass[i * n + j];
-                if (equation.coupled()) curved[i * n + j] += equation.coupled_stiffening(i, j, 0.5 * h, exaggerated);
-            }
+            for (int j = 0; j < n && equation.coupled(); ++j)
+                curved[i * n + j] += equation.coupled_stiffening(i, j, 0.5 * h, exaggerated);
             curved[i * n + i] += equation.stiffening(i, 0.5 * h, exaggerated);
         }
         for (int k = 1; k < stages; ++k)
@@ -1276,15 +1305,13 @@ class ConstrainedStepper {
         }
     }
 
+    // The lower triangle of Z' X Z for a symmetric X.
     void reduce(const std::vector<double>& full, int free, std::vector<double>& out) {
-        out.assign(free * free, 0.0);
+        out.resize(free * free);
         for (int b = 0; b < free; ++b) {
-            for (int i = 0; i < n; ++i) y[i] = inner(&full[i * n], &null[b * n]);
-            for (int a = 0; a < free; ++a) out[a * free + b] = inner(&null[a * n], y.data());
-        }
-        for (int a = 0; a < free; ++a) {
-            for (int b = 0; b < a; ++b)
-                out[a * free + b] = out[b * free + a] = 0.5 * (out[a * free + b] + out[b * free + a]);
+            std::fill(y.begin(), y.end(), 0.0);
+            for (int i = 0; i < n; ++i) add_scaled(n, null[b * n + i], &full[i * n], y.data());
+            for (int a = b; a < free; ++a) out[a * free + b] = inner(&null[a * n], y.data());
         }
     }
 
@@ -1358,7 +1385,7 @@ class ConstrainedLinearization {
     bool varies = false, ramp = false;
 
   private:
-    ConstrainedStepper stepper;
+    ConstrainedStepper<> stepper;
     int n;
     ConstrainedState state;
     ChainedDerivatives chained;

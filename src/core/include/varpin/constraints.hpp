@@ -115,13 +115,16 @@ class Constraints {
         : products_(std::move(products)), ties_(std::move(ties)), customs_(std::move(customs)), n_(dof) {
         LinkCollector collector(bodies, links_);
         for (VectorSum& sum : vectors) {
-            Joined joined{std::move(sum), {}};
+            Joined joined{std::move(sum), {}, legs_, false};
             for (CarriedVector& part : joined.sum.parts) {
                 part.body = collector.take(part.body);
+                joined.moves = joined.moves || part.body >= 0;
                 joined.paths.push_back(links_.path(part.body));
             }
+            legs_ += joined.sum.parts.size();
             vectors_.push_back(std::move(joined));
         }
+        for (const Body& link : links_.bodies) span_.push_back(length(link.translation));
         rows_ = static_cast<int>(products_.size() + ties_.size());
         for (const CustomRows& own_rows : customs_) rows_ += own_rows.rows;
         for (std::size_t k = 0; k < ties_.size(); ++k) {
@@ -141,24 +144,12 @@ class Constraints {
         fit(w);
         std::copy(q, q + n_, w.at_q.begin());
         forward_kinematics(links_, q, w.at.data());
-        std::size_t leg = 0;
-        for (std::size_t a = 0; a < vectors_.size(); ++a) move_vector(q, a, leg, w);
-        std::fill(w.C.begin(), w.C.end(), 0.0);
-        std::fill(w.size.begin(), w.size.end(), 0.0);
-        int r = 0;
-        for (const ProductRow& product : products_) {
-            const Vec3<double>&X = w.value[product.x], &Y = w.value[product.y];
-            w.g[r] = product.factor * dot(X, Y) - product.constant;
-            w.scale[r] = std::abs(product.factor) * (w.reach[product.x] * length(Y) + length(X) * w.reach[product.y]) +
-                         std::abs(product.constant);
-            const Vec3<double>*Xs = &w.slope[product.x * n_], *Ys = &w.slope[product.y * n_];
-            const double *X_size = &w.slope_size[product.x * n_], *Y_size = &w.slope_size[product.y * n_];
-            for (int c = 0; c < n_; ++c) {
-                w.C[r * n_ + c] = product.factor * (dot(Xs[c], Y) + dot(X, Ys[c]));
-                w.size[r * n_ + c] = std::abs(product.factor) * (X_size[c] * length(Y) + length(X) * Y_size[c]);
-            }
-            ++r;
+        for (std::size_t a = 0; a < vectors_.size(); ++a) {
+            if (vectors_[a].moves) move_vector(q, a, w);
         }
+        int r = 0;
+        for (const ProductRow& product : products_) write_product(product, r++, w);
+        std::fill(w.C.begin() + r * n_, w.C.end(), 0.0);
         for (const TieRow& tie : ties_) {
             const double leader = q[tie.leader];
             double total = 0.0, slope = 0.0, size = std::abs(q[tie.follower]);
@@ -197,15 +188,20 @@ class Constraints {
             if (scale == 0.0) continue;
             w.weight[product.x] += scale * w.value[product.y];
             w.weight[product.y] += scale * w.value[product.x];
+            if (!vectors_[product.x].moves || !vectors_[product.y].moves) continue;
             const Vec3<double>*X = &w.slope[product.x * n_], *Y = &w.slope[product.y * n_];
             for (int i = 0; i < n_; ++i) {
-                for (int j = 0; j < n_; ++j) H[i * n_ + j] += scale * (dot(X[i], Y[j]) + dot(X[j], Y[i]));
+                for (int j = 0; j <= i; ++j) {
+                    const double term = scale * (dot(X[i], Y[j]) + dot(X[j], Y[i]));
+                    H[i * n_ + j] += term;
+                    if (i != j) H[j * n_ + i] += term;
+                }
             }
         }
-        std::size_t leg = 0;
         for (std::size_t a = 0; a < vectors_.size(); ++a) {
-            for (std::size_t part = 0; part < vectors_[a].sum.parts.size(); ++part, ++leg) {
-                const auto& levers = w.levers[leg];
+            if (!vectors_[a].moves) continue;
+            for (std::size_t part = 0; part < vectors_[a].sum.parts.size(); ++part) {
+                const auto& levers = w.levers[vectors_[a].first_leg + part];
                 for (std::size_t i = 0; i < levers.size(); ++i) {
                     const Vec3<double> turned = cross(w.weight[a], levers[i].turn);
                     for (std::size_t j = i; j < levers.size(); ++j) {
@@ -235,10 +231,9 @@ class Constraints {
         // For each vector: sum_i X_ij v_i by j, and sum_i X_i v_i.
         std::fill(w.moved.begin(), w.moved.end(), Vec3<double>{});
         std::fill(w.weight.begin(), w.weight.end(), Vec3<double>{});
-        std::size_t leg = 0;
         for (std::size_t a = 0; a < vectors_.size(); ++a) {
-            for (std::size_t part = 0; part < vectors_[a].sum.parts.size(); ++part, ++leg) {
-                const auto& levers = w.levers[leg];
+            for (std::size_t part = 0; part < vectors_[a].sum.parts.size(); ++part) {
+                const auto& levers = w.levers[vectors_[a].first_leg + part];
                 Vec3<double> before{}, beyond{};
                 for (const auto& lever : levers) {
                     w.moved[a * n_ + lever.coordinate] += cross(before, lever.shift);
@@ -277,6 +272,8 @@ class Constraints {
     struct Joined {
         VectorSum sum;
         std::vector<std::vector<int>> paths;  // bodies from the root to that of each part
+        std::size_t first_leg = 0;            // of its parts, in ConstraintJet::levers
+        bool moves = false;                   // with any body; else it is constant
     };
 
     Links links_;
@@ -285,6 +282,8 @@ class Constraints {
     std::vector<TieRow> ties_;
     std::vector<DrivenRow> driven_;
     std::vector<CustomRows> customs_;
+    std::vector<double> span_;  // of each link: the length of its translation
+    std::size_t legs_ = 0;      // parts of all vectors
     int n_ = 0;
     int rows_ = 0;
 
@@ -292,8 +291,6 @@ class Constraints {
 
     void fit(ConstraintJet& w) const {
         if (w.at_q.size() == static_cast<std::size_t>(n_)) return;
-        std::size_t legs = 0;
-        for (const Joined& joined : vectors_) legs += joined.sum.parts.size();
         w.g.resize(rows_);
         w.scale.resize(rows_);
         w.C.resize(rows_ * n_);
@@ -301,35 +298,62 @@ class Constraints {
         w.at_q.resize(n_);
         w.custom.resize(customs_.empty() ? 0 : n_ * n_);
         w.at.resize(links_.bodies.size());
-        w.levers.resize(legs);
+        w.levers.resize(legs_);
         w.value.resize(vectors_.size());
         w.reach.resize(vectors_.size());
         w.slope.resize(vectors_.size() * n_);
         w.slope_size.resize(vectors_.size() * n_);
         w.moved.resize(vectors_.size() * n_);
         w.weight.resize(vectors_.size());
+        // Vectors that do not move are found once.
+        const std::vector<double> any(n_);
+        for (std::size_t a = 0; a < vectors_.size(); ++a) {
+            if (!vectors_[a].moves) move_vector(any.data(), a, w);
+        }
     }
 
-    void move_vector(const double* q, std::size_t a, std::size_t& leg, ConstraintJet& w) const {
+    void write_product(const ProductRow& product, int r, ConstraintJet& w) const {
+        const Vec3<double> X = w.value[product.x], Y = w.value[product.y];
+        const double X_length = length(X), Y_length = length(Y), factor = product.factor, size = std::abs(factor);
+        w.g[r] = factor * dot(X, Y) - product.constant;
+        w.scale[r] =
+            size * (w.reach[product.x] * Y_length + X_length * w.reach[product.y]) + std::abs(product.constant);
+        double *C = &w.C[r * n_], *C_size = &w.size[r * n_];
+        std::fill(C, C + n_, 0.0);
+        std::fill(C_size, C_size + n_, 0.0);
+        if (vectors_[product.x].moves) add_slope(product.x, factor * Y, size * Y_length, w, C, C_size);
+        if (vectors_[product.y].moves) add_slope(product.y, factor * X, size * X_length, w, C, C_size);
+    }
+
+    // Add the slope of vector a times another vector, and its size times that vector's.
+    void add_slope(int a, const Vec3<double>& other, double other_size, const ConstraintJet& w, double* C,
+                   double* C_size) const {
+        const Vec3<double>* slope = &w.slope[a * n_];
+        const double* slope_size = &w.slope_size[a * n_];
+        for (int c = 0; c < n_; ++c) C[c] += dot(slope[c], other);
+        for (int c = 0; c < n_; ++c) C_size[c] += slope_size[c] * other_size;
+    }
+
+    void move_vector(const double* q, std::size_t a, ConstraintJet& w) const {
         Vec3<double>* slope = &w.slope[a * n_];
         double* size = &w.slope_size[a * n_];
         std::fill(slope, slope + n_, Vec3<double>{});
         std::fill(size, size + n_, 0.0);
-        w.value[a] = {};
-        w.reach[a] = 0.0;
+        Vec3<double> value{};
+        double reach = 0.0;
         const auto& parts = vectors_[a].sum.parts;
-        for (std::size_t part = 0; part < parts.size(); ++part, ++leg) {
+        for (std::size_t part = 0; part < parts.size(); ++part) {
             const CarriedVector& carried = parts[part];
             const double side = part == 0 ? 1.0 : -1.0;
-            auto& levers = w.levers[leg];
+            auto& levers = w.levers[vectors_[a].first_leg + part];
             levers.clear();
             Vec3<double> x = carried.point;
             if (carried.body >= 0) {
                 x = w.at[carried.body].rotation * carried.point;
                 if (!carried.direction) x += w.at[carried.body].position;
             }
-            w.value[a] += side * x;
-            w.reach[a] += length(x);
+            value += side * x;
+            reach += length(x);
             for (int j : vectors_[a].paths[part]) {
                 const Body& link = links_.bodies[j];
                 if (carried.direction && link.prismatic) continue;
@@ -342,11 +366,13 @@ class Constraints {
                 const double moved = length(lever.shift);
                 size[link.coordinate] += moved;
                 // The rounding of joint positions limits the precision of a point.
-                w.reach[a] += moved * std::abs(q[link.coordinate]);
-                if (!carried.direction) w.reach[a] += length(link.translation);
+                reach += moved * std::abs(q[link.coordinate]);
+                if (!carried.direction) reach += span_[j];
                 levers.push_back(lever);
             }
         }
+        w.value[a] = value;
+        w.reach[a] = reach;
     }
 };
 

@@ -80,16 +80,16 @@ inline int factor_lu_pivoting(double* a, int n, int* order) {
             std::swap(order[k], order[best]);
             for (int j = 0; j < n; ++j) std::swap(a[k * n + j], a[best * n + j]);
         }
-        const double* __restrict top = a + k * n;
+        const double* top = a + k * n;
         const double pivot = top[k];
         if (!(std::abs(pivot) > 0.0) || !(std::abs(pivot) < std::numeric_limits<double>::infinity())) return 0;
         if (pivot < 0.0) sign = -sign;
         const double inverse = 1.0 / pivot;
         for (int i = k + 1; i < n; ++i) {
-            double* __restrict row = a + i * n;
+            double* row = a + i * n;
             const double factor = row[k] * inverse;
             row[k] = factor;
-            for (int j = k + 1; j < n; ++j) row[j] -= factor * top[j];
+            detail::subtract_scaled(row, factor, top, k + 1, n);
         }
     }
     return sign;

@@ -30,6 +30,7 @@ class Horizon(Frozen):
         hold: Steps that share one control.
         control_joints: The joint whose force each control is; None where controls are something else.
         before: The control before the horizon (m,), or None where it is unknown.
+        linear: Whether controls are linear between nodes, with decisions at both ends of every ``hold`` steps.
     """
 
     t: Floats
@@ -38,6 +39,7 @@ class Horizon(Frozen):
     hold: int
     control_joints: tuple[str, ...] | None
     before: Floats | None
+    linear: bool = False
 
     @property
     def steps(self) -> int:
@@ -78,7 +80,10 @@ class BoundConstraint(Frozen, ABC):
 
     @abstractmethod
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """The values c (..., K, rows) on motions, q and v (..., N + 1, n) at the nodes and u (..., N, m)."""
+        """The values c (..., K, rows) on motions, q and v (..., N + 1, n) at the nodes and u (..., N, m).
+
+        Where controls are linear between nodes, u (..., N + 1, m) are those at the nodes.
+        """
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         """dc/d(q, v) (K, rows, 2n) of one motion, q and v (N + 1, n).

@@ -168,8 +168,9 @@ class BoundRate(BoundConstraint):
 class WithinControlRate(PlanConstraint):
     """abs(u_k - u_(k-1)) / T <= limit, T = hold dt: controls change no faster than the drives can.
 
-    Controls are held and jump between decisions; the rate is the jump divided by the period. ``ControlRateCost`` is its
-    soft counterpart.
+    Controls are held and jump between decisions; the rate is the jump divided by the period. Where controls are linear
+    between nodes it is the slope of each line, and the first control is ``before`` where that is given: the limited
+    controls are then continuous from tick to tick of an :class:`Mpc`. ``ControlRateCost`` is the soft counterpart.
     """
 
     limit: JointValues
@@ -225,13 +226,17 @@ class WithinControlRate(PlanConstraint):
         names = joints if joints is not None else tuple(f"control {i}" for i in range(m))
         limited = np.flatnonzero(np.isfinite(limit))
         period = float(horizon.t[horizon.hold] - horizon.t[0])
-        decisions = np.arange(0 if before is not None else 1, horizon.steps // horizon.hold)
+        if horizon.linear:
+            # A given first control is no decision: lines have slopes, and no jumps.
+            decisions = np.arange(1, horizon.steps // horizon.hold + 1)
+        else:
+            decisions = np.arange(0 if before is not None else 1, horizon.steps // horizon.hold)
         if decisions.size == 0:
             raise InputError(f"{name}: one decision without a control before has no change")
         return BoundRate(
             self,
             decisions,
-            horizon.t[: -1 : horizon.hold][decisions],
+            horizon.t[:: horizon.hold][decisions],
             tuple(f"{side} rate of {names[i]}" for side in ("upper", "lower") for i in limited),
             "control/s",
             0.1 * float(np.median(limit[limited])),

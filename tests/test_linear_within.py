@@ -1,0 +1,149 @@
+"""Plans within hard constraints whose controls are linear between nodes."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import varpin as vp
+
+N = 8
+ROBOT = vp.planar_chain(2)
+BEFORE = [12.0, 3.0]
+CASES = {
+    "speeds": [vp.WithinVelocityLimits(ROBOT, (-0.9, 0.9))],
+    "goal": [vp.ReachFrame(ROBOT, "tip", position=[1.2, 0.0, -0.9])],
+    "slopes": [vp.WithinControlRate([15.0, 5.0])],
+    "given begin": [
+        vp.WithinControlRate([150.0, np.inf], before=BEFORE),
+        vp.WithinJointLimits(ROBOT, ([-1.0, -0.35], [1.0, 1.0])),
+    ],
+}
+
+
+def links(name: str, **options: object) -> vp.OptimalControlProblem:
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(0.1) + vp.ControlRateCost(1e-4)
+    cost += vp.Terminal(vp.TrackingCost([0.6, -0.4], 1e2) + vp.VelocityCost(1e1))
+    given = {"dt": 0.1, "steps": N, "controls": "linear", "constraints": CASES[name]} | options
+    return vp.OptimalControlProblem(vp.Scene(ROBOT, damping=0.1), cost, [0.1, 0.2], [0.0, 0.0], **given)
+
+
+def moved(problem: vp.OptimalControlProblem, u: np.ndarray) -> vp.Trajectory:
+    """The motion under controls (N + 1, m) at the nodes, without feedback."""
+    return problem.simulate(vp.LinearPolicy(u[1:], np.zeros((N, 2, 4)), np.zeros((N, 4)), before=u[0], linear=True))
+
+
+def values(problem: vp.OptimalControlProblem, motion: vp.Trajectory) -> list[np.ndarray]:
+    return [bound.value(motion.q, motion.v, motion.u_nodes) for bound in problem.bound_constraints]
+
+
+def fixed(problem: vp.OptimalControlProblem) -> np.ndarray:
+    """Which controls (N + 1, m) are given."""
+    found = np.zeros((N + 1, 2), dtype=bool)
+    found[0] = False if problem.begin is None else ~np.isnan(problem.begin)
+    return found
+
+
+@pytest.mark.parametrize("limited", [False, True])
+@pytest.mark.parametrize("name", CASES)
+def test_karush_kuhn_tucker(name, limited):
+    """The Lagrangian's slopes by differences, and multipliers of the right signs."""
+    most = 20.0 if name == "given begin" else 16.0
+    options = {"control_limits": (-most, most)} if limited else {"integrator": vp.Midpoint()}
+    problem = links(name, **options)
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged, plan.reason
+    assert plan.violation <= 1e-9
+    u, (lower, upper) = plan.controls, problem.control_limits
+    assert (u >= lower).all()
+    assert (u <= upper).all()
+    assert (u[fixed(problem)] == BEFORE[:1]).all()
+
+    def parts(u):
+        motion = moved(problem, u)
+        pulls = zip(values(problem, motion), plan.constraints, strict=True)
+        return np.concatenate([problem.shares(motion), *((c * report.multipliers).ravel() for c, report in pulls)])
+
+    slopes, sizes = np.zeros(u.shape), np.zeros(u.shape)
+    for i in np.ndindex(*u.shape):
+        w = np.zeros(u.shape)
+        w[i] = 1e-4
+        found = (parts(u + w) - parts(u - w)) / 2e-4
+        slopes[i], sizes[i] = found.sum(), np.abs(found).sum()
+    held = ((u <= lower) & (slopes > 0.0)) | ((u >= upper) & (slopes < 0.0)) | fixed(problem)
+    # The search ends where the cost would fall by 1e-13 of itself: slopes are small as its root is.
+    assert np.abs(np.where(held, 0.0, slopes)).max() <= 1e-5 * sizes.max()
+    assert any(report.active.any() for report in plan.constraints)
+    for report in plan.constraints:
+        if not report.equality:
+            assert (report.multipliers >= 0.0).all()
+            assert np.abs(report.multipliers * report.values).max() <= 1e-8 * abs(plan.cost)
+
+
+@pytest.mark.parametrize("name", ["speeds", "given begin"])
+def test_scipy_finds_no_less(name):
+    problem = links(name)
+    plan = vp.solve(problem, check=False)
+    given = fixed(problem)
+
+    def motion(x):
+        u = plan.controls.copy()
+        u[~given] = x
+        return moved(problem, u)
+
+    def rule(x, i):
+        return -values(problem, motion(x))[i].ravel()
+
+    rules = [{"type": "ineq", "fun": rule, "args": (i,)} for i in range(len(CASES[name]))]
+    free = plan.controls[~given]
+    start = free * (1.0 + 0.02 * np.random.default_rng(0).normal(size=free.size))
+    best = minimize(
+        lambda x: problem.cost_of(motion(x)), start, method="SLSQP", constraints=rules,
+        options={"maxiter": 200, "ftol": 1e-10},
+    )  # fmt: skip
+    assert best.success
+    assert plan.cost <= best.fun * (1.0 + 1e-6)
+    assert best.fun <= plan.cost * (1.0 + 1e-4)
+
+
+def test_slopes_are_those_of_the_lines():
+    problem = links("slopes")
+    plan = vp.solve(problem, check=False)
+    (report,) = plan.constraints
+    slopes = np.diff(plan.controls, axis=0) / problem.dt
+    np.testing.assert_allclose(report.values, np.hstack([slopes - [15.0, 5.0], -slopes - [15.0, 5.0]]), atol=1e-9)
+    assert report.active.any()
+    np.testing.assert_allclose(report.t, problem.dt * np.arange(1, N + 1), atol=1e-12)
+    told = plan.verify()
+    assert told.constraints[0].open_loop <= 1e-6
+
+
+def test_rounds_go_on_where_they_stopped(tmp_path):
+    """Cut, saved and read, the rounds end with the same bytes."""
+    problem = links("given begin")
+    whole = vp.solve(problem, check=False)
+    part = vp.solve(problem, max_iterations=3, check=False)
+    assert part.status is vp.Status.MAX_ITERATIONS
+    rest = vp.solve(problem, resume=vp.Solution.load(part.save(tmp_path / "plan.npz"), problem), check=False)
+    assert rest.controls.tobytes() == whole.controls.tobytes()
+    assert rest.gains.tobytes() == whole.gains.tobytes()
+    assert rest.multipliers.values.tobytes() == whole.multipliers.values.tobytes()
+
+
+def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
+    """From tick to tick the lines join, and the plant's torque changes no faster than allowed, noise or not."""
+    scene = vp.Scene(ROBOT, damping=0.1)
+    hold = scene.holding_torque([0.1, 0.2])
+    cost = vp.TrackingCost([0.4, 0.0], 1e2) + vp.VelocityCost(1.0) + vp.ControlCost(1e-3)
+    within = [vp.WithinControlRate(40.0, before=hold)]
+    problem = vp.OptimalControlProblem(
+        scene, cost, [0.1, 0.2], [0, 0], dt=0.04, steps=12, controls="linear", constraints=within
+    )
+    plant = vp.Plant(vp.Scene(ROBOT, damping=0.2, noise=vp.AdditiveNoise(0.02)), vp.Midpoint(), substeps=4)
+    run = vp.Mpc(problem, iterations=3).run(plant, duration=0.6, rng=0)
+    steps = np.abs(np.diff(run.motion.u, axis=0)) / run.motion.dt
+    assert steps.max() > 39.0
+    assert steps.max() <= 40.0 * (1.0 + 1e-3)
+    assert run.constraints[0].worst <= 0.04
+    ends = np.array([plan.controls[:2] for plan in run.plans])
+    np.testing.assert_allclose(ends[0, 0], hold, atol=1e-12)
+    np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1], atol=1e-9)
