@@ -75,17 +75,17 @@ def refine(
                 if best is None:
                     raise
                 solution = best
-            solution, verified = replace(solution, status=Status.INTERRUPTED), None
+            solution, told = replace(solution, status=Status.INTERRUPTED), None
         except VarpinError as error:
             if best is None:
                 raise
             return _with(best, wish, tried, chosen, f"with dt = {problem.dt:g} s there is no plan: {error}")
-        if verified is None:
+        if told is None:
             ended = f"interrupted with dt = {problem.dt:g} s"
             if best is None:
                 return _with(solution, wish, tried, 0, ended)
             return _with(replace(best, status=Status.INTERRUPTED, reason=ended), wish, tried, chosen, ended)
-        tried.append(_row(solution, verified, time.perf_counter() - began))
+        tried.append(_row(solution, told, time.perf_counter() - began))
         logger.info("%s: true cost: %s", problem.scene.robot.name, tried[-1])
         meets = _within(tried[-1], wish) and solution.status.converged
         if best is None or meets or not abs(tried[-1].loss) >= abs(tried[chosen].loss):
