@@ -63,7 +63,7 @@ class _Heard(logging.Handler):
 
 
 def tried(path: Path) -> Row:
-    """A file, taken as far as it goes: a tenth of a second from its middle posture, with the file's own damping."""
+    """A file, taken as far as it goes: a tenth of a second from its middle posture, with what it gives itself."""
     heard, stage, joints = _Heard(), "load", 0
     logging.getLogger("varpin").addHandler(heard)
     try:
@@ -73,8 +73,11 @@ def tried(path: Path) -> Row:
         str(vp.inspect_robot(robot))
         stage = "simulate"
         lower, upper = (np.nan_to_num(limit, posinf=0.0, neginf=0.0) for limit in robot.position_limits)
-        scene = vp.Scene(robot, damping="robot")
-        motion = vp.simulate(scene, 0.5 * (lower + upper), np.zeros(robot.dof), dt=1e-3, steps=100)
+        scene = vp.Scene(robot, damping="robot", constraints="robot" if robot.equalities else ())
+        q0 = 0.5 * (lower + upper)
+        motion = vp.simulate(
+            scene, vp.assemble(scene, q0) if scene.constraints else q0, np.zeros(robot.dof), dt=1e-3, steps=100
+        )
         if not np.isfinite(motion.q).all():
             return Row(stage, joints, told, "the motion is not finite")
         stage = "replay"

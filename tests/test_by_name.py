@@ -249,3 +249,15 @@ def test_a_torque_limit_by_name_leaves_the_others_their_own():
     own = torque_shares(UR5, torques, torques, None)
     assert shares[:, 2].tolist() == [0.5] * 3
     np.testing.assert_array_equal(np.delete(shares, 2, axis=1), np.delete(own, 2, axis=1))
+
+
+def test_a_posture_by_its_name_is_told_how_to_be_given():
+    """The command line takes names of postures; from Python they are positions of the robot's."""
+    scene = vp.Scene(vp.planar_chain(2))
+    for call in (
+        lambda: vp.simulate(scene, "home", [0, 0], dt=0.01, steps=2),
+        lambda: vp.OptimalControlProblem(scene, vp.ControlCost(1.0), "home", [0, 0], dt=0.1, steps=2),
+        lambda: scene.holding_torque("home"),
+    ):
+        with refused(vp.InputError, "(2,)", "robot.posture('home')"):
+            call()

@@ -733,6 +733,8 @@ def test_scene_is_solved_saved_and_resumed(scene, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert "3 of 3 computed" in out
     assert "not converged" in err
+    assert "varpin solve scene.toml --resume part.npz" in err
+    assert "solve(problem" not in out + err
     assert main(["solve", scene, "--resume", "part.npz", "--html", "plan.html"]) == 0
     assert "converged" in capsys.readouterr().out
     file = vp.load_scene(scene)
@@ -784,3 +786,12 @@ def test_speed_of_a_scene_s_replay(tmp_path, monkeypatch, words, speed):
     monkeypatch.setattr("varpin.cli.outputs.replay", lambda *_, speed, html, **__: asked.append(speed) or html.touch())
     assert main(["simulate", "ur5_reach", "--html", str(tmp_path / "a.html"), "--quiet", *words]) == 0
     assert asked == [speed]
+
+
+def test_a_plan_that_cannot_be_is_told_with_its_constraint(scene, tmp_path, capsys):
+    rule = '[[plan_constraint]]\ntype = "reach_frame"\nframe = "pip"\nposition = [9.0, 0.0, 0.0]\n[outputs]'
+    (tmp_path / "scene.toml").write_text(SCENE.replace("[outputs]", rule).replace("steps = 20", "steps = 4"))
+    assert main(["solve", scene, "--quiet"]) == exits.STEP_FAILED
+    err = capsys.readouterr().err
+    assert "infeasible: ReachFrame" in err
+    assert "plan.reason" not in err

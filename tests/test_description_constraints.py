@@ -110,7 +110,10 @@ def test_locked_joints_take_their_constraints_along(tmp_path):
     )
     for kind in ("connect", "weld"):
         path.write_text(path.read_text().replace("<connect", f"<{kind}"))
-        assert not tied(qa=0.0, qb=0.0, qc=0.0, qd=0.0)[1].constraints
+        robot, scene = tied(qa=0.0, qb=0.0, qc=0.0, qd=0.0)
+        assert not scene.constraints
+        assert not robot.loops
+        assert tied(qa=0.0, qb=0.0, qd=0.0)[0].loops == (("b", "c"),)
         with refused(vp.InputError, f"<{kind}> 'pin'"):
             tied(qa=0.0, qb=0.0, qc=0.5, qd=0.0)
 

@@ -43,6 +43,7 @@ MESH = '<asset><mesh name="tet" file="tet.obj"/></asset>'
 STANDS = body("s", BOX, 'pos="1 0 0" quat="0.8 0.3 0 0"', "")
 LEANING = 'pos="0 0 0.3" euler="0.4 -0.2 0.3"'
 EQUAL = "<equality>{}</equality>"
+TENDON = '<tendon><fixed name="f"><joint joint="ja" coef="1"/></fixed></tendon>'
 INACTIVE = default('<equality active="false"/>')
 FRAME = '<frame pos="0 0 1" euler="0.1 0.2 0.3">{}</frame>'
 FILES = {
@@ -190,7 +191,8 @@ def test_joints_with_the_name_of_a_body_are_locked(tmp_path):
         (one(MASS + TIP, EQUAL.format('<joint joint1="ja" active="false"/>')), "inactive equality constraints"),
         (one(MASS + TIP, INACTIVE, EQUAL.format('<connect body1="a"/>')), "inactive equality constraints"),
         (one(MASS + TIP, EQUAL.format('<tendon tendon1="t"/>')), "equality constraints of kind tendon"),
-        (one(MASS + TIP, '<tendon><fixed name="f"><joint joint="ja" coef="1"/></fixed></tendon>'), "tendons"),
+        (one(MASS + TIP, TENDON, EQUAL.format('<tendon tendon1="f"/>')), "equality constraints of kind tendon"),
+        (one(MASS + TIP, TENDON), "tendons"),
     ],
 )
 def test_what_is_left_out_is_told(tmp_path, caplog, text, facts):

@@ -107,6 +107,16 @@ def test_configurations_are_mujoco_s(tmp_path, kind):
         np.testing.assert_allclose(C @ (np.eye(robot.dof) - np.linalg.pinv(mine) @ mine), 0.0, rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("offset", ["", 'polycoef="0.1 0.5 0 0 0"'])
+def test_a_tendon_of_two_joints_ties_them(tmp_path, offset):
+    tendon = '<tendon><fixed name="t"><joint joint="ax" coef="-2"/><joint joint="cz" coef="0.5"/></fixed></tendon>'
+    robot, model, data = both(tmp_path, document(f'<tendon tendon1="t" {offset}/>', tendon))
+    scene = vp.Scene(robot, constraints="robot")
+    for q in np.random.default_rng(0).uniform(-0.9, 0.9, (2, robot.dof)):
+        for mine, its in zip(scene.constraint_values(q), rows(model, data, q), strict=True):
+            np.testing.assert_allclose(-2.0 * mine, its, rtol=0, atol=1e-13)
+
+
 def rod(name, place, length, inside="", at="0 0 0"):
     """A rod along its x axis that turns about y."""
     return (

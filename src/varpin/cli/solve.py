@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -69,24 +70,40 @@ def _solve(request: argparse.Namespace, errors: Console) -> int:
         }
         written, trouble = write_all(errors, writers, request.interrupts)
     status = status or trouble
+    told = _status(solution, request.scene, request.save if saved in written else None)
     if not request.quiet:
         console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-        for line in solution.table().splitlines()[:-1]:
+        # The last two lines are the status, which the next table has, and its reason.
+        for line in solution.table().splitlines()[:-2]:
             say(console, line, prefix="")
-        console.print(_plan_table(file, solution, wall_time, written))
+        console.print(_plan_table(file, solution, told, wall_time, written))
     if not solution.status.converged:
-        say(errors, solution.status.value, style="yellow")
+        say(errors, told, style="yellow")
     if unmet and solution.refinement is not None:
         say(errors, solution.refinement.reason, style="yellow")
     return status
 
 
-def _plan_table(file: SceneFile, solution: Solution, wall_time: float, files: Iterable[Path]) -> Table:
+def _status(solution: Solution, scene: str, kept: Path | None) -> str:
+    """How the search ended, with advice for the command line; ``kept`` is the file that has the solution."""
+    if solution.status is Status.MAX_ITERATIONS:
+        advice = "--save NPZ keeps the solution, and --resume NPZ continues from it"
+        if kept is not None:
+            scene, file = (shlex.quote(str(path)) for path in (scene, kept))
+            advice = f"varpin solve {scene} --resume {file} continues from this solution"
+        return f"not converged: more iterations may help; {advice}"
+    if solution.status is Status.INFEASIBLE:
+        return f"infeasible: {solution.reason}"
+    known: str = solution.status.value
+    return known
+
+
+def _plan_table(file: SceneFile, solution: Solution, told: str, wall_time: float, files: Iterable[Path]) -> Table:
     table, problem = facts(file.spec.title), solution.problem
     apart = f", planned in {len(file.required.parts)} parts" if len(file.required.parts) > 1 else ""
     add_row(table, "joints", f"{file.robot.dof} of {file.required.described} computed{apart}")
     add_row(table, "horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}")
-    add_row(table, "status", solution.status.value, style="" if solution.status.converged else "bold yellow")
+    add_row(table, "status", told, style="" if solution.status.converged else "bold yellow")
     noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
     add_row(table, "cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations")
     if solution.refinement is not None and solution.refinement.tried:

@@ -92,7 +92,7 @@ def _to_true_cost(
         raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
     deadline = time.perf_counter() + checked_time(options.get("time_limit", np.inf))
 
-    def once(finer: OptimalControlProblem, start: LinearPolicy | None) -> Solution:
+    def once(finer: OptimalControlProblem, start: LinearPolicy | Solution | None) -> Solution:
         own = {**options, "check": False}
         if start is not None:
             own |= {"controls": start, "states": None}

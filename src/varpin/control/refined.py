@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from varpin.control.history import Status
 
 
@@ -28,6 +30,8 @@ class Refined:
         status: How the search ended.
         seconds: Time of the search and the verification [s].
         share: Share in the time of all steps tried.
+        excess: Excess of the true cost over the optimum of finer controls, relative to the latter: an estimate from a
+            few iterations with half the step. Infinite where they were not made.
     """
 
     dt: float
@@ -40,6 +44,7 @@ class Refined:
     status: Status
     seconds: float
     share: float = 1.0
+    excess: float = np.inf
 
     HEADER = "      dt  steps         cost    true cost       loss  iterations   time"
 
@@ -55,8 +60,8 @@ class Refinement:
     """The step sizes tried for a plan of a given true cost, and the result.
 
     Attributes:
-        wish: The greatest allowed loss, relative to the plan's cost.
-        met: Whether the loss of the plan is within it.
+        wish: The greatest allowed loss, relative to the plan's cost, and excess over the optimum of finer controls.
+        met: Whether the loss of the plan is within it, and the excess, where finer controls were compared.
         tried: The steps tried, from the coarsest on.
         chosen: Index of the plan's step in ``tried``.
         reason: How the refinement ended.

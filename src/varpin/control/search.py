@@ -26,7 +26,7 @@ from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.control.multiple_shooting import GapClosing, Path, path_of
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.refinement import SUFFICIENT, refine
+from varpin.control.refinement import COMPARISON, SUFFICIENT, refine
 from varpin.control.solution import Solution
 from varpin.control.trials import Attempt, Trials
 from varpin.core import Watch
@@ -161,13 +161,15 @@ def solve(
             oscillate. ``Solution.warnings`` and the log have the result. It takes as long as a few motions of the
             search.
         true_cost: Greatest difference between the plan's cost and its cost with feedback on the continuous system,
-            relative to the former: 0.01 for a percent. The problem's step is the coarsest; it is halved, each search
-            starting from the plan before, until :meth:`Solution.verify` confirms the accuracy. ``Solution.problem`` has
-            the plan's step. ``Solution.refinement`` lists the steps tried, or why the accuracy cannot be reached; a
-            warning reports that, too. Controls that are held over several steps keep their period. ``max_iterations``
-            is for each step, ``time_limit`` for all; without constraints, ``tolerance`` is at least a hundredth of
-            ``true_cost``. Ctrl-C keeps the best plan so far. Where dampers are far faster
-            than the step, ``controls="linear"`` in the problem reaches the accuracy at much larger steps.
+            relative to the former: 0.01 for a percent; and greatest excess of the latter over the optimum of finer
+            controls, as estimated from a few iterations with half the step (not with constraints). The problem's step
+            is the coarsest; it is halved, each search starting from the plan before, until both are within it.
+            ``Solution.problem`` has the plan's step. ``Solution.refinement`` lists the steps tried, or why the accuracy
+            cannot be reached; a warning reports that, too. Controls that are held over several steps keep their period,
+            and their optimum is that of the period. ``max_iterations`` is for each step, ``time_limit`` for all;
+            without constraints, ``tolerance`` is at least a hundredth of ``true_cost``. Ctrl-C keeps the best plan so
+            far. Where dampers are far faster than the step, ``controls="linear"`` in the problem reaches the accuracy
+            at much larger steps.
         noise: Gradient of the noise cost, where the noise's strength depends on the state or the control. ``"held"``:
             as in the paper, with the Hessian of the value function held; it neglects the derivatives of that Hessian,
             and ends next to the minimum of the expected cost. ``"whole"``: the search continues from there to that
@@ -226,15 +228,16 @@ def solve(
             raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
 
         wish = positive("true_cost", true_cost, "1")
-        # Active constraints are identified and polished near the optimum only.
-        sufficient = tolerance if problem.constraints else max(tolerance, SUFFICIENT * wish)
+        sufficient = max(tolerance, SUFFICIENT * wish)
 
-        def once(finer: OptimalControlProblem, start: LinearPolicy | None) -> Solution:
+        def once(
+            finer: OptimalControlProblem, start: LinearPolicy | Solution | None, most: int = max_iterations
+        ) -> Solution:
             return solve(
                 finer,
                 controls if start is None else start,
                 tolerance=sufficient,
-                max_iterations=max_iterations,
+                max_iterations=most,
                 second_order=second_order,
                 forward=forward,
                 armijo=armijo,
@@ -248,7 +251,8 @@ def solve(
                 states=states if start is None else None,
             )
 
-        refined = refine(problem, once, wish, lambda: deadline - time.perf_counter())
+        compare = functools.partial(once, most=min(COMPARISON, max_iterations))
+        refined = refine(problem, once, wish, lambda: deadline - time.perf_counter(), compare)
         return looked_at(refined)[0] if check else refined
 
     search = _Search(problem, second_order, forward, armijo, backtracking, regularization, whole_noise=noise == "whole")

@@ -30,8 +30,8 @@ from varpin.support.executors import executing, in_order
 
 logger = logging.getLogger(__name__)
 
-# Paths that are asked for the integrator: one of so many, and so many at most.
-_OF, _ASKED = 16, 8
+# Paths on which the integrator is chosen: one of every _OF, at most _CHOOSING.
+_OF, _CHOOSING = 16, 8
 
 
 def simulate_ensemble(
@@ -145,7 +145,7 @@ def _usual(
     """The integrator of paths from (q0, v0) (P, n) where none is given: one that is right for a few of them."""
     if scene.processes:
         return usual_integrator(scene, q0[0], v0[0], dt, noisy=True)
-    some = np.linspace(0, len(q0) - 1, min(1 + len(q0) // _OF, _ASKED)).astype(np.int64)
+    some = np.linspace(0, len(q0) - 1, min(1 + len(q0) // _OF, _CHOOSING)).astype(np.int64)
     chosen = stronger(usual_integrator(scene, q0[path], v0[path], dt, noisy=False) for path in some)
     if not changes_along(scene) or not steps:
         return chosen

@@ -313,7 +313,7 @@ def _classes(root: ET.Element, reader: _Reader) -> dict[str, dict[str, dict[str,
 
 
 def _equalities(root: ET.Element, reader: _Reader) -> tuple[Equality, ...]:
-    """The active equality constraints of bodies, sites and joints; the others are counted as left out."""
+    """The active equality constraints of bodies, sites, joints and pairs of joints; the others count as left out."""
     found: list[Equality] = []
     for part in root.iterfind("equality/*"):
         # Defaults are those of <equality>, whatever the kind.
@@ -322,6 +322,8 @@ def _equalities(root: ET.Element, reader: _Reader) -> tuple[Equality, ...]:
             reader.left_out["inactive equality constraints"] += 1
         elif part.tag in ("connect", "weld"):
             found.append(_closure(part, reader))
+        elif part.tag == "tendon" and (gear := _gear_of_tendon(part, root, reader)) is not None:
+            found.append(gear)
         elif part.tag == "joint":
             c = reader.numbers(part, "polycoef", (1, 2, 3, 4, 5)) if "polycoef" in part.attrib else np.array([0.0, 1.0])
             # Left-out coefficients have their defaults, as in MuJoCo.
@@ -333,6 +335,20 @@ def _equalities(root: ET.Element, reader: _Reader) -> tuple[Equality, ...]:
         else:
             reader.left_out[f"equality constraints of kind {part.tag}"] += 1
     return tuple(found)
+
+
+def _gear_of_tendon(part: ET.Element, root: ET.Element, reader: _Reader) -> Gear | None:
+    """The tie of two joints by a ``<fixed>`` tendon of constant length; None for other tendons."""
+    name = part.get("tendon1", "")
+    tendon = next((each for each in root.iterfind("tendon/fixed") if each.get("name") == name), None)
+    if part.get("tendon2") or tendon is None:
+        return None
+    parts = [(each.get("joint", ""), float(reader.numbers(each, "coef", (1,))[0])) for each in tendon]
+    if len(parts) != 2 or not all(weight for _, weight in parts):
+        return None
+    offset = reader.numbers(part, "polycoef", (1, 2, 3, 4, 5))[0] if "polycoef" in part.attrib else 0.0
+    (joint, weight), (leader, other) = parts
+    return Gear(_named(part, name), joint, leader, (float(offset) / weight, -other / weight))
 
 
 def _closure(part: ET.Element, reader: _Reader) -> Closure:

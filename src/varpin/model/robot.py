@@ -464,7 +464,7 @@ def _built(
         package_dirs=description.package_dirs,
         visuals=visuals,
         group_states=of_joints(description.postures, description.model.names),
-        loops=description.loops,
+        loops=_open(description.loops, model),
         equalities=description.equalities,
     )
     return robot, description
@@ -527,6 +527,15 @@ def _lock(
         if tie.follower not in positions
     )
     return reduced, ties, visuals, locked
+
+
+def _open(loops: Sequence[tuple[str, str]], model: pin.Model) -> tuple[tuple[str, str], ...]:
+    """The loops that remain: those between frames that a joint of ``model`` moves against each other."""
+
+    def carriers(name: str) -> set[int]:
+        return {frame.parentJoint for frame in model.frames if frame.name == name and frame.type != pin.FrameType.JOINT}
+
+    return tuple((a, b) for a, b in loops if carriers(a).isdisjoint(carriers(b)))
 
 
 def _unwound(model: pin.Model, ties: tuple[Tie, ...]) -> pin.Model:

@@ -78,6 +78,10 @@ def broadcast_array(name: str, value: object, size: int) -> Floats:
     return np.array(np.broadcast_to(require_finite(name, array), (size,)))
 
 
+# Arguments that are positions of joints, for which the name of a posture may be given by mistake.
+_POSITIONS = frozenset({"q", "q0", "q1", "rest"})
+
+
 def joint_array(name: str, value: JointValues, joints: Sequence[str], *, uniform: bool = False) -> Floats:
     """``value`` as a new float array (n,) with a number for each of the n ``joints``.
 
@@ -91,6 +95,11 @@ def joint_array(name: str, value: JointValues, joints: Sequence[str], *, uniform
         UnknownJoint: There is no joint of that name.
         InputError: As for :func:`finite_array`.
     """
+    if isinstance(value, str) and name in _POSITIONS:
+        raise InputError(
+            f"{name} must be real numbers, ({len(joints)},) or by joint name, got {value!r}; the positions of a "
+            f"posture are robot.posture({value!r})"
+        )
     if not isinstance(value, Mapping):
         return broadcast_array(name, value, len(joints)) if uniform else finite_array(name, value, (len(joints),))
     array = np.zeros(len(joints))
