@@ -246,13 +246,14 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
     if not scene.processes or problem.linear or scene.inputs:
         return []
     dt, hold, feedback = 0.5 * problem.dt, 2 * problem.hold, Feedback(solution.gains, solution.previous_gains)
-    finer, failure = rollout(scene, problem.integrator, problem.q0, problem.v0, _in_parts(solution, 2)[1], dt)
-    if failure is not None:
-        return []
-    in_halves = problem.at(dt=dt, hold=hold, integrator=problem.integrator)
     try:
+        finer, failure = rollout(scene, problem.integrator, problem.q0, problem.v0, _in_parts(solution, 2)[1], dt)
+        if failure is not None:
+            return []
+        in_halves = problem.at(dt=dt, hold=hold, integrator=problem.integrator)
         planned, fine = noise_cost(problem, solution.trajectory, feedback), noise_cost(in_halves, finer, feedback)
     except VarpinError:
+        # A custom noise or cost, or the linearization, may fail off the plan.
         return []
     if abs(fine - planned) <= _NOISE_OFF * (abs(solution.cost) + max(planned, fine)):
         return []
