@@ -190,7 +190,7 @@ def test_the_error_of_a_period_is_that_of_its_closed_form():
 
 
 def test_what_goes_wrong_late_is_found():
-    """A fifth of its way is added to what is left of a motion from a node on, of which every record is consistent."""
+    """A fifth of its travel is added to the rest of a motion from a node on, and every record is consistent."""
     setup, motion = falling(dt=1e-2, steps=400)
     before = battery.measures(setup, vp.Midpoint(), motion, exact_motion(setup, 1e-2, 400, 0.3))
     later = vp.simulate(setup.scene, motion.q[250] + 0.3, motion.v[250], dt=1e-2, steps=150, integrator=vp.Midpoint())
@@ -605,7 +605,7 @@ def test_each_joint_is_checked_by_itself():
     setup = Setup(scene, np.zeros(2), np.array([1.0, -0.5]))
     motion = vp.simulate(scene, setup.q0, setup.v0, dt=1e-2, steps=100)
     exact = exact_motion(setup, 1e-2, 100, 1.0)
-    far = dataclasses.replace(exact, way=3000.0)
+    far = dataclasses.replace(exact, travel=3000.0)
     off = tampered(motion, q=motion.q * [1.0, 1.5], v=motion.v * [1.0, -1.0])
     assert error_of("joint", exact, motion) < 1e-2
     assert error_of("velocity", exact, motion) < 1e-2

@@ -50,7 +50,7 @@ def test_a_chain_that_falls(q0):
 
 
 def test_one_violent_step(load):
-    """A kinova that falls is off by half of its way for steps in which it whips about; others are right to 1e-9."""
+    """A kinova that falls is off by half of its travel for steps in which it whips about; others are right to 1e-9."""
     damping = [1.136e-2, 1.614e-2, 7.62e-3, 5.4e-4, 1.82e-3, 7e-5]
     scene, q0 = vp.Scene(load("kinova"), damping=damping), np.array([-0.92, 0.87, 0.38, 0.91, 0.62, 0.21])
     v0 = [1.4, 1.9, -1.2, -0.2, 1.0, 0.4]

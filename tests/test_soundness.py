@@ -484,7 +484,7 @@ def test_accurate_motions_are_quiet(load, robot):
 
 @pytest.mark.parametrize("robot", ["chain2", "chain3", "ur5"])
 def test_wrong_motions_are_told_of(load, robot):
-    """Where DOP853 finds any joint off by a fifth of its way, something is said."""
+    """Where DOP853 finds any joint off by a fifth of its travel, something is said."""
     known = vp.planar_chain(int(robot[-1])) if robot.startswith("chain") else load(robot)
     n, told = known.dof, 0
     for seed in range(3):

@@ -33,7 +33,7 @@ from varpin.errors import InputError, VarpinError
 
 Floats = NDArray[np.float64]
 Fields = Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]
-Reference = Callable[[float], Floats]
+ReferenceMotion = Callable[[float], Floats]
 
 
 # --- the system ------------------------------------------------------------------------------------------------------
@@ -349,7 +349,7 @@ class TrackingCost:
     terminal (q - r(t_f))^2 at the end.
     """
 
-    reference: Reference
+    reference: ReferenceMotion
     position: float = 10.0
     effort: float = 0.1
     terminal: float = 1.0

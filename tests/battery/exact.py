@@ -22,11 +22,11 @@ from varpin.simulation.accuracy import (
     CLOSE,
     DISTURBANCE,
     Window,
-    between,
     disturbance,
     examined_nodes,
     grown,
     inertias,
+    nodes_between,
 )
 from varpin.study.extremes.exact import NODES, PATIENCE, START, EndsHereError, Exact, in_units, integrated, kicked
 from varpin.trajectory import Trajectory
@@ -152,7 +152,7 @@ def period_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     inertia = inertias(scene, trajectory.q[first])
     first = np.concatenate([first, np.setdiff1d(quarters, first)])
     worst, end = math.nan, time.process_time() + _PATIENCE_PERIODS
-    for steps in (first, between(trajectory.steps, first)):
+    for steps in (first, nodes_between(trajectory.steps, first)):
         for step in steps.tolist():
             worst = np.fmax(worst, _error_from(scene, integrator, trajectory, step, inertia))
             if worst >= 1.0 or time.process_time() > end:

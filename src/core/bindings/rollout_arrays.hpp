@@ -1,5 +1,5 @@
-// Input and output of a rollout at the border: the Python named tuples Commands and RolloutArrays, checked and converted to
-// those of policy.hpp and nodes.hpp. docs/core.md, "The map".
+// Input and output of a rollout at the border: the Python named tuples Commands and RolloutArrays, checked and
+// converted to those of policy.hpp and nodes.hpp. docs/core.md, "The map".
 #pragma once
 
 #include <cstdint>
@@ -88,7 +88,7 @@ class CommandArrays {
           limits(field<In<2>>(commands, "limits")),
           before(field<In<2>>(commands, "before")),
           within(field<In<3>>(commands, "within")),
-          places(field<In<1>>(commands, "places")),
+          stage_times(field<In<1>>(commands, "stage_times")),
           hold(nb::cast<int>(commands.attr("hold"))) {
         const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
         const std::size_t decisions = u.shape(0), width = gains.shape(2);
@@ -103,9 +103,9 @@ class CommandArrays {
         }
         require(limits, "limits", {2, m});
         earlier = given(before, "before", {paths, m});
-        linear = places.shape(0) > 0;
+        linear = stage_times.shape(0) > 0;
         if (linear) {
-            require(places, "places", {static_cast<std::size_t>(stages)});
+            require(stage_times, "stage_times", {static_cast<std::size_t>(stages)});
             if (!earlier && steps > 0)
                 throw std::invalid_argument("linear controls need the control before the first step");
             if (within.shape(0) > 0) throw std::invalid_argument("controls are either linear or given at stages");
@@ -129,7 +129,7 @@ class CommandArrays {
                 limits.data() + m,
                 earlier ? before.data() : nullptr,
                 changing ? within.data() : nullptr,
-                linear ? places.data() : nullptr};
+                linear ? stage_times.data() : nullptr};
     }
 
   private:
@@ -137,7 +137,7 @@ class CommandArrays {
     In<3> gains;
     In<2> reference, limits, before;
     In<3> within;
-    In<1> places;
+    In<1> stage_times;
     int hold;
     bool feedback = false;  // whether there are gains
     bool earlier = false;   // whether the controls before the first step are known

@@ -184,11 +184,11 @@ def _overlaps(problem: OptimalControlProblem, bound: BoundConstraint) -> Iterato
 
 def _range(robot: Robot) -> tuple[Floats, Floats]:
     """Lower and upper bounds, (n,) each, of the random postures [rad or m]."""
-    room = np.where(_turning(robot) > 0.0, 2.0 * np.pi, _RAIL)
+    width = np.where(_turning(robot) > 0.0, 2.0 * np.pi, _RAIL)
     lower, upper = robot.position_limits
     below, above = np.abs(lower) < _ENDLESS, np.abs(upper) < _ENDLESS
-    low = np.where(below, lower, np.where(above, upper, 0.0) - room)
-    high = np.where(above, upper, np.where(below, lower, 0.0) + room)
+    low = np.where(below, lower, np.where(above, upper, 0.0) - width)
+    high = np.where(above, upper, np.where(below, lower, 0.0) + width)
     return low, high
 
 

@@ -343,9 +343,9 @@ def _search_of(problem: OptimalControlProblem, controls: object, resume: Solutio
 
 def _onto_limits(u: Floats, limits: Floats) -> Floats:
     """Controls (R, m), moved exactly onto a limit where they differ from it by rounding."""
-    room = 8.0 * np.finfo(float).eps * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+    rounding = 8.0 * np.finfo(float).eps * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
     for limit in limits:
-        u = np.where(np.abs(u - limit) <= room, limit, u)
+        u = np.where(np.abs(u - limit) <= rounding, limit, u)
     return u
 
 

@@ -12,8 +12,8 @@ Bytes = NDArray[np.uint8]
 
 _HELD: Floats = np.zeros((0, 0, 0))
 _HELD.setflags(write=False)
-_NOWHERE: Floats = np.zeros(0)
-_NOWHERE.setflags(write=False)
+_NO_TIMES: Floats = np.zeros(0)
+_NO_TIMES.setflags(write=False)
 
 
 class Tree(NamedTuple):
@@ -132,7 +132,7 @@ class Commands(NamedTuple):
     within: Floats = _HELD
     # (s,) stages in a step of unit length: controls are then linear in time over each decision's steps, from the
     # previous control to u at their end; empty for held controls
-    places: Floats = _NOWHERE
+    stage_times: Floats = _NO_TIMES
 
 
 class RolloutArrays(NamedTuple):

@@ -419,7 +419,7 @@ def open_loop(u: Floats) -> Commands:
 
 def open_line(u: Floats, times: Sequence[float]) -> Commands:
     """Controls (N + 1, m) at nodes without feedback, linear between them, for a method with stages at ``times``."""
-    return open_loop(u[1:])._replace(before=u[:1].copy(), places=np.array(tuple(times) or (0.5,)))
+    return open_loop(u[1:])._replace(before=u[:1].copy(), stage_times=np.array(tuple(times) or (0.5,)))
 
 
 @functools.cache
@@ -447,8 +447,8 @@ def lines(commands: Commands, ends: Floats, times: Sequence[float]) -> Lines:
     steps = np.arange(len(ends))
     begins = np.vstack([commands.before[:1], ends])[steps - steps % commands.hold]
 
-    def at(places: Floats) -> Floats:
-        share = ((steps % commands.hold)[:, None] + places)[:, :, None] / commands.hold
+    def at(stage_times: Floats) -> Floats:
+        share = ((steps % commands.hold)[:, None] + stage_times)[:, :, None] / commands.hold
         found: Floats = (1.0 - share) * begins[:, None] + share * ends[:, None]
         return found
 

@@ -160,9 +160,9 @@ class Reference(Integrator):
             before = u[s - 1 : s] if s else commands.before[i : i + 1]
             u[s] = before[0] if held else control_of(commands, decision, state.x[i], before)
             values = commands.within[s] if len(commands.within) else u[s : s + 1]
-            if len(commands.places):
+            if len(commands.stage_times):
                 first = u[s - held - 1] if s > held else commands.before[i]
-                share = (held + commands.places[:, None]) / commands.hold
+                share = (held + commands.stage_times[:, None]) / commands.hold
                 values = (1.0 - share) * first + share * u[s]
             force = self._force(values @ scene.actuation.T + (drift[i, s] if len(drift) else 0.0), dt)
             try:

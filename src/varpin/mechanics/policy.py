@@ -326,4 +326,4 @@ class LinearPolicy(Frozen):
             reference = np.concatenate([reference, self.previous], axis=1)
         before = np.zeros((0, controls)) if self.before is None else self.before[None].copy()
         found = Commands(self.u, gains, reference, hold, self.limits, before)
-        return found if not self.linear else found._replace(places=np.array(tuple(stage_times) or (0.5,)))
+        return found if not self.linear else found._replace(stage_times=np.array(tuple(stage_times) or (0.5,)))

@@ -173,14 +173,14 @@ def disturbance(trajectory: Trajectory, step: int, count: int) -> tuple[float, f
 def examined_nodes(scene: Scene, trajectory: Trajectory) -> Integers:
     """First nodes of the windows in which a motion is examined (K,).
 
-    They are the start, the places where velocities change most, some spread over the motion, and the steps with the
+    They are the start, the nodes where velocities change most, some spread over the motion, and the steps with the
     largest changes of the energy defect.
     """
     # The first window covers one period of the fastest joint.
     v, steps = trajectory.v, trajectory.steps
     seen = np.zeros(steps, dtype=bool)
     seen[: min(FIRST, int(Window.at(scene, trajectory, 0).judged.min()))] = True
-    found = [0, *blows(v, WINDOW, seen)]
+    found = [0, *violent_windows(v, WINDOW, seen)]
     for node in np.linspace(0, max(0, steps - WINDOW), _SPREAD + 1)[1:].astype(np.int64):
         if not seen[node : node + WINDOW].all():
             found.append(int(node))
@@ -190,10 +190,10 @@ def examined_nodes(scene: Scene, trajectory: Trajectory) -> Integers:
     return np.unique(found)
 
 
-def between(steps: int, seen: Integers) -> Integers:
-    """More nodes to look from, evenly spread, where errors at those seen come close to what is wrong.
+def nodes_between(steps: int, seen: Integers) -> Integers:
+    """More first nodes of windows, evenly spread, for errors close to their thresholds.
 
-    The one in the middle first, then those in the middle of both halves, and so on.
+    The middle node comes first, then the middle nodes of both halves, and so on.
     """
     nodes = np.linspace(0, steps, _BETWEEN + 2)[1:-1].astype(np.int64)
     order = [k for part in (8, 4, 2, 1) for k in range(part, _BETWEEN + 1, 2 * part)]
@@ -201,13 +201,13 @@ def between(steps: int, seen: Integers) -> Integers:
     return np.array([node for node in dict.fromkeys(found.tolist()) if node not in seen], dtype=np.int64)
 
 
-def blows(v: Floats, length: int, seen: NDArray[np.bool_] | None = None) -> list[int]:
-    """The first steps of windows of some length about the largest changes of v (N + 1, n); they are marked as seen."""
+def violent_windows(v: Floats, length: int, seen: NDArray[np.bool_] | None = None) -> list[int]:
+    """The first steps of windows about the largest changes of v (N + 1, n); the windows are marked as seen."""
     steps = len(v) - 1
     seen = np.zeros(steps, dtype=bool) if seen is None else seen
     change = np.abs(np.diff(v, axis=0))
     most = change.max(axis=0)
-    # A joint's changes in units of its own largest.
+    # Changes of each joint, in units of its largest one.
     change = ((change / np.where(most > 0.0, most, np.inf)) ** 2).sum(axis=1)
     found: list[int] = []
     for _ in range(VIOLENT):
@@ -231,24 +231,24 @@ def masses(scene: Scene, q: Floats) -> Floats:
     return scene.core.jets(q, np.zeros_like(q))[0]
 
 
-def changed(v: Floats) -> Floats:
+def velocity_change(v: Floats) -> Floats:
     """The change of velocities over the nodes (K, ...): the range they cover, at most the largest speed."""
     fastest = np.abs(v).max(axis=0)
     change: Floats = np.clip(np.ptp(v, axis=0), EVEN * fastest, fastest)
     return change
 
 
-def noticed(scene: Scene, travel: Floats, speed: Floats, light: Floats, duration: Floats) -> tuple[Floats, Floats]:
-    """Travels and largest velocities (..., n) as units of errors; those of the other joints bound them from below.
+def error_units(scene: Scene, travel: Floats, speed: Floats, light: Floats, duration: Floats) -> tuple[Floats, Floats]:
+    """Units of errors (..., n): travels and largest velocities, bounded from below by those of the other joints.
 
-    ``light`` are the velocities of :func:`light_speed` (..., n), ``duration`` the time in which they are judged [s].
+    ``light`` are the velocities of :func:`light_joint_speed` (..., n), ``duration`` is the time of the judgement [s].
     """
     least = np.minimum(LITTLE * largest_of_its_kind(scene, speed), light)
     least_travel = np.minimum(LITTLE * largest_of_its_kind(scene, travel), light * duration)
     return np.maximum(travel, least_travel), np.maximum(speed, least)
 
 
-def light_speed(inertia: Floats, change: Floats) -> Floats:
+def light_joint_speed(inertia: Floats, change: Floats) -> Floats:
     """``LIGHT`` times the velocity at which each joint has the energy of the largest change (..., n)."""
     root = np.sqrt(inertia)
     light: Floats = LIGHT * (root * change).max(axis=-1, keepdims=True) / root
@@ -305,7 +305,9 @@ def _units(
         q, v = trajectory.q[:last, alike], trajectory.v[:last, alike]
         travel[alike] = np.maximum(np.ptp(q[first:], axis=0), _REST * np.ptp(q, axis=0))
         speed[alike] = np.maximum(np.abs(v[first:]).max(axis=0), _REST * np.abs(v).max(axis=0))
-        change[alike] = changed(v[first:])
-    travel, speed = noticed(scene, travel, speed, light_speed(inertia, change), trajectory.dt * span.astype(np.float64))
+        change[alike] = velocity_change(v[first:])
+    travel, speed = error_units(
+        scene, travel, speed, light_joint_speed(inertia, change), trajectory.dt * span.astype(np.float64)
+    )
     tiny = np.finfo(np.float64).tiny
     return np.maximum(travel, tiny), np.maximum(speed, tiny)

@@ -142,7 +142,7 @@ def next_block(
         return open_loop(u)._replace(hold=min(1 if most == 1 else commands.hold, left))
     if isinstance(controls, OpenLoop):
         return sampled(controls, record, min(most, left))
-    if most == 1 and not len(commands.places):
+    if most == 1 and not len(commands.stage_times):
         return next_command(commands, record)
     first = record.steps // commands.hold
     before = record.last.u[None, -1] if record.steps else None

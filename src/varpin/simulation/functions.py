@@ -81,8 +81,8 @@ def evaluated(
     """Controls that are a function of time at the stages of some steps, or in their middles for one-stage methods."""
     times, numbers = integrator.stage_times, np.array(steps, dtype=np.int64)
     # Kinematic inputs move to the values at the ends of steps.
-    places = (*(times or (0.5,)), *((1.0,) if scene.inputs else ()))
-    at = (numbers[:, None] + np.array(places)) * dt
+    fractions = (*(times or (0.5,)), *((1.0,) if scene.inputs else ()))
+    at = (numbers[:, None] + np.array(fractions)) * dt
     called = np.ones(at.shape, dtype=np.bool_)
     if times and times[0] == 0.0 and times[-1] == 1.0:
         # The first stage of a step is the last stage of the step before.

@@ -1,9 +1,9 @@
 """Errors of single steps that add up or grow over a whole motion.
 
-Where disturbances grow a thousandfold, steps that are right to five digits make a motion that is right to two. And a
-step in which a force has a kink is off by far more than its neighbours. Repeated steps give the error of a step, and
-the fastest modes of the linearized motion bound its growth. Only where the product is large, the whole motion is
-repeated by a method of more stages, in smaller steps at kinks.
+Where disturbances grow a thousandfold, steps that are right to five digits make a motion that is right to two. A step
+in which a force has a kink has a far larger error than its neighbours. Repeated steps give the error of a step, and the
+fastest modes of the linearized motion bound its growth. Only where the product is large, the whole motion is repeated
+by a method of more stages, in smaller steps at kinks.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bou
 from varpin.simulation.retaking import Finer, finer, shortest_parts, taken_again
 from varpin.trajectory import Trajectory
 
-# Begin of the warning.
-SAID = "disturbances grow here"
+# First words of the warning.
+WORDS = "disturbances grow here"
 
 # Number of repeated steps; fewest steps and most joints of an examined motion.
-_PLACES, _LEAST, _JOINTS = 6, 8, 60
-# Number of further steps, those that change velocities most, as where controls jump.
+_NODES, _LEAST, _JOINTS = 6, 8, 60
+# Number of further steps: those with the largest changes of velocity, such as jumps of controls.
 _VIOLENT = 4
 # Most steps with a kink that are repeated one by one, and their parts; also the parts of all of them in a repetition of
 # the whole motion.
 _KINKS, _PARTS = 12, 8
 # Thresholds of the warning, as shares of the largest joint travel, where errors grow and where kinks make them; and the
 # part of them from which a motion is repeated.
-WARNED, _BENT, NEAR = 0.02, 0.003, 0.3
+WARNED, _KINKED, NEAR = 0.02, 0.003, 0.3
 # A joint travel below this counts as no motion [rad or m].
 _SHORTEST = 1e-8
 # The share of the fastest mode's exponent by which a disturbance grows: at most half in 60 motions of arms and chains,
@@ -89,26 +89,26 @@ def grown_error(
 ) -> Growth | None:
     """The error of a motion after errors of its steps have added up or grown; None below the threshold of the warning.
 
-    If the motion is known to be ``predictable`` apart from kinks, only these are looked at. None, too, under noise,
-    with forces in Python, and of an integrator that chooses its own steps.
+    If the motion is known to be ``predictable`` apart from kinks, only steps with kinks are examined. Also None under
+    noise, with forces in Python, and for an integrator that chooses its own steps.
     """
-    if isinstance(integrator, Reference) or _hidden(scene, trajectory):
+    if isinstance(integrator, Reference) or _unknown(scene, trajectory):
         return None
-    bent = kinks(scene, trajectory)
-    even = not (predictable or _few(trajectory) or len(bent.steps) == trajectory.steps)
-    if not (even or len(bent.steps)):
+    kinked = kinks(scene, trajectory)
+    even = not (predictable or _few(trajectory) or len(kinked.steps) == trajectory.steps)
+    if not (even or len(kinked.steps)):
         return None
     other = finer(integrator, trajectory, damped=False, pulled=False)
     travel = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
-    # Ways of rounding alone are no motion.
+    # Rounding alone is no motion.
     travel = np.maximum(travel, max(_SHORTEST, ROUNDING * (1.0 + float(np.abs(trajectory.q).max()))))
-    at = _places(trajectory)
+    at = _nodes(trajectory)
     by_steps, by_kinks, largest = 0.0, 0.0, 0.0
     if even:
-        # A few violent steps may be off by more than all others together. Those with kinks are counted below.
+        # A few violent steps may have larger errors than all others together. Steps with kinks are counted below.
         change = np.abs(np.diff(trajectory.v, axis=0)).max(axis=1)
-        change[bent.steps] = -1.0
-        spread = np.setdiff1d(at, bent.steps)
+        change[kinked.steps] = -1.0
+        spread = np.setdiff1d(at, kinked.steps)
         violent = change.argsort()[-_VIOLENT:]
         violent = violent[change[violent] >= 0.0]
         off = _steps_off(scene, integrator, trajectory, other, np.append(spread, violent), 1)
@@ -118,22 +118,22 @@ def grown_error(
         usual, rare = shares[: len(spread)], shares[len(spread) :]
         by_steps = max(trajectory.steps * float(usual.max(initial=0.0)), float(rare.sum()))
         largest = float(off[0].max(initial=0.0))
-    if len(bent.steps):
-        chosen = bent.steps[np.unique(np.linspace(0, len(bent.steps) - 1, _KINKS).astype(np.int64))]
+    if len(kinked.steps):
+        chosen = kinked.steps[np.unique(np.linspace(0, len(kinked.steps) - 1, _KINKS).astype(np.int64))]
         off = _steps_off(scene, integrator, trajectory, other, chosen, _PARTS)
         if off is None:
             return None
         # Errors of velocities may last to the end.
         left = trajectory.dt * (trajectory.steps - chosen)[:, None]
-        by_kinks = len(bent.steps) * float(((off[0] + off[1] * left) / travel).max(axis=1).mean())
+        by_kinks = len(kinked.steps) * float(((off[0] + off[1] * left) / travel).max(axis=1).mean())
         largest = max(largest, float(off[0].max()))
     # Errors of kinks grow, too.
     small = NEAR * WARNED / max(by_steps + by_kinks, 1e-300)
-    add_up = by_kinks > NEAR * _BENT
+    add_up = by_kinks > NEAR * _KINKED
     if not add_up and (_few(trajectory) or _grows_less(scene, trajectory, at, small)):
         return None
     parts = other.parts * shortest_parts(trajectory)
-    parts[bent.steps] = np.maximum(parts[bent.steps], _PARTS)
+    parts[kinked.steps] = np.maximum(parts[kinked.steps], _PARTS)
     again = taken_again(scene, other.method, trajectory, integrator.stage_times, 0, trajectory.steps, parts)
     if again is None:
         return None
@@ -142,13 +142,13 @@ def grown_error(
     shares = apart / travel
     joint = int(shares.max(axis=0).argmax())
     share = float(shares[:, joint].max())
-    by_bends = by_kinks > by_steps
-    least = _BENT if by_bends else WARNED
+    mostly_kinks = by_kinks > by_steps
+    least = _KINKED if mostly_kinks else WARNED
     if share <= least:
         return None
     first = float(trajectory.t[(shares[:, joint] > least).argmax()])
-    causes = bent.causes if by_bends else ()
-    return Growth(joint, float(apart[:, joint].max()), share, first, largest, causes, len(bent.steps))
+    causes = kinked.causes if mostly_kinks else ()
+    return Growth(joint, float(apart[:, joint].max()), share, first, largest, causes, len(kinked.steps))
 
 
 def _steps_off(
@@ -163,7 +163,7 @@ def _steps_off(
             return None
         after_q, after_v = np.array([q for q, _ in ends]), np.array([v for _, v in ends])
     else:
-        # Controls that change within a step do so for both, nearly.
+        # The mean control of the step stands for controls that change within it.
         forces = np.repeat((trajectory.u[at] @ scene.actuation.T)[:, None], parts, axis=1)
         nothing = open_loop(np.zeros((parts, scene.controls)))
         once = other.method.motions(scene, q[at], v[at], nothing, forces, trajectory.dt / parts)
@@ -185,23 +185,23 @@ def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], fac
         return True
     if factor > _factor(float(rate_bounds(aq, av).mean()), trajectory):
         return True
-    # Eigenvalues take longer than all else: at half of the places.
+    # Eigenvalues take longer than all else: at half of the nodes.
     typical = float(_modes(aq[::2], av[::2]).mean())
     if scene.constraints:
-        # Loops pass places where modes are much faster than elsewhere.
+        # Loops pass configurations with much faster modes than elsewhere.
         typical = max(typical, float(np.maximum(_modes(aq, av), 0.0).mean()))
     return factor > _factor(typical, trajectory)
 
 
-def _hidden(scene: Scene, trajectory: Trajectory) -> bool:
+def _unknown(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether errors of steps are unknown: under noise or Python forces, or for many joints."""
-    hidden = scene.custom is not None or trajectory.dw.any() or not trajectory.steps
-    return bool(hidden or scene.robot.dof > _JOINTS)
+    unknown = scene.custom is not None or trajectory.dw.any() or not trajectory.steps
+    return bool(unknown or scene.robot.dof > _JOINTS)
 
 
 def _unexamined(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether growth is not examined: where errors of steps are unknown, and for few steps."""
-    return _hidden(scene, trajectory) or _few(trajectory)
+    return _unknown(scene, trajectory) or _few(trajectory)
 
 
 def _few(trajectory: Trajectory) -> bool:
@@ -209,9 +209,9 @@ def _few(trajectory: Trajectory) -> bool:
     return int(np.maximum(trajectory.statistics.substeps, 1).sum()) < _LEAST
 
 
-def _places(trajectory: Trajectory) -> NDArray[np.int64]:
+def _nodes(trajectory: Trajectory) -> NDArray[np.int64]:
     """Nodes of the motion at which it is linearized."""
-    return np.linspace(0, trajectory.steps - 1, _PLACES + 2).astype(np.int64)[1:-1]
+    return np.linspace(0, trajectory.steps - 1, _NODES + 2).astype(np.int64)[1:-1]
 
 
 def _slopes(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> tuple[Floats, Floats]:
@@ -227,7 +227,7 @@ def _slopes(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64]) -> tupl
 
 
 def _modes(aq: Floats, av: Floats) -> Floats:
-    """The rate at which the fastest mode of the linearized accelerations grows at each place (K,) [1/s]."""
+    """The rate at which the fastest mode of the linearized accelerations grows at each node (K,) [1/s]."""
     rates: Floats = np.linalg.eigvals(first_order(aq, av)).real.max(axis=1)
     return rates
 

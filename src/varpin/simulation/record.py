@@ -154,7 +154,7 @@ def located(
     """
     state, (first,) = integrator.start(scene, start[0][None], start[1][None])
     dw = np.zeros((0, scene.processes)) if increments is None else increments
-    record = MotionRecord(scene, integrator, dt, dw, first, commands if len(commands.places) else None)
+    record = MotionRecord(scene, integrator, dt, dw, first, commands if len(commands.stage_times) else None)
     while record.steps < steps_of(commands):
         block = next_command(commands, record)
         drawn = dw[None, record.steps : record.steps + steps_of(block)] if len(dw) else dw[None, :0][:0]
@@ -217,7 +217,7 @@ class Motions:
         done = len(segment.u)
         dw = None if increments is None else increments[:done]
         within = commands.within[:done] if len(commands.within) else None
-        line = commands if len(commands.places) else None
+        line = commands if len(commands.stage_times) else None
         made = _trajectory(self.scene, self.integrator, self.dt, self._first, [segment], dw, within, line)
         return made, segment.failure
 

@@ -217,7 +217,7 @@ def _integrated(
         commands = commands_of(scene, integrator, controls, steps, dt)
     hold = task.period if callable(controls) else commands.hold if isinstance(controls, LinearPolicy) else None
     state, (start,) = integrator.start(scene, task.q0[None], task.v0[None])
-    linear = bool(len(commands.places))
+    linear = bool(len(commands.stage_times))
     if linear:
         # The loop's check is for held controls.
         hold = None

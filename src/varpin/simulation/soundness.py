@@ -35,18 +35,19 @@ from varpin.simulation.accuracy import (
     WRONG_VELOCITY,
     MotionError,
     Window,
-    between,
-    blows,
     disturbance,
     examined_nodes,
     grown,
     inertias,
+    nodes_between,
+    violent_windows,
 )
 from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.damping import Fast, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
-from varpin.simulation.growth import NEAR, SAID, grown_error, growth_bound
+from varpin.simulation.growth import NEAR, grown_error, growth_bound
 from varpin.simulation.growth import WARNED as GROWTH_WARNED
+from varpin.simulation.growth import WORDS as GROWTH_WORDS
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.simulation.phase import phase_lost
@@ -57,7 +58,7 @@ from varpin.trajectory import Trajectory
 # Estimated error from which on a warning is given: estimates are accurate to some percent.
 CAUTION = 0.95
 # The same for estimates from fewer steps than a period, which are less accurate.
-_UNSETTLED = 0.7
+_CAUTION_IF_ROUGH = 0.7
 # Error below which a window is accepted as it is, and error from which on more windows are examined: the error there
 # may be three times as large as in the first windows.
 _SMALL, _NEAR = 0.2, 0.35
@@ -79,7 +80,7 @@ _ADDS = 4.0
 _STOPPING = 3
 # Number of steps repeated from where a joint comes to rest, and the parts of each: the second number if the first
 # fails.
-_SETTLING, _SETTLED = 6, (2, 16)
+_REST_STEPS, _REST_PARTS = 6, (2, 16)
 # Largest error of the velocity there without a warning: the median in widths of the friction, and the largest as a
 # share of the joint's largest velocity.
 _MEDIAN_OFF, _MOST_OFF = 0.1, 1e-3
@@ -225,11 +226,11 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         return ()
     # A kinematic input does work that the balance does not have.
     found = [] if scene.inputs else [*_energy(scene, integrator, trajectory)]
-    unsettled = _unsettled(scene, integrator, trajectory)
+    at_rest = _wrong_at_rest(scene, integrator, trajectory)
     resolution = resolution_of(scene, integrator, trajectory)
     if resolution.resolved:
         more = () if found else _accumulated(scene, integrator, trajectory, resolution)
-        return (*found, *more, *unsettled)
+        return (*found, *more, *at_rest)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and is_wrong(error):
         dt, start = trajectory.dt, trajectory.t[error.step]
@@ -249,7 +250,7 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         and not (integrator.l_stable or isinstance(integrator, Reference))
         and (fast := _fast_damping(scene, trajectory)).rate
     ):
-        # No other method gets through these steps: ringing is looked for in the motion itself.
+        # No other method integrates these steps: ringing is looked for in the motion itself.
         before, after = trajectory.v[:-1], trajectory.v[1:]
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():
             found.append(_ringing(scene, fast, trajectory.dt))
@@ -257,7 +258,7 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         found.extend(_unresolved_damping(scene, integrator, trajectory))
     if not found:
         found.extend(_accumulated(scene, integrator, trajectory, Resolution(False)))
-    return (*found, *(finding for finding in unsettled if finding.kind not in {other.kind for other in found}))
+    return (*found, *(finding for finding in at_rest if finding.kind not in {other.kind for other in found}))
 
 
 def _unresolved_damping(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -284,18 +285,18 @@ def _growing(
     if found is None:
         return ()
     off = (
-        f"joint {trajectory.joint_names[found.joint]!r} elsewhere by up to {found.off:.2g} rad or m, "
+        f"joint {trajectory.joint_names[found.joint]!r} by up to {found.off:.2g} rad or m, "
         f"{100 * found.share:.2g}% of the largest joint travel, from t = {found.time:.4g} s on"
     )
     if found.causes:
         sentence = (
             f"{' and '.join(found.causes)} in {found.kinks} steps: dt = {trajectory.dt:g} s is coarse for {integrator} "
-            f"there, and smaller steps put {off}"
+            f"there, and smaller steps move {off}"
         )
         return (Finding("kinks of forces", sentence, found.joint),)
     sentence = (
-        f"{SAID}: single steps of dt = {trajectory.dt:g} s by {integrator} are off by about "
-        f"{found.step:.1g} rad or m, and a method of more stages puts {off}; "
+        f"{GROWTH_WORDS}: single steps of dt = {trajectory.dt:g} s by {integrator} are off by about "
+        f"{found.step:.1g} rad or m, and a method of more stages moves {off}; "
         "smaller steps or more stages keep the motion right for longer"
     )
     return (Finding("growing errors", sentence, found.joint),)
@@ -307,15 +308,15 @@ def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     if lost is None:
         return ()
     sentence = (
-        f"oscillations of {lost.rate / (2.0 * np.pi):.3g} Hz lose phase or height: over the motion, steps of "
-        f"dt = {trajectory.dt:g} s by {integrator} put them off by about {100 * lost.turned:.2g}% of their height, "
+        f"oscillations of {lost.rate / (2.0 * np.pi):.3g} Hz lose phase or amplitude: over the motion, steps of "
+        f"dt = {trajectory.dt:g} s by {integrator} make an error of about {100 * lost.turned:.2g}% of their amplitude, "
         f"and joint {trajectory.joint_names[lost.joint]!r} by {lost.off:.2g} rad or m, {100 * lost.share:.2g}% of the "
-        "largest joint travel; smaller steps or more stages keep them"
+        "largest joint travel; smaller steps or more stages reduce it"
     )
     return (Finding("phase", sentence, lost.joint),)
 
 
-def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+def _wrong_at_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
     """A warning if a joint with dry friction does not come to rest correctly, however small the error in its motion.
 
     The friction force is wrong where a velocity near rest is wrong by a part of the width over which the force changes
@@ -326,12 +327,12 @@ def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
         return ()
     for stop in stops(scene, trajectory.v):
         rate = rate_at_stops(scene, trajectory.q, trajectory.v, trajectory.u, [stop], 2.0 / trajectory.dt)
-        count = min(_SETTLING, trajectory.steps - stop.step)
-        if not rate or count < _SETTLING // 2:
+        count = min(_REST_STEPS, trajectory.steps - stop.step)
+        if not rate or count < _REST_STEPS // 2:
             continue
-        off = _off_rest(scene, integrator, trajectory, stop, count)
-        if len(off) < _SETTLING // 2:
-            # No method gets through these steps, so nothing shows that they are right.
+        off = _velocity_errors(scene, integrator, trajectory, stop, count)
+        if len(off) < _REST_STEPS // 2:
+            # No method integrates these steps, so their error is unknown.
             return (_ringing(scene, Fast(rate, stop), trajectory.dt),)
         lasting, most = float(np.median(off)), float(off.max())
         speed = float(np.abs(trajectory.v[:, stop.joint]).max())
@@ -341,15 +342,15 @@ def _unsettled(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     return ()
 
 
-def _off_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory, stop: Stop, count: int) -> Floats:
-    """The error of a joint's velocity after each step from where it stops, as far as the repetition gets."""
+def _velocity_errors(scene: Scene, integrator: Integrator, trajectory: Trajectory, stop: Stop, count: int) -> Floats:
+    """The error of a joint's velocity after each step from where it stops, as far as the repetition goes."""
     off, method = np.zeros(0), stopping(scene, _STOPPING)
-    for parts in _SETTLED[1:] if scene.constraints else _SETTLED:
+    for parts in _REST_PARTS[1:] if scene.constraints else _REST_PARTS:
         again = taken_again(scene, method, trajectory, integrator.stage_times, stop.step, count, parts)
         if again is not None:
             off = np.abs(again[1] - trajectory.v[stop.step : stop.step + count + 1])[1:, stop.joint]
             off = off[np.isfinite(off)]
-        if len(off) >= _SETTLING // 2:
+        if len(off) >= _REST_STEPS // 2:
             break
     return off
 
@@ -591,12 +592,12 @@ def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
     apart = max(pieces, 1 + steps % 2 if every else 1) - 1
     begins = np.array([i * (steps - length) // apart for i in range(apart + 1)]) if apart else _FROM_START
     if pieces == _WINDOWS:
-        begins = np.union1d(begins, blows(v, length))
+        begins = np.union1d(begins, violent_windows(v, length))
     elif not every:
         seen = np.zeros(steps, dtype=np.bool_)
         for begin in begins.tolist():
             seen[begin : begin + length] = True
-        begins = np.union1d(begins, np.array(blows(v, length, seen)[:1], dtype=np.int64))
+        begins = np.union1d(begins, np.array(violent_windows(v, length, seen)[:1], dtype=np.int64))
     return begins, length
 
 
@@ -715,7 +716,7 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         return None
     damped = bool(_fast_damping(scene, trajectory).rate)
     other = finer(integrator, trajectory, damped=damped, pulled=pulled, constrained=bool(scene.constraints))
-    # Where guards divided steps, the repeated ones are as short as their parts.
+    # Steps divided by guards are repeated in parts of the same length.
     parts = other.parts * shortest_parts(trajectory)
     first = examined_nodes(scene, trajectory)
     inertia = inertias(scene, trajectory.q[first])
@@ -725,13 +726,13 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
     # Nodes near the first node of an examined window.
     seen = np.zeros(trajectory.steps + 1, dtype=np.bool_)
     worst = None
-    for chosen in (first, between(trajectory.steps, first)):
+    for chosen in (first, nodes_between(trajectory.steps, first)):
         for step in chosen.tolist():
             if seen[step]:
                 continue
             window = Window.at(scene, trajectory, step)
             if chosen is first and small[step : step + int(window.judged.max())].all():
-                # What is small beside a motion may be large beside what it calms down to.
+                # An error that is small for this motion may be large for a slower one after it.
                 units = window.units(scene, trajectory, inertia)
                 if (within < _SMALL * units).all():
                     continue
@@ -756,7 +757,7 @@ def motion_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
 
 def is_wrong(error: MotionError) -> bool:
     """Whether an error exceeds its threshold."""
-    return not error.worst <= (CAUTION if error.settled else _UNSETTLED)
+    return not error.worst <= (CAUTION if error.settled else _CAUTION_IF_ROUGH)
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,17 @@ namespace varpin {
 
 // R decisions, each held over `hold` steps; x is the state, optionally followed by the previous control.
 struct Commands {
-    int controls = 0;                   // m
-    int hold = 1;                       // steps of a decision
-    const double* u = nullptr;          // (R, m)
-    const double* gains = nullptr;      // (R, m, width), or null for none
-    const double* reference = nullptr;  // (R, width)
-    int width = 0;                      // 2n, or 2n + m if x has the previous control
-    const double* least = nullptr;      // (m) infinite where there is no limit
-    const double* greatest = nullptr;   // (m)
-    const double* before = nullptr;     // (P, m) control of each path before its first, or null for the reference
-    const double* within = nullptr;     // (N, s, m) controls at the stages of each step, or null for constant ones
-    const double* places = nullptr;     // (s) times of the stages for linear controls, which need `before`; or null
+    int controls = 0;                     // m
+    int hold = 1;                         // steps of a decision
+    const double* u = nullptr;            // (R, m)
+    const double* gains = nullptr;        // (R, m, width), or null for none
+    const double* reference = nullptr;    // (R, width)
+    int width = 0;                        // 2n, or 2n + m if x has the previous control
+    const double* least = nullptr;        // (m) infinite where there is no limit
+    const double* greatest = nullptr;     // (m)
+    const double* before = nullptr;       // (P, m) control of each path before its first, or null for the reference
+    const double* within = nullptr;       // (N, s, m) controls at the stages of each step, or null for constant ones
+    const double* stage_times = nullptr;  // (s) times of the stages for linear controls, which need `before`; or null
 };
 
 // Controls of step s of a path, clipped to their limits, into row s of u (N, m).
@@ -64,13 +64,13 @@ inline const double* stage_controls(const Commands& commands, std::ptrdiff_t pat
                                     const double* u, std::vector<double>& line) {
     const int m = commands.controls;
     if (commands.within) return commands.within + s * stages * m;
-    if (!commands.places) return nullptr;
+    if (!commands.stage_times) return nullptr;
     const std::ptrdiff_t first = s - s % commands.hold;
     const double* from = first > 0 ? u + (first - 1) * m : commands.before + path * m;
     const double* to = u + s * m;
     line.resize(static_cast<std::size_t>(stages) * m);
     for (int i = 0; i < stages; ++i) {
-        const double share = (static_cast<double>(s - first) + commands.places[i]) / commands.hold;
+        const double share = (static_cast<double>(s - first) + commands.stage_times[i]) / commands.hold;
         for (int c = 0; c < m; ++c) line[i * m + c] = (1.0 - share) * from[c] + share * to[c];
     }
     return line.data();

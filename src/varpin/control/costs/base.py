@@ -26,7 +26,7 @@ from varpin.support.frozen import Frozen
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 
-Reference = ArrayLike | Callable[[float], ArrayLike]
+ReferenceValues = ArrayLike | Callable[[float], ArrayLike]
 
 
 class CostError(VarpinError, ValueError):
@@ -393,7 +393,7 @@ def weight_matrix(name: str, weight: Floats, size: int) -> Floats:
     return weight * np.eye(size) if weight.ndim < 2 else weight
 
 
-def sample(name: str, reference: Reference, points: Points, size: int, *, held: bool = False) -> Floats:
+def sample(name: str, reference: ReferenceValues, points: Points, size: int, *, held: bool = False) -> Floats:
     """A reference at the points, (N, size), or (1, size) where it is constant.
 
     With ``held``, an array may also have one row for each step, constant over the step.

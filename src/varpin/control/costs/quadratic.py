@@ -13,7 +13,7 @@ from varpin.control.costs.base import (
     CompiledCost,
     Cost,
     Points,
-    Reference,
+    ReferenceValues,
     checked_weight,
     sample,
     weight_matrix,
@@ -26,10 +26,10 @@ class _Quadratic(Cost):
     """weight . (y - y_r)^2 for one block y of z."""
 
     weight: Floats | Mapping[str, float]
-    reference: Reference | Mapping[str, float]
+    reference: ReferenceValues | Mapping[str, float]
     block: str
 
-    def __init__(self, reference: Reference | Mapping[str, float], weight: JointValues) -> None:
+    def __init__(self, reference: ReferenceValues | Mapping[str, float], weight: JointValues) -> None:
         self.weight = weight if isinstance(weight, Mapping) else checked_weight(type(self).__name__, weight)
         given = callable(reference) or isinstance(reference, Mapping)
         self.reference = reference if given else as_floats(f"{type(self).__name__} reference", reference)
@@ -85,7 +85,7 @@ class TrackingCost(_Quadratic):
 
     block = "q"
 
-    def __init__(self, reference: Reference | Mapping[str, float], weight: JointValues = 1.0) -> None:
+    def __init__(self, reference: ReferenceValues | Mapping[str, float], weight: JointValues = 1.0) -> None:
         """Describe the cost.
 
         Args:
@@ -106,7 +106,7 @@ class VelocityCost(_Quadratic):
 
     block = "v"
 
-    def __init__(self, weight: JointValues = 1.0, reference: Reference | Mapping[str, float] = 0.0) -> None:
+    def __init__(self, weight: JointValues = 1.0, reference: ReferenceValues | Mapping[str, float] = 0.0) -> None:
         """Describe the cost; see :class:`TrackingCost`."""
         super().__init__(reference, weight)
 
@@ -116,7 +116,7 @@ class ControlCost(_Quadratic):
 
     block = "u"
 
-    def __init__(self, weight: JointValues = 1.0, reference: Reference | Mapping[str, float] = 0.0) -> None:
+    def __init__(self, weight: JointValues = 1.0, reference: ReferenceValues | Mapping[str, float] = 0.0) -> None:
         """Describe the cost; see :class:`TrackingCost`, with m controls for n coordinates.
 
         Args:

@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats, Integers
-from varpin.control.costs.base import BoundCost, CompiledCost, CostError, Points, Reference, sample
+from varpin.control.costs.base import BoundCost, CompiledCost, CostError, Points, ReferenceValues, sample
 from varpin.control.costs.residual import TaskCost
 from varpin.control.costs.terms import Terms
 from varpin.core import Subject
@@ -57,7 +57,7 @@ class FramePositionCost(_FrameCost):
 
     size = 3
 
-    def __init__(self, robot: Robot, frame: str, target: Reference, weight: ArrayLike = 1.0) -> None:
+    def __init__(self, robot: Robot, frame: str, target: ReferenceValues, weight: ArrayLike = 1.0) -> None:
         """Describe the cost.
 
         Args:
@@ -157,7 +157,7 @@ class FrameVelocityCost(_FrameCost):
 
     size = 6
 
-    def __init__(self, robot: Robot, frame: str, target: Reference = 0.0, weight: ArrayLike = 1.0) -> None:
+    def __init__(self, robot: Robot, frame: str, target: ReferenceValues = 0.0, weight: ArrayLike = 1.0) -> None:
         """Describe the cost.
 
         Args:
@@ -195,7 +195,7 @@ class CenterOfMassCost(TaskCost):
 
     size = 3
 
-    def __init__(self, robot: Robot, target: Reference, weight: ArrayLike = 1.0) -> None:
+    def __init__(self, robot: Robot, target: ReferenceValues, weight: ArrayLike = 1.0) -> None:
         """Describe the cost; see :class:`FramePositionCost`.
 
         Raises:

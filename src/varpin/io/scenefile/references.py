@@ -111,7 +111,7 @@ class Sine:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceSignal:
     """A reference in a file, before it is applied to a robot.
 
     Attributes:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from varpin.io.scenefile.plan_constraints import Kind
-from varpin.io.scenefile.references import Reference
+from varpin.io.scenefile.references import ReferenceSignal
 from varpin.io.scenefile.table import ByName, Table
 from varpin.io.scenefile.terms import Term
 from varpin.mechanics import constraints
@@ -139,7 +139,7 @@ class CostSpec:
     term: Term
     weight: ByName
     terminal: bool
-    reference: Reference | None
+    reference: ReferenceSignal | None
     holding_q: ByName | str | None
     frame: str
     numbers: Mapping[str, float]

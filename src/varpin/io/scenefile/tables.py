@@ -32,7 +32,7 @@ from varpin.io.scenefile.keys import (
     word,
 )
 from varpin.io.scenefile.plan_constraints import PLAN_CONSTRAINTS, Kind
-from varpin.io.scenefile.references import Reference, Sine
+from varpin.io.scenefile.references import ReferenceSignal, Sine
 from varpin.io.scenefile.spec import (
     CONSTRAINTS,
     FIGURES,
@@ -592,7 +592,7 @@ class SceneSpec:
     shape: str
     integrator: Integrator | None
     costs: tuple[CostSpec, ...]
-    controls: Reference | str | None
+    controls: ReferenceSignal | str | None
     seed: int | None
     options: Mapping[str, Any]
     outputs: OutputKeys
@@ -734,17 +734,17 @@ def _cost(table: Table, keys: TypedKeys, dt: float) -> CostSpec:
     )
 
 
-def _reference_of(table: Table, name: str, value: Any, dt: float) -> Reference:
+def _reference_of(table: Table, name: str, value: Any, dt: float) -> ReferenceSignal:
     nested = table.table(name)
     if isinstance(value, WaypointKeys):
-        return Reference(table, name, times=value.times, values=value.values, smooth=value.between == "smooth")
+        return ReferenceSignal(table, name, times=value.times, values=value.values, smooth=value.between == "smooth")
     if isinstance(value, FileKeys):
-        return Reference(table, name, file=value.file)
+        return ReferenceSignal(table, name, file=value.file)
     if not isinstance(value, SinesKeys):
-        return Reference(table, name, offset=value)
+        return ReferenceSignal(table, name, offset=value)
     for index, sine in enumerate(value.sines):
         if sine.frequency > 0.5 / dt:
             most = f"<= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves"
             raise nested.error(f"sines[{index}].frequency", f"must be {most}, got {sine.frequency:g}")
     sines = tuple(Sine(sine.of, sine.amplitude, sine.frequency, sine.phase) for sine in value.sines)
-    return Reference(table, name, offset=value.offset, sines=sines)
+    return ReferenceSignal(table, name, offset=value.offset, sines=sines)

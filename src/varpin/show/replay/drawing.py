@@ -120,8 +120,8 @@ class _Drawing:
             lines += [goal.places for goal in actor.goals]
             seen = np.concatenate([points, *lines, *marked])
             # Regions much larger than the motion are shown in part.
-            low, high, room = seen.min(axis=0), seen.max(axis=0), 0.3 * size
-            around = [np.clip(region.corners, low - room, high + room) for region in actor.regions]
+            low, high, margin = seen.min(axis=0), seen.max(axis=0), 0.3 * size
+            around = [np.clip(region.corners, low - margin, high + margin) for region in actor.regions]
             extents.append(np.concatenate([seen, *around]))
             poses.append(picture.body_poses(positions))
         if not np.abs(np.concatenate(extents)).max() < _FARTHEST:

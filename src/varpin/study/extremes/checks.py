@@ -18,7 +18,7 @@ from varpin.integrators import Gauss, Integrator, Midpoint
 from varpin.linearization import linearize
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import changed
+from varpin.simulation.accuracy import velocity_change
 from varpin.simulation.run import simulate
 from varpin.study.extremes.exact import SHORTEST, Exact
 from varpin.study.extremes.record import CONSERVED_MOMENTUM, LEVELS
@@ -57,7 +57,7 @@ def energy_error(scene: Scene, trajectory: Trajectory) -> float:
     off = np.maximum(off, 0.0) if scene.dissipates else np.abs(off)
     some = trajectory.q[_spread(trajectory.steps, _FEW_NODES)]
     inertia = np.max([np.diag(_pinocchio(scene, q, np.zeros_like(q))[2]) for q in some], axis=0)
-    scale = min(kinetic.max(), 0.5 * inertia @ changed(trajectory.v) ** 2) + np.abs(work).max()
+    scale = min(kinetic.max(), 0.5 * inertia @ velocity_change(trajectory.v) ** 2) + np.abs(work).max()
     # A robot at rest turns nothing over: there rounding of the potential is all there is.
     scale = max(scale, 1e-9 * np.abs(trajectory.energy).max())
     if not np.isfinite(scale):
@@ -82,7 +82,7 @@ def symmetric(integrator: Integrator) -> bool:
 
 
 def reversal_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> float:
-    """Takes the last steps back, and returns how far from their start that ends, in units of the way.
+    """The distance from their start after the last steps are reversed, in units of the travel.
 
     Only of symmetric methods, where nothing drives or damps and no step is taken in parts.
     """
@@ -98,8 +98,8 @@ def reversal_error(scene: Scene, integrator: Integrator, trajectory: Trajectory)
     if back.statistics.split_steps:
         return math.nan
     legs = trajectory.q[-k - 1 :]
-    way = max(float(np.abs(np.diff(legs, axis=0)).max()), SHORTEST)
-    return float(np.abs(back.q[::-1] - legs).max() / way)
+    travel = max(float(np.abs(np.diff(legs, axis=0)).max()), SHORTEST)
+    return float(np.abs(back.q[::-1] - legs).max() / travel)
 
 
 def symplecticity_error(A: Floats) -> float:

@@ -19,7 +19,7 @@ from varpin.core import ForwardDynamics
 from varpin.integrators import ExplicitEuler, Integrator
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import DISTURBANCE, changed, grown, light_speed, masses, noticed
+from varpin.simulation.accuracy import DISTURBANCE, error_units, grown, light_joint_speed, masses, velocity_change
 from varpin.trajectory import Trajectory
 
 _TOLERANCE = 1e-11
@@ -67,8 +67,8 @@ class Exact:
         nodes: Their indices (K,).
         q: (K, n) [rad or m].
         v: (K, n) [rad/s or m/s].
-        way: Largest distance from the start [rad or m].
-        ways: The same of each joint (n,) [rad or m].
+        travel: Largest distance from the start [rad or m].
+        travels: The same for each joint (n,) [rad or m].
         speeds: Largest velocity of each joint (n,) [rad/s or m/s].
         cut: Whether it is known over a part of the window only.
     """
@@ -76,24 +76,24 @@ class Exact:
     nodes: NDArray[np.int64]
     q: Floats
     v: Floats
-    way: float
-    ways: Floats
+    travel: float
+    travels: Floats
     speeds: Floats
     cut: bool = False
 
     def errors(self, trajectory: Trajectory) -> dict[str, float]:
         """Largest distances of a motion, NaN if it ends before the first node.
 
-        ``error`` in q, in units of the way; ``joint`` in q and ``velocity`` in v, each joint in units of its own way
-        and velocity, so that what is far or fast does not hide the others.
+        ``error`` in q, in units of the travel; ``joint`` in q and ``velocity`` in v, each joint in units of its own
+        travel and velocity, so that a far or fast joint does not hide the others.
         """
         nodes = self.nodes[self.nodes <= trajectory.steps]
         if not len(nodes):
             return {}
         q, v = (np.abs(a[nodes] - b[: len(nodes)]) for a, b in ((trajectory.q, self.q), (trajectory.v, self.v)))
         return {
-            "error": float(q.max() / self.way),
-            "joint": float((q / self.ways).max()),
+            "error": float(q.max() / self.travel),
+            "joint": float((q / self.travels).max()),
             "velocity": float((v / self.speeds).max()),
         }
 
@@ -154,15 +154,15 @@ def exact_motion(
 def in_units(
     scene: Scene, q0: Floats, v0: Floats, dt: float, nodes: NDArray[np.int64], q: Floats, v: Floats, *, cut: bool
 ) -> Exact:
-    """An exact motion with its ways and speeds: of each joint its own, or a small part of the others'."""
+    """An exact motion with travels and speeds: each joint's own, or a small share of the others'."""
     velocities = np.vstack([v0, v])
     M = lagrangian_jet(scene, q0, np.zeros_like(q0), backend="pinocchio").Lvv
-    ways, speeds = noticed(
+    travels, speeds = error_units(
         scene,
         np.abs(q - q0).max(axis=0),
         np.abs(velocities).max(axis=0),
-        light_speed(np.diag(M), changed(velocities)),
+        light_joint_speed(np.diag(M), velocity_change(velocities)),
         np.asarray(float(nodes[-1]) * dt),
     )
-    way = max(float(np.abs(q - q0).max()), SHORTEST)
-    return Exact(nodes, q, v, way, np.maximum(ways, SHORTEST), np.maximum(speeds, SHORTEST), cut)
+    travel = max(float(np.abs(q - q0).max()), SHORTEST)
+    return Exact(nodes, q, v, travel, np.maximum(travels, SHORTEST), np.maximum(speeds, SHORTEST), cut)

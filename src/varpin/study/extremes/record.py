@@ -51,7 +51,7 @@ class Cell:
         kind: One of the five.
         error: Largest distance in q from the exact motion over its window, in units of how far that goes; of a plan,
             the part of its cost that single controls would take off.
-        joint: The same distance, each joint in units of its own way.
+        joint: The same distance, each joint in units of its own travel.
         velocity: The same of v, in units of each joint's largest velocity.
         period: Largest error over a period from any of many nodes of the whole motion, in units of what is wrong.
         energy: Largest error of the energy balance, in units of the energy there is to turn over.

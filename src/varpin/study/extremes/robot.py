@@ -207,7 +207,7 @@ def judge(
         wrong: The failed checks.
     """
     # These warnings are not about the steps that the checks judge.
-    elsewhere = (*limits.KINDS, growth.SAID)
+    elsewhere = (*limits.KINDS, growth.WORDS)
     warnings = (warning for warning in trajectory.warnings if not warning.startswith(elsewhere))
     said = (*(() if error is None else (line_of(error),)), *warnings)
     if not finite(trajectory):
