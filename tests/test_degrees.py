@@ -84,3 +84,13 @@ def test_other_positions_in_degrees(scene, caplog):
     closed = vp.Scene(scene.robot, constraints=[vp.PointOnPoint("tool0", [0.8, 0.1, 0.2])])
     with refused(vp.InputError, "q0", *FACTS):
         vp.simulate(closed, HOME, np.zeros(6), dt=1e-3, steps=2)
+
+
+def test_stops_in_degrees(caplog):
+    robot = vp.load_robot("so100")
+    vp.Scene(robot, forces=[vp.JointStop(1e3, 5.0), vp.JointStop(1e3, lower=-1.5, upper={"shoulder_lift": 1.5})])
+    assert not caplog.records
+    vp.Scene(robot, forces=[vp.JointStop(1e3, 5.0, lower=-90.0, upper=90.0)])
+    told = [record.getMessage() for record in caplog.records]
+    assert [sentence.partition(" of the JointStop")[0] for sentence in told] == ["the lower end", "the upper end"]
+    assert all("looks like degrees" in sentence for sentence in told)

@@ -11,6 +11,7 @@ from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
+from varpin.control.moments import noise_cost
 from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
@@ -37,6 +38,8 @@ _OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
 _LITTLE = 1e-3
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
 _LINEAR_FRICTION = 0.25
+# Part of the expected cost by which noise may cost other than planned in half steps without a warning.
+_NOISE_OFF = 0.05
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
@@ -86,6 +89,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
         _unfinished(solution)
         + _noise_left_out(solution)
         + _friction_under_noise(solution)
+        + _noise_in_halves(solution)
         + (_alternating(solution) or _restless(solution))
         + _between(solution)
     )
@@ -124,15 +128,15 @@ def replayed(solution: Solution) -> Replay:
     return Replay(*lost)
 
 
-def _in_parts(solution: Solution) -> tuple[Commands, Commands]:
+def _in_parts(solution: Solution, parts: int = PARTS) -> tuple[Commands, Commands]:
     """Commands in parts of the plan's steps: the controls alone, and with feedback."""
     problem = solution.problem
     variational, times = problem.integrator.variational, problem.integrator.stage_times
     alone = open_line(solution.controls, times) if problem.linear else open_loop(solution.controls)
-    policy = solution.policy_on("momentum" if variational else "velocity", PARTS)
+    policy = solution.policy_on("momentum" if variational else "velocity", parts)
     m, n = problem.scene.controls, problem.scene.robot.dof
-    fed = policy.commands(problem.steps * PARTS, m, n, variational=variational, stage_times=times)
-    return alone._replace(hold=problem.hold * PARTS), fed
+    fed = policy.commands(problem.steps * parts, m, n, variational=variational, stage_times=times)
+    return alone._replace(hold=problem.hold * parts), fed
 
 
 def _alternating(solution: Solution) -> list[Finding]:
@@ -229,6 +233,36 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
             f"noise moves joint {name!r} by {worst:.2g} times the width of its dry friction ({width:g} rad/s or m/s), "
             "for which the friction is not linear: noise_cost, gains and margins are of the linearized friction and "
             "may be wrong many times over; plan.monte_carlo() and simulate_ensemble have the whole of it",
+        )
+    ]
+
+
+def _noise_in_halves(solution: Solution) -> list[Finding]:
+    """A finding if noise costs other than planned in steps of half the length.
+
+    Its impulses come one a step, which is right to first order in the step.
+    """
+    problem, scene = solution.problem, solution.problem.scene
+    if not scene.processes or problem.linear or scene.inputs:
+        return []
+    dt, hold, feedback = 0.5 * problem.dt, 2 * problem.hold, Feedback(solution.gains, solution.previous_gains)
+    try:
+        finer, failure = rollout(scene, problem.integrator, problem.q0, problem.v0, _in_parts(solution, 2)[1], dt)
+        if failure is not None:
+            return []
+        in_halves = problem.at(dt=dt, hold=hold, integrator=problem.integrator)
+        planned, fine = noise_cost(problem, solution.trajectory, feedback), noise_cost(in_halves, finer, feedback)
+    except VarpinError:
+        # A custom noise or cost, or the linearization, may fail off the plan.
+        return []
+    if abs(fine - planned) <= _NOISE_OFF * (abs(solution.cost) + max(planned, fine)):
+        return []
+    return [
+        Finding(
+            "noise within steps",
+            f"noise costs {fine:.3g} in halves of dt = {problem.dt:g} s, and {planned:.3g} in the plan's steps, which "
+            "are long for it: on the robot noise_cost is another, although plan.monte_carlo(), in the same steps, "
+            f"agrees with it; problem.at(dt={dt:g}, hold={hold}) is closer",
         )
     ]
 

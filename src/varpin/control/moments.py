@@ -96,6 +96,18 @@ def noise_gradient(
     return found - known
 
 
+def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback) -> float:
+    """The noise cost of a motion under feedback, without that of control changes."""
+    here = _steps_of(problem, trajectory, np.ones(problem.scene.processes, dtype=bool))
+    C = propagated(here.J, here.g, here.gz, problem, feedback)
+    x = here.J.shape[1]
+    over_time = (here.cost * C[:-1]).sum()
+    at_end = (_end_hessian(problem, trajectory) * C[-1, :x, :x]).sum()
+    kicks = problem.dt * np.einsum("Nak,Nab,Nbk->", here.g, here.kicked, here.g, optimize=True)
+    kicks += problem.dt * np.einsum("Nakz,Nab,Nbky,Nzy->", here.gz, here.kicked, here.gz, C[:-1], optimize=True)
+    return 0.5 * float(over_time + at_end + kicks)
+
+
 def _end_hessian(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
     """Hessian of the terminal cost in x (2n, 2n)."""
     n = problem.scene.robot.dof

@@ -69,23 +69,23 @@ def refine(
             # A comparison that has converged is the plan of its step.
             done = isinstance(start, Solution) and start.status.converged
             solution = start if isinstance(start, Solution) and done else search(problem, start)
-            told = None if solution.status is Status.INTERRUPTED else _true_costs(solution, wish)
+            costs = None if solution.status is Status.INTERRUPTED else _true_costs(solution, wish)
         except KeyboardInterrupt:
             if solution is None:
                 if best is None:
                     raise
                 solution = best
-            solution, told = replace(solution, status=Status.INTERRUPTED), None
+            solution, costs = replace(solution, status=Status.INTERRUPTED), None
         except VarpinError as error:
             if best is None:
                 raise
             return _with(best, wish, tried, chosen, f"with dt = {problem.dt:g} s there is no plan: {error}")
-        if told is None:
+        if costs is None:
             ended = f"interrupted with dt = {problem.dt:g} s"
             if best is None:
                 return _with(solution, wish, tried, 0, ended)
             return _with(replace(best, status=Status.INTERRUPTED, reason=ended), wish, tried, chosen, ended)
-        tried.append(_row(solution, told, time.perf_counter() - began))
+        tried.append(_row(solution, costs, time.perf_counter() - began))
         logger.info("%s: true cost: %s", problem.scene.robot.name, tried[-1])
         meets = _within(tried[-1], wish) and solution.status.converged
         if best is None or meets or not abs(tried[-1].loss) >= abs(tried[chosen].loss):
@@ -166,14 +166,14 @@ def _true_costs(solution: Solution, wish: float) -> tuple[float, float, bool]:
 
 def _row(solution: Solution, costs: tuple[float, float, bool], seconds: float) -> Refined:
     problem = solution.problem
-    opened, closed, told = costs
+    opened, closed, known = costs
     return Refined(
         dt=problem.dt,
         steps=problem.steps,
         cost=solution.cost,
         true_cost=closed,
         open_loop_cost=opened,
-        loss=excess(closed, solution.cost) if told else np.nan,
+        loss=excess(closed, solution.cost) if known else np.nan,
         iterations=solution.iterations,
         status=solution.status,
         seconds=seconds,

@@ -61,9 +61,7 @@ def propagated(J: Floats, g: Floats, gz: Floats, problem: OptimalControlProblem,
         through = np.zeros((x + m, x + m))
         through[:x], through[x:, x:] = J[k], np.eye(m)
         covariance = through @ covariance @ through.T
-        covariance[:x, :x] += problem.dt * (
-            g[k] @ g[k].T + np.einsum("akz,zy,bky->ab", gz[k], C[k], gz[k], optimize=True)
-        )
+        covariance[:x, :x] += problem.dt * (g[k] @ g[k].T + (gz[k] @ C[k]).reshape(x, -1) @ gz[k].reshape(x, -1).T)
     C[N] = covariance
     return C
 

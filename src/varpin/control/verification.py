@@ -297,10 +297,10 @@ def true_costs(
             above=planned_cost + _FAR * wish * abs(planned_cost),
         )
         opened, closed = found.opened[0], found.closed[0]
-        told = found.accuracy <= _UNKNOWN or found.decided or not np.isfinite([opened, closed]).any()
-        if told or not problem.scene.dissipates:
+        known = found.accuracy <= _UNKNOWN or found.decided or not np.isfinite([opened, closed]).any()
+        if known or not problem.scene.dissipates:
             break
-    return opened, closed, told
+    return opened, closed, known
 
 
 class _TrueCosts(NamedTuple):

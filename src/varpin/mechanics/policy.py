@@ -204,7 +204,8 @@ class LinearPolicy(Frozen):
         object.__setattr__(self, "joints", names)
         object.__setattr__(self, "servos", None if servos is None else tuple(servos))
         object.__setattr__(self, "period", None if period is None else positive("period", period, "s"))
-        by_name = isinstance(before, Mapping) or any(isinstance(side, Mapping) for side in limits or ())
+        sides = () if limits is None else limits
+        by_name = isinstance(before, Mapping) or any(isinstance(side, Mapping) for side in sides)
         if by_name and names is None:
             raise InputError(
                 "limits and before by joint name take the names of the controls, joints=scene.control_joints"

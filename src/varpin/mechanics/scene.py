@@ -896,6 +896,12 @@ def _forces(
             logger.warning(units)
     bound = [each for force in given for each in bound_force(force, robot)]
     elements = [each for each in bound if isinstance(each, Element)]
+    for side, name in enumerate(("lower", "upper")):
+        ends = np.zeros(robot.dof)
+        for element in of_kind(elements, "JointStop"):
+            ends[element.coordinate] = element.values[side] if np.isfinite(element.values[side]) else 0.0
+        if units := degrees_hint(robot, f"the {name} end of the JointStop", ends):
+            logger.warning(units)
     own_code = tuple(force for force in given if isinstance(force, CustomForce))
     total = {kind: np.zeros(robot.dof) for kind in ("JointDamper", "JointSpring", "Armature")}
     for element in elements:

@@ -1,0 +1,80 @@
+"""What noise costs a plan, against the exact covariance in continuous time; and the warning where steps are long."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.linalg import expm
+
+import varpin as vp
+from varpin.control.moments import noise_cost
+from varpin.control.spread import Feedback
+
+LEVEL, DAMPING = 0.3, 1.5
+WEIGHTS = {"q": 5.0, "v": 1.0, "u": 0.05}
+
+
+def plan(dt: float, hold: int = 1, **options: object) -> vp.Solution:
+    """One joint without gravity, held at rest: the noise cost is the whole cost."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=DAMPING, noise=vp.AdditiveNoise(LEVEL))
+    cost = vp.TrackingCost([0.0], WEIGHTS["q"]) + vp.VelocityCost(WEIGHTS["v"]) + vp.ControlCost(WEIGHTS["u"])
+    problem = vp.OptimalControlProblem(
+        scene,
+        cost + vp.Terminal(vp.VelocityCost(0.1)),
+        [0.0],
+        [0.0],
+        dt=dt,
+        steps=round(1.0 / dt),
+        hold=hold,
+        **options,
+    )
+    return vp.solve(problem)
+
+
+def exact(solution: vp.Solution) -> float:
+    """E[cost] from the moments of (q, v, u), whose equations are linear, by the matrix exponential."""
+    model = solution.problem.scene.robot.model
+    inertia = pin.crba(model, model.createData(), pin.neutral(model))[0, 0]
+    A = np.array([[0.0, 1.0, 0.0], [0.0, -DAMPING / inertia, 1.0 / inertia], [0.0, 0.0, 0.0]])
+    kick = np.diag([0.0, (LEVEL / inertia) ** 2, 0.0])
+    rates = np.zeros((11, 11))
+    rates[:9, :9] = np.kron(A, np.eye(3)) + np.kron(np.eye(3), A)
+    rates[:9, 10] = kick.ravel()
+    rates[9, :9] = np.diag(list(WEIGHTS.values())).ravel()
+    interval = expm(rates * solution.problem.dt * solution.problem.hold)
+    S, total = np.zeros((3, 3)), 0.0
+    for gain in solution.gains[:, 0]:
+        decide = np.eye(3)
+        decide[2] = gain[0], gain[1] * inertia, 0.0
+        S = decide @ S @ decide.T
+        end = interval @ np.concatenate([S.ravel(), [0.0, 1.0]])
+        S, total = end[:9].reshape(3, 3), total + end[9]
+    return total + 0.1 * S[1, 1]
+
+
+@pytest.mark.parametrize("kick", ["left", "split"])
+@pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), vp.ControlNoise(0.2) + vp.StateNoise(0.5, center=[0.1, 0.1])])
+def test_it_is_that_of_the_backward_pass(noise, kick):
+    scene = vp.Scene(vp.planar_chain(2), damping=0.4, noise=noise)
+    cost = vp.TrackingCost([0.5, 0.2], 5.0) + vp.VelocityCost(0.3) + vp.ControlCost(0.01)
+    problem = vp.OptimalControlProblem(
+        scene, cost + vp.Terminal(vp.VelocityCost(1.0)), [0.2, 0.1], [0.0, 0.0], dt=0.05, steps=12, hold=2,
+        integrator=vp.Gauss(2, kick=kick),
+    )  # fmt: skip
+    found = vp.solve(problem, check=False)
+    own = noise_cost(problem, found.trajectory, Feedback(found.gains, found.previous_gains))
+    assert own == pytest.approx(found.noise_cost, rel=1e-9)
+
+
+def test_a_plan_whose_steps_are_long_for_the_noise_says_so():
+    long = plan(0.1)
+    assert abs(long.noise_cost / exact(long) - 1.0) > 0.15
+    (sentence,) = (warning for warning in long.warnings if "noise costs" in warning)
+    halves = float(sentence.split()[2])
+    assert abs(halves - exact(long)) < 0.6 * abs(long.noise_cost - exact(long))
+    assert "problem.at(dt=0.05, hold=2) is closer" in sentence
+
+
+def test_one_whose_steps_are_short_does_not():
+    short = plan(0.005, hold=20)
+    assert short.noise_cost == pytest.approx(exact(short), rel=0.05)
+    assert not any("noise costs" in warning for warning in short.warnings)
