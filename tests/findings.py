@@ -21,6 +21,7 @@ MARKS = {
     "noise not drawn": "none was drawn",
     "nothing random": "nothing is random",
     "noise left out": "least cost without noise",
+    "noise within steps": "noise costs",
     "growth": "disturbances grow",
     "steps in parts": "parts",
     "ringing": "will ring",

@@ -366,7 +366,9 @@ def test_a_plan_that_whirls_with_nothing_said_is_silent_wrong(monkeypatch, small
 def test_added_noise_of_any_strength_hides_nothing():
     quiet, loud = (judge_plan(BY_NAME[f"added noise of {strength}"], vp.Midpoint()) for strength in ("1e-09", "1e+06"))
     assert quiet.kind is Kind.ACCURATE
-    assert loud.kind is Kind.ACCURATE
+    # Steps of 10 ms are long for so much noise: in half steps its cost is 10 % less.
+    assert loud.kind is Kind.DEGRADED
+    assert about(loud.said, "noise within steps")
 
 
 def test_the_cost_by_hand_has_the_weights():

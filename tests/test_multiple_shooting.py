@@ -92,8 +92,9 @@ def test_what_goes_with_it(kind):
     options = {"true_cost": 0.01} if kind == "true cost" else {}
     found = vp.solve(problem, states=line([1.0, 0.5]), check=False, **options)
     assert found.status.converged
-    # As cheap as what a search of its own makes of it.
-    assert vp.solve(found.problem, found, check=False).cost == pytest.approx(found.cost, rel=1e-5)
+    # As cheap as what a search of its own makes of it; searches for a true cost end at a hundredth of the wish.
+    within = 1e-4 if kind == "true cost" else 1e-5
+    assert vp.solve(found.problem, found, check=False).cost == pytest.approx(found.cost, rel=within)
     if kind == "limits":
         assert np.abs(found.controls).max() <= 30.0
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from findings import about
 from scipy.linalg import expm
 
 import varpin as vp
@@ -68,7 +69,7 @@ def test_it_is_that_of_the_backward_pass(noise, kick):
 def test_a_plan_whose_steps_are_long_for_the_noise_says_so():
     long = plan(0.1)
     assert abs(long.noise_cost / exact(long) - 1.0) > 0.15
-    (sentence,) = (warning for warning in long.warnings if "noise costs" in warning)
+    (sentence,) = about(long.warnings, "noise within steps")
     halves = float(sentence.split()[2])
     assert abs(halves - exact(long)) < 0.6 * abs(long.noise_cost - exact(long))
     assert "problem.at(dt=0.05, hold=2) is closer" in sentence
@@ -77,4 +78,4 @@ def test_a_plan_whose_steps_are_long_for_the_noise_says_so():
 def test_one_whose_steps_are_short_does_not():
     short = plan(0.005, hold=20)
     assert short.noise_cost == pytest.approx(exact(short), rel=0.05)
-    assert not any("noise costs" in warning for warning in short.warnings)
+    assert not about(short.warnings, "noise within steps")
