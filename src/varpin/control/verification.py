@@ -217,55 +217,24 @@ def verify(
     The substeps double until the relative change of both costs is at most ``tolerance``. Where the explicit method does
     not reach that because of fast dampers or dry friction, the L-stable one repeats the comparison.
     """
-    for integrator in _members(problem, plan, max_substeps):
-        found = _against(
-            problem,
-            plan,
-            planned_cost,
-            policy,
-            integrator,
-            status=status,
-            tolerance=tolerance,
-            max_substeps=max_substeps,
-            progress=progress,
-        )
-        if found.told or not problem.scene.dissipates:
-            break
-    if not found.told:
-        logger.warning("%s", found._why_unknown)
-    return found
-
-
-def _against(
-    problem: OptimalControlProblem,
-    plan: Trajectory,
-    planned_cost: float,
-    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
-    integrator: Integrator,
-    *,
-    status: Status,
-    tolerance: float,
-    max_substeps: int,
-    progress: Callable[[int, int], None] | None,
-) -> Verification:
-    """:func:`verify` by one integrator."""
-    found = _true_costs(
-        problem, plan, policy, integrator, tolerance=tolerance, max_substeps=max_substeps, progress=progress
-    )
+    found = _true_costs(problem, plan, policy, tolerance=tolerance, max_substeps=max_substeps, progress=progress)
     end = plan.q[-1]
-    return Verification(
+    verified = Verification(
         planned_cost=planned_cost,
         open_loop_cost=found.opened[0],
         closed_loop_cost=found.closed[0],
         open_loop_gap=float(np.abs(found.opened[1] - end).max()),
         closed_loop_gap=float(np.abs(found.closed[1] - end).max()),
-        defect=_defect(problem, plan, found.substeps, integrator),
+        defect=_defect(problem, plan, found.substeps, found.integrator),
         substeps=found.substeps,
         accuracy=found.accuracy,
         status=status,
-        integrator=str(integrator),
-        constraints=_violations(problem, plan, found.ways, found.substeps, integrator),
+        integrator=str(found.integrator),
+        constraints=_violations(problem, plan, found.ways, found.substeps, found.integrator),
     )
+    if not verified.told:
+        logger.warning("%s", verified._why_unknown)
+    return verified
 
 
 def true_costs(
@@ -286,21 +255,9 @@ def true_costs(
         wish: Greatest allowed loss with feedback, relative to ``planned_cost``.
         accuracy: Relative accuracy of costs within the wish.
     """
-    for integrator in _members(problem, plan, max_substeps):
-        found = _true_costs(
-            problem,
-            plan,
-            policy,
-            integrator,
-            tolerance=accuracy,
-            max_substeps=max_substeps,
-            above=planned_cost + _FAR * wish * abs(planned_cost),
-        )
-        opened, closed = found.opened[0], found.closed[0]
-        known = found.accuracy <= _UNKNOWN or found.decided or not np.isfinite([opened, closed]).any()
-        if known or not problem.scene.dissipates:
-            break
-    return opened, closed, known
+    above = planned_cost + _FAR * wish * abs(planned_cost)
+    found = _true_costs(problem, plan, policy, tolerance=accuracy, max_substeps=max_substeps, above=above)
+    return found.opened[0], found.closed[0], found.known
 
 
 class _TrueCosts(NamedTuple):
@@ -312,6 +269,39 @@ class _TrueCosts(NamedTuple):
     substeps: int
     accuracy: float
     decided: bool
+    integrator: Integrator
+
+    @property
+    def known(self) -> bool:
+        """Whether the costs are good enough, greater than a bound, or infinite."""
+        return self.accuracy <= _UNKNOWN or self.decided or not np.isfinite([self.opened[0], self.closed[0]]).any()
+
+
+def _true_costs(
+    problem: OptimalControlProblem,
+    plan: Trajectory,
+    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
+    *,
+    tolerance: float,
+    max_substeps: int,
+    progress: Callable[[int, int], None] | None = None,
+    above: float = np.inf,
+) -> _TrueCosts:
+    """True costs by the explicit integrator, or by the L-stable one where dissipation keeps that from an answer."""
+    for integrator in _members(problem, plan, max_substeps):
+        found = _costs_by(
+            integrator,
+            problem,
+            plan,
+            policy,
+            tolerance=tolerance,
+            max_substeps=max_substeps,
+            progress=progress,
+            above=above,
+        )
+        if found.known or not problem.scene.dissipates:
+            break
+    return found
 
 
 def _members(problem: OptimalControlProblem, plan: Trajectory, max_substeps: int) -> tuple[Integrator, ...]:
@@ -322,16 +312,16 @@ def _members(problem: OptimalControlProblem, plan: Trajectory, max_substeps: int
     return (_FAST,) if fast else (_USUAL, _FAST)
 
 
-def _true_costs(
+def _costs_by(
+    integrator: Integrator,
     problem: OptimalControlProblem,
     plan: Trajectory,
     policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
-    integrator: Integrator,
     *,
     tolerance: float,
     max_substeps: int,
-    progress: Callable[[int, int], None] | None = None,
-    above: float = np.inf,
+    progress: Callable[[int, int], None] | None,
+    above: float,
 ) -> _TrueCosts:
     """True costs by one integrator, also where the one with feedback is surely greater than ``above``."""
     state: Literal["momentum", "velocity"] = "momentum" if integrator.variational else "velocity"
@@ -363,7 +353,7 @@ def _true_costs(
             break
         substeps *= 2
     blind = blind._replace(hold=problem.hold * substeps)
-    return _TrueCosts(opened, closed, (blind, feedback), substeps, accuracy, bool(decided))
+    return _TrueCosts(opened, closed, (blind, feedback), substeps, accuracy, bool(decided), integrator)
 
 
 def _violations(

@@ -346,9 +346,7 @@ def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) ->
     """Forces of the controls plus a drift (N, n): (N, 1, n), or (N, s, n) for controls that change within steps."""
     drift = drift[:, None] if isinstance(drift, np.ndarray) else drift
     u = trajectory.u_stages if trajectory.u_stages.shape[1] else trajectory.u[:, None]
-    # Velocities of cubic inputs are controls without a force.
-    plain = scene.direct and scene.controls == scene.robot.dof
-    total = u if plain else u @ scene.actuation.T
+    total = u if scene.direct else u @ scene.actuation.T
     return np.ascontiguousarray(total + drift if isinstance(drift, np.ndarray) else total)
 
 

@@ -390,8 +390,8 @@ class Scene(Frozen):
 
     @cached_property
     def direct(self) -> bool:
-        """Whether each control is the input of a linearized step: :attr:`transmission` is the identity."""
-        return np.array_equal(self.transmission, np.eye(len(self.transmission)))
+        """Whether each control is the force of a joint: :attr:`actuation` is the identity, and :attr:`transmission`."""
+        return np.array_equal(self.actuation, np.eye(self.robot.dof))
 
     @property
     def _gear(self) -> Floats:

@@ -73,7 +73,7 @@ def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
     It comes from the fastest mode at two nodes; more would take longer than many a motion. It is 1 where
     :func:`grown_error` is None for every motion, and infinite where the linearization fails.
     """
-    if _unexamined(scene, trajectory):
+    if _unknown(scene, trajectory) or _few(trajectory):
         return 1.0
     try:
         slopes = _slopes(scene, trajectory, np.array([trajectory.steps // 3, 2 * trajectory.steps // 3]))
@@ -197,11 +197,6 @@ def _unknown(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether errors of steps are unknown: under noise or Python forces, or for many joints."""
     unknown = scene.custom is not None or trajectory.dw.any() or not trajectory.steps
     return bool(unknown or scene.robot.dof > _JOINTS)
-
-
-def _unexamined(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether growth is not examined: where errors of steps are unknown, and for few steps."""
-    return _unknown(scene, trajectory) or _few(trajectory)
 
 
 def _few(trajectory: Trajectory) -> bool:

@@ -40,17 +40,17 @@ def kinks(scene: Scene, trajectory: Trajectory) -> Kinks:
         ("joints come to their stops, or leave them", _stopping),
         ("dry friction changes sides", _turning),
     ):
-        own = look(scene, trajectory)
-        if own.any():
+        steps = look(scene, trajectory)
+        if steps.any():
             causes.append(cause)
-        found |= own
+        found |= steps
     return Kinks(np.flatnonzero(found), tuple(causes))
 
 
 def _saturating(scene: Scene, trajectory: Trajectory) -> NDArray[np.bool_]:
     """Steps (N,) in which a drive reaches or leaves its limit."""
     found = np.zeros(trajectory.steps, dtype=np.bool_)
-    servos = [own for own in of_kind(scene.elements, "PositionServo") if np.isfinite(own.values[2])]
+    servos = [servo for servo in of_kind(scene.elements, "PositionServo") if np.isfinite(servo.values[2])]
     if not servos:
         return found
     force = trajectory.u @ scene.actuation.T
@@ -69,9 +69,9 @@ def _stopping(scene: Scene, trajectory: Trajectory) -> NDArray[np.bool_]:
         c, (lower, upper, *_, width) = stop.coordinate, stop.values
         q, reach = trajectory.q[:, c], np.abs(trajectory.v[:, c]) * trajectory.dt
         for depth in (lower - q, q - upper):
-            place = np.clip(np.ceil(depth / width), 0.0, 2.0)
+            zone = np.clip(np.ceil(depth / width), 0.0, 2.0)
             bounces = (depth[:-1] <= 0.0) & (depth[1:] <= 0.0) & (depth[:-1] + reach[:-1] > 0.0)
-            found |= (place[:-1] != place[1:]) | bounces
+            found |= (zone[:-1] != zone[1:]) | bounces
     return found
 
 
