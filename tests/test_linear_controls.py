@@ -183,9 +183,6 @@ def test_refusals() -> None:
         links(controls="cubic")
     with refused(vp.InputError, "hold"):
         links(hold=2)
-    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
-    with refused(vp.InputError, "noise"):
-        vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0, 0], [0, 0], dt=0.1, steps=2, controls="linear")
     problem = links()
     plan = vp.solve(problem, check=False)
     with refused(vp.InputError, "second_order"):
@@ -194,17 +191,6 @@ def test_refusals() -> None:
         vp.solve(problem.at(controls="held"), plan)
     with refused(vp.InputError, "before"):
         vp.LinearPolicy(np.zeros((2, 1)), np.zeros((2, 1, 2)), np.zeros((2, 2)), linear=True)
-    with refused(vp.InputError, "noise"):
-        vp.simulate(scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, rng=0)
-    with refused(vp.InputError, "linear"):
-        vp.simulate_ensemble(problem.scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, paths=2, rng=0,
-                             integrator=problem.integrator)  # fmt: skip
-
-
-def test_monte_carlo_refuses_them_by_name() -> None:
-    plan = vp.solve(links(), max_iterations=1, check=False)
-    with refused(vp.InputError, "linear"):
-        plan.monte_carlo(2, rng=0)
 
 
 @pytest.mark.parametrize("joints", [1, 2])

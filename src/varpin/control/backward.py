@@ -15,7 +15,18 @@ from varpin import core
 from varpin.arrays import Floats
 from varpin.control.costs import CostError, Expansion
 from varpin.control.descent import Model, Stake, at_stake
-from varpin.control.linear_controls import RULE, Derivatives, LinearSteps, at_samples, linear_steps, size
+from varpin.control.linear_controls import (
+    RULE,
+    Derivatives,
+    LinearSteps,
+    after_impulse,
+    at_samples,
+    derivatives,
+    linear_steps,
+    noisy,
+    size,
+    with_pull,
+)
 from varpin.control.moments import noise_gradient
 from varpin.control.penalties import PenalizedProblem, PenalizedRate, flat, rate_columns
 from varpin.control.problem import OptimalControlProblem
@@ -391,6 +402,7 @@ def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
         feedback[:, :, plan.feedback.shape[2] :][:, :, :m] = plan.previous
     expected, moves, state = np.empty((R, x + m)), np.empty((R, m)), np.zeros(x + m)
     previous = np.zeros((0, m, m)) if plan.previous is None or problem.linear else plan.previous
+    spread = np.zeros((R if plan.spread.size else 0, x, x)) if problem.linear else plan.spread
     for begin, end in along.blocks:
         rows = slice(begin // problem.hold, end // problem.hold)
         gains = core.Gains(
@@ -399,7 +411,7 @@ def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
             previous=previous[rows],
             control_gradient=plan.gradient[rows],
             costate=np.zeros((0, x)),
-            spread=plan.spread[begin:end],
+            spread=spread[begin:end],
         )
         steps = along.steps(begin, end, None, _Limits(along.slack, np.zeros((0, x + m))))
         core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows])
@@ -437,6 +449,8 @@ class Along:
         self.kept: tuple[Linearization, Floats] | None = None
         # Gradient of the noise cost, added to the cost's gradient at its samples (N s, 2n + m) once it is known.
         self.added: Floats | float = 0.0
+        # With linear controls in (x, w, u) of each step (N, 2n + 2m).
+        self.pulled: Floats | None = None
         self.noise_differentiated = False
 
     @cached_property
@@ -451,10 +465,14 @@ class Along:
     def differentiate_noise(self, plan: Plan, processes: NDArray[np.bool_]) -> None:
         """Add the whole gradient of the noise cost of ``processes`` (k,) under the plan's gains to later passes."""
         problem, N = self.problem, self.problem.steps
-        lin, velocity = self.linearized(0, N)
         feedback = Feedback(plan.feedback, plan.previous)
         pull = noise_gradient(problem, self.trajectory, feedback, self.rate, processes)
+        if problem.linear:
+            self.pulled, self.noise_differentiated = pull, True
+            vars(self).pop("line", None)
+            return
         # A gradient in (x, u) is one in (q, v, u) at the step's first sample.
+        lin, velocity = self.linearized(0, N)
         rule, x, m = problem.model_rule, 2 * problem.scene.robot.dof, problem.scene.controls
         D = np.zeros((N, x + m, x + m))
         D[:, :x] = at_samples(rule[:1], np.concatenate([lin.A, lin.B], axis=2), velocity)[0]
@@ -496,16 +514,18 @@ class Along:
     @cached_property
     def line(self) -> LinearSteps:
         """The steps with the control in the state, where controls are linear between nodes."""
-        found = self.running
-        return linear_steps(self.problem, self.of_lines, found.gradient, found.hessian, self.rate, self.pull)
+        problem, found, lines = self.problem, self.running, self.of_lines
+        steps = linear_steps(problem, lines, found.gradient, found.hessian, self.rate, self.pull)
+        if problem.processes:
+            x = lines.A.shape[1]
+            kicked = after_impulse(problem.model_rule, found.hessian, lines.velocity, problem.steps, x, problem.dt)
+            steps = noisy(steps, lines, kicked)
+        return steps if self.pulled is None else with_pull(steps, self.pulled, problem.dt)
 
     @cached_property
     def of_lines(self) -> Derivatives:
         """Derivatives of the steps whose controls are linear between nodes."""
-        problem = self.problem
-        lin, velocity = self.linearized(0, problem.steps)
-        ramp = problem.integrator.ramps(problem.scene, self.trajectory) @ problem.scene.transmission
-        return Derivatives(lin.A, lin.B - ramp, ramp, velocity)
+        return derivatives(*self.linearized(0, self.problem.steps))
 
     @property
     def maps(self) -> tuple[Floats, Floats]:
@@ -558,13 +578,13 @@ class Along:
         )
 
     def _on_lines(self, limits: _Limits) -> core.ExpandedSteps:
-        N, X, m = self.line.B.shape
+        X, m = self.line.B.shape[1:]
         return core.ExpandedSteps(
             A=self.line.A,
             B=self.line.B,
-            G=np.zeros((N, X, 0)),
-            Gx=np.zeros((N, X, 0, X)),
-            Gu=np.zeros((N, X, 0, m)),
+            G=self.line.G,
+            Gx=self.line.Gx,
+            Gu=self.line.Gu,
             rule=RULE,
             gradient=self.line.gradient,
             hessian=self.line.hessian,
@@ -696,20 +716,22 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
     end_gradient, end_hessian = np.zeros(X), np.zeros((X, X))
     end_gradient[:x], end_hessian[:x, :x] = by_state, by_states
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
+    line, k = along.line, problem.processes
+    spread = np.empty((R if k else 0, X, X))
     gains = core.Gains(
         feedforward=feedforward,
         feedback=feedback,
         previous=np.empty((0, m, m)),
         control_gradient=gradient,
         costate=np.empty((0, X)),
-        spread=np.empty((0, X, X)),
+        spread=spread,
     )
     steps = along.steps(0, R, None, limits or _Limits(np.zeros((0, 2, m)), np.zeros((0, X + m))))
     how = (problem.dt, 1, float(regularization))
     found: core.BackwardPass | core.RootPass
     if roots:
         final = squares_of(cost.gradient, cost.hessian)
-        squares = squares_of(along.line.gradient, along.line.hessian)
+        squares = squares_of(line.gradient, line.hessian)
         change = squares_of(np.zeros((0, m)), np.zeros((0, m, m)))
         if final is None or squares is None or change is None:
             return None
@@ -721,6 +743,11 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
         failed = found.run(*how, steps, gains)
     if failed >= 0 or not (math.isfinite(found.slope) and math.isfinite(found.curvature)):
         return None
+    jumps, noise = np.empty((0, x, x // 2)), found.noise
+    after = spread[1:, :x, :x] + problem.dt * line.kicked
+    if k:
+        jumps, G = along.linearized(0, problem.steps)[0].J, line.G[1:, :x]
+        noise += 0.5 * problem.dt * float((G * (line.kicked @ G)).sum())
     return Plan(
         feedforward,
         feedback[:, :, :x].copy(),
@@ -728,9 +755,9 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
         gradient,
         found.slope,
         found.curvature,
-        0.0,
-        np.empty((0, x, x // 2)),
-        np.empty((0, x, x)),
+        noise,
+        jumps,
+        after,
         limits is not None,
         found.loss,
         along.model,
@@ -739,7 +766,7 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
 
 def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> Linearization:
     try:
-        return linearize_steps(problem.scene, part, problem.integrator, problem.q0)
+        return linearize_steps(problem.scene, part, problem.integrator, problem.q0, ramps=problem.linear)
     except LinearizationError as error:
         step = begin + error.step
         raise LinearizationError(step, step * problem.dt, error.reason) from None
