@@ -21,10 +21,13 @@ from varpin.control.linear_controls import (
     LinearSteps,
     after_impulse,
     at_samples,
+    curvature_on_lines,
     derivatives,
+    in_step,
     linear_steps,
     noisy,
     size,
+    widened,
     with_pull,
 )
 from varpin.control.moments import noise_gradient
@@ -126,8 +129,12 @@ def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floa
     return g
 
 
-def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, costate: Floats) -> Floats:
-    """Second-derivative terms of dynamics and noise fields in the cost to go (N, 2n + m, 2n + m), in (x, u)."""
+def _curvature(along: Along, plan: Plan, costate: Floats) -> Floats:
+    """Second-derivative terms of dynamics and noise fields in the cost to go (N, 2n + m, 2n + m), in (x, u).
+
+    With linear controls they are those of N + 1 steps in (X, u).
+    """
+    problem, trajectory = along.problem, along.trajectory
     scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
     N, samples, rule = problem.steps, len(problem.model_rule), problem.model_rule
     gradient = problem.expand_running(trajectory).gradient.reshape(N, samples, -1)
@@ -144,18 +151,20 @@ def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: Pla
     if after:
         z += np.einsum("Ni,Nix->Nx", pulls[3], velocity_at_nodes(scene, trajectory.q[1:], trajectory.v[1:]))
     second = second_order_steps(scene, trajectory, z, problem.integrator)
-    total = np.block([[second.xx, np.swapaxes(second.ux, 1, 2)], [second.ux, second.uu]])
+    if problem.linear:
+        total = curvature_on_lines(problem, trajectory, z, second.xx)
+    else:
+        total = np.block([[second.xx, np.swapaxes(second.ux, 1, 2)], [second.ux, second.uu]])
     if rule[:, [2, 6]].any():
         total[:, : 2 * n, : 2 * n] += velocity_curvature(scene, trajectory.q[:-1], trajectory.v[:-1], pulls[1])
     if after:
-        lin = _linearize(problem, trajectory, 0)
-        J = np.concatenate([lin.A, lin.B], axis=2)
+        J, _ = in_step(_linearize(problem, trajectory, 0))
         total += np.swapaxes(J, 1, 2) @ velocity_curvature(scene, trajectory.q[1:], trajectory.v[1:], pulls[3]) @ J
     if problem.processes and problem.integrator.variational:
         pull = plan.spread @ impulses(problem, trajectory, plan.jumps)
         weight = problem.integrator.left * np.swapaxes(plan.jumps, 1, 2) @ pull
         total[:, :n, :n] += scene.noise.curvature(weight)
-    return total
+    return widened(total, scene.controls) if problem.linear else total
 
 
 def backward(
@@ -181,7 +190,7 @@ def backward(
     plan, costate = _pass(along, max(regularization, 1e-3), costates=True)
     if plan is None:
         return None
-    return _foreseeing(along, regularization, _curvature(problem, trajectory, plan, costate))
+    return _foreseeing(along, regularization, _curvature(along, plan, costate))
 
 
 def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
@@ -552,7 +561,7 @@ class Along:
     def steps(self, begin: int, end: int, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
         """The expansions of a block of steps for the core."""
         if self.problem.linear:
-            return self._on_lines(limits)
+            return self._on_lines(curvature, limits)
         problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.model_rule)
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
@@ -577,7 +586,7 @@ class Along:
             pull=self.pull[rows],
         )
 
-    def _on_lines(self, limits: _Limits) -> core.ExpandedSteps:
+    def _on_lines(self, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
         X, m = self.line.B.shape[1:]
         return core.ExpandedSteps(
             A=self.line.A,
@@ -589,7 +598,7 @@ class Along:
             gradient=self.line.gradient,
             hessian=self.line.hessian,
             velocity=np.zeros((0, X // 2, X)),
-            curvature=np.zeros((0, X + m, X + m)),
+            curvature=np.zeros((0, X + m, X + m)) if curvature is None else curvature,
             slack=limits.slack,
             expected=limits.expected,
             rate=np.zeros((0, m, m)),
@@ -647,7 +656,7 @@ def _one_pass(
         pull = along.terminal.cost.gradient[:, n:]
         by_states = by_states + velocity_curvature(scene, along.trajectory.q[-1:], along.trajectory.v[-1:], pull)[0]
     if problem.linear:
-        return _one_pass_on_lines(along, regularization, limits, roots=roots), np.empty((0, 2 * n))
+        return _one_pass_on_lines(along, regularization, costates, curvature, by_states, limits, roots=roots)
     noisy = N if k else 0
     jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
@@ -708,25 +717,35 @@ def _one_pass(
     return plan, costate
 
 
-def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | None, *, roots: bool) -> Plan | None:
-    """The pass of a plan whose controls are linear between nodes."""
+def _one_pass_on_lines(
+    along: Along,
+    regularization: float,
+    costates: bool,
+    curvature: Floats | None,
+    by_states: Floats,
+    limits: _Limits | None,
+    *,
+    roots: bool,
+) -> tuple[Plan | None, Floats]:
+    """The pass of a plan whose controls are linear between nodes; ``by_states`` is the terminal Hessian (2n, 2n)."""
     problem, X, x = along.problem, along.states, 2 * along.problem.scene.robot.dof
     R, m = problem.decisions, problem.scene.controls
-    cost, D, by_state, by_states = along.terminal
+    cost, D, by_state, _ = along.terminal
     end_gradient, end_hessian = np.zeros(X), np.zeros((X, X))
     end_gradient[:x], end_hessian[:x, :x] = by_state, by_states
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
     line, k = along.line, problem.processes
-    spread = np.empty((R if k else 0, X, X))
+    spread, costate = np.empty((R if k else 0, X, X)), np.empty((R if costates else 0, X))
+    of_states = costate[1:, :x]
     gains = core.Gains(
         feedforward=feedforward,
         feedback=feedback,
         previous=np.empty((0, m, m)),
         control_gradient=gradient,
-        costate=np.empty((0, X)),
+        costate=costate,
         spread=spread,
     )
-    steps = along.steps(0, R, None, limits or _Limits(np.zeros((0, 2, m)), np.zeros((0, X + m))))
+    steps = along.steps(0, R, curvature, limits or _Limits(np.zeros((0, 2, m)), np.zeros((0, X + m))))
     how = (problem.dt, 1, float(regularization))
     found: core.BackwardPass | core.RootPass
     if roots:
@@ -734,7 +753,7 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
         squares = squares_of(line.gradient, line.hessian)
         change = squares_of(np.zeros((0, m)), np.zeros((0, m, m)))
         if final is None or squares is None or change is None:
-            return None
+            return None, of_states
         wide = np.concatenate([D, np.zeros((x, X - x))], axis=1)
         found = core.RootPass(m, final.after(wide).padded(X).core, end_gradient)
         failed = found.run(*how, steps, gains, squares.core, change.core)
@@ -742,13 +761,13 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
         found = core.BackwardPass(m, end_gradient, end_hessian)
         failed = found.run(*how, steps, gains)
     if failed >= 0 or not (math.isfinite(found.slope) and math.isfinite(found.curvature)):
-        return None
+        return None, of_states
     jumps, noise = np.empty((0, x, x // 2)), found.noise
     after = spread[1:, :x, :x] + problem.dt * line.kicked
     if k:
         jumps, G = along.linearized(0, problem.steps)[0].J, line.G[1:, :x]
         noise += 0.5 * problem.dt * float((G * (line.kicked @ G)).sum())
-    return Plan(
+    plan = Plan(
         feedforward,
         feedback[:, :, :x].copy(),
         feedback[:, :, x : x + m].copy(),
@@ -762,6 +781,7 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
         found.loss,
         along.model,
     )
+    return plan, of_states
 
 
 def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> Linearization:

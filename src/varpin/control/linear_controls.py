@@ -14,12 +14,16 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem
-from varpin.linearization import Linearization
+from varpin.linearization import Linearization, linearize_steps, node_jets
+from varpin.mechanics.scene import quiet
 from varpin.trajectory import Trajectory
 
 # The sampling rule of a cost in (X, u) at the beginning of the step.
 RULE: Floats = np.array([[1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
 RULE.setflags(write=False)
+
+# Changes of velocities [rad/s or m/s] between the points of differences in controls.
+_SHIFT = 1e-4
 
 
 class Derivatives(NamedTuple):
@@ -142,6 +146,44 @@ def noisy(steps: LinearSteps, found: Derivatives, kicked: Floats) -> LinearSteps
     gradient[1:, kept] += np.einsum("Nakz,Nak->Nz", weighted, found.G)
     hessian[1:, kept[:, None], kept] += np.einsum("Nakz,Naky->Nzy", found.Gz, weighted)
     return steps._replace(gradient=gradient, hessian=hessian, G=G, Gx=Gx, Gu=Gu, kicked=kicked)
+
+
+def curvature_on_lines(problem: OptimalControlProblem, trajectory: Trajectory, z: Floats, in_state: Floats) -> Floats:
+    """Second derivatives (N, 2n + 2m, 2n + 2m) of z . x' of each step in (x, w, u), for z (N, 2n).
+
+    Those ``in_state`` (N, 2n, 2n) are given. Those in controls are central differences of first derivatives, whose
+    points change the fastest joint's velocity by _SHIFT.
+    """
+    scene, n, m, h = quiet(problem.scene), problem.scene.robot.dof, problem.scene.controls, problem.dt
+    N, x = len(z), 2 * n
+    found = np.zeros((N, x + 2 * m, x + 2 * m))
+    found[:, :x, :x] = in_state
+    M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
+    speeds = np.abs(h * np.linalg.solve(M, np.broadcast_to(scene.actuation, (N, n, m)))).max(axis=1)
+    shift = _SHIFT / np.where(speeds > 0.0, speeds, 1.0)
+    for c in range(2 * m):
+        du = np.zeros((N, 2 * m))
+        du[:, c] = shift[:, c % m]
+        pulls = []
+        for sign in (1.0, -1.0):
+            near = shifted_lines(problem, trajectory, sign * du)
+            J, _ = in_step(linearize_steps(scene, near, problem.integrator, problem.q0, ramps=True))
+            pulls.append(np.einsum("Na,Naz->Nz", z, J))
+        found[:, :, x + c] = (pulls[0] - pulls[1]) / (2.0 * shift[:, c % m, None])
+    found[:, x:, :x] = np.swapaxes(found[:, :x, x:], 1, 2)
+    found[:, x:, x:] = 0.5 * (found[:, x:, x:] + np.swapaxes(found[:, x:, x:], 1, 2))
+    return found
+
+
+def widened(curvature: Floats, m: int) -> Floats:
+    """Hessians (N, 2n + 2m, 2n + 2m) in (x, w, u) as those of N + 1 steps in (X, u)."""
+    N, Z, _ = curvature.shape
+    x = Z - 2 * m
+    X = x + m + m % 2
+    kept = np.r_[0 : x + m, X : X + m]
+    wide = np.zeros((N + 1, X + m, X + m))
+    wide[1:, kept[:, None], kept] = curvature
+    return wide
 
 
 def with_pull(steps: LinearSteps, pull: Floats, dt: float) -> LinearSteps:

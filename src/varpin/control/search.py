@@ -206,8 +206,6 @@ def solve(
     if not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held' or 'whole', got {noise!r}")
     report_all = require_reports(callback, progress)
-    if problem.linear and second_order:
-        raise InputError("second_order is for held controls; the problem's are linear between nodes")
     positive("tolerance", tolerance, "1")
     deadline = time.perf_counter() + checked_time(time_limit)
     fraction("armijo", armijo)
