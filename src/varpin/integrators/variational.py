@@ -169,8 +169,13 @@ class Variational(Integrator):
         if scene.processes and self.left < 1.0:
             raise InputError("kick='split' does not go with constraints: take kick='left'")
         noise = scene.noise.diffusion
-        if scene.inputs and (noise is None or noise.control.any()):
-            raise InputError("noise that depends on the controls does not go with a KinematicInput")
+        if scene.inputs and noise is None:
+            raise InputError("a CustomNoise does not go with a KinematicInput: take ControlNoise or StateNoise")
+        if noise is not None and noise.control[:, :, scene.prescribed].any():
+            raise InputError(
+                "ControlNoise is proportional to forces, and the control of a KinematicInput is a position: its "
+                "intensity (n, k, m) must be 0 there"
+            )
         if scene.noise.velocity_dependent:
             raise InputError("noise whose fields depend on the velocity does not go with constraints")
         return places
