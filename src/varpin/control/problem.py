@@ -170,7 +170,8 @@ class OptimalControlProblem(Frozen):
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or a lower limit above the upper one; linear controls
                 with ``hold``; ``hold`` with a :class:`KinematicInput`; another ``sampling`` than
-                "gauss" with a cubic one; constraints that are no plan constraints or of another robot.
+                "gauss" with a cubic one, or with linear controls; constraints that are no plan constraints or of
+                another robot.
             CostError: A reference function fails.
             AssemblyError: The scene's constraints cannot be satisfied near q0.
         """
@@ -198,6 +199,12 @@ class OptimalControlProblem(Frozen):
         if controls == "linear" and hold != 1:
             raise InputError(
                 f"linear controls change at every node: leave hold = {hold} out, or take controls='held'", "controls"
+            )
+        if controls == "linear" and sampling != "gauss":
+            raise InputError(
+                f"costs sampled by the rule {sampling!r} do not see controls that alternate from node to node, so that "
+                "linear ones would: leave sampling out, for 'gauss'",
+                "sampling",
             )
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
