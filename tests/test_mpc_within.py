@@ -5,6 +5,8 @@ import pytest
 from refusals import naming, refused, unnamed
 
 import varpin as vp
+from varpin.control import backward
+from varpin.control.penalties import penalized
 
 ROBOT = vp.planar_chain(2)
 ARM = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
@@ -125,3 +127,30 @@ def test_what_the_plant_violates_is_told_of():
     run = vp.Mpc(tracking(FAMILIES["speeds"])).run(noisy, duration=0.6, rng=1)
     assert run.constraints[0].worst > 0.05
     assert naming(run.warnings, "motion violates", "WithinVelocityLimits")
+
+
+def test_passes_that_look_for_active_bounds_end_with_the_time(monkeypatch):
+    """The plan of a tick whose time for them is over: one pass, and a step that lowers the augmented cost."""
+    problem = tracking([*FAMILIES["speeds"], *FAMILIES["a moving sphere"]])
+    first = vp.Mpc(problem).plan(0.0, problem.q0, problem.v0)
+    made = []
+
+    def counted(*args, **options):
+        made.append(None)
+        return plain(*args, **options)
+
+    plain = backward._pass
+    monkeypatch.setattr(backward, "_pass", counted)
+    moved = problem.at(t0=0.1, q0=first.trajectory.q[5], v0=first.trajectory.v[5])
+    zeros = [np.zeros(item.shape) for item in moved.bound_constraints]
+    weights = np.full(len(zeros), 100.0)
+    motion = moved.simulate(moved.holding_policy())
+    passes, changes = [], []
+    for until in (0.0, np.inf):
+        made.clear()
+        goal = penalized(moved, zeros, weights, zeros, until=until)
+        plan = backward.backward(goal, motion, 0.0)
+        passes.append(len(made))
+        changes.append(plan.expected_decrease)
+    assert passes[0] <= 2 < passes[1]
+    assert 0.0 < changes[0] <= changes[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -205,8 +206,8 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
     if not (isinstance(problem, PenalizedProblem) and problem.passes) or len(along.blocks) > 1:
         return _within_limits(along, regularization, curvature)
     rows = _Rows(along, problem)
-    held, best, least, last = rows.begun, None, 0.0, None
-    for _ in range(problem.passes):
+    held, best, least = rows.begun, None, 0.0
+    for done in range(1, problem.passes + 1):
         passing = rows.along(held)
         plan = _within_limits(passing, regularization, curvature)
         if plan is None:
@@ -219,10 +220,11 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
         if all(np.array_equal(a, b) for a, b in zip(met, held, strict=True)):
             break
         rows.move(plan, held, ahead, slope)
-        held, last = [penalty.held(s) for penalty, s in zip(rows.penalties, rows.at, strict=True)], plan
-    else:
-        if last is not None and rows.slope < 0.0 and rows.lowered < least:
-            best = rows.there(last)
+        held = [penalty.held(s) for penalty, s in zip(rows.penalties, rows.at, strict=True)]
+        if done == problem.passes or time.perf_counter() > problem.until:
+            if rows.slope < 0.0 and rows.lowered < least:
+                best = rows.there(plan)
+            break
     if best is None:
         return _within_limits(along, regularization, curvature)
     return replace(best, model=along.model)

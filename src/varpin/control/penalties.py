@@ -5,6 +5,7 @@ Equations (P2) and (P3) of docs/plan-constraints.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -149,6 +150,7 @@ class PenalizedProblem(OptimalControlProblem):
         all_penalties: Penalties of all constraints, in the problem's order.
         quiet: Whether plans leave the scene's noise out: otherwise stiff penalties would add to the noise cost.
         passes: Greatest number of passes that determine the active rows; 0 keeps those of the nominal motion.
+        until: Time (of ``time.perf_counter``) after which there is no further one of them.
         given: The given first controls, where controls are linear between nodes.
     """
 
@@ -156,6 +158,7 @@ class PenalizedProblem(OptimalControlProblem):
     all_penalties: tuple[Penalty, ...]
     quiet: bool
     passes: int
+    until: float
     given: Floats | None
 
     @property
@@ -249,6 +252,7 @@ def penalized(
     *,
     quiet: bool = True,
     passes: int = _PASSES,
+    until: float = math.inf,
 ) -> PenalizedProblem:
     """The augmented Lagrangian of a problem.
 
@@ -259,6 +263,7 @@ def penalized(
         backoff: For each constraint (K, rows).
         quiet: Leave the scene's noise out.
         passes: Greatest number of backward passes that determine the active rows.
+        until: Time (of ``time.perf_counter``) after which there is no further one of them.
     """
     made = object.__new__(PenalizedProblem)
     parts = [
@@ -271,7 +276,7 @@ def penalized(
         "penalties": tuple(part for part in parts if not part.bound.of_controls),
         "all_penalties": tuple(parts),
     }
-    changes |= {"constraints": (), "bound_constraints": (), "quiet": quiet, "passes": passes}
+    changes |= {"constraints": (), "bound_constraints": (), "quiet": quiet, "passes": passes, "until": until}
     if on_rate:
         rate = problem.rate
         if rate is None:

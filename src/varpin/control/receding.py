@@ -28,6 +28,8 @@ from varpin.trajectory import Trajectory
 _GROWTH, _ENOUGH, _HEAVIEST = 10.0, 0.5, 1e4
 # Greatest number of backward passes that determine an iteration's active rows; most are known from the tick before.
 _PASSES = 8
+# The share of the time left that these passes take at most; the rest is for the linearization and trials.
+_SHARE = 0.5
 # Bound on multipliers, times the first weight and the constraint's scale: those of an infeasible constraint wind up.
 _LARGEST = 1e3
 # A tick is infeasible when _STUCK ticks in a row have left more than _LOWERED of a violation.
@@ -78,7 +80,8 @@ def replan(
     longest = 0.0
     for k in range(max_iterations):
         started = time.perf_counter()
-        goal = penalized(problem, multipliers, weights, backoff, passes=_PASSES)
+        until = started + _SHARE * (deadline - started)
+        goal = penalized(problem, multipliers, weights, backoff, passes=_PASSES, until=until)
         found = search.replan(
             goal,
             found,
