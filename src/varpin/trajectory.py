@@ -17,7 +17,7 @@ from varpin._version import __version__
 from varpin.arrays import Floats, Integers
 from varpin.errors import FileError, InputError
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
-from varpin.model import Robot
+from varpin.model import Robot, require_robot
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, table, warning_count
@@ -362,8 +362,8 @@ class Trajectory(Frozen):
                 or NaN, as in the saved motion.
         """
         source = path_like("path", path)
-        if robot is not None and not isinstance(robot, Robot):
-            raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
+        if robot is not None:
+            require_robot(robot)
         return cls.of_members(source, read_npz(source, FORMAT), robot)
 
     @classmethod
@@ -468,6 +468,15 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         warnings=(),
         accuracy=None,
     )
+
+
+def require_trajectory(motion: object) -> Trajectory:
+    """``motion`` itself; an InputError if it is no Trajectory, which names that of a plan or a controller's run."""
+    if isinstance(motion, Trajectory):
+        return motion
+    own = next((name for name in ("trajectory", "motion") if isinstance(getattr(motion, name, None), Trajectory)), None)
+    hint = f"; give its .{own}" if own else ""
+    raise InputError(f"the motion must be a varpin.Trajectory, got {type(motion).__name__}{hint}")
 
 
 def kinematic_input_rows(trajectory: Trajectory) -> Floats:

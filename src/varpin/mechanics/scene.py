@@ -45,7 +45,7 @@ from varpin.mechanics.forces import (
     of_kind,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
-from varpin.model import Robot, degrees_hint, require_sound
+from varpin.model import Robot, degrees_hint, require_robot, require_sound
 from varpin.model.tree import block_ends, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
 from varpin.support.frozen import Frozen
@@ -213,8 +213,7 @@ class Scene(Frozen):
             UnknownJoint: An argument names a joint that is no coordinate of the robot.
             UnknownFrame: A force or constraint names a frame that the robot does not have.
         """
-        if not isinstance(robot, Robot):
-            raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
+        require_robot(robot)
         require_sound(robot.tree)
         n = robot.dof
         if robot.tree.armature.size != n:
@@ -739,8 +738,12 @@ def same(one: Floats, other: Floats) -> bool:
 
 def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> list[str]:
     """Messages on how a scene differs from the one of these :attr:`Scene.values`, with ``noise`` or without."""
-    found = []
-    # A file of another version may have other names.
+    # A file may be of another version, or of a core with forces of one's own.
+    found = [
+        f"the motion depends on {name}, which this installation of varpin does not know"
+        for name, before in values.items()
+        if name not in VALUES and before.size and (noise or not name.startswith("noise."))
+    ]
     for name, before in ((name, values[name]) for name in VALUES if name in values):
         now = scene.values.get(name)
         if name.startswith("noise.") and (not noise or now is None):

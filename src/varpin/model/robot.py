@@ -327,6 +327,14 @@ class Robot(Frozen):
         return configuration
 
 
+def require_robot(robot: object, taker: str = "") -> Robot:
+    """``robot`` itself; an InputError if it is no Robot, which names the taker, if there is one."""
+    if not isinstance(robot, Robot):
+        where = f"{taker}: " if taker else ""
+        raise InputError(f"{where}robot must come from load_robot, got {type(robot).__name__}")
+    return robot
+
+
 def load_robot(
     source: "str | os.PathLike[str] | pin.Model | pin.RobotWrapper",
     *,
