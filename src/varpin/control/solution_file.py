@@ -253,7 +253,15 @@ def _require_problem(source: Path, members: Members, problem: OptimalControlProb
 
 
 def _require_surroundings(source: Path, members: Members, problem: OptimalControlProblem, kind: str) -> None:
-    for name, array in _surroundings(problem).items():
+    """Refuse numbers, of those whose names begin with ``kind``, that differ or are on one side alone."""
+    known = _surroundings(problem)
+    for name, array in members.items():
+        if name.startswith(kind) and name not in known and array.size:
+            raise FileError(
+                f"{source} is of a problem with {name.replace('.', ' ')}, which the given one, or this installation "
+                "of varpin, does not have"
+            )
+    for name, array in known.items():
         found = members.get(name)
         if name.startswith(kind) and (found is None or found.dtype != array.dtype or not same(found, array)):
             raise FileError(f"{source} is of a problem with another {name.replace('.', ' ')}")
