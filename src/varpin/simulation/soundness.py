@@ -43,7 +43,7 @@ from varpin.simulation.accuracy import (
     violent_windows,
 )
 from varpin.simulation.chatter import RUN, Alternation, alternation
-from varpin.simulation.damping import Fast, fast_damping
+from varpin.simulation.damping import Fast, damping_at_stop, damping_of, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.growth import NEAR, grown_error, growth_bound
 from varpin.simulation.growth import WARNED as GROWTH_WARNED
@@ -171,7 +171,7 @@ def findings_from_record(scene: Scene, integrator: Integrator, trajectory: Traje
     fast = _fast_damping(scene, trajectory)
     # Methods of more stages stop faster dampers.
     if not integrator.l_stable and trajectory.dt * fast.rate > 2.0 * getattr(integrator, "stages", 1):
-        found.append(_ringing(scene, fast, trajectory.dt))
+        found.append(_ringing(scene, _damping_of(scene, trajectory), trajectory.dt))
     if split := _in_parts(trajectory):
         found.append(Finding("split steps", f"{split}: dt = {trajectory.dt:g} s is coarse here"))
     return (*found, *_beyond_limits(scene, trajectory))
@@ -196,6 +196,11 @@ def _fast_damping(scene: Scene, trajectory: Trajectory) -> Fast:
     return fast_damping(scene, trajectory.q, trajectory.v, trajectory.u, trajectory.dt)
 
 
+def _damping_of(scene: Scene, trajectory: Trajectory, joint: int | None = None) -> Fast:
+    """The damping to name: that of a joint, if a step cannot resolve it, else the fastest."""
+    return damping_of(scene, trajectory.q, trajectory.v, trajectory.u, trajectory.dt, joint)
+
+
 def _applied(scene: Scene, trajectory: Trajectory) -> Floats:
     """Constant forces of the controls in each step (N, n)."""
     return np.ascontiguousarray(trajectory.u @ scene.actuation.T)
@@ -205,19 +210,32 @@ def _ringing(scene: Scene, fast: Fast, dt: float, off: str = "", joint: int | No
     """The warning that damping or dry friction is faster than the step; ``off`` ends it with the error."""
     times = f"(dt * {fast.rate:.3g}/s = {dt * fast.rate:.3g} > 2)"
     cure = f"dt below {2.0 / fast.rate:.3g} s resolves it"
+    names = scene.robot.joint_names
     if fast.stop is None:
-        does = f"damping is faster than the step {times}: velocities that it should stop will ring; {cure}"
+        where = "" if fast.joint is None else f" at joint {names[fast.joint]!r}"
+        does = f"damping is faster than the step{where} {times}: velocities that it should stop will ring; {cure}"
         # Radau's methods do not keep constraints.
         method = "" if scene.constraints else ", varpin.Radau(3) stops them"
-        return Finding("fast damping", f"{does}{method}{off}", joint)
-    name, wide = scene.robot.joint_names[fast.stop.joint], 0.5 * dt * fast.rate * fast.stop.width
+        return Finding("fast damping", f"{does}{method}{off}", fast.joint if joint is None else joint)
+    wide = _resolved_width(scene, fast.stop, dt * fast.rate)
+    wider = f", so does a width above {wide:.3g} rad/s or m/s" if wide < np.inf else ""
     method = "" if scene.constraints else ", and varpin.Radau(3) stops it"
     return Finding(
         "fast friction",
-        f"dry friction is faster than the step where joint {name!r} comes to rest or turns back {times}: its velocity "
-        f"may ring or creep there; {cure}, so does a width above {wide:.3g} rad/s or m/s{method}{off}",
+        f"dry friction is faster than the step where joint {names[fast.stop.joint]!r} comes to rest or turns back "
+        f"{times}: its velocity may ring or creep there; {cure}{wider}{method}{off}",
         fast.stop.joint if joint is None else joint,
     )
+
+
+def _resolved_width(scene: Scene, stop: Stop, turned: float) -> float:
+    """The width from which on the step resolves a joint's friction beside its damper; infinite if there is none.
+
+    ``turned`` is the rate of both times the step.
+    """
+    damper = float(scene.damping[stop.joint])
+    left = 2.0 / turned * (stop.slope + damper) - damper
+    return stop.slope * stop.width / left if left > 0.0 else np.inf
 
 
 def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -238,8 +256,8 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
             f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
             f"{100 * error.position:.3g}% of its travel over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
-        fast = Fast(0.0) if integrator.l_stable else _fast_damping(scene, trajectory)
-        if fast.rate:
+        if not integrator.l_stable and _fast_damping(scene, trajectory).rate:
+            fast = _damping_of(scene, trajectory, error.joint)
             found.append(_ringing(scene, fast, dt, f"; {off}", error.joint))
         else:
             split = f" ({_in_parts(trajectory)})" if _in_parts(trajectory) else ""
@@ -248,12 +266,12 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     elif (
         error is None
         and not (integrator.l_stable or isinstance(integrator, Reference))
-        and (fast := _fast_damping(scene, trajectory)).rate
+        and _fast_damping(scene, trajectory).rate
     ):
         # No other method integrates these steps: ringing is looked for in the motion itself.
         before, after = trajectory.v[:-1], trajectory.v[1:]
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():
-            found.append(_ringing(scene, fast, trajectory.dt))
+            found.append(_ringing(scene, _damping_of(scene, trajectory), trajectory.dt))
     if scene.constraints and not found:
         found.extend(_unresolved_damping(scene, integrator, trajectory))
     if not found:
@@ -266,7 +284,8 @@ def _unresolved_damping(scene: Scene, integrator: Integrator, trajectory: Trajec
     other = finer(integrator, trajectory, damped=True, pulled=True, constrained=True)
     fast = _fast_damping(scene, trajectory)
     resolves = 2.0 * getattr(other.method, "stages", 1) * other.parts
-    return (_ringing(scene, fast, trajectory.dt),) if trajectory.dt * fast.rate > resolves else ()
+    told = trajectory.dt * fast.rate > resolves
+    return (_ringing(scene, _damping_of(scene, trajectory), trajectory.dt),) if told else ()
 
 
 def _accumulated(
@@ -325,20 +344,23 @@ def _wrong_at_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory)
     kicked = trajectory.dw.any() and scene.noise.diffusion is None
     if integrator.l_stable or isinstance(integrator, Reference) or kicked:
         return ()
+    given = trajectory.q, trajectory.v, trajectory.u
     for stop in stops(scene, trajectory.v):
-        rate = rate_at_stops(scene, trajectory.q, trajectory.v, trajectory.u, [stop], 2.0 / trajectory.dt)
+        rate = rate_at_stops(scene, *given, [stop], 2.0 / trajectory.dt)
         count = min(_REST_STEPS, trajectory.steps - stop.step)
         if not rate or count < _REST_STEPS // 2:
             continue
         off = _velocity_errors(scene, integrator, trajectory, stop, count)
         if len(off) < _REST_STEPS // 2:
             # No method integrates these steps, so their error is unknown.
-            return (_ringing(scene, Fast(rate, stop), trajectory.dt),)
+            return (_ringing(scene, damping_at_stop(scene, *given, trajectory.dt, stop), trajectory.dt),)
         lasting, most = float(np.median(off)), float(off.max())
         speed = float(np.abs(trajectory.v[:, stop.joint]).max())
         if lasting > _MEDIAN_OFF * stop.width or (most > stop.width and most > _MOST_OFF * speed):
-            since = f"; after t = {trajectory.t[stop.step]:.4g} s it is off by up to {most:.3g} rad/s or m/s"
-            return (_ringing(scene, Fast(rate, stop), trajectory.dt, since),)
+            fast = damping_at_stop(scene, *given, trajectory.dt, stop)
+            which = "it" if fast.stop else f"the velocity of joint {trajectory.joint_names[stop.joint]!r}, which stops,"
+            since = f"; after t = {trajectory.t[stop.step]:.4g} s {which} is off by up to {most:.3g} rad/s or m/s"
+            return (_ringing(scene, fast, trajectory.dt, since, stop.joint),)
     return ()
 
 
