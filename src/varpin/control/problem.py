@@ -168,9 +168,8 @@ class OptimalControlProblem(Frozen):
             UnknownJoint: An unknown joint name, or one of a joint that is not driven, for controls.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or a lower limit above the upper one; linear controls
-                with ``hold`` or in a scene with noise; ``hold`` or linear controls with a
-                :class:`KinematicInput`; another ``sampling`` than "gauss" with a cubic one; constraints that are no
-                plan constraints or of another robot.
+                with ``hold``; ``hold`` or linear controls with a :class:`KinematicInput`; another ``sampling`` than
+                "gauss" with a cubic one; constraints that are no plan constraints or of another robot.
             CostError: A reference function fails.
             AssemblyError: The scene's constraints cannot be satisfied near q0.
         """
@@ -198,10 +197,6 @@ class OptimalControlProblem(Frozen):
         if controls == "linear" and hold != 1:
             raise InputError(
                 f"linear controls change at every node: leave hold = {hold} out, or take controls='held'", "controls"
-            )
-        if controls == "linear" and scene.processes:
-            raise InputError(
-                "plans with linear controls take no noise: use controls='held', or leave the noise out", "controls"
             )
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")

@@ -180,9 +180,9 @@ def solve(
             pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of another planner
             will do: auxiliary joint forces hold the first motion on it, and the first iterations remove them (multiple
             shooting). ``controls`` are then those along the states, by default the inverse dynamics' clipped to their
-            limits. Single shooting continues from there. Held controls only, and no :class:`KinematicInput`. A search
-            that ends with auxiliary forces left drops them: resumed, it continues from the controls alone, not as if it
-            had not been interrupted.
+            limits. Single shooting continues from there. Linear controls are held ones until then. There must be no
+            :class:`KinematicInput`. A search that ends with auxiliary forces left drops them: resumed, it continues
+            from the controls alone, not as if it had not been interrupted.
 
     Returns:
         The best motion found, however the search ended. ``status`` and ``reason`` tell how it ended; ``warnings`` lists
@@ -206,8 +206,6 @@ def solve(
     if not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held' or 'whole', got {noise!r}")
     report_all = require_reports(callback, progress)
-    if problem.linear and second_order:
-        raise InputError("second_order is for held controls; the problem's are linear between nodes")
     positive("tolerance", tolerance, "1")
     deadline = time.perf_counter() + checked_time(time_limit)
     fraction("armijo", armijo)

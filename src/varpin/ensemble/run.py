@@ -114,8 +114,6 @@ def simulate_ensemble(
     if integrator is None:
         integrator = _usual(scene, start[0], start[1], controls, steps, dt)
     commands = commands_of(scene, integrator, controls, steps, dt)
-    if len(commands.stage_times):
-        raise InputError("an ensemble takes controls that are held; those of the policy are linear between nodes")
     with executing(executor, workers) as pool:
         shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
         sums = Sums(shared, paths, levels, store=store)

@@ -162,8 +162,11 @@ class Integrator(ABC):
         segments: list[Segment] = []
         for j in range(steps_of(commands)):
             row = rows(commands, j // commands.hold, j // commands.hold + 1, segments[-1].u[None, -1] if j else None)
-            if j % commands.hold > 0:
+            if (taken := j % commands.hold) > 0:
                 row = open_loop(segments[-1].u)
+                if len(commands.stage_times):
+                    first = segments[j - taken - 1].u if j > taken else commands.before[:1]
+                    row = _rest_of_line(row, first, taken, commands)
             segments.append(self.step_in_python(scene, state, row, increments[:, j : j + 1], dt))
             if segments[-1].failure is not None:
                 break
@@ -454,6 +457,20 @@ def lines(commands: Commands, ends: Floats, times: Sequence[float]) -> Lines:
 
     mean, after = at(np.array([0.5, 1.0])).swapaxes(0, 1)
     return Lines(mean.copy(), at(np.array(times)), np.vstack([commands.before[:1], after]))
+
+
+def _rest_of_line(end: Commands, first: Floats, taken: int, commands: Commands) -> Commands:
+    """The line from ``first`` (1, m) to ``end`` over the steps of a decision, after ``taken`` steps."""
+    here = first + taken / commands.hold * (end.u - first)
+    return end._replace(before=here, hold=commands.hold - taken, stage_times=commands.stage_times)
+
+
+def first_of(command: Commands, control: Floats, times: Sequence[float]) -> Commands:
+    """The first step under a decision's ``control`` (m,): its mean, and the values at the stages if they change."""
+    if not len(command.stage_times):
+        return open_loop(control[None])._replace(within=command.within)
+    mean, stages, _ = lines(command, control[None], times)
+    return open_loop(mean) if not stages.size else open_loop(mean)._replace(within=np.ascontiguousarray(stages))
 
 
 def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> Floats:

@@ -34,8 +34,8 @@ from varpin.integrators.base import (
     drifts,
     failure_of,
     first_nodes,
+    first_of,
     forces,
-    open_loop,
     parts_of,
     segments_of,
     steps_of,
@@ -169,8 +169,13 @@ class Variational(Integrator):
         if scene.processes and self.left < 1.0:
             raise InputError("kick='split' does not go with constraints: take kick='left'")
         noise = scene.noise.diffusion
-        if scene.inputs and (noise is None or noise.control.any()):
-            raise InputError("noise that depends on the controls does not go with a KinematicInput")
+        if scene.inputs and noise is None:
+            raise InputError("a CustomNoise does not go with a KinematicInput: take ControlNoise or StateNoise")
+        if noise is not None and noise.control[:, :, scene.prescribed].any():
+            raise InputError(
+                "ControlNoise is proportional to forces, and the control of a KinematicInput is a position: its "
+                "intensity (n, k, m) must be 0 there"
+            )
         if scene.noise.velocity_dependent:
             raise InputError("noise whose fields depend on the velocity does not go with constraints")
         return places
@@ -283,23 +288,25 @@ class Variational(Integrator):
     ) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python."""
         q, p, v, _ = state.paths.nodes()
-        control = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
-        F, drift = diffusion_and_drift(scene, q[0], v[0], control, state.start[0])
+        decided = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
+        now = first_of(command, decided, self.stage_times)
+        F, drift = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
         if len(increment):
             state.paths.kick(self.left * (F @ increment[0, 0])[None])
         (segment,) = self.rollout_compiled(
             scene,
             state,
-            open_loop(control[None])._replace(within=command.within),
+            now,
             scene.silence,
             self.drift_share * drift[None, None],
             dt,
         )
         if len(increment) and self.left < 1.0 and segment.failure is None:
             q, p, v, _ = state.paths.nodes()
-            F, _ = diffusion_and_drift(scene, q[0], v[0], control, state.start[0])
+            F, _ = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
             state.paths.kick((1.0 - self.left) * (F @ increment[0, 0])[None])
             _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
+        segment.u[:] = decided
         return segment
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:

@@ -229,7 +229,7 @@ class Scene(Frozen):
         bound, order = joined([bound_constraint(constraint, robot) for constraint in values["constraints"]])
         _require_positions(robot, values["actuation"], values["elements"], bound)
         values["actuation"], bound = _with_rates(values["actuation"], bound)
-        values["noise"] = bind(noise, values["actuation"], robot.joint_names)
+        values["noise"] = bind(noise, _of_forces(values["actuation"], bound), robot.joint_names)
         values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -959,6 +959,14 @@ def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Eleme
                 f"the KinematicInput of joint {name!r} needs a control of its own for its position, and this actuation "
                 "has none; name the joint in the actuation, or give it a column with a 1"
             )
+
+
+def _of_forces(actuation: Floats, bound: Bound) -> Floats:
+    """The actuation with zeros for the positions of kinematic inputs, which absorb all forces on their joints."""
+    moved = [tie.follower for tie in bound.rows.ties if tie.follower == tie.leader and not tie.coefficients]
+    forces = actuation.copy()
+    forces[moved] = 0.0
+    return forces
 
 
 def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:

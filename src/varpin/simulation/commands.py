@@ -45,11 +45,6 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
                 f"the policy's controls are positions of {', '.join(controls.servos) or 'no joints'} and forces of all "
                 f"others; the scene has servos on {', '.join(scene.servo_joints) or 'no joints'}"
             )
-        if controls.linear and scene.processes:
-            raise InputError(
-                "a policy whose controls are linear between nodes acts in scenes without noise alone: leave the "
-                "scene's noise out, or plan with held controls"
-            )
         return controls.commands(
             steps, scene.controls, scene.robot.dof, integrator.variational, dt, integrator.stage_times
         )

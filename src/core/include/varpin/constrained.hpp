@@ -301,7 +301,8 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
                 const double* dw = noisy ? increments + row * k : nullptr;
                 apply_policy(commands, p, s, n, path.q.data(), path.momentum.data(), u);
                 if (noisy) {
-                    noise_impulse(mechanism, 1.0, path.q.data(), path.center.data(), u + s * controls, dw, y.data());
+                    const double* felt = mean_control(commands, p, s, u, mean);
+                    noise_impulse(mechanism, 1.0, path.q.data(), path.center.data(), felt, dw, y.data());
                     kick(y.data(), state);
                 }
                 const double* extra = drift ? drift + row * n : nullptr;
@@ -381,6 +382,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     std::array<std::vector<double>, 2> by_rates;  // (2n, 2n) and (2n, n), derivatives in rates at both ends
     std::vector<double> given;                    // (s, n) force at the stages of the whole step, if it varies
     std::vector<double> line;                     // (s, m) controls at the stages, if they are linear in time
+    std::vector<double> mean;                     // (m) and their mean
     std::vector<double> at;                       // (s + 1, s) t_kj
     std::vector<double> weight;                   // (s, s) w_ik
     Trial trial;

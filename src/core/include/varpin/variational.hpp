@@ -250,7 +250,8 @@ class VariationalStepper final : public Stepper {
                 const std::int64_t row = path * steps + s;
                 const double* dw = noisy ? increments + row * k : nullptr;
                 apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
-                if (noisy) noise_kick(left, u + s * m, dw, state);
+                const double* felt = noisy ? mean_control(commands, path, s, u, mean) : nullptr;
+                if (noisy) noise_kick(left, felt, dw, state);
                 if (impulses) kick(impulses + 2 * row * n, state);
                 const double* within = stage_controls(commands, path, s, stages, u, line);
                 stride = within ? static_cast<int>(n) : 0;
@@ -264,7 +265,7 @@ class VariationalStepper final : public Stepper {
                 nodes.ended[path] = static_cast<std::int64_t>(outcome);
                 if (outcome != Outcome::solved) break;
                 state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
-                if (noisy && left < 1.0) noise_kick(1.0 - left, u + s * m, dw, state);
+                if (noisy && left < 1.0) noise_kick(1.0 - left, felt, dw, state);
                 if (impulses) kick(impulses + (2 * row + 1) * n, state);
                 record_node(state, n, nodes, row);
                 nodes.done[path] = s + 1;
@@ -286,6 +287,7 @@ class VariationalStepper final : public Stepper {
     Trial trial;
     std::vector<double> given;  // (s, n) varying force at the stages of the whole step
     std::vector<double> line;   // (s, m) linear controls at these stages
+    std::vector<double> mean;   // (m) and their mean
     std::vector<double> guess;  // (s, n) extrapolated stage velocities
     std::vector<double> bend;   // (2, n)
     std::vector<double> at;     // (n)
