@@ -457,7 +457,7 @@ class Along:
             self.blocks, self.states = [(0, problem.decisions)], size(problem)
         self.kept: tuple[Linearization, Floats] | None = None
         # Gradient of the noise cost, added to the cost's gradient at its samples (N s, 2n + m) once it is known.
-        self.added: Floats | float = 0.0
+        self.added: Floats | None = None
         # With linear controls in (x, w, u) of each step (N, 2n + 2m).
         self.pulled: Floats | None = None
         self.noise_differentiated = False
@@ -493,7 +493,7 @@ class Along:
     @property
     def slopes(self) -> Floats:
         """The gradient of the running cost at its samples, with that of the noise cost if it was added."""
-        return self.running.gradient + self.added
+        return self.running.gradient if self.added is None else self.running.gradient + self.added
 
     @cached_property
     def stake(self) -> Stake:

@@ -304,7 +304,7 @@ class OptimalControlProblem(Frozen):
         """R, the number of decisions: steps / hold, or steps + 1 where controls are linear between nodes."""
         return self.steps + 1 if self.linear else self.steps // self.hold
 
-    @property
+    @cached_property
     def linear(self) -> bool:
         """Whether controls are linear in time between nodes."""
         return self.controls == "linear"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass, replace
@@ -443,6 +444,12 @@ class _Search:
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
         self.trials = Trials(problem)
+        integrator = problem.integrator
+        # Whether steps may be divided, and the integrator with fewer halvings, by their greatest number.
+        self.divides = (
+            isinstance(integrator, Variational) and integrator.guard is not None and is_dataclass(integrator)
+        )
+        self.less: dict[int, Integrator] = {}
         self._around: Along | None = None
         self.trajectory: Trajectory
         self.shares: Floats  # the terms of the trajectory's cost
@@ -818,14 +825,16 @@ class _Search:
     def _bounds(self) -> Iterator[_Bounds]:
         """Bounds on trials, from tight to none."""
         integrator = self.problem.integrator
-        guard = integrator.guard if isinstance(integrator, Variational) else None
-        if not (self.bounded and guard is not None and is_dataclass(integrator)):
+        if not (self.bounded and self.divides and isinstance(integrator, Variational)):
             yield _Bounds(integrator, np.inf, watched=False)
             return
         # A step cut into s substeps has taken at most s - 1 halvings.
         few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
         for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
-            yield _Bounds(_cut_less(integrator, halvings), parts, watched=halvings > _HALVINGS)
+            less = self.less.get(halvings)
+            if less is None:
+                less = self.less[halvings] = _cut_less(integrator, halvings)
+            yield _Bounds(less, parts, watched=halvings > _HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
     def _try(self, step: float, plan: Plan, here: _Here, bounds: _Bounds) -> _Trial:
@@ -841,10 +850,10 @@ class _Search:
         u = here.controls + step * plan.feedforward
         if problem.limited:
             u = _onto_limits(u, problem.control_limits)
-        commands = here.feedback._replace(u=u)
+        commands = Commands(u, *here.feedback[1:])
         if problem.linear:
             # The first control has no feedback: its state is given.
-            commands = here.feedback._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
+            commands = commands._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
         try:
             attempt = self.trials.attempt(
                 commands, integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
@@ -862,9 +871,9 @@ class _Search:
         except _TRIAL_ERRORS as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
-        if not np.isfinite(there).all():
-            return _Trial()
         cost = float((there - self.shares).sum())
+        if not math.isfinite(cost):
+            return _Trial()
         return _Trial(attempt, there, cost, cost + noise + more)
 
     def _noise_beyond(self, trial: Trajectory, plan: Plan) -> float:

@@ -411,11 +411,12 @@ class Variational(Integrator):
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         """Arguments of the core, by name, to repeat every step at dw = 0."""
         statistics = trajectory.statistics
-        damage = statistics.damage()
-        if damage is None and (statistics.substeps < 1).any():
-            damage = "statistics.substeps holds numbers of parts that no step has"
-        if damage is not None:
-            raise InputError(f"the trajectory is damaged: {damage}")
+        if statistics.halvings.size or not (statistics.substeps == 1).all():
+            damage = statistics.damage()
+            if damage is None and (statistics.substeps < 1).any():
+                damage = "statistics.substeps holds numbers of parts that no step has"
+            if damage is not None:
+                raise InputError(f"the trajectory is damaged: {damage}")
         drift = self.drift_share * drifts(scene, trajectory) if scene.noise.velocity_dependent else 0.0
         force = forces(scene, trajectory, drift)
         arrays = {

@@ -432,7 +432,7 @@ class Scene(Frozen):
         held: Floats = self.holding @ q
         return held
 
-    @property
+    @cached_property
     def processes(self) -> int:
         """k, the number of Wiener processes."""
         return self.noise.processes

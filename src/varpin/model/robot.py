@@ -122,7 +122,7 @@ class Robot(Frozen):
         head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
         return facts(f"Robot {self.name}", rows, table(head, [(name, *map(float, row)) for name, *row in columns]))
 
-    @property
+    @cached_property
     def dof(self) -> int:
         """n, the number of generalized coordinates."""
         return len(self.joint_names)
