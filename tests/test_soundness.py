@@ -648,7 +648,15 @@ def test_steps_under_constraints_take_no_impulses_by_hand():
 @pytest.mark.parametrize("controls", ["held", "changing", "none"])
 @pytest.mark.parametrize(
     "integrator",
-    [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Gauss(2), vp.Radau(2), vp.RungeKutta4(), vp.ExplicitEuler()],
+    [
+        vp.Midpoint(),
+        vp.Midpoint(kick="split"),
+        vp.Gauss(2),
+        vp.Gauss(2, kick="held"),
+        vp.Radau(2),
+        vp.RungeKutta4(),
+        vp.ExplicitEuler(),
+    ],
     ids=str,
 )
 def test_noisy_motions_pass_where_smaller_steps_under_the_same_kicks_agree(integrator, controls):
@@ -671,13 +679,15 @@ def test_noisy_motions_pass_where_smaller_steps_under_the_same_kicks_agree(integ
         q, v = (np.array([x]) for x in start)
         off = 0.0
         for k in range(steps):
-            ends = np.zeros((1, 16, 2, 2))
+            ends, force = np.zeros((1, 16, 2, 2)), np.zeros((0, 0, 2))
             at = motion.q[k : k + 1], motion.v[k : k + 1], motion.u[k : k + 1], motion.q[0]
             ends[0, 0, 0] = left * scene.noise.fields(*at).F[0] @ motion.dw[k]
             at = motion.q[k + 1 : k + 2], *at[1:]
             ends[0, -1, 1] = (1.0 - left) * scene.noise.fields(*at).F[0] @ motion.dw[k]
+            if integrator.holds_noise:
+                force, ends = np.tile(ends[:, :1, 0] / dt, (1, 16, 1)), 0.0 * ends
             parts = open_loop(np.repeat(motion.u[k : k + 1], 16, axis=0))
-            fine = vp.Gauss(3).motions(scene, q, v, parts, np.zeros((0, 0, 2)), dt / 16, ends)
+            fine = vp.Gauss(3).motions(scene, q, v, parts, force, dt / 16, ends)
             q, v = fine[0][:, -1], fine[1][:, -1]
             off = max(off, np.abs((q[0] - motion.q[k + 1]) / np.ptp(motion.q, axis=0)).max())
         assert off < WRONG_POSITION

@@ -242,14 +242,17 @@ def _require_problem(source: Path, members: Members, problem: OptimalControlProb
     given = {name: getattr(problem, name) for name in (*_PROBLEM, "dt")}
     # Files without this entry are older than linear controls.
     members = {"controls": np.array("held"), **members}
-    for name, value in (given | {"problem.integrator": repr(problem.integrator)}).items():
+    for name, value in given.items():
         if name not in members or not np.array_equal(members[name], value):
-            what = name.removeprefix("problem.")
-            raise FileError(f"{source} is of a problem with {what} = {members.get(name, 'unknown')}, not {value}")
+            raise FileError(f"{source} is of a problem with {name} = {members.get(name, 'unknown')}, not {value}")
     described, found = problem.described_constraints, str(members.get("problem.constraints", ""))
     if described != found:
         raise FileError(f"{source} is of a problem with constraints = {found or 'none'}, not {described or 'none'}")
     _require_surroundings(source, members, problem, "noise.")
+    # After the noise, which decides about the default integrator.
+    stored, here = str(members.get("problem.integrator", "unknown")), repr(problem.integrator)
+    if stored != here:
+        raise FileError(f"{source} is of a problem with integrator = {stored}, not {here}: give it as integrator=")
 
 
 def _require_surroundings(source: Path, members: Members, problem: OptimalControlProblem, kind: str) -> None:

@@ -191,6 +191,7 @@ class VariationalRollout(_Rollout):
         left: float,
         paths: int,
         solver: Solver = Solver.automatic,
+        held: bool = False,
     ) -> None: ...
     def fork(self, guards: Guards) -> VariationalRollout:
         """An independent copy of the paths."""
@@ -215,7 +216,14 @@ class ConstrainedRollout(_Rollout):
     """Paths under constraints."""
 
     def __init__(
-        self, mechanism: Mechanism, tableau: Tableau, places: Floats, tolerance: float, guards: Guards, paths: int
+        self,
+        mechanism: Mechanism,
+        tableau: Tableau,
+        places: Floats,
+        tolerance: float,
+        guards: Guards,
+        paths: int,
+        held: bool = False,
     ) -> None: ...
     def fork(self, guards: Guards) -> ConstrainedRollout:
         """An independent copy of the paths."""

@@ -131,6 +131,11 @@ class Integrator(ABC):
         return 1.0
 
     @property
+    def holds_noise(self) -> bool:
+        """Whether the noise of a step is a force that is constant over it, instead of impulses at its ends."""
+        return False
+
+    @property
     def drift_share(self) -> float:
         """The share of the Ito correction that has to be added as a drift.
 
@@ -264,7 +269,8 @@ class Integrator(ABC):
         """Derivatives of each step at dw = 0.
 
         They are taken in the state (N, 2n, 2n), in a constant force (N, 2n, n), and in the noise impulse (N, 2n, n), a
-        jump of the momentum, or of the velocity for integrators on (q, v).
+        jump of the momentum, or of the velocity for integrators on (q, v). For integrators that hold the noise of a
+        step, the last ones are those in the impulse of a constant force.
 
         Raises:
             LinearizationError: A step has no solution at dw = 0.
@@ -343,6 +349,24 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
         return np.zeros((trajectory.steps, scene.robot.dof))
     nodes = zip(trajectory.q[:-1], trajectory.v[:-1], trajectory.u, strict=True)
     return np.array([diffusion_and_drift(scene, q, v, u, trajectory.q[0])[1] for q, v, u in nodes])
+
+
+def held_noise(scene: Scene, trajectory: Trajectory, steps: slice = slice(None)) -> Floats:
+    """The constant forces over some steps of a motion (N, n) whose impulses are those of its noise.
+
+    Zero for joints of kinematic inputs, whose drives absorb the noise.
+    """
+    q, v = trajectory.q[:-1][steps], trajectory.v[:-1][steps]
+    F = scene.noise.fields(q, v, trajectory.u[steps], trajectory.q[0]).F
+    return without_inputs(scene, np.einsum("Nik,Nk->Ni", F, trajectory.dw[steps]) / trajectory.dt)
+
+
+def without_inputs(scene: Scene, values: Floats) -> Floats:
+    """Values (..., n) with zeros for joints of kinematic inputs."""
+    if scene.inputs:
+        values = values.copy()
+        values[..., list(scene.inputs.values())] = 0.0
+    return values
 
 
 def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) -> Floats:
