@@ -446,9 +446,7 @@ class _Search:
         self.trials = Trials(problem)
         integrator = problem.integrator
         # Whether steps may be divided, and the integrator with fewer halvings, by their greatest number.
-        self.divides = (
-            isinstance(integrator, Variational) and integrator.guard is not None and is_dataclass(integrator)
-        )
+        self.divides = isinstance(integrator, Variational) and integrator.guard is not None and is_dataclass(integrator)
         self.less: dict[int, Integrator] = {}
         self._around: Along | None = None
         self.trajectory: Trajectory
