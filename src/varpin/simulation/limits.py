@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.core import inside_bounds
 from varpin.mechanics.forces import drive_forces, of_kind
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
@@ -40,10 +41,15 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
         yield LOOPS, f"{LOOPS}, and the motion is that of a tree: {pairs}; {closed} closes them"
     if not any(scene.bounded):
         return
+    q, v, u = trajectory.q, trajectory.v, trajectory.u
+    inside = inside_bounds(scene.core, q, v, u, trajectory.u_stages, scene.bound_rows)
+    if all(inside) and scene.direct_efforts:
+        return
     robot, t = scene.robot, trajectory.t
     stopped = {element.coordinate for element in of_kind(scene.elements, "JointStop")}
-    for bounded, (kind, why, of, (least, most), beyond, units) in zip(
+    for bounded, kept, (kind, why, of, (least, most), beyond, units) in zip(
         scene.bounded,
+        (*inside[:2], inside[2] and scene.direct_efforts),
         (
             (POSITION, "which nothing stops", _positions, scene.bounds.position, _OUTSIDE, ("rad", "m")),
             (VELOCITY, "which nothing holds back", _velocities, scene.bounds.velocity, None, ("rad/s", "m/s")),
@@ -51,7 +57,7 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
         ),
         strict=True,
     ):
-        if not bounded:
+        if kept or not bounded:
             continue
         values = of(scene, trajectory)
         top, bottom = values.max(axis=0, initial=-np.inf), values.min(axis=0, initial=np.inf)
