@@ -60,16 +60,14 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
         if kept or not bounded:
             continue
         values = of(scene, trajectory)
-        top, bottom = values.max(axis=0, initial=-np.inf), values.min(axis=0, initial=np.inf)
-        if ((top <= most) & (bottom >= least)).all():
-            continue
         slides = robot.slides
         with np.errstate(invalid="ignore"):
             excess = np.maximum(least - values, values - most)
             excess = np.where(excess > (_SHARE * most if beyond is None else beyond), excess, -np.inf)
-        parts = []
         worst = excess.max(axis=0, initial=-np.inf)
-        joints = [int(c) for c in np.argsort(-worst, kind="stable") if worst[c] > 0.0]
+        if not (worst > 0.0).any():
+            continue
+        parts, joints = [], [int(c) for c in np.argsort(-worst, kind="stable") if worst[c] > 0.0]
         for c in joints[:_NAMED]:
             first, peak = int(np.argmax(excess[:, c] > 0.0)), int(np.argmax(excess[:, c]))
             since = "from the start" if first == 0 else f"from t = {t[first]:.4g} s"
@@ -77,10 +75,9 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
             amount = f"at most {worst[c]:.3g} {units[int(slides[c])]} {side} {limit:.4g} at t = {t[peak]:.4g} s"
             softly = " (its stop gives way)" if kind == POSITION and c in stopped else ""
             parts.append(f"{robot.joint_names[c]!r} {since}, {amount}{softly}")
-        if parts:
-            more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
-            reason = "" if kind == POSITION and set(joints) <= stopped else f", {why}"
-            yield kind, f"{kind}{reason}: {'; '.join(parts)}{more}"
+        more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
+        reason = "" if kind == POSITION and set(joints) <= stopped else f", {why}"
+        yield kind, f"{kind}{reason}: {'; '.join(parts)}{more}"
 
 
 def _positions(_: Scene, trajectory: Trajectory) -> Floats:
