@@ -21,6 +21,7 @@ from varpin.model.chain import rod_chain
 from varpin.simulation import limits
 from varpin.simulation.accuracy import CLOSE, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY, Window, examined_nodes
 from varpin.simulation.chatter import alternation
+from varpin.simulation.clearance import clearly_right
 from varpin.simulation.retaking import shortest_parts, taken_again
 from varpin.simulation.soundness import (
     CAUTION,
@@ -558,7 +559,10 @@ def test_what_a_look_costs(links, integrator, evaluations):
         own = int((motion.statistics.jets + motion.statistics.sweeps).sum())
         evaluations()
         examined(scene, integrator, motion)
-        assert 0 < evaluations() <= most * own
+        spent = evaluations()
+        assert spent <= most * own
+        # Motions that are clearly right are told without a step.
+        assert (spent == 0) == clearly_right(scene, integrator, motion)
 
 
 def test_the_steps_of_a_look_are_bounded(monkeypatch):

@@ -26,7 +26,7 @@ Bytes = NDArray[np.uint8]
 
 FORMAT = "varpin.trajectory/2"
 
-_ARRAYS = ("t", "q", "v", "p", "u", "dw", "energy", "masses")
+_SEALED = ("t", "q", "v", "p", "u", "dw", "energy", "masses", "constraint_forces", "u_stages", "u_nodes")
 # Number of parts of steps that are checked at a time.
 _AT_A_TIME = 1_000_000
 
@@ -265,7 +265,20 @@ class Trajectory(Frozen):
                 "u_nodes": (nodes, m if lines != (0,) else 0),
             }
         )
-        for name in (*_ARRAYS, "constraint_forces", "u_stages", "u_nodes"):
+        self._seal()
+
+    @classmethod
+    def assembled(cls, **values: Any) -> Trajectory:
+        """A trajectory of all its attributes, with arrays that are known to fit each other; they become read-only."""
+        made = object.__new__(cls)
+        # The frozen dataclass refuses assignments.
+        vars(made).update(values)
+        made._seal()
+        return made
+
+    def _seal(self) -> None:
+        """Make all arrays read-only."""
+        for name in _SEALED:
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)

@@ -431,22 +431,37 @@ def failure_of(nodes: RolloutArrays, path: int, done: int, reasons: Mapping[int,
 
 def first_nodes(q: Floats, p: Floats, v: Floats, energy: Floats, controls: int) -> list[Segment]:
     """A segment of one node for each of P paths, from q, p and v (P, n) and energies (P,) at their starts."""
-    none, zero, u = np.zeros(1, dtype=np.int64), np.zeros(1), np.zeros((1, controls))
-    statistics = StepStatistics(none, none, none, none, np.zeros(0, dtype=np.uint8), zero, zero, zero)
+    u, statistics = np.zeros((1, controls)), _no_statistics()
     rows = (slice(i, i + 1) for i in range(len(q)))
     return [Segment(q[row], p[row], v[row], u, energy[row], statistics) for row in rows]
 
 
+@functools.cache
+def _no_statistics() -> StepStatistics:
+    """The statistics of a first node, read-only."""
+    none, zero, halvings = np.zeros(1, dtype=np.int64), np.zeros(1), np.zeros(0, dtype=np.uint8)
+    for array in (none, zero, halvings):
+        array.setflags(write=False)
+    return StepStatistics(none, none, none, none, halvings, zero, zero, zero)
+
+
 def open_loop(u: Floats) -> Commands:
     """Controls (N, m) without feedback."""
-    m = u.shape[1]
-    u = np.ascontiguousarray(u)
-    return Commands(u, np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m)))
+    return Commands(np.ascontiguousarray(u), *_without_feedback(u.shape[1]))
 
 
 def open_line(u: Floats, times: Sequence[float]) -> Commands:
     """Controls (N + 1, m) at nodes without feedback, linear between them, for a method with stages at ``times``."""
     return open_loop(u[1:])._replace(before=u[:1].copy(), stage_times=np.array(tuple(times) or (0.5,)))
+
+
+@functools.cache
+def _without_feedback(controls: int) -> tuple[Floats, Floats, int, Floats, Floats]:
+    """Gains, reference, hold, limits and control before the first of :func:`open_loop`, read-only."""
+    gains, reference, before = np.zeros((0, controls, 0)), np.zeros((0, 0)), np.zeros((0, controls))
+    for array in (gains, reference, before):
+        array.setflags(write=False)
+    return gains, reference, 1, no_limits(controls), before
 
 
 @functools.cache
@@ -533,6 +548,8 @@ def steps_of(commands: Commands) -> int:
 
 def rows(commands: Commands, begin: int, end: int, before: Floats | None = None) -> Commands:
     """The commands of decisions begin, ..., end - 1; ``before`` (P, m) replaces the previous control of each path."""
+    if begin == 0 and end >= len(commands.u) and before is None:
+        return commands
     part = slice(begin, end)
     return commands._replace(
         u=commands.u[part],

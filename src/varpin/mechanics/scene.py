@@ -297,6 +297,17 @@ class Scene(Frozen):
         damped = any(map(dissipates, self.elements)) or any(map(dissipates, self.couplings))
         return damped or self.custom is not None
 
+    @cached_property
+    def linear(self) -> bool:
+        """Whether all forces beside the robot's own are linear in a joint's q and v: no constraints, noise or kinks."""
+        if self.constraints or self.couplings or self.processes or self.custom is not None:
+            return False
+        return all(
+            element.kind in ("JointSpring", "JointDamper")
+            or (element.kind == "PositionServo" and bool(np.isinf(element.values[2])))
+            for element in self.elements
+        )
+
     @property
     def conservative(self) -> bool:
         """Whether energy is constant without controls and noise: all forces have a potential."""
@@ -488,6 +499,18 @@ class Scene(Frozen):
             upper[c] = max(upper[c], last + _STOP_DEPTH * width) if last < upper[c] + width else upper[c]
         speed, effort = self.robot.velocity_limit, self.robot.effort_limit
         return Bounds((lower, upper), (-speed, speed), (-effort, effort))
+
+    @cached_property
+    def bound_rows(self) -> Floats:
+        """:attr:`bounds` as an array (3, 2, n)."""
+        rows = np.array(self.bounds)
+        rows.setflags(write=False)
+        return rows
+
+    @cached_property
+    def direct_efforts(self) -> bool:
+        """Whether the motors' forces are those of the controls: there are neither servos nor kinematic inputs."""
+        return not (self.servo_joints or self.inputs)
 
     @cached_property
     def bounded(self) -> tuple[bool, ...]:

@@ -43,6 +43,7 @@ from varpin.simulation.accuracy import (
     violent_windows,
 )
 from varpin.simulation.chatter import RUN, Alternation, alternation
+from varpin.simulation.clearance import clearly_right
 from varpin.simulation.damping import Fast, damping_at_stop, damping_of, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.growth import NEAR, grown_error, growth_bound
@@ -113,8 +114,9 @@ def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
         trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
+    errors = () if clearly_right(scene, integrator, trajectory) else _errors_found(scene, integrator, trajectory)
     found = (
-        *_errors_found(scene, integrator, trajectory),
+        *errors,
         *alternating(scene, integrator, trajectory),
         *_beyond_limits(scene, trajectory),
     )
