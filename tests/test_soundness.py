@@ -70,7 +70,7 @@ def test_the_error_of_a_motion_is_what_theory_says(integrator, formula):
 )
 def test_steps_that_do_not_resolve_the_motion_are_spoken_of(integrator, caplog):
     with caplog.at_level(logging.WARNING, "varpin"):
-        _, motion = oscillator(1e-3, integrator)
+        _, motion = oscillator(1e-3, integrator, steps=200)
         assert motion.warnings == ()
         assert not caplog.records
         _, motion = oscillator(1.9 if integrator.order < 6 else 6.0, integrator)
@@ -445,7 +445,7 @@ def test_a_short_blow_in_a_long_quiet_motion_is_found():
             scene, [0.0, 0.7], [1e-3, 0.0], dt=0.02, steps=1200, controls=controls, integrator=vp.SemiImplicitEuler()
         )
         quiet = vp.simulate(scene, [0.0, 0.7], [1e-3, 0.0], dt=0.02, steps=1200, integrator=vp.SemiImplicitEuler())
-        assert quiet.warnings == ()
+        assert not {*quiet.warnings} - {*about(quiet.warnings, "adding up")}
         error = motion_error(scene, vp.SemiImplicitEuler(), motion)
         assert error.worst > 1.0
         assert at - 100 < error.step <= at + 4

@@ -24,7 +24,7 @@ from varpin.simulation.choice import changes_along, integrator_along, stronger, 
 from varpin.simulation.commands import commands_of
 from varpin.simulation.record import rollout
 from varpin.simulation.soundness import Finding, announce
-from varpin.simulation.start import in_degrees, on_constraints
+from varpin.simulation.start import in_other_units, on_constraints
 from varpin.simulation.time_steps import time_steps
 from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, require_finite
 from varpin.support.executors import executing, in_order
@@ -131,7 +131,7 @@ def simulate_ensemble(
             raise EnsembleInterrupted(sums.ensemble((*sums.lost(), *seen))) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*in_degrees(scene, start[0][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
+    found = (*in_other_units(scene, start[0][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene, dt, found)
     return sums.ensemble(found)
 

@@ -46,6 +46,7 @@ from varpin.simulation.chatter import RUN, Alternation, alternation
 from varpin.simulation.clearance import clearly_right
 from varpin.simulation.damping import Fast, damping_at_stop, damping_of, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
+from varpin.simulation.growth import ADDED as ADDED_WORDS
 from varpin.simulation.growth import NEAR, grown_error, growth_bound
 from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.growth import WORDS as GROWTH_WORDS
@@ -316,8 +317,8 @@ def _growing(
         )
         return (Finding("kinks of forces", sentence, found.joint),)
     sentence = (
-        f"{GROWTH_WORDS}: single steps of dt = {trajectory.dt:g} s by {integrator} are off by about "
-        f"{found.step:.1g} rad or m, and a method of more stages moves {off}; "
+        f"{GROWTH_WORDS if found.grows else ADDED_WORDS}: single steps of dt = {trajectory.dt:g} s by {integrator} are "
+        f"off by about {found.step:.1g} rad or m, and a method of more stages moves {off}; "
         "smaller steps or more stages keep the motion right for longer"
     )
     return (Finding("growing errors", sentence, found.joint),)
