@@ -183,6 +183,10 @@ def test_refusals() -> None:
         links(controls="cubic")
     with refused(vp.InputError, "hold"):
         links(hold=2)
+    # The optimum of a midpoint sum alternates freely: its controls cost nothing in the middle of a step.
+    for sampling in ("midpoint", "start"):
+        with refused(vp.InputError, repr(sampling), "alternate", "'gauss'"):
+            links(sampling=sampling)
     problem = links()
     plan = vp.solve(problem, check=False)
     with refused(vp.InputError, "second-order", "variational"):

@@ -36,10 +36,10 @@ def line(problem: vp.OptimalControlProblem, u: np.ndarray) -> vp.LinearPolicy:
     ("noise", "options"),
     [
         (CONTROL, {"integrator": vp.Gauss(2)}),
-        (CONTROL, {"integrator": vp.Midpoint(), "sampling": "midpoint", "joints": 1}),
+        (CONTROL, {"integrator": vp.Midpoint(), "joints": 1}),
         (CONTROL, {"integrator": vp.RungeKutta4(), "rate": 1e-2}),
         (STATE, {"integrator": vp.Gauss(2, kick="split")}),
-        (CONTROL + STATE, {"integrator": vp.Gauss(2, kick="split"), "sampling": "start"}),
+        (CONTROL + STATE, {"integrator": vp.Gauss(2, kick="split")}),
     ],
 )
 def test_the_gradient_is_that_of_the_expected_cost(noise: object, options: dict) -> None:

@@ -185,3 +185,49 @@ def test_the_four_bar_is_that_of_index_reduced_equations(tmp_path):
     q, v = exact.motion(q0, np.zeros(3), motion.t[[0, -1]])
     np.testing.assert_allclose(motion.q[-1], q[-1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(motion.v[-1], v[-1], rtol=0, atol=1e-8)
+
+
+def upright(roll: str, offset: float = 0.0) -> str:
+    """A four-bar in the x z plane whose joints turn about z of bodies that are rolled by a quarter turn."""
+
+    def bar(name, place, length, inside="", turn=""):
+        return (
+            f'<body name="{name}" pos="{place}" {turn}><joint name="{name}" axis="0 0 1"/><geom type="capsule" '
+            f'fromto="0 0 0 {length} 0 0" size="0.01" mass="{length}"/>{inside}</body>'
+        )
+
+    pin, hole = '<site name="pin" pos="0.4 0 0"/>', f'<site name="hole" pos="0.35 0 {offset}"/>'
+    crank = bar("crank", "0 0 0", 0.2, bar("coupler", "0.2 0 0", 0.4, pin), 'quat="1 1 0 0"')
+    rocker = bar("rocker", "0.5 0 0", 0.35, hole, f'euler="{roll} 0 0"')
+    return document('<connect site1="pin" site2="hole"/>', world=crank + rocker)
+
+
+@pytest.mark.parametrize(("roll", "offset"), [("1.5708", 0.0), ("1.5705", 0.0), ("1.5708", 1e-4)])
+def test_a_planar_loop_with_rounded_axes_is_closed_in_its_plane(tmp_path, caplog, roll, offset):
+    start = [1.2, -1.0, 1.2]
+    exact, *_ = both(tmp_path, upright(repr(0.5 * np.pi)))
+    assert not caplog.records
+    scene = vp.Scene(exact, constraints="robot")
+    (constraint,) = scene.constraints
+    assert isinstance(constraint, vp.PointOnPoint)
+    q0 = vp.assemble(scene, start)
+    whole = vp.simulate(scene, q0, np.zeros(3), dt=0.01, steps=100, integrator=vp.Gauss(3))
+    rounded, *_ = both(tmp_path, upright(roll, offset))
+    (record,) = caplog.records
+    assert "planar loop" in record.message
+    assert "<connect> 'pin'" in record.message
+    scene = vp.Scene(rounded, constraints="robot")
+    (constraint,) = scene.constraints
+    assert isinstance(constraint, vp.PointOnLine)
+    start = vp.assemble(scene, start)
+    np.testing.assert_allclose(start, q0, atol=1e-6)
+    motion = vp.simulate(scene, start, np.zeros(3), dt=0.01, steps=100, integrator=vp.Gauss(3))
+    np.testing.assert_allclose(motion.q, whole.q, atol=2e-5)
+
+
+def test_a_loop_in_space_is_not_taken_for_a_planar_one(tmp_path, caplog):
+    robot, *_ = both(tmp_path, upright("1.56"))
+    assert not caplog.records
+    scene = vp.Scene(robot, constraints="robot")
+    with pytest.raises(vp.AssemblyError):
+        vp.assemble(scene, [1.2, -1.0, 1.2])

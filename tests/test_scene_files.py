@@ -476,9 +476,9 @@ MISTAKES = {
         changed('type = "midpoint"', 'type = "mid_point"'),
         "integrator.type",
     ),
-    "linear controls under noise": (
-        changed("duration = 0.1", 'duration = 0.1\ncontrols = "linear"'),
-        "horizon.controls",
+    "linear controls that the cost does not see": (
+        changed("duration = 0.1", 'duration = 0.1\ncontrols = "linear"\nsampling = "midpoint"'),
+        "horizon.sampling",
     ),
     "limits of too many rates": (
         GOOD + '\n[[plan_constraint]]\ntype = "control_rate"\nlimit = [1.0, 2.0, 3.0, 4.0]',

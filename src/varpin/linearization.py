@@ -137,6 +137,9 @@ def linearize_steps(
     Jx, Jf, Jk = integrator.linearize(scene, trajectory)
     q, v = trajectory.q, trajectory.v
     ramp = integrator.ramps(scene, trajectory) @ scene.transmission if ramps else None
+    if ramp is not None and scene.inputs:
+        # Only the end of a step counts.
+        ramp[:, :, scene.prescribed] = (Jf @ scene.transmission)[:, :, scene.prescribed]
     if scene.processes == 0:
         return Linearization(
             A=Jx,

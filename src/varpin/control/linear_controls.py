@@ -15,6 +15,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem
 from varpin.linearization import Linearization, linearize_steps, node_jets
+from varpin.mechanics.inputs import with_ends
 from varpin.mechanics.scene import quiet
 from varpin.trajectory import Trajectory
 
@@ -72,7 +73,8 @@ def shifted_lines(problem: OptimalControlProblem, trajectory: Trajectory, du: Fl
     nodes[1:] += du[:, m:]
     share = np.array(problem.integrator.stage_times).reshape(-1, 1)
     stages = (1.0 - share) * begins[:, None] + share * ends[:, None]
-    return replace(trajectory, u=0.5 * (begins + ends), u_nodes=nodes, u_stages=stages)
+    mean, stages = (with_ends(problem.scene, values, ends) for values in (0.5 * (begins + ends), stages))
+    return replace(trajectory, u=mean, u_nodes=nodes, u_stages=stages)
 
 
 def derivatives(lin: Linearization, velocity: Floats) -> Derivatives:
@@ -161,6 +163,8 @@ def curvature_on_lines(problem: OptimalControlProblem, trajectory: Trajectory, z
     M, _ = node_jets(scene, trajectory.q[:-1], trajectory.v[:-1])
     speeds = np.abs(h * np.linalg.solve(M, np.broadcast_to(scene.actuation, (N, n, m)))).max(axis=1)
     shift = _SHIFT / np.where(speeds > 0.0, speeds, 1.0)
+    # Positions, and velocities of cubics.
+    shift[:, scene.prescribed] = _SHIFT
     for c in range(2 * m):
         du = np.zeros((N, 2 * m))
         du[:, c] = shift[:, c % m]

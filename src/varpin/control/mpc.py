@@ -19,7 +19,7 @@ from varpin.control.solution import rest_of
 from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure
-from varpin.mechanics.inputs import in_parts_of_steps
+from varpin.mechanics.inputs import in_parts_of_steps, with_ends
 from varpin.mechanics.policy import FirstOrderHold
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.simulation.chatter import alternation
@@ -534,7 +534,9 @@ def _simulated(
         # Joints with kinematic inputs move on one line or cubic to their next positions over the tick.
         controls = in_parts_of_steps(plant.scene, u[None], q[None], v[None], dt * plant.substeps, plant.substeps)
     else:
-        controls = FirstOrderHold(np.vstack([begun, u])).refined(plant.substeps)
+        line = FirstOrderHold(np.vstack([begun, u])).refined(plant.substeps).u
+        moved = in_parts_of_steps(plant.scene, u[None], q[None], v[None], dt * plant.substeps, plant.substeps)
+        controls = FirstOrderHold(np.vstack([line[:1], with_ends(plant.scene, line[1:], moved)]))
     options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": controls, "integrator": method}
     options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}
     try:

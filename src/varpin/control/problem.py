@@ -33,6 +33,7 @@ from varpin.core import sample_steps
 from varpin.errors import InputError
 from varpin.integrators import Gauss, Integrator, Radau
 from varpin.integrators.same_scene import require_motion
+from varpin.mechanics.inputs import as_moved
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
@@ -169,8 +170,9 @@ class OptimalControlProblem(Frozen):
             UnknownJoint: An unknown joint name, or one of a joint that is not driven, for controls.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or a lower limit above the upper one; linear controls
-                with ``hold``; ``hold`` or linear controls with a :class:`KinematicInput`; another ``sampling`` than
-                "gauss" with a cubic one; constraints that are no plan constraints or of another robot.
+                with ``hold``; ``hold`` with a :class:`KinematicInput`; another ``sampling`` than
+                "gauss" with a cubic one, or with linear controls; constraints that are no plan constraints or of
+                another robot.
             CostError: A reference function fails.
             AssemblyError: The scene's constraints cannot be satisfied near q0.
         """
@@ -184,10 +186,10 @@ class OptimalControlProblem(Frozen):
             raise InputError(f"sampling must be 'midpoint', 'gauss' or 'start', got {sampling!r}")
         if not is_one_of(controls, ("held", "linear")):
             raise InputError(f"controls must be 'held' or 'linear', got {controls!r}")
-        if scene.inputs and (hold != 1 or controls == "linear"):
+        if scene.inputs and hold != 1:
             raise InputError(
-                "the control of a KinematicInput is its joint's position at the next node: leave hold and "
-                "controls='linear' out; the joint moves linearly, or on a cubic, between nodes"
+                "the control of a KinematicInput is its joint's position at the next node: leave hold out; the joint "
+                "moves linearly, or on a cubic, between nodes"
             )
         cubic = max(scene.rates, default=-1) >= 0
         if cubic and sampling != "gauss":
@@ -198,6 +200,12 @@ class OptimalControlProblem(Frozen):
         if controls == "linear" and hold != 1:
             raise InputError(
                 f"linear controls change at every node: leave hold = {hold} out, or take controls='held'", "controls"
+            )
+        if controls == "linear" and sampling != "gauss":
+            raise InputError(
+                f"costs sampled by the rule {sampling!r} do not see controls that alternate from node to node, so that "
+                "linear ones would: leave sampling out, for 'gauss'",
+                "sampling",
             )
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
@@ -282,9 +290,13 @@ class OptimalControlProblem(Frozen):
     def begin(self) -> Floats | None:
         """The first control (m,) where controls are linear between nodes, NaN where it is free; None if all are.
 
-        It is given where a limit of the rate begins with a control before the horizon: lines do not jump.
+        It is given where a limit of the rate begins with a control before the horizon: lines do not jump. Of a
+        kinematic input it is where the joint is.
         """
         found = None
+        scene = self.scene
+        if self.linear and scene.inputs:
+            found = as_moved(scene, self.q0, self.v0, np.full(scene.controls, np.nan))
         for item in self.bound_constraints if self.linear else ():
             if isinstance(item, BoundRate) and item.before is not None:
                 found = np.full(self.scene.controls, np.nan) if found is None else found

@@ -16,6 +16,7 @@ from varpin.core import Watch
 from varpin.core.arrays import Bytes, Commands, RolloutArrays
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure, Lines, lines, statistics_of
+from varpin.mechanics.inputs import with_ends
 from varpin.trajectory import Trajectory
 
 # Arrays that are the same for all whole motions of a problem under held controls, without constraints.
@@ -187,6 +188,9 @@ class Trials:
         )
         nodes.done[0] = done
         line = lines(commands, segment.u, self.problem.integrator.stage_times)
+        line = line._replace(
+            mean=with_ends(scene, line.mean, segment.u), stages=with_ends(scene, line.stages, segment.u)
+        )
         impulses = np.zeros((done, 0)) if segment.impulses is None else segment.impulses
         return Attempt(
             self,

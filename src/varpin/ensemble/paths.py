@@ -19,7 +19,7 @@ from varpin.errors import VarpinError
 from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import Failure, lines, rows
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.inputs import as_moved
+from varpin.mechanics.inputs import as_moved, with_ends
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import Children
 from varpin.simulation.record import located
@@ -313,7 +313,7 @@ class _Chunk:
         shared, u = self.shared, segment.u[:steps]
         if self.linear:
             mean, _, nodes = lines(shared.commands._replace(before=before), u, ())
-            return mean, nodes[1:]
+            return with_ends(shared.scene, mean, u), nodes[1:]
         moving = shared.scene.inputs and shared.commands.hold > 1
         moved = as_moved(shared.scene, segment.q[:steps], segment.v[:steps], u) if moving else u
         return moved, moved

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from varpin.errors import InputError
-from varpin.mechanics.constraints import Constraint, FrameOnFrame, JointTie, PointOnPoint
+from varpin.mechanics.constraints import Constraint, FrameOnFrame, JointTie, PointOnLine, PointOnPoint
 from varpin.model import Robot
 from varpin.model.equalities import Closure, Gear, on_named_frame
 from varpin.model.tree import place_of_frame
@@ -39,6 +39,8 @@ def _closure(closure: Closure, robot: Robot) -> Constraint | None:
         return None
     if closure.turns:
         return FrameOnFrame(a, b, (there * here.inverse()).homogeneous)
+    if closure.plane is not None:
+        return PointOnLine(_point(a, here), _point(b, there), there.rotation @ np.array(closure.plane.normal))
     return PointOnPoint(_point(a, here), _point(b, there))
 
 

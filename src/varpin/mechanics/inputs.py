@@ -66,6 +66,16 @@ def prescribing(scene: Scene, commands: Commands, ends: Floats) -> Commands:
     return commands._replace(u=u, within=within)
 
 
+def with_ends(scene: Scene, values: Floats, ends: Floats) -> Floats:
+    """Controls (N, ..., m) within N steps with those of kinematic inputs replaced by the ones at their ends (N, m)."""
+    own = scene.prescribed
+    if not len(own):
+        return values
+    values = values.copy()
+    values[..., own] = ends[:, own].reshape(len(ends), *(1,) * (values.ndim - 2), len(own))
+    return values
+
+
 def as_moved(scene: Scene, q: Floats, v: Floats, u: Floats) -> Floats:
     """Controls u (..., m) with those of kinematic inputs replaced by where these are, q and v (..., n).
 

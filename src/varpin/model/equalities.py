@@ -13,7 +13,12 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import pinocchio as pin
 
+from varpin.arrays import Floats
 from varpin.errors import RobotError
+
+# Greatest tilt [rad] of axes in a planar loop, and greatest offset of its point across the plane relative to the loop's
+# size; below _EXACT they count as exact.
+_PARALLEL, _EXACT = 1e-3, 1e-10
 
 _KINDS = {"body": pin.FrameType.BODY, "site": pin.FrameType.OP_FRAME}
 
@@ -26,6 +31,13 @@ class End(NamedTuple):
     place: pin.SE3 | None  # placement in the body or site; None: where the other end is in the reference configuration
 
 
+class Plane(NamedTuple):
+    """The plane of a loop's motion."""
+
+    normal: tuple[float, float, float]  # in the axes of the second frame, b
+    tilt: float  # greatest angle of a joint's axis with the normal, or of a slide's with the plane [rad]
+
+
 @dataclass(frozen=True, eq=False)
 class Closure:
     """Two frames that coincide (``<weld>``), or their origins alone (``<connect>``).
@@ -35,12 +47,14 @@ class Closure:
         a: Frame of the first body.
         b: Frame of the second body.
         turns: Whether the axes of the frames coincide, too.
+        plane: Of a planar loop whose numbers are rounded; its point coincides in this plane only.
     """
 
     name: str
     a: End
     b: End
     turns: bool
+    plane: Plane | None = None
 
 
 @dataclass(frozen=True)
@@ -101,7 +115,9 @@ def at_reference(equalities: Sequence[Equality], model: pin.Model, path: Path) -
                 a = a._replace(place=at.inverse() * there * b.place)
             elif b.place is None:
                 b = b._replace(place=there.inverse() * at * a.place)
-            found.append(replace(equality, a=a, b=b))
+            frames = (model.getFrameId(end.frame, _KINDS[end.kind]) for end in (a, b))
+            plane = None if equality.turns else _rounded_plane(model, data, q, [*frames], at * a.place, there * b.place)
+            found.append(replace(equality, a=a, b=b, plane=plane))
             continue
         rest = position(equality, equality.joint)
         turned = np.polynomial.Polynomial(equality.coefficients)
@@ -109,6 +125,33 @@ def at_reference(equalities: Sequence[Equality], model: pin.Model, path: Path) -
             turned = turned(np.polynomial.Polynomial([-position(equality, equality.leader), 1.0]))
         found.append(replace(equality, coefficients=tuple((turned + rest).coef.tolist())))
     return tuple(found)
+
+
+def _rounded_plane(
+    model: pin.Model, data: pin.Data, q: Floats, frames: Sequence[int], a: pin.SE3, b: pin.SE3
+) -> Plane | None:
+    """The plane of a loop closed at the frames ``a`` and ``b``, if it is planar up to the rounding of a file's numbers.
+
+    None for loops in space, and for those that are planar to the last digit.
+    """
+    sides = [set(model.supports[model.frames[frame].parentJoint]) for frame in frames]
+    loop = sorted(sides[0] ^ sides[1])
+    if not loop or any(model.joints[j].nv != 1 for j in loop):
+        return None
+    J = pin.computeJointJacobians(model, data, q)[:, [model.joints[j].idx_v for j in loop]]
+    hinges, slides = J[3:, np.abs(J[3:]).max(axis=0) > 0.5], J[:3, np.abs(J[3:]).max(axis=0) <= 0.5]
+    if not hinges.size:
+        return None
+    normal = (hinges * np.where(hinges[:, 0] @ hinges < 0.0, -1.0, 1.0)).sum(axis=1)
+    normal /= np.linalg.norm(normal)
+    tilts = [*np.linalg.norm(np.cross(hinges.T, normal), axis=1), *np.abs(slides.T @ normal)]
+    tilt = float(np.max(tilts))
+    size = max(float(np.linalg.norm(data.oMi[j].translation - b.translation)) for j in loop)
+    off = abs(float(normal @ (a.translation - b.translation)))
+    if tilt > _PARALLEL or off > _PARALLEL * size or (tilt <= _EXACT and off <= _EXACT * size):
+        return None
+    x, y, z = b.rotation.T @ normal
+    return Plane((float(x), float(y), float(z)), tilt)
 
 
 def prefixed(equality: Equality, prefix: str) -> Equality:

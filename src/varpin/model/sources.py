@@ -291,11 +291,17 @@ def _of_mjcf(path: Path, name: str) -> Description:
     mjcf = read_mjcf(path)
     description = _of_model(build_mjcf_model(path, mjcf.dynamics), name, None)
     equalities = at_reference(mjcf.equalities, description.model, path)
+    planar = (
+        f"{each.name} closes a planar loop, whose axes are parallel to {each.plane.tilt:.1g} rad in the file: it holds "
+        "in the plane of the loop alone"
+        for each in equalities
+        if isinstance(each, Closure) and each.plane is not None
+    )
     return replace(
         description,
         mjcf=path,
         expanded=mjcf.looks,
-        remarks=mjcf.remarks,
+        remarks=(*mjcf.remarks, *planar),
         loops=tuple((each.a.frame, each.b.frame) for each in equalities if isinstance(each, Closure)),
         equalities=equalities,
     )

@@ -125,7 +125,7 @@ class SceneFile:
             raise spec.root.error("cost", str(error)) from None
         except InputError as error:
             places = {f"constraints[{i}]": (keys.table, "") for i, keys in enumerate(spec.plan_constraints)}
-            places["controls"] = spec.root, "horizon.controls"
+            places |= {name: (spec.root, f"horizon.{name}") for name in ("controls", "sampling")}
             table, key = places.get(error.argument or "", (spec.root, "cost"))
             raise table.error(key, str(error)) from None
 
