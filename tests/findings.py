@@ -23,6 +23,7 @@ MARKS = {
     "noise left out": "least cost without noise",
     "noise within steps": "noise costs",
     "growth": "disturbances grow",
+    "adding up": "errors of steps add up",
     "steps in parts": "parts",
     "ringing": "will ring",
     "moved start": "q0 was moved",

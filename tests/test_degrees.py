@@ -11,6 +11,7 @@ from refusals import refused, unnamed
 
 import varpin as vp
 from varpin.cli import main
+from varpin.control.hints import hints
 from varpin.model import degrees_hint
 
 HOME = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0])
@@ -94,3 +95,71 @@ def test_stops_in_degrees(caplog):
     told = [record.getMessage() for record in caplog.records]
     assert [sentence.partition(" of the JointStop")[0] for sentence in told] == ["the lower end", "the upper end"]
     assert all("looks like degrees" in sentence for sentence in told)
+
+
+def springs(scene, **given):
+    force = vp.FrameSpring("tool0", given.pop("b", [0.6, 0.2, 0.4]), 10.0, **given)
+    return vp.Scene(scene.robot, forces=force)
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda scene: vp.Scene(scene.robot, gravity=(0.0, 0.0, -9810.0)), ("9810 m/s^2", "mm/s^2")),
+        (lambda scene: springs(scene, rest=300.0), ("FrameSpring: rest", "300 m", "millimetres")),
+        (lambda scene: springs(scene, rest=[0.0, 0.0, 300.0]), ("FrameSpring: rest", "300 m", "millimetres")),
+        (lambda scene: springs(scene, b=[600.0, 200.0, 400.0]), ("point b", "millimetres")),
+    ],
+)
+def test_millimetres_in_a_scene(scene, make, named):
+    """Told of with a motion, and first of a plan; the same in metres is not."""
+    q0, rest = np.deg2rad(HOME), np.zeros(6)
+    motion = vp.simulate(make(scene), q0, rest, dt=1e-4, steps=2)
+    assert not unnamed(motion.warnings[0], named)
+    cost = vp.ControlCost(1e-3)
+    problem = vp.OptimalControlProblem(make(scene), cost, q0, rest, dt=1e-4, steps=2)
+    assert not unnamed(vp.solve(problem, max_iterations=1).warnings[0], named)
+    for fine in (springs(scene, rest=0.3), vp.Scene(scene.robot, gravity=(0.0, 0.0, -1e4)), scene):
+        assert not any(
+            "mm" in told or "milli" in told for told in vp.simulate(fine, q0, rest, dt=1e-4, steps=2).warnings
+        )
+
+
+@pytest.mark.parametrize("scale", [1000.0, 1.0])
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (
+            lambda r, k: vp.KeepClear(
+                r, [vp.Obstacle.sphere(k * np.array([0.9, 0.5, 0.4]), 0.1, "ball")], links=["forearm_link"]
+            ),
+            "'ball'",
+        ),
+        (
+            lambda r, k: vp.KeepClear(
+                r,
+                [vp.Obstacle.box([0.9, 0.5, 0.4], k * np.array([0.1, 0.2, 0.2]), name="tray")],
+                links=["forearm_link"],
+            ),
+            "'tray'",
+        ),
+        (
+            lambda r, k: vp.KeepClear(r, [vp.Obstacle.sphere([2.0, 0.5, 0.4], 0.1)], k * 0.1, links=["forearm_link"]),
+            "KeepClear: distance",
+        ),
+        (
+            lambda r, k: vp.KeepOutOfSphere(r, "tool0", k * np.array([0.9, 0.3, 0.4]), 0.1),
+            "KeepOutOfSphere: the distance",
+        ),
+        (lambda r, k: vp.KeepInSphere(r, "tool0", [0.0, 0.0, 0.4], k * 1.0), "KeepInSphere: radius"),
+        (lambda r, k: vp.KeepInBox(r, "tool0", k * np.array([-1.0, -1.0, -1.0]), k * 1.0), "KeepInBox"),
+        (lambda r, k: vp.KeepInHalfSpace(r, "tool0", [0.0, 0.0, 1.0], k * -0.3), "KeepInHalfSpace: offset"),
+    ],
+)
+def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):
+    constraints = [make(scene.robot, scale)]
+    given = {"dt": 0.05, "steps": 2, "constraints": constraints}
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), np.deg2rad(HOME), np.zeros(6), **given)
+    told = [found.sentence for found in hints(problem) if "millimetres" in found.sentence]
+    assert bool(told) == (scale > 1.0)
+    assert scale == 1.0 or not unnamed(told[0], named)

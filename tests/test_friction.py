@@ -105,6 +105,26 @@ def test_friction_faster_than_the_step_is_told_of(integrator):
         assert about(own(fine), "dry friction") == [], (width, dt)
 
 
+def test_a_warning_has_the_rate_of_the_joint_that_it_names(load):
+    """Not that of a wrist whose damper is fifty times faster."""
+    robot = load("tiago_no_hand")
+    lower, upper = (np.clip(np.nan_to_num(ends), -3.0, 3.0) for ends in robot.position_limits)
+    q0, v0, level = 0.5 * (lower + upper), np.zeros(robot.dof), np.zeros(robot.dof)
+    head = robot.joint_names.index("head_1_joint")
+    v0[head], level[head] = 0.3, 1.0
+    scene = vp.Scene(robot, damping="robot", forces=vp.CoulombFriction(level, 0.02))
+    controls, inverse = scene.holding_torque(q0), np.linalg.inv(vp.lagrangian_jet(scene, q0, np.zeros(len(q0))).Lvv)
+    motion = vp.simulate(scene, q0, v0, dt=0.005, steps=20, controls=controls, integrator=vp.Midpoint())
+    (told,) = about(own(motion), "dry friction")
+    assert not unnamed(told, "'head_1_joint'")
+    rate = (1.0 / 0.02 + scene.damping[head]) * inverse[head, head]
+    assert f"(dt * {rate:.3g}/s" in told
+    assert inverse.diagonal() @ scene.damping > 50.0 * rate
+    # With the damper's share, which no width takes away.
+    wide = 1.0 / (2.0 / 0.005 / inverse[head, head] - scene.damping[head])
+    assert f"a width above {wide:.3g} " in told
+
+
 def test_friction_so_fast_that_steps_take_very_short_parts():
     """Joints of an arm ring that should rest; the method that stops them takes parts of a step of 1e-4 and less."""
     scene = vp.Scene(vp.load_robot("ur5"), forces=vp.CoulombFriction([8.0, 8.0, 5.0, 2.0, 2.0, 1.0], 1e-5))

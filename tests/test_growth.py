@@ -33,17 +33,17 @@ def test_arms_under_torques_that_jump(load, name, seed):
         motion = vp.simulate(scene, q0, np.zeros(len(q0)), dt=dt, steps=steps, controls=controls)
         told = about(motion.warnings, "growth")
         wrong = off(scene, q0, motion)
-        assert (wrong > 0.02) == bool(told) == ((name, dt) == ("panda", 0.02))
+        assert (wrong > 0.01) == bool(told) == ((name, dt) == ("panda", 0.02))
 
 
 @pytest.mark.parametrize("q0", [[2.0, -1.0, 1.5], [0.1, 0.0, -0.1]], ids=["high", "low"])
 def test_a_chain_that_falls(q0):
-    """From high up it is chaotic; near rest it swings, for as long as one likes."""
+    """From high up it is chaotic; near rest it swings, and loses phase in ten seconds."""
     scene = vp.Scene(vp.planar_chain(3))
     motion = vp.simulate(scene, q0, np.zeros(3), dt=0.01, steps=1000)
     told = about(motion.warnings, "growth")
     wrong = off(scene, q0, motion)
-    assert (wrong > 0.05) == bool(told)
+    assert (wrong > 0.01) == bool(told)
     if told:
         (percent,) = (float(part.split("%")[0]) for part in told[0].split(", ") if "% of the largest" in part)
         assert 0.3 * wrong < percent / 100.0 < 3.0 * wrong
@@ -66,3 +66,17 @@ def test_short_motions_are_told_of_too(load, name, dt, steps, seed):
     motion = vp.simulate(scene, q0, np.zeros(len(q0)), dt=dt, steps=steps, controls=controls)
     assert off(scene, q0, motion) > 0.02
     assert about(motion.warnings, "growth", "coarse steps")
+
+
+@pytest.mark.parametrize(("dt", "wrong"), [(0.02, True), (0.01, False)])
+def test_errors_that_only_add_up_are_told_of_as_such(dt, wrong):
+    """A damped chain by a method of first order: off by 1.6 % at 20 ms, by half of it at 10 ms."""
+    scene, q0 = vp.Scene(vp.planar_chain(2), gravity=False, damping=2.0), [0.0, 0.7]
+    motion = vp.simulate(scene, q0, [1e-3, 0.0], dt=dt, duration=6.0, integrator=vp.SemiImplicitEuler())
+    share = off(scene, q0, motion)
+    assert (share > 0.01) == wrong
+    told = about(motion.warnings, "adding up")
+    assert bool(told) == wrong
+    assert not about(motion.warnings, "growth")
+    if wrong:
+        assert f"{100 * share:.2g}% of the largest joint travel" in told[0]

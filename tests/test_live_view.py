@@ -245,7 +245,7 @@ def test_a_server_that_dies_costs_the_picture_alone(opened, scene, caplog, monke
 def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
     asked = []
     monkeypatch.setattr(viewer_module.webbrowser, "open", lambda url, new=0: asked.append(url) or True)
-    monkeypatch.setattr(live, "_BROWSER_LIMIT", 0.1)
+    monkeypatch.setattr(live.LiveView.wait, "__defaults__", (0.1,))
     with vp.LiveView(scene) as view:
         assert asked == [view.url]
         assert f'<iframe src="{view.url}"' in view._repr_html_()

@@ -187,27 +187,6 @@ def test_reversible():
     np.testing.assert_allclose(-back.v[-1], v0, rtol=0, atol=1e-10)
 
 
-def energy_errors(dt, steps, starts):
-    """Energy errors (len(starts), steps + 1) of three 1 m, 1 kg links from horizontal rest, in m g n^2 / 2."""
-    scene = vp.Scene(vp.planar_chain(3))
-    runs = [
-        vp.simulate(scene, np.full(3, tilt), np.zeros(3), dt=dt, steps=steps, integrator=vp.Midpoint())
-        for tilt in starts
-    ]
-    assert sum(run.statistics.split_steps for run in runs) <= 1e-2 * steps * len(runs)
-    return np.array([run.energy - run.energy[0] for run in runs]) / (GRAVITY * 9 / 2)
-
-
-def test_energy_of_a_long_run_has_no_trend():
-    """1000 s at 1e-2: chaotic, so eight starts within 1e-6 rad are eight independent runs."""
-    errors = energy_errors(1e-2, 100_000, np.arange(8) * 1e-7)
-    blocks = errors[:, 1:].reshape(8, 20, -1).mean(axis=2)
-    slopes_ = np.polyfit(np.arange(20.0), blocks.T, 1)[0]
-    assert abs(slopes_.mean()) < 3.5 * slopes_.std(ddof=1) / np.sqrt(8)
-    assert np.abs(errors.mean(axis=1)).max() < 5e-3
-    assert np.abs(errors).max() < 5e-2
-
-
 def test_energy_round_off_walks_at_random():
     """A mass on a spring: the midpoint rule conserves its energy exactly, so what is left is rounding."""
     model = pin.Model()
@@ -222,7 +201,10 @@ def test_energy_round_off_walks_at_random():
 @pytest.mark.slow
 def test_energy_of_a_million_small_steps_does_not_drift():
     """The three links at 1e-4 for 100 s: once the method's own oscillation is quiet, only rounding is left."""
-    errors = np.abs(energy_errors(1e-4, 1_000_000, [0.0])[0])
+    scene = vp.Scene(vp.planar_chain(3))
+    run = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-4, steps=1_000_000, integrator=vp.Midpoint())
+    assert run.statistics.split_steps <= 10_000
+    errors = np.abs(run.energy - run.energy[0]) / (GRAVITY * 9 / 2)
     quiet = errors[1:].reshape(100, -1).min(axis=1)
     assert quiet.max() < 1e-9
     # Seconds in which nothing fast happens return to the same energy at the end as at the start.

@@ -47,10 +47,11 @@ class Linearization:
         K: Derivative of x1 in a kick (N, 2n, n): a jump of the momentum at the start of the step, with the drift
             unchanged. It is dx1/dp0 if no diffusion field depends on the velocity. Otherwise the drift from
             Stratonovich to Ito, (1/2) sum_i (dF_i/dv) M^-1 F_i, is that of the state before the kick; dx1/dp0 includes
-            the derivative of the drift, and is A[:, :, n:], or A[:, :, n:] M^-1 for integrators on (q, v).
+            the derivative of the drift, and is A[:, :, n:], or A[:, :, n:] M^-1 for integrators on (q, v). With
+            ``kick="held"`` it is the derivative in the impulse of a force that is constant over the step.
         J: The same for a jump of x's second half (N, 2n, n): of p, which is K, or of v.
         F: Diffusion fields (N, n, k).
-        G: dx1/dw (N, 2n, k); K F if the whole kick precedes the step.
+        G: dx1/dw (N, 2n, k); K F if the whole kick precedes the step or is held over it.
         Gx: Derivative of G in x0 through the fields (N, 2n, k, 2n).
         Gu: Derivative of G in u (N, 2n, k, m).
         dt: Time step [s].

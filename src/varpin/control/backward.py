@@ -44,6 +44,7 @@ from varpin.linearization import (
     velocity_at_nodes,
     velocity_curvature,
 )
+from varpin.mechanics.forces import limited_servos
 from varpin.trajectory import Trajectory
 
 Mask = NDArray[np.bool_]
@@ -175,23 +176,27 @@ def backward(
     second_order: bool = False,
     *,
     along: Along | None = None,
+    demands: bool = False,
 ) -> Plan | None:
     """One backward pass along a motion; None where the model has no minimum in a control.
 
-    ``along`` has the expansions of other passes along the motion.
+    ``along`` has the expansions of other passes along the motion. With ``demands``, ``regularization`` also applies to
+    what servos demand of their drives, relative to the cost at stake.
 
     Raises:
         CostError: An expansion of the cost is not finite.
         LinearizationError: A step has no derivative.
     """
     along = Along(problem, trajectory) if along is None else along
+    damping = regularization * along.stake.moved * along.demands if demands and regularization > 0.0 else None
     if not second_order:
-        return _foreseeing(along, regularization, None)
+        return _foreseeing(along, regularization, damping)
     # First derivatives of the cost to go, then with them second derivatives of the dynamics (stagewise Newton).
     plan, costate = _pass(along, max(regularization, 1e-3), costates=True)
     if plan is None:
         return None
-    return _foreseeing(along, regularization, _curvature(along, plan, costate))
+    curvature = _curvature(along, plan, costate)
+    return _foreseeing(along, regularization, curvature if damping is None else curvature + damping)
 
 
 def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
@@ -459,7 +464,7 @@ class Along:
             self.blocks, self.states = [(0, problem.decisions)], size(problem)
         self.kept: tuple[Linearization, Floats] | None = None
         # Gradient of the noise cost, added to the cost's gradient at its samples (N s, 2n + m) once it is known.
-        self.added: Floats | float = 0.0
+        self.added: Floats | None = None
         # With linear controls in (x, w, u) of each step (N, 2n + 2m).
         self.pulled: Floats | None = None
         self.noise_differentiated = False
@@ -495,7 +500,7 @@ class Along:
     @property
     def slopes(self) -> Floats:
         """The gradient of the running cost at its samples, with that of the noise cost if it was added."""
-        return self.running.gradient + self.added
+        return self.running.gradient if self.added is None else self.running.gradient + self.added
 
     @cached_property
     def stake(self) -> Stake:
@@ -537,6 +542,27 @@ class Along:
     def of_lines(self) -> Derivatives:
         """Derivatives of the steps whose controls are linear between nodes."""
         return derivatives(*self.linearized(0, self.problem.steps))
+
+    @cached_property
+    def demands(self) -> Floats:
+        """Hessians (N, 2n + m, 2n + m) in (x, u) of the squared changes of what servos demand of their drives.
+
+        The demand is that at the begin of a step, in units of the effort limit.
+        """
+        problem, motion, scene = self.problem, self.trajectory, self.problem.scene
+        n, N = scene.robot.dof, problem.steps
+        speed = np.tile(np.eye(n, 2 * n, n), (N, 1, 1))
+        if problem.integrator.variational:
+            speed = velocity_at_nodes(scene, motion.q[:-1], motion.v[:-1])
+        found = np.zeros((N, 2 * n + scene.controls, 2 * n + scene.controls))
+        for servo in limited_servos(scene.elements):
+            c, (stiffness, damping, effort) = servo.coordinate, servo.values
+            row = np.zeros((N, 2 * n + scene.controls))
+            row[:, : 2 * n] = -damping * speed[:, c]
+            row[:, c] -= stiffness
+            row[:, 2 * n :] = scene.actuation[c]
+            found += np.einsum("Na,Nb->Nab", row, row) / effort**2
+        return found
 
     @property
     def maps(self) -> tuple[Floats, Floats]:

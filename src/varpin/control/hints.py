@@ -8,20 +8,36 @@ from itertools import combinations
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.constraints import BoundConstraint, KeepClear, ReachFrame, WithinJointLimits
+from varpin.control.constraints import (
+    BoundConstraint,
+    KeepClear,
+    KeepInBox,
+    KeepInHalfSpace,
+    KeepInSphere,
+    KeepOutOfSphere,
+    PlanConstraint,
+    ReachFrame,
+    WithinJointLimits,
+)
 from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
 from varpin.control.costs.base import Scaled
 from varpin.control.problem import OptimalControlProblem
-from varpin.model import ADVICE, Robot, degrees_hint, looks_like_degrees
+from varpin.model import ADVICE, AFAR, IN_MILLIMETRES, Robot, degrees_hint, looks_like_degrees, millimetres_hint
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.simulation.soundness import Finding
-from varpin.simulation.start import in_degrees
+from varpin.simulation.start import in_other_units
 
-# Largest plausible distance of a goal, in units of the reach: a larger one looks like millimetres.
-_AFAR = 50.0
 # Kinds of findings about values in wrong units.
-UNITS = ("start in degrees", "goal in degrees", "goal in millimetres", "limits in degrees")
-_MILLIMETRES = ": it may be in millimetres, and positions are in metres"
+UNITS = (
+    "start in degrees",
+    "goal in degrees",
+    "goal in millimetres",
+    "limits in degrees",
+    "gravity in millimetres",
+    "springs in millimetres",
+    "places in millimetres",
+)
+_MILLIMETRES = f": {IN_MILLIMETRES}"
 # Random postures in which the distance of a pair of bodies is tested.
 _POSTURES = 64
 # A joint limit of at least _ENDLESS [rad or m] is none: postures are then within a turn, or _RAIL [m], to either side.
@@ -32,8 +48,8 @@ _SAME = 1e-6
 
 def hints(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about constraints that no motion satisfies, and about values that look like degrees or millimetres."""
-    found = [*in_degrees(problem.scene, problem.q0)]
-    found += [*_goals(problem), *_targets(problem), *_limits(problem), *_ends(problem)]
+    found = [*in_other_units(problem.scene, problem.q0)]
+    found += [*_goals(problem), *_targets(problem), *_limits(problem), *_ends(problem), *_places(problem)]
     for bound in problem.bound_constraints:
         found += _overlaps(problem, bound)
     return found
@@ -61,7 +77,7 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
         most = reach(goal.robot, goal.kinematics)
         away = float(np.linalg.norm(goal.position - goal.kinematics.links.translation[0]))
         if away > most:
-            far = away > _AFAR * most
+            far = away > AFAR * most
             yield Finding(
                 "goal in millimetres" if far else "goal out of reach",
                 f"{goal.label} has its goal {away:.4g} m from the first joint, and the frame gets {most:.4g} m from "
@@ -109,7 +125,7 @@ def _targets(problem: OptimalControlProblem) -> Iterator[Finding]:
         frame = frame_kinematics(robot, term.frame)
         most = reach(robot, frame)
         away = float(np.linalg.norm(np.asarray(term.target) - frame.links.translation[0]))
-        if away > _AFAR * most and term.frame not in named:
+        if away > AFAR * most and term.frame not in named:
             named.add(term.frame)
             yield Finding(
                 "goal in millimetres",
@@ -134,6 +150,42 @@ def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
                 f"{limits.label} lets {limits.robot.joint_names[joint]} turn to {wide[joint]:.4g} rad, "
                 f"{wide[joint] / (2.0 * np.pi):.0f} turns, and looks like degrees: {ADVICE}",
             )
+
+
+def _places(problem: OptimalControlProblem) -> Iterator[Finding]:
+    """Obstacles and regions whose places or sizes look like millimetres."""
+    for constraint in problem.constraints:
+        lengths = _lengths(constraint)
+        if lengths and (sentence := millimetres_hint(problem.scene.robot, lengths)):
+            yield Finding("places in millimetres", sentence)
+
+
+def _lengths(constraint: PlanConstraint) -> dict[str, float]:
+    """Names of a constraint's lengths, and their sizes [m]; places count by their distance from the robot's root."""
+    name = type(constraint).__name__
+    if isinstance(constraint, KeepClear):
+        found = {f"{name}: distance": abs(constraint.distance)}
+        root = constraint.robot.tree.translation[0]
+        for body in constraint.obstacles:
+            label = f"{name}: the obstacle {body.name!r}"
+            found[f"{label}: its distance"] = float(min(np.linalg.norm(x - root) for x in (body.begin, body.end)))
+            found[f"{label}: its radius or side"] = max(
+                body.radius, 0.0 if body.sides is None else float(body.sides.max())
+            )
+        return found
+    if isinstance(constraint, KeepInSphere | KeepOutOfSphere):
+        found = {f"{name}: radius": constraint.radius}
+        if not callable(constraint.center):
+            root = constraint.robot.tree.translation[0]
+            found[f"{name}: the distance of its centre"] = float(np.linalg.norm(constraint.center - root))
+        return found
+    if isinstance(constraint, KeepInHalfSpace):
+        return {f"{name}: offset": abs(constraint.offset)}
+    if isinstance(constraint, KeepInBox):
+        # One far side may stand for none.
+        sides = np.abs(constraint.limits[np.isfinite(constraint.limits)])
+        return {f"{name}: its nearest side": float(sides[sides > 0.0].min(initial=np.inf)) if sides.any() else 0.0}
+    return {}
 
 
 def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:

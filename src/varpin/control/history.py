@@ -61,6 +61,7 @@ class Iteration:
             their limits, on the same derivatives, do not count.
         rollouts: Number of trials of the line search.
         seconds: Time of the iteration [s].
+        second_order: Whether second derivatives of the dynamics were used.
     """
 
     index: int
@@ -74,6 +75,7 @@ class Iteration:
     backward_passes: int
     rollouts: int
     seconds: float
+    second_order: bool = False
 
     HEADER = "iter         cost   noise cost  expected  decrease      grad      reg      step  rollouts"
 
@@ -81,6 +83,7 @@ class Iteration:
         return (
             f"{self.index:4d} {self.cost:12.6e} {self.noise_cost:12.4e} {self.expected_decrease:9.2e} "
             f"{self.decrease:9.2e} {self.gradient:9.2e} {self.regularization:8.1e} {self.step:9.2e} {self.rollouts:9d}"
+            f"{'  second derivatives' if self.second_order else ''}"
         )
 
 
@@ -102,6 +105,7 @@ class SearchState:
         bounded: Whether the line search stops trials with many substeps.
         cut: Whether it has stopped one.
         whole: Whether the search uses the whole gradient of the noise cost.
+        saturated: Whether it takes into account that drives of servos are at their limits.
         history: The iterations before.
     """
 
@@ -119,6 +123,7 @@ class SearchState:
     cut: bool
     history: tuple[Iteration, ...]
     whole: bool = False
+    saturated: bool = False
 
     def __repr__(self) -> str:
         return f"SearchState(cost {self.cost:.6g}, after {len(self.history)} iterations)"

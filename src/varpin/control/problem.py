@@ -104,7 +104,8 @@ class OptimalControlProblem(Frozen):
         dt: Time step [s].
         steps: N.
         integrator: Any of varpin's. If left out, ``Gauss(stages=4)``; ``Radau(stages=4)`` where dry friction or dampers
-            are more than 10 times as fast as the step at ``q0`` and rest, and the scene has no constraints.
+            are more than 10 times as fast as the step at ``q0`` and rest, and the scene has no constraints. Both with
+            ``kick="held"`` where the scene has noise.
         sampling: Where in each step running costs are sampled. ``"gauss"``, the default: at its two Gauss points, with
             a cubic motion between the nodes, of fourth order; at four points where a :class:`varpin.KinematicInput` is
             cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of
@@ -316,7 +317,7 @@ class OptimalControlProblem(Frozen):
         """R, the number of decisions: steps / hold, or steps + 1 where controls are linear between nodes."""
         return self.steps + 1 if self.linear else self.steps // self.hold
 
-    @property
+    @cached_property
     def linear(self) -> bool:
         """Whether controls are linear in time between nodes."""
         return self.controls == "linear"
@@ -688,12 +689,13 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4), and rings after each jump
     of a held control. In reaches of damped arms, plans of the L-stable method lose less from z = 10 on, and those of
     the default up to 5. With constraints of the scene it is always the default, since Radau's methods do not support
-    them.
+    them. Noise is held over the step: in the long steps of plans an impulse costs two to five times as much.
     """
-    stages = default_integrator().stages
+    stages: int = default_integrator().stages
+    kick: Literal["held", "left"] = "held" if scene.processes else "left"
     if scene.constraints or not dt * rate_at_rest(scene, q0) > _STIFF:
-        return default_integrator()
-    return Radau(stages=stages)
+        return Gauss(stages=stages, kick=kick)
+    return Radau(stages=stages, kick=kick)
 
 
 def _control_limits(given: tuple[JointValues, JointValues] | None, scene: Scene) -> Floats:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass, replace
@@ -38,6 +39,7 @@ from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.failures import StepFailure, named
+from varpin.simulation.kinks import saturates
 from varpin.simulation.record import located
 from varpin.support.checks import (
     JointValues,
@@ -143,7 +145,8 @@ def solve(
 
     Other Args:
         second_order: Full differential dynamic programming: second derivatives of the dynamics too, wherever the
-            model stays convex. Converges quadratically; needs an integrator that has them (:class:`Midpoint`).
+            model stays convex. Converges quadratically; needs an integrator that has them (:class:`Midpoint`). The
+            search switches to them by itself where steps get short while drives of servos are at their limits.
         forward: ``"closed"``: the feedback gains act in the line search. ``"open"``: only the feed-forward part, as in
             the paper; it diverges where the open loop is unstable over the horizon.
         armijo: Least share of the expected decrease that a step must reach (the paper's alpha).
@@ -439,10 +442,17 @@ class _Search:
         self.armijo, self.backtracking, self.regularization = armijo, backtracking, regularization
         self.growth = 1.0
         self.exact = second_order
+        # Whether drives of servos have come to their limits while steps were short: from then on changes of their
+        # demands are regularized, and second derivatives are used.
+        self.saturated = False
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
         self.trials = Trials(problem)
+        integrator = problem.integrator
+        # Whether steps may be divided, and the integrator with fewer halvings, by their greatest number.
+        self.divides = isinstance(integrator, Variational) and integrator.guard is not None and is_dataclass(integrator)
+        self.less: dict[int, Integrator] = {}
         self._around: Along | None = None
         self.trajectory: Trajectory
         self.shares: Floats  # the terms of the trajectory's cost
@@ -454,6 +464,8 @@ class _Search:
         self.above = 0.0  # cost of the trajectory minus that of the best one, without noise
         self.bounded = True  # whether trials stop at a number of substeps
         self.cut = False  # whether one did
+        # The motion before the last step, its shares, cost, and cost above the best one.
+        self.before: tuple[Trajectory, Floats, float, float] | None = None
         self.gains: list[float] = []  # decrease of the least expected cost in each iteration
         self.reason = ""
         self.anew = anew  # whether the final motion gets a backward pass of its own
@@ -506,6 +518,8 @@ class _Search:
         self.regularization, self.growth = state.regularization, state.growth
         self.bounded, self.cut = state.bounded, state.cut
         self.whole = state.whole and self.wants_whole
+        if state.saturated:
+            self._take_saturation()
 
     def _state(self) -> SearchState:
         return SearchState(
@@ -523,6 +537,7 @@ class _Search:
             cut=self.cut,
             history=tuple(self.history),
             whole=self.whole,
+            saturated=self.saturated,
         )
 
     def run(self, tolerance: float, max_iterations: int, deadline: float, report: Report) -> Status:
@@ -535,6 +550,8 @@ class _Search:
             except _TRIAL_ERRORS as error:
                 if not self.history:
                     raise
+                if isinstance(error, LinearizationError) and self._go_back():
+                    continue
                 logger.warning("%s: %s", self.label, error)
                 self.reason = str(error)
                 return Status.NOT_DIFFERENTIABLE
@@ -714,10 +731,19 @@ class _Search:
             backward_passes=passes,
             rollouts=0 if step is None else step.trials,
             seconds=time.perf_counter() - started,
+            second_order=self.exact,
         )
         self.history.append(item)
         logger.info("%s: %s", self.label, item)
         report(item, self.trajectory)
+
+    def _go_back(self) -> bool:
+        """Return to the motion before the last step, with more regularization; whether there is one."""
+        if self.before is None or not self._stiffen():
+            return False
+        logger.info("%s: back to the motion before, as the last one cannot be linearized", self.label)
+        (self.trajectory, self.shares, self.cost, self.above), self.before = self.before, None
+        return True
 
     def _steps_short(self) -> bool:
         """Whether the last step is very short, or short like the one before it."""
@@ -751,10 +777,19 @@ class _Search:
         Where second derivatives of the dynamics make the model indefinite, they are left out.
         """
         passes = 0
+        if self.regularization > 0.0 and self._saturates():
+            self._take_saturation()
         self.exact = self.second_order if exact is None else exact
         while True:
             passes += 1 + self._differentiate_noise(self.regularization)
-            self.plan = backward(self.problem, self.trajectory, self.regularization, self.exact, along=self.along)
+            self.plan = backward(
+                self.problem,
+                self.trajectory,
+                self.regularization,
+                self.exact,
+                along=self.along,
+                demands=self.saturated,
+            )
             if self.plan is not None:
                 self.planned = self.trajectory, self.regularization, self.exact
                 return passes
@@ -762,6 +797,22 @@ class _Search:
                 self.exact = False
             elif not self._stiffen():
                 return passes
+
+    def _saturates(self) -> bool:
+        """Whether drives of servos are at their limits for the first time."""
+        # A controller's ticks keep to first derivatives, and so do controls that are linear between nodes.
+        watched = self.anew and not (self.saturated or self.problem.linear or self.wants_whole)
+        return watched and saturates(self.problem.scene, self.trajectory)
+
+    def _take_saturation(self) -> None:
+        """From now on regularize changes of what servos demand, and use second derivatives where there are any."""
+        problem = self.problem
+        scene = problem.scene
+        self.saturated = True
+        exists = scene.custom is None and not scene.constraints and not scene.noise.velocity_dependent
+        if problem.integrator.variational and exists and not self.second_order:
+            self.second_order = True
+            logger.info("%s: servos are at the limits of their drives: second derivatives from now on", self.label)
 
     def _least_regularized(self) -> tuple[Plan | None, float]:
         """The plan with the least regularization that gives the model a minimum, and that regularization."""
@@ -808,6 +859,7 @@ class _Search:
                 break
         hidden = 0.0
         if taken.motion is not None and taken.shares is not None:
+            self.before = self.trajectory, self.shares, self.cost, self.above
             self.trajectory, self.shares = taken.motion.trajectory(), taken.shares
             self.cost = float(taken.shares.sum())
             self.above += taken.cost
@@ -818,14 +870,16 @@ class _Search:
     def _bounds(self) -> Iterator[_Bounds]:
         """Bounds on trials, from tight to none."""
         integrator = self.problem.integrator
-        guard = integrator.guard if isinstance(integrator, Variational) else None
-        if not (self.bounded and guard is not None and is_dataclass(integrator)):
+        if not (self.bounded and self.divides and isinstance(integrator, Variational)):
             yield _Bounds(integrator, np.inf, watched=False)
             return
         # A step cut into s substeps has taken at most s - 1 halvings.
         few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
         for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
-            yield _Bounds(_cut_less(integrator, halvings), parts, watched=halvings > _HALVINGS)
+            less = self.less.get(halvings)
+            if less is None:
+                less = self.less[halvings] = _cut_less(integrator, halvings)
+            yield _Bounds(less, parts, watched=halvings > _HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
     def _try(self, step: float, plan: Plan, here: _Here, bounds: _Bounds) -> _Trial:
@@ -841,10 +895,10 @@ class _Search:
         u = here.controls + step * plan.feedforward
         if problem.limited:
             u = _onto_limits(u, problem.control_limits)
-        commands = here.feedback._replace(u=u)
+        commands = Commands(u, *here.feedback[1:])
         if problem.linear:
             # The first control has no feedback: its state is given.
-            commands = here.feedback._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
+            commands = commands._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
         try:
             attempt = self.trials.attempt(
                 commands, integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
@@ -862,9 +916,9 @@ class _Search:
         except _TRIAL_ERRORS as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
-        if not np.isfinite(there).all():
-            return _Trial()
         cost = float((there - self.shares).sum())
+        if not math.isfinite(cost):
+            return _Trial()
         return _Trial(attempt, there, cost, cost + noise + more)
 
     def _noise_beyond(self, trial: Trajectory, plan: Plan) -> float:

@@ -30,7 +30,8 @@ _PROBLEM = ("q0", "v0", "t0", "steps", "hold", "controls", "sampling", "control_
 _STATUSES = tuple(Status)
 _NUMBERS = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
 _REFINED = tuple(item.name for item in fields(Refined) if item.name != "status")
-_COLUMNS = tuple(item.name for item in fields(Iteration))
+# The columns of a history; the truth values of `second_order` are an entry of their own, which older files do not have.
+_COLUMNS = tuple(item.name for item in fields(Iteration) if item.type != "bool")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,7 @@ class _Search:
     cut: int
     history: int
     whole: int = 0
+    saturated: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +85,7 @@ class _Plan:
     warnings: tuple[str, ...] = field(metadata={"entry": "plan.warnings"})
     history: Annotated[Floats, Axes("iterations", len(_COLUMNS))]
     previous_gains: Annotated[Floats, Axes("decisions", "controls", "controls", finite=True)] | None = None
+    second_order: Annotated[Floats, Axes("iterations")] | None = None
     refined: Annotated[Floats, Axes("refined", len(_REFINED) + 1)] | None = None
     refinement: _Refinement | None = None
     search: _Search | None = None
@@ -107,10 +110,10 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     if state is not None:
         numbers: dict[str, Any] = {name: getattr(state, name) for name in _NUMBERS}
         numbers |= {"bounded": int(state.bounded), "cut": int(state.cut), "history": len(state.history)}
-        numbers["whole"] = int(state.whole)
+        numbers |= {"whole": int(state.whole), "saturated": int(state.saturated)}
         search = _Search(prefixes[id(state.trajectory)], gains=np.array(state.gains), **numbers)
         best = None if state.best is None else _Best(prefixes[id(state.best)])
-    apart = ("search", "best", "refined", "refinement")
+    apart = ("search", "best", "refined", "refinement", "second_order")
     given = {item.name: solution[item.name] for item in fields(_Plan) if item.name not in apart}
     refinement: Refinement | None = solution["refinement"]
     if refinement is not None:
@@ -122,7 +125,8 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
         ).reshape(-1, len(_REFINED) + 1)
         given["refinement"] = _Refinement(refinement.wish, int(refinement.met), refinement.chosen, refinement.reason)
     given |= {"status": solution["status"].name, "history": _rows(solution["history"])}
-    members |= members_of(_Plan(**given, search=search, best=best))
+    exact = np.array([float(item.second_order) for item in solution["history"]])
+    members |= members_of(_Plan(**given, search=search, best=best, second_order=exact if exact.any() else None))
     members |= {name: getattr(problem, name) for name in _PROBLEM}
     members |= {"problem.integrator": repr(problem.integrator)} | _surroundings(problem)
     if problem.constraints:
@@ -148,12 +152,13 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     found = problem.cost_of(motions[""])
     if not abs(found - plan.cost) <= 1e-9 * max(abs(found), abs(plan.cost)):
         raise FileError(f"{source} is of a problem with another cost: {plan.cost:.9g}, and here {found:.9g}")
-    history = _iterations(source, plan.history)
+    history = _iterations(source, plan.history, plan.second_order)
     if bool(problem.constraints) != (plan.multipliers is not None):
         raise FileError(f"{source}: multipliers of the problem's constraints do not belong to it, or are missing")
     if (problem.rate is not None or problem.linear) and plan.previous_gains is None:
         raise FileError(f"{source}: previous_gains is missing")
-    given = {item.name: getattr(plan, item.name) for item in fields(_Plan) if item.name not in ("best", "refined")}
+    apart = ("best", "refined", "second_order")
+    given = {item.name: getattr(plan, item.name) for item in fields(_Plan) if item.name not in apart}
     given["refinement"] = _refinement(source, plan)
     given |= {"status": Status[plan.status], "history": history}
     given |= {"search": _search(source, members, plan, motions, history, problem)}
@@ -203,6 +208,7 @@ def _search(
         bounded=bool(state.bounded),
         cut=bool(state.cut),
         whole=bool(state.whole),
+        saturated=bool(state.saturated),
         **{name: getattr(state, name) for name in _NUMBERS},
     )
 
@@ -242,18 +248,29 @@ def _require_problem(source: Path, members: Members, problem: OptimalControlProb
     given = {name: getattr(problem, name) for name in (*_PROBLEM, "dt")}
     # Files without this entry are older than linear controls.
     members = {"controls": np.array("held"), **members}
-    for name, value in (given | {"problem.integrator": repr(problem.integrator)}).items():
+    for name, value in given.items():
         if name not in members or not np.array_equal(members[name], value):
-            what = name.removeprefix("problem.")
-            raise FileError(f"{source} is of a problem with {what} = {members.get(name, 'unknown')}, not {value}")
+            raise FileError(f"{source} is of a problem with {name} = {members.get(name, 'unknown')}, not {value}")
     described, found = problem.described_constraints, str(members.get("problem.constraints", ""))
     if described != found:
         raise FileError(f"{source} is of a problem with constraints = {found or 'none'}, not {described or 'none'}")
     _require_surroundings(source, members, problem, "noise.")
+    # After the noise, which decides about the default integrator.
+    stored, here = str(members.get("problem.integrator", "unknown")), repr(problem.integrator)
+    if stored != here:
+        raise FileError(f"{source} is of a problem with integrator = {stored}, not {here}: give it as integrator=")
 
 
 def _require_surroundings(source: Path, members: Members, problem: OptimalControlProblem, kind: str) -> None:
-    for name, array in _surroundings(problem).items():
+    """Refuse numbers, of those whose names begin with ``kind``, that differ or are on one side alone."""
+    known = _surroundings(problem)
+    for name, array in members.items():
+        if name.startswith(kind) and name not in known and array.size:
+            raise FileError(
+                f"{source} is of a problem with {name.replace('.', ' ')}, which the given one, or this installation "
+                "of varpin, does not have"
+            )
+    for name, array in known.items():
         found = members.get(name)
         if name.startswith(kind) and (found is None or found.dtype != array.dtype or not same(found, array)):
             raise FileError(f"{source} is of a problem with another {name.replace('.', ' ')}")
@@ -264,11 +281,14 @@ def _rows(history: tuple[Iteration, ...]) -> Floats:
     return np.array([[float(getattr(item, name)) for name in _COLUMNS] for item in history]).reshape(-1, len(_COLUMNS))
 
 
-def _iterations(source: Path, rows: Floats) -> tuple[Iteration, ...]:
-    """The iterations in the rows of a history."""
+def _iterations(source: Path, rows: Floats, exact: Floats | None) -> tuple[Iteration, ...]:
+    """The iterations in the rows of a history, and whether each was of second order."""
     whole = [index for index, item in enumerate(fields(Iteration)) if item.type == "int"]
     counts = rows[:, whole]
     if not ((counts >= 0.0) & (counts < 2.0**53) & (counts == np.floor(counts))).all():
         raise FileError(f"{source}: history holds counts that are no whole numbers")
-    typed = [[int(value) if index in whole else value for index, value in enumerate(row)] for row in rows.tolist()]
-    return tuple(Iteration(*row) for row in typed)
+    typed: list[list[Any]] = [
+        [int(value) if index in whole else value for index, value in enumerate(row)] for row in rows.tolist()
+    ]
+    orders = [[]] * len(rows) if exact is None else exact[:, None].astype(bool).tolist()
+    return tuple(Iteration(*row, *order) for row, order in zip(typed, orders, strict=True))

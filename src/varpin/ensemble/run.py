@@ -24,8 +24,9 @@ from varpin.simulation.choice import changes_along, integrator_along, stronger, 
 from varpin.simulation.commands import commands_of
 from varpin.simulation.record import rollout
 from varpin.simulation.soundness import Finding, announce
-from varpin.simulation.start import in_degrees, on_constraints
-from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
+from varpin.simulation.start import in_other_units, on_constraints
+from varpin.simulation.time_steps import time_steps
+from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, require_finite
 from varpin.support.executors import executing, in_order
 
 logger = logging.getLogger(__name__)
@@ -39,8 +40,9 @@ def simulate_ensemble(
     q0: JointValues,
     v0: JointValues,
     *,
-    dt: float,
-    steps: int,
+    dt: float | None = None,
+    steps: int | None = None,
+    duration: float | None = None,
     paths: int,
     rng: np.random.Generator | int,
     controls: JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None = None,
@@ -61,7 +63,8 @@ def simulate_ensemble(
         q0: Initial configuration, (n,) or by joint name for all paths, or (P, n) [rad or m].
         v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
-        steps: N.
+        steps: N, their number.
+        duration: steps * dt [s]. Two of the three are given.
         paths: P.
         rng: Seed or generator.
         controls: None, (N, m), (m,), by joint name, :class:`OpenLoop`, :class:`FirstOrderHold`, or a
@@ -91,7 +94,8 @@ def simulate_ensemble(
         EnsembleInterrupted: Ctrl-C; holds the finished paths. It is a KeyboardInterrupt.
     """
     require_scene(scene)
-    dt, steps, paths = positive("dt", dt, "s"), count("steps", steps), count("paths", paths, least=1)
+    dt, steps = time_steps(dt, steps, duration)
+    paths = count("paths", paths, least=1)
     _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
     if scene.noise.diffusion is None:
@@ -127,7 +131,7 @@ def simulate_ensemble(
             raise EnsembleInterrupted(sums.ensemble((*sums.lost(), *seen))) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*in_degrees(scene, start[0][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
+    found = (*in_other_units(scene, start[0][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene, dt, found)
     return sums.ensemble(found)
 

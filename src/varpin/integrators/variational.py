@@ -39,6 +39,7 @@ from varpin.integrators.base import (
     parts_of,
     segments_of,
     steps_of,
+    without_inputs,
     written,
 )
 from varpin.mechanics.scene import Scene, refuse_constraints
@@ -122,7 +123,7 @@ class Variational(Integrator):
 
     guard: Guard | None
     tolerance: float
-    kick: Literal["left", "split"]
+    kick: Literal["left", "split", "held"]
 
     variational = True
 
@@ -135,13 +136,18 @@ class Variational(Integrator):
         if not (self.guard is None or isinstance(self.guard, Guard)):
             raise InputError(f"guard must be a varpin.Guard, or None for no guards, got {self.guard!r}")
         positive("tolerance", self.tolerance, "rounding units")
-        if not is_one_of(self.kick, ("left", "split")):
-            raise InputError(f"kick must be 'left' or 'split', got {self.kick!r}")
+        if not is_one_of(self.kick, ("left", "split", "held")):
+            raise InputError(f"kick must be 'left', 'split' or 'held', got {self.kick!r}")
 
     @property
     def left(self) -> float:
         """See :attr:`Integrator.left`."""
-        return 1.0 if self.kick == "left" else 0.5
+        return 0.5 if self.kick == "split" else 1.0
+
+    @property
+    def holds_noise(self) -> bool:
+        """See :attr:`Integrator.holds_noise`."""
+        return self.kick == "held"
 
     @property
     def keeps_constraints(self) -> bool:
@@ -167,7 +173,7 @@ class Variational(Integrator):
             refuse_constraints(scene, str(self))
             raise InputError(f"{self} keeps no constraints")
         if scene.processes and self.left < 1.0:
-            raise InputError("kick='split' does not go with constraints: take kick='left'")
+            raise InputError("kick='split' does not go with constraints: take kick='left' or kick='held'")
         noise = scene.noise.diffusion
         if scene.inputs and noise is None:
             raise InputError("a CustomNoise does not go with a KinematicInput: take ControlNoise or StateNoise")
@@ -215,10 +221,24 @@ class Variational(Integrator):
         guards = self._guards_of(driven=bool(scene.inputs))
         if scene.constraints:
             rollout = ConstrainedRollout(
-                scene.core, self._tableau(), self._places(scene), float(self.tolerance), guards, len(q0)
+                scene.core,
+                self._tableau(),
+                self._places(scene),
+                float(self.tolerance),
+                guards,
+                len(q0),
+                self.holds_noise,
             )
         else:
-            rollout = VariationalRollout(scene.core, self._tableau(), float(self.tolerance), guards, self.left, len(q0))
+            rollout = VariationalRollout(
+                scene.core,
+                self._tableau(),
+                float(self.tolerance),
+                guards,
+                self.left,
+                len(q0),
+                held=self.holds_noise,
+            )
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return VariationalRun(rollout, q0.copy(), bool(scene.inputs))
@@ -291,14 +311,17 @@ class Variational(Integrator):
         decided = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
         now = first_of(command, decided, self.stage_times)
         F, drift = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
-        if len(increment):
+        drift = self.drift_share * drift
+        if len(increment) and self.holds_noise:
+            drift = drift + without_inputs(scene, F @ increment[0, 0]) / dt
+        elif len(increment):
             state.paths.kick(self.left * (F @ increment[0, 0])[None])
         (segment,) = self.rollout_compiled(
             scene,
             state,
             now,
             scene.silence,
-            self.drift_share * drift[None, None],
+            drift[None, None],
             dt,
         )
         if len(increment) and self.left < 1.0 and segment.failure is None:
@@ -315,7 +338,10 @@ class Variational(Integrator):
         Divided steps are repeated in the same parts, and the derivatives of the parts are multiplied.
         """
         Jx, Jf = self._derivatives(scene, trajectory)
-        kicks = Jx[:, :, scene.robot.dof :]
+        n = scene.robot.dof
+        if self.holds_noise:
+            return Jx, Jf, without_inputs(scene, Jf[:, :, :n] / trajectory.dt)
+        kicks = Jx[:, :, n:]
         if max(scene.rates, default=-1) >= 0:
             # A noise impulse does not change the velocity of a joint with a cubic input.
             kicks = kicks @ _along(scene, trajectory.q[:-1])
@@ -411,11 +437,12 @@ class Variational(Integrator):
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         """Arguments of the core, by name, to repeat every step at dw = 0."""
         statistics = trajectory.statistics
-        damage = statistics.damage()
-        if damage is None and (statistics.substeps < 1).any():
-            damage = "statistics.substeps holds numbers of parts that no step has"
-        if damage is not None:
-            raise InputError(f"the trajectory is damaged: {damage}")
+        if statistics.halvings.size or not (statistics.substeps == 1).all():
+            damage = statistics.damage()
+            if damage is None and (statistics.substeps < 1).any():
+                damage = "statistics.substeps holds numbers of parts that no step has"
+            if damage is not None:
+                raise InputError(f"the trajectory is damaged: {damage}")
         drift = self.drift_share * drifts(scene, trajectory) if scene.noise.velocity_dependent else 0.0
         force = forces(scene, trajectory, drift)
         arrays = {
@@ -484,6 +511,7 @@ def _along(scene: Scene, q: Floats) -> Floats:
 
 
 @functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=64)
 def _core_guards(given: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
     guard = given or Guard(max_halvings=0)
     return Guards.make(

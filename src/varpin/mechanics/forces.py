@@ -479,6 +479,11 @@ def of_kind(elements: Iterable[Element], kind: str) -> tuple[Element, ...]:
     return tuple(element for element in elements if element.kind == kind)
 
 
+def limited_servos(elements: Iterable[Element]) -> tuple[Element, ...]:
+    """The servos with an effort limit."""
+    return tuple(servo for servo in of_kind(elements, "PositionServo") if np.isfinite(servo.values[2]))
+
+
 def drive_force(servo: Element, q: Floats, v: Floats, force: Floats) -> Floats:
     """The force of a servo on its joint (K,) [N m or N], S of :class:`PositionServo`.
 

@@ -5,6 +5,10 @@ from varpin.model.angles import looks_like_degrees as looks_like_degrees
 from varpin.model.chain import planar_chain as planar_chain
 from varpin.model.combination import combine as combine
 from varpin.model.degrees import degrees_hint as degrees_hint
+from varpin.model.millimetres import AFAR as AFAR
+from varpin.model.millimetres import IN_MILLIMETRES as IN_MILLIMETRES
+from varpin.model.millimetres import longest_reach as longest_reach
+from varpin.model.millimetres import millimetres_hint as millimetres_hint
 from varpin.model.payload import Payload as Payload
 from varpin.model.robot import Robot as Robot
 from varpin.model.robot import build_robot as build_robot
@@ -12,6 +16,7 @@ from varpin.model.robot import check_inertia as check_inertia
 from varpin.model.robot import geometry as geometry
 from varpin.model.robot import load_robot as load_robot
 from varpin.model.robot import readable_geometry as readable_geometry
+from varpin.model.robot import require_robot as require_robot
 from varpin.model.sources import bundled_robots as bundled_robots
 from varpin.model.sources import models_dir as models_dir
 from varpin.model.sources import robot_names as robot_names

@@ -82,7 +82,9 @@ def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floa
     array = as_floats("controls", controls)
     if array.shape != shape and array.shape != shape[1:]:
         raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
-    return np.broadcast_to(require_finite("controls", array), shape).copy()
+    rows = np.empty(shape)
+    rows[:] = require_finite("controls", array)
+    return rows
 
 
 def held_rows(scene: Scene, controls: JointValues | None) -> Floats:

@@ -16,8 +16,10 @@ from varpin.arrays import Floats, Integers
 from varpin.core import fastest_damping, pulls_fast
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
-from varpin.simulation.friction import Stop, rate_at_stops, stops
+from varpin.simulation.friction import JointRates, Stop, joint_rates, rate_at_stops, states_at_stops, stops
 
+# Largest rate times the step that a step resolves.
+_RESOLVED = 2.0
 # Nodes spread over the motion: one of this many, and the least and the largest number.
 _OF, _LEAST, _MOST = 16, 4, 12
 # Most joints with dry friction, and most stops, with nodes of their own.
@@ -30,10 +32,12 @@ class Fast(NamedTuple):
     Attributes:
         rate: The fastest rate [1/s]; 0 for none.
         stop: Where a joint comes to rest, if the rate is that of its dry friction; else None.
+        joint: The coordinate whose damping it is, where that was looked for.
     """
 
     rate: float
     stop: Stop | None = None
+    joint: int | None = None
 
 
 def fast_damping(scene: Scene, q: Floats, v: Floats, u: Floats, dt: float) -> Fast:
@@ -43,7 +47,7 @@ def fast_damping(scene: Scene, q: Floats, v: Floats, u: Floats, dt: float) -> Fa
     """
     if not scene.dissipates or not len(u):
         return Fast(0.0)
-    least = 2.0 / dt
+    least = _RESOLVED / dt
     at = np.union1d(_spread(len(v) - 1), _slowest(scene, v))
     fastest = Fast(fastest_damping(scene.core, q[at], v[at], _forces(scene, u, at), least))
     nodes, reached = _in_stops(scene, q, v, dt)
@@ -54,6 +58,38 @@ def fast_damping(scene: Scene, q: Floats, v: Floats, u: Floats, dt: float) -> Fa
         if rate := rate_at_stops(scene, q, v, u, [stop], max(least, fastest.rate)):
             fastest = Fast(rate, stop)
     return fastest
+
+
+def damping_of(scene: Scene, q: Floats, v: Floats, u: Floats, dt: float, joint: int | None = None) -> Fast:
+    """The fastest damping along a motion of one joint, with its own rate; where :func:`fast_damping` looks for it.
+
+    The joint is ``joint``, if steps of ``dt`` [s] cannot resolve its damping; else the one with the fastest.
+    """
+    at = np.union1d(_spread(len(v) - 1), _slowest(scene, v))
+    nodes, reached = _in_stops(scene, q, v, dt)
+    resting = stops(scene, v)
+    parts = [(q[at], v[at], _forces(scene, u, at)), (reached, v[nodes], _forces(scene, u, nodes))]
+    if resting:
+        parts.append(states_at_stops(scene, q, v, u, resting))
+    marks = [None] * (len(at) + len(nodes)) + resting
+    return _named(joint_rates(scene, *(np.concatenate(part) for part in zip(*parts, strict=True))), marks, dt, joint)
+
+
+def damping_at_stop(scene: Scene, q: Floats, v: Floats, u: Floats, dt: float, stop: Stop) -> Fast:
+    """The damping where a joint comes to rest: its own, if steps of ``dt`` [s] cannot resolve it, else the fastest."""
+    return _named(joint_rates(scene, *states_at_stops(scene, q, v, u, [stop])), [stop], dt, stop.joint)
+
+
+def _named(rates: JointRates, stops: list[Stop | None], dt: float, joint: int | None) -> Fast:
+    """Of rates at some states, with their stops, the fastest of a joint, or of all if the joint's are slow."""
+    if joint is not None and dt * float(rates.own[:, joint].max()) > _RESOLVED:
+        state = int(rates.own[:, joint].argmax())
+        rate = float(rates.own[state, joint])
+    else:
+        state = int(rates.fastest.argmax())
+        rate, joint = float(rates.fastest[state]), int(rates.leading[state])
+    stop = stops[state]
+    return Fast(rate, stop if stop is not None and stop.joint == joint else None, joint)
 
 
 def turns_fast(scene: Scene, q: Floats, v: Floats, u: Floats, h: float) -> bool:

@@ -8,6 +8,7 @@ by a method of more stages, in smaller steps at kinks.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.errors import LinearizationError
-from varpin.integrators import Integrator, Reference
+from varpin.integrators import Gauss, Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
+from varpin.integrators.collocation import MOST_STAGES
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
 from varpin.simulation.kinks import kinks
@@ -24,11 +26,11 @@ from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bou
 from varpin.simulation.retaking import Finer, finer, shortest_parts, taken_again
 from varpin.trajectory import Trajectory
 
-# First words of the warning.
-WORDS = "disturbances grow here"
+# First words of the warning, where errors grow and where they only add up.
+WORDS, ADDED = "disturbances grow here", "errors of steps add up here"
 
 # Number of repeated steps; fewest steps and most joints of an examined motion.
-_NODES, _LEAST, _JOINTS = 6, 8, 60
+_NODES, FEWEST, JOINTS = 6, 8, 60
 # Number of further steps: those with the largest changes of velocity, such as jumps of controls.
 _VIOLENT = 4
 # Most steps with a kink that are repeated one by one, and their parts; also the parts of all of them in a repetition of
@@ -36,13 +38,15 @@ _VIOLENT = 4
 _KINKS, _PARTS = 12, 8
 # Thresholds of the warning, as shares of the largest joint travel, where errors grow and where kinks make them; and the
 # part of them from which a motion is repeated.
-WARNED, _KINKED, NEAR = 0.02, 0.003, 0.3
+WARNED, _KINKED, NEAR = 0.01, 0.003, 0.6
+# Errors at the end that are larger than this multiple of the sum of all steps' errors have grown.
+_AMPLIFIED = 2.0
 # A joint travel below this counts as no motion [rad or m].
 _SHORTEST = 1e-8
 # The share of the fastest mode's exponent by which a disturbance grows: at most half in 60 motions of arms and chains,
 # because modes turn. The exponent is the integral of the rate, which is unsteady: of the nodes the mean counts. And the
 # largest exponent that is computed.
-_ALIGNED, _MOST = 0.5, 60.0
+ALIGNED, _MOST = 0.5, 60.0
 
 
 class Growth(NamedTuple):
@@ -56,6 +60,7 @@ class Growth(NamedTuple):
         step: The largest error of a single step [rad or m].
         causes: What happens in steps with a kink, in words, if most of the error comes from them; else empty.
         kinks: Number of steps with a kink.
+        grows: Whether errors have grown; else they have added up.
     """
 
     joint: int
@@ -65,6 +70,7 @@ class Growth(NamedTuple):
     step: float
     causes: tuple[str, ...] = ()
     kinks: int = 0
+    grows: bool = True
 
 
 def growth_bound(scene: Scene, trajectory: Trajectory) -> float:
@@ -132,23 +138,36 @@ def grown_error(
     add_up = by_kinks > NEAR * _KINKED
     if not add_up and (_few(trajectory) or _grows_less(scene, trajectory, at, small)):
         return None
-    parts = other.parts * shortest_parts(trajectory)
-    parts[kinked.steps] = np.maximum(parts[kinked.steps], _PARTS)
-    again = taken_again(scene, other.method, trajectory, integrator.stage_times, 0, trajectory.steps, parts)
-    if again is None:
-        return None
-    # Unknown from where a step of the repetition fails.
-    apart = np.nan_to_num(np.abs(again[0] - trajectory.q))
-    shares = apart / travel
-    joint = int(shares.max(axis=0).argmax())
-    share = float(shares[:, joint].max())
     mostly_kinks = by_kinks > by_steps
     least = _KINKED if mostly_kinks else WARNED
+    for closer in (other, _closer(other)):
+        parts = closer.parts * shortest_parts(trajectory)
+        parts[kinked.steps] = np.maximum(parts[kinked.steps], _PARTS)
+        again = taken_again(scene, closer.method, trajectory, integrator.stage_times, 0, trajectory.steps, parts)
+        if again is None:
+            return None
+        # Unknown from where a step of the repetition fails.
+        apart = np.nan_to_num(np.abs(again[0] - trajectory.q))
+        shares = apart / travel
+        joint = int(shares.max(axis=0).argmax())
+        share = float(shares[:, joint].max())
+        grows = share > _AMPLIFIED * (by_steps + by_kinks)
+        # Where errors grow, so do those of the repetition: near the threshold a still better one decides.
+        if not (grows and NEAR * least < share <= least):
+            break
     if share <= least:
         return None
     first = float(trajectory.t[(shares[:, joint] > least).argmax()])
     causes = kinked.causes if mostly_kinks else ()
-    return Growth(joint, float(apart[:, joint].max()), share, first, largest, causes, len(kinked.steps))
+    return Growth(joint, float(apart[:, joint].max()), share, first, largest, causes, len(kinked.steps), grows)
+
+
+def _closer(other: Finer) -> Finer:
+    """A method with two stages more than another, or in half its steps."""
+    method = other.method
+    if not isinstance(method, Gauss | Radau) or method.stages + 2 > MOST_STAGES:
+        return Finer(method, 2 * other.parts, 0.0)
+    return Finer(replace(method, stages=method.stages + 2), other.parts, 0.0)
 
 
 def _steps_off(
@@ -196,12 +215,12 @@ def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], fac
 def _unknown(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether errors of steps are unknown: under noise or Python forces, or for many joints."""
     unknown = scene.custom is not None or trajectory.dw.any() or not trajectory.steps
-    return bool(unknown or scene.robot.dof > _JOINTS)
+    return bool(unknown or scene.robot.dof > JOINTS)
 
 
 def _few(trajectory: Trajectory) -> bool:
     """Whether a motion has too few steps, parts of divided ones included, for disturbances to grow."""
-    return int(np.maximum(trajectory.statistics.substeps, 1).sum()) < _LEAST
+    return int(np.maximum(trajectory.statistics.substeps, 1).sum()) < FEWEST
 
 
 def _nodes(trajectory: Trajectory) -> NDArray[np.int64]:
@@ -230,4 +249,4 @@ def _modes(aq: Floats, av: Floats) -> Floats:
 def _factor(rate: float, trajectory: Trajectory) -> float:
     """The factor by which a disturbance grows over a motion whose fastest mode has this rate [1/s]."""
     length = float(trajectory.t[-1] - trajectory.t[0])
-    return float(np.exp(min(_ALIGNED * rate * length, _MOST)))
+    return float(np.exp(min(ALIGNED * rate * length, _MOST)))

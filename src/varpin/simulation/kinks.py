@@ -5,13 +5,14 @@ Collocation of any order does not resolve a kink within a step.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Integers
-from varpin.mechanics.forces import of_kind
+from varpin.arrays import Floats, Integers
+from varpin.mechanics.forces import limited_servos, of_kind
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -50,16 +51,26 @@ def kinks(scene: Scene, trajectory: Trajectory) -> Kinks:
 def _saturating(scene: Scene, trajectory: Trajectory) -> NDArray[np.bool_]:
     """Steps (N,) in which a drive reaches or leaves its limit."""
     found = np.zeros(trajectory.steps, dtype=np.bool_)
-    servos = [servo for servo in of_kind(scene.elements, "PositionServo") if np.isfinite(servo.values[2])]
+    for before, after in _demands(scene, trajectory):
+        found |= np.trunc(np.clip(before, -1.0, 1.0)) != np.trunc(np.clip(after, -1.0, 1.0))
+    return found
+
+
+def saturates(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether a drive comes to its limit along a motion."""
+    return any(max(np.abs(before).max(), np.abs(after).max()) >= 1.0 for before, after in _demands(scene, trajectory))
+
+
+def _demands(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[Floats, Floats]]:
+    """For each servo with an effort limit, its demand at the begin and the end of steps (N,), in units of the limit."""
+    servos = limited_servos(scene.elements)
     if not servos:
-        return found
+        return
     force = trajectory.u @ scene.actuation.T
     for servo in servos:
         c, (stiffness, damping, effort) = servo.coordinate, servo.values
         pull = -stiffness * trajectory.q[:, c] - damping * trajectory.v[:, c]
-        before, after = (np.clip((force[:, c] + part) / effort, -1.0, 1.0) for part in (pull[:-1], pull[1:]))
-        found |= np.trunc(before) != np.trunc(after)
-    return found
+        yield (force[:, c] + pull[:-1]) / effort, (force[:, c] + pull[1:]) / effort
 
 
 def _stopping(scene: Scene, trajectory: Trajectory) -> NDArray[np.bool_]:

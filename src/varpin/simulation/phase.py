@@ -27,7 +27,7 @@ Complexes = NDArray[np.complex128]
 # Number of nodes with a linearization, and the most joints of a robot that is examined.
 _NODES, _JOINTS = 9, 60
 # Threshold of the warning, as a share of the largest joint travel.
-WARNED = 0.02
+WARNED = 0.01
 # Least phase of an oscillation over the motion [rad]. Slower ones lose little; and a free joint has the eigenvalue zero
 # twice, which rounding splits into slow modes of any amplitude.
 _TURNS = 1.0

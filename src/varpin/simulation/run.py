@@ -27,7 +27,7 @@ from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstabl
 from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import MotionRecord, function_error
 from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
-from varpin.simulation.start import in_degrees, on_constraints
+from varpin.simulation.start import in_other_units, on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
 from varpin.support.checks import JointValues, count, joint_array
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
@@ -130,7 +130,7 @@ def simulate(
     if controls is None and (scene.servo_joints or scene.inputs):
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
-    early = in_degrees(scene, q0)
+    early = in_other_units(scene, q0)
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
         early = (*early, *moved)
@@ -141,7 +141,7 @@ def simulate(
         early = (*early, *unmet)
         dt = span / steps
     else:
-        dt, steps = time_steps(dt, steps, duration)
+        dt, steps = time_steps(dt, steps, duration, choosable=True)
     period = count("period", period, least=1)
     _require_memory(scene, steps)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats, Integers
 from varpin.core import energy_turnover, glance, windows_agree
 from varpin.integrators import ExplicitEuler, Integrator, Reference
-from varpin.integrators.base import open_loop
+from varpin.integrators.base import held_noise, open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -43,8 +43,10 @@ from varpin.simulation.accuracy import (
     violent_windows,
 )
 from varpin.simulation.chatter import RUN, Alternation, alternation
-from varpin.simulation.damping import Fast, fast_damping
+from varpin.simulation.clearance import clearly_right
+from varpin.simulation.damping import Fast, damping_at_stop, damping_of, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
+from varpin.simulation.growth import ADDED as ADDED_WORDS
 from varpin.simulation.growth import NEAR, grown_error, growth_bound
 from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.growth import WORDS as GROWTH_WORDS
@@ -113,8 +115,9 @@ def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
         trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
+    errors = () if clearly_right(scene, integrator, trajectory) else _errors_found(scene, integrator, trajectory)
     found = (
-        *_errors_found(scene, integrator, trajectory),
+        *errors,
         *alternating(scene, integrator, trajectory),
         *_beyond_limits(scene, trajectory),
     )
@@ -171,7 +174,7 @@ def findings_from_record(scene: Scene, integrator: Integrator, trajectory: Traje
     fast = _fast_damping(scene, trajectory)
     # Methods of more stages stop faster dampers.
     if not integrator.l_stable and trajectory.dt * fast.rate > 2.0 * getattr(integrator, "stages", 1):
-        found.append(_ringing(scene, fast, trajectory.dt))
+        found.append(_ringing(scene, _damping_of(scene, trajectory), trajectory.dt))
     if split := _in_parts(trajectory):
         found.append(Finding("split steps", f"{split}: dt = {trajectory.dt:g} s is coarse here"))
     return (*found, *_beyond_limits(scene, trajectory))
@@ -196,6 +199,11 @@ def _fast_damping(scene: Scene, trajectory: Trajectory) -> Fast:
     return fast_damping(scene, trajectory.q, trajectory.v, trajectory.u, trajectory.dt)
 
 
+def _damping_of(scene: Scene, trajectory: Trajectory, joint: int | None = None) -> Fast:
+    """The damping to name: that of a joint, if a step cannot resolve it, else the fastest."""
+    return damping_of(scene, trajectory.q, trajectory.v, trajectory.u, trajectory.dt, joint)
+
+
 def _applied(scene: Scene, trajectory: Trajectory) -> Floats:
     """Constant forces of the controls in each step (N, n)."""
     return np.ascontiguousarray(trajectory.u @ scene.actuation.T)
@@ -205,19 +213,32 @@ def _ringing(scene: Scene, fast: Fast, dt: float, off: str = "", joint: int | No
     """The warning that damping or dry friction is faster than the step; ``off`` ends it with the error."""
     times = f"(dt * {fast.rate:.3g}/s = {dt * fast.rate:.3g} > 2)"
     cure = f"dt below {2.0 / fast.rate:.3g} s resolves it"
+    names = scene.robot.joint_names
     if fast.stop is None:
-        does = f"damping is faster than the step {times}: velocities that it should stop will ring; {cure}"
+        where = "" if fast.joint is None else f" at joint {names[fast.joint]!r}"
+        does = f"damping is faster than the step{where} {times}: velocities that it should stop will ring; {cure}"
         # Radau's methods do not keep constraints.
         method = "" if scene.constraints else ", varpin.Radau(3) stops them"
-        return Finding("fast damping", f"{does}{method}{off}", joint)
-    name, wide = scene.robot.joint_names[fast.stop.joint], 0.5 * dt * fast.rate * fast.stop.width
+        return Finding("fast damping", f"{does}{method}{off}", fast.joint if joint is None else joint)
+    wide = _resolved_width(scene, fast.stop, dt * fast.rate)
+    wider = f", so does a width above {wide:.3g} rad/s or m/s" if wide < np.inf else ""
     method = "" if scene.constraints else ", and varpin.Radau(3) stops it"
     return Finding(
         "fast friction",
-        f"dry friction is faster than the step where joint {name!r} comes to rest or turns back {times}: its velocity "
-        f"may ring or creep there; {cure}, so does a width above {wide:.3g} rad/s or m/s{method}{off}",
+        f"dry friction is faster than the step where joint {names[fast.stop.joint]!r} comes to rest or turns back "
+        f"{times}: its velocity may ring or creep there; {cure}{wider}{method}{off}",
         fast.stop.joint if joint is None else joint,
     )
+
+
+def _resolved_width(scene: Scene, stop: Stop, turned: float) -> float:
+    """The width from which on the step resolves a joint's friction beside its damper; infinite if there is none.
+
+    ``turned`` is the rate of both times the step.
+    """
+    damper = float(scene.damping[stop.joint])
+    left = 2.0 / turned * (stop.slope + damper) - damper
+    return stop.slope * stop.width / left if left > 0.0 else np.inf
 
 
 def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -238,8 +259,8 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
             f"smaller steps from t = {start:.4g} s on move joint {trajectory.joint_names[error.joint]!r} by "
             f"{100 * error.position:.3g}% of its travel over a period, and its velocity by {100 * error.velocity:.3g}%"
         )
-        fast = Fast(0.0) if integrator.l_stable else _fast_damping(scene, trajectory)
-        if fast.rate:
+        if not integrator.l_stable and _fast_damping(scene, trajectory).rate:
+            fast = _damping_of(scene, trajectory, error.joint)
             found.append(_ringing(scene, fast, dt, f"; {off}", error.joint))
         else:
             split = f" ({_in_parts(trajectory)})" if _in_parts(trajectory) else ""
@@ -248,12 +269,12 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     elif (
         error is None
         and not (integrator.l_stable or isinstance(integrator, Reference))
-        and (fast := _fast_damping(scene, trajectory)).rate
+        and _fast_damping(scene, trajectory).rate
     ):
         # No other method integrates these steps: ringing is looked for in the motion itself.
         before, after = trajectory.v[:-1], trajectory.v[1:]
         if ((before * after < 0.0) & (np.abs(before) > _STILL) & (np.abs(after) > 0.5 * np.abs(before))).any():
-            found.append(_ringing(scene, fast, trajectory.dt))
+            found.append(_ringing(scene, _damping_of(scene, trajectory), trajectory.dt))
     if scene.constraints and not found:
         found.extend(_unresolved_damping(scene, integrator, trajectory))
     if not found:
@@ -266,7 +287,8 @@ def _unresolved_damping(scene: Scene, integrator: Integrator, trajectory: Trajec
     other = finer(integrator, trajectory, damped=True, pulled=True, constrained=True)
     fast = _fast_damping(scene, trajectory)
     resolves = 2.0 * getattr(other.method, "stages", 1) * other.parts
-    return (_ringing(scene, fast, trajectory.dt),) if trajectory.dt * fast.rate > resolves else ()
+    told = trajectory.dt * fast.rate > resolves
+    return (_ringing(scene, _damping_of(scene, trajectory), trajectory.dt),) if told else ()
 
 
 def _accumulated(
@@ -295,8 +317,8 @@ def _growing(
         )
         return (Finding("kinks of forces", sentence, found.joint),)
     sentence = (
-        f"{GROWTH_WORDS}: single steps of dt = {trajectory.dt:g} s by {integrator} are off by about "
-        f"{found.step:.1g} rad or m, and a method of more stages moves {off}; "
+        f"{GROWTH_WORDS if found.grows else ADDED_WORDS}: single steps of dt = {trajectory.dt:g} s by {integrator} are "
+        f"off by about {found.step:.1g} rad or m, and a method of more stages moves {off}; "
         "smaller steps or more stages keep the motion right for longer"
     )
     return (Finding("growing errors", sentence, found.joint),)
@@ -325,26 +347,29 @@ def _wrong_at_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory)
     kicked = trajectory.dw.any() and scene.noise.diffusion is None
     if integrator.l_stable or isinstance(integrator, Reference) or kicked:
         return ()
+    given = trajectory.q, trajectory.v, trajectory.u
     for stop in stops(scene, trajectory.v):
-        rate = rate_at_stops(scene, trajectory.q, trajectory.v, trajectory.u, [stop], 2.0 / trajectory.dt)
+        rate = rate_at_stops(scene, *given, [stop], 2.0 / trajectory.dt)
         count = min(_REST_STEPS, trajectory.steps - stop.step)
         if not rate or count < _REST_STEPS // 2:
             continue
         off = _velocity_errors(scene, integrator, trajectory, stop, count)
         if len(off) < _REST_STEPS // 2:
             # No method integrates these steps, so their error is unknown.
-            return (_ringing(scene, Fast(rate, stop), trajectory.dt),)
+            return (_ringing(scene, damping_at_stop(scene, *given, trajectory.dt, stop), trajectory.dt),)
         lasting, most = float(np.median(off)), float(off.max())
         speed = float(np.abs(trajectory.v[:, stop.joint]).max())
         if lasting > _MEDIAN_OFF * stop.width or (most > stop.width and most > _MOST_OFF * speed):
-            since = f"; after t = {trajectory.t[stop.step]:.4g} s it is off by up to {most:.3g} rad/s or m/s"
-            return (_ringing(scene, Fast(rate, stop), trajectory.dt, since),)
+            fast = damping_at_stop(scene, *given, trajectory.dt, stop)
+            which = "it" if fast.stop else f"the velocity of joint {trajectory.joint_names[stop.joint]!r}, which stops,"
+            since = f"; after t = {trajectory.t[stop.step]:.4g} s {which} is off by up to {most:.3g} rad/s or m/s"
+            return (_ringing(scene, fast, trajectory.dt, since, stop.joint),)
     return ()
 
 
 def _velocity_errors(scene: Scene, integrator: Integrator, trajectory: Trajectory, stop: Stop, count: int) -> Floats:
     """The error of a joint's velocity after each step from where it stops, as far as the repetition goes."""
-    off, method = np.zeros(0), stopping(scene, _STOPPING)
+    off, method = np.zeros(0), stopping(scene, _STOPPING, integrator)
     for parts in _REST_PARTS[1:] if scene.constraints else _REST_PARTS:
         again = taken_again(scene, method, trajectory, integrator.stage_times, stop.step, count, parts)
         if again is not None:
@@ -535,7 +560,7 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     jumps = not (steady or trajectory.u_stages.shape[1])
     other, times = integrator, 2
     if damped and not (integrator.l_stable or pulled):
-        other, times = stopping(scene, _STOPPING), 1
+        other, times = stopping(scene, _STOPPING, integrator), 1
     elif pulled or (damped and jumps):
         better = finer(integrator, trajectory, damped=damped, pulled=pulled)
         if better.parts != 1:
@@ -548,9 +573,15 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         # All paths have the same commands; their forces may differ.
         held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
         commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
-    kicks = _kicks_of(scene, integrator, trajectory, begins, length, times) if noisy else None
+    kicks, of_noise = None, scene.no_drift
+    if noisy and integrator.holds_noise:
+        of_noise = held_noise(scene, trajectory)[begins[:, None] + np.arange(length)]
+        of_noise = of_noise.reshape(len(begins), length // times, times, -1).mean(axis=2)
+        drift = drift + of_noise if drift.size else of_noise
+    elif noisy:
+        kicks = _kicks_of(scene, integrator, trajectory, begins, length, times)
     if trajectory.u_stages.shape[1]:
-        again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks)
+        again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks, of_noise)
     else:
         again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt, kicks)
     if times == 1 and not (jumps or pulled) and again is not None:
@@ -682,6 +713,7 @@ def _windows_under(
     other: Integrator,
     times: int,
     kicks: Floats | None,
+    drift: Floats,
 ) -> tuple[Floats, Floats] | None:
     """Windows of a motion with controls that change within steps, repeated by another method or in double steps."""
     at, mine, found = other.stage_times, integrator.stage_times, []
@@ -689,7 +721,7 @@ def _windows_under(
         values = trajectory.u_stages[begin : begin + length]
         commands = changing(in_parts(values, mine, 1, at) if times == 1 else in_pairs(values, mine, at), at)
         node = slice(begin, begin + 1)
-        given = commands, np.zeros((0, 0, scene.robot.dof)), times * trajectory.dt
+        given = commands, drift[window : window + 1], times * trajectory.dt
         kick = None if kicks is None else kicks[window : window + 1]
         again = other.motions(scene, trajectory.q[node], trajectory.v[node], *given, kick)
         if again is None:

@@ -83,6 +83,7 @@ class AnyConstrainedStepper {
     virtual ~AnyConstrainedStepper() = default;
 
     Guards guards;
+    bool held = false;  // whether the noise of a step is a force that is constant over it, instead of an impulse
 
     virtual bool begin(const double* q, const double* v, ConstrainedState& state) = 0;
     virtual bool look_at(ConstrainedState& state) = 0;
@@ -300,12 +301,18 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
                 const std::int64_t row = p * steps + s;
                 const double* dw = noisy ? increments + row * k : nullptr;
                 apply_policy(commands, p, s, n, path.q.data(), path.momentum.data(), u);
-                if (noisy) {
-                    const double* felt = mean_control(commands, p, s, u, mean);
+                const double* extra = drift ? drift + row * n : nullptr;
+                const double* felt = noisy ? mean_control(commands, p, s, u, mean) : nullptr;
+                if (noisy && held) {
+                    held_noise(mechanism, h, extra, path.q.data(), path.center.data(), felt, dw, y.data());
+                    // The entry of a driven joint is its goal, and its drive absorbs the noise.
+                    for (const DrivenRow& own : mechanism.constraints.driven())
+                        y[own.coordinate] = extra ? extra[own.coordinate] : 0.0;
+                    extra = y.data();
+                } else if (noisy) {
                     noise_impulse(mechanism, 1.0, path.q.data(), path.center.data(), felt, dw, y.data());
                     kick(y.data(), state);
                 }
-                const double* extra = drift ? drift + row * n : nullptr;
                 const double* within = stage_controls(commands, p, s, stages, u, line);
                 stride = within ? static_cast<int>(n) : 0;
                 constant_force(mechanism, extra, u + s * controls, force.data());

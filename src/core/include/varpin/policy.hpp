@@ -121,6 +121,13 @@ inline void noise_impulse(const Mechanism& mechanism, double part, const double*
     }
 }
 
+// The constant force over a step of length h whose impulse is that of the noise, plus a drift (n), which may be null.
+inline void held_noise(const Mechanism& mechanism, double h, const double* drift, const double* q, const double* center,
+                       const double* u, const double* increments, double* force) {
+    noise_impulse(mechanism, 1.0 / h, q, center, u, increments, force);
+    for (int i = 0; drift && i < mechanism.dof(); ++i) force[i] += drift[i];
+}
+
 // The centres of the diffusion fields for a rollout from q.
 inline void diffusion_centers(const Mechanism& mechanism, const double* q, double* center) {
     const Diffusion& fields = mechanism.diffusion;
