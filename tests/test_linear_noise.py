@@ -39,7 +39,7 @@ def line(problem: vp.OptimalControlProblem, u: np.ndarray) -> vp.LinearPolicy:
         (CONTROL, {"integrator": vp.Midpoint(), "joints": 1}),
         (CONTROL, {"integrator": vp.RungeKutta4(), "rate": 1e-2}),
         (STATE, {"integrator": vp.Gauss(2, kick="split")}),
-        (CONTROL + STATE, {"integrator": vp.Gauss(2, kick="split")}),
+        (CONTROL + STATE, {"integrator": vp.Gauss(2, kick="held")}),
     ],
 )
 def test_the_gradient_is_that_of_the_expected_cost(noise: object, options: dict) -> None:
@@ -69,7 +69,7 @@ def test_the_gradient_is_that_of_the_expected_cost(noise: object, options: dict)
 
 
 @pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), CONTROL + STATE, SLIDING])
-@pytest.mark.parametrize("kick", ["left", "split"])
+@pytest.mark.parametrize("kick", ["left", "split", "held"])
 def test_the_noise_cost_is_that_of_the_covariance(noise: object, kick: str) -> None:
     """Forward by covariances in plain loops, backward by the value function: two ways to the same number."""
     weight = 1e-3
@@ -96,7 +96,7 @@ def test_the_noise_cost_is_that_of_the_covariance(noise: object, kick: str) -> N
 
 
 @pytest.mark.parametrize("noise", [CONTROL + STATE, SLIDING], ids=["core", "python"])
-@pytest.mark.parametrize("kick", ["left", "split"])
+@pytest.mark.parametrize("kick", ["left", "split", "held"])
 def test_the_effect_of_noise_along_a_line(noise: object, kick: str) -> None:
     """Its derivatives in the controls at both ends, by differences of the fields before and after a quiet step."""
     integrator = vp.Gauss(2, kick=kick)
@@ -122,7 +122,7 @@ def test_the_effect_of_noise_along_a_line(noise: object, kick: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("noise", "integrator"), [(CONTROL, vp.Gauss(2)), (SLIDING, vp.RungeKutta4())], ids=["core", "python"]
+    ("noise", "integrator"), [(CONTROL, vp.Gauss(2, kick="held")), (SLIDING, vp.RungeKutta4())], ids=["core", "python"]
 )
 def test_paths_cost_what_the_plan_expects(noise: object, integrator: vp.Integrator) -> None:
     problem = reach(noise, integrator=integrator)
