@@ -230,7 +230,16 @@ def test_an_ensemble_under_a_plan_is_what_its_model_says():
     plan = vp.solve(problem, check=False)
     scene, steps, dt = problem.scene, problem.steps, problem.dt
     paths = vp.simulate_ensemble(
-        scene, problem.q0, problem.v0, dt=dt, steps=steps, paths=500, rng=0, controls=plan.policy, store=False
+        scene,
+        problem.q0,
+        problem.v0,
+        dt=dt,
+        steps=steps,
+        paths=500,
+        rng=0,
+        controls=plan.policy,
+        integrator=problem.integrator,
+        store=False,
     )
     lin = vp.linearize(scene, plan.trajectory)
     P = np.zeros((8, 8))
@@ -245,16 +254,43 @@ def test_an_ensemble_under_a_plan_is_what_its_model_says():
     by_moments = plan.monte_carlo(300, rng=1)
     assert abs(by_moments.cost - by_moments.predicted) < 4.0 * by_moments.standard_error
     again = vp.simulate_ensemble(
-        scene, problem.q0, problem.v0, dt=dt, steps=steps, paths=40, rng=0, controls=plan.policy, workers=1
+        scene,
+        problem.q0,
+        problem.v0,
+        dt=dt,
+        steps=steps,
+        paths=40,
+        rng=0,
+        controls=plan.policy,
+        integrator=problem.integrator,
+        workers=1,
     )
     other = vp.simulate_ensemble(
-        scene, problem.q0, problem.v0, dt=dt, steps=steps, paths=40, rng=0, controls=plan.policy, workers=2
+        scene,
+        problem.q0,
+        problem.v0,
+        dt=dt,
+        steps=steps,
+        paths=40,
+        rng=0,
+        controls=plan.policy,
+        integrator=problem.integrator,
+        workers=2,
     )
     np.testing.assert_array_equal(again.q, other.q)
     g = scene.core.constraints(again.q.reshape(-1, 4))[0]
     assert np.abs(g).max() < 1e-12
     child = np.random.default_rng(0).spawn(1)[0]
-    single = vp.simulate(scene, problem.q0, problem.v0, dt=dt, steps=steps, controls=plan.policy, rng=child)
+    single = vp.simulate(
+        scene,
+        problem.q0,
+        problem.v0,
+        dt=dt,
+        steps=steps,
+        controls=plan.policy,
+        integrator=problem.integrator,
+        rng=child,
+    )
     np.testing.assert_array_equal(again.q[0], single.q)
 
 

@@ -190,6 +190,12 @@ def test_linear_feedback(kick):
             np.testing.assert_allclose(end.p[path, k + 1], p, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("other", ["dt", "steps"])
+def test_a_duration_stands_for_the_step_or_their_number(other):
+    there = run()
+    np.testing.assert_array_equal(run(**{"duration": there.t[-1], other: None}).q, there.q)
+
+
 @pytest.mark.parametrize(
     ("arguments", "facts"),
     [
@@ -453,6 +459,9 @@ CUSTOM = vp.CustomNoise(lambda q, v, u: np.eye(2), 2)
         ({"quantiles": [0.5, 1.5]}, ("quantiles", "[0, 1]", "[0.5, 1.5]")),
         ({"quantiles": 0.5}, ("quantiles", "[0, 1]", "0.5")),
         ({"quantiles": [np.nan]}, ("quantiles[0]", "nan")),
+        ({"duration": 1.0}, ("dt", "steps", "duration", "all three")),
+        ({"steps": None}, ("dt", "steps", "duration")),
+        ({"steps": None, "duration": 0.1234567}, ("duration", "dt")),
         ({"workers": 0}, ("workers", "1", "0")),
         ({"workers": 1.5}, ("workers", "1.5")),
     ],

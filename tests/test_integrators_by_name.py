@@ -17,6 +17,7 @@ MADE = [
     vp.Midpoint(alpha=1 / 3, kick="split", guard=vp.Guard(max_halvings=3)),
     vp.Gauss(),
     vp.Gauss(4, vp.Guard(energy_budget=1e-3), kick="split"),
+    vp.Radau(3, kick="held"),
     vp.ExplicitEuler(),
     vp.SemiImplicitEuler(),
     vp.RungeKutta4(),

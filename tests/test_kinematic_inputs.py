@@ -344,6 +344,33 @@ def test_noise_does_not_move_what_is_moved_by_hand():
     np.testing.assert_allclose(still.q[:, 0], q[0], atol=1e-14)
 
 
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_noise_of_the_other_controls(interpolation):
+    """The hand moves as told, the motor's noise is as in a scene whose hand has no control, and a plan knows it."""
+    hand = vp.KinematicInput("joint1", interpolation)
+    given = {"gravity": False, "damping": 0.2, "actuation": ["joint1", "joint2"], "constraints": hand}
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(robot, noise=vp.ControlNoise(0.4), **given)
+    cost = vp.ControlCost([300.0, 1e-3, *([300.0] if interpolation == "cubic" else [])])
+    cost += vp.Terminal(vp.TrackingCost([0.0, -1.5], 20.0) + vp.VelocityCost([0.0, 2.0]))
+    problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.2], [0, 0], dt=0.08, steps=6, integrator=vp.Gauss(2))
+    plan = vp.solve(problem, check=False)
+    assert plan.noise_cost > 0.1 * plan.cost
+    told = plan.monte_carlo(1500, rng=0)
+    assert abs(told.cost - told.predicted) < 3.0 * told.standard_error
+    motion = problem.simulate(plan.policy, rng=0)
+    np.testing.assert_allclose(motion.q[1:, 0], motion.u[:, 0], atol=1e-12)
+    # The same impulses as torques of the motor.
+    field = np.zeros((2, 1, motion.u.shape[1]))
+    field[1, 0, 1] = 0.4
+    alone = vp.Scene(robot, noise=vp.ControlNoise(field), **given)
+    again = vp.simulate(
+        alone, [0.0, 0.2], [0.0, 0.0], dt=0.08, steps=6, controls=motion.u, integrator=problem.integrator,
+        increments=motion.dw[:, 1:2],
+    )  # fmt: skip
+    np.testing.assert_allclose(again.q, motion.q, atol=1e-12)
+
+
 def test_a_controller_moves_a_joint_by_hand():
     """The plant is heavier and damped; the joint goes on evenly from tick to tick, and the pole comes to hang."""
     hand = vp.KinematicInput("joint1")
@@ -388,8 +415,12 @@ def test_what_does_not_know_inputs_refuses_them():
         vp.simulate(vp.Scene(robot, constraints=two), q, v, dt=0.01, steps=3)
     with refused(vp.InputError, "constraints"):
         vp.simulate(scene, q, v, dt=0.01, steps=3, integrator=vp.RungeKutta4())
-    noisy = vp.Scene(robot, constraints=[loop, hand], noise=vp.ControlNoise(0.1))
-    with refused(vp.InputError, "KinematicInput"):
+    noisy = vp.Scene(robot, constraints=[loop, hand], noise=vp.ControlNoise(np.full((3, 2, 3), 0.1)))
+    with refused(vp.InputError, "ControlNoise", "KinematicInput", "position"):
+        vp.simulate(noisy, q, v, dt=0.01, steps=3, rng=0)
+    own = vp.CustomNoise(lambda q, v, u: np.ones((3, 1)), 1)
+    noisy = vp.Scene(robot, constraints=[loop, hand], noise=own)
+    with refused(vp.InputError, "CustomNoise", "KinematicInput"):
         vp.simulate(noisy, q, v, dt=0.01, steps=3, rng=0)
     for actuation in (["joint2"], 2.0 * np.eye(3), np.ones((3, 1))):
         with refused(vp.InputError, "control"):

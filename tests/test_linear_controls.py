@@ -5,7 +5,7 @@ import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin.control.backward import Along, _one_pass
+from varpin.control.backward import Along, _one_pass, backward, noise_shares
 
 N = 8
 RNG = np.random.default_rng(3)
@@ -183,28 +183,14 @@ def test_refusals() -> None:
         links(controls="cubic")
     with refused(vp.InputError, "hold"):
         links(hold=2)
-    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
-    with refused(vp.InputError, "noise"):
-        vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0, 0], [0, 0], dt=0.1, steps=2, controls="linear")
     problem = links()
     plan = vp.solve(problem, check=False)
-    with refused(vp.InputError, "second_order"):
-        vp.solve(links(integrator=vp.Midpoint()), second_order=True)
+    with refused(vp.InputError, "second-order", "variational"):
+        vp.solve(links(integrator=vp.RungeKutta4()), second_order=True)
     with refused(vp.InputError, "linear"):
         vp.solve(problem.at(controls="held"), plan)
     with refused(vp.InputError, "before"):
         vp.LinearPolicy(np.zeros((2, 1)), np.zeros((2, 1, 2)), np.zeros((2, 2)), linear=True)
-    with refused(vp.InputError, "noise"):
-        vp.simulate(scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, rng=0)
-    with refused(vp.InputError, "linear"):
-        vp.simulate_ensemble(problem.scene, [0, 0], [0, 0], dt=0.1, steps=N, controls=plan.policy, paths=2, rng=0,
-                             integrator=problem.integrator)  # fmt: skip
-
-
-def test_monte_carlo_refuses_them_by_name() -> None:
-    plan = vp.solve(links(), max_iterations=1, check=False)
-    with refused(vp.InputError, "linear"):
-        plan.monte_carlo(2, rng=0)
 
 
 @pytest.mark.parametrize("joints", [1, 2])
@@ -239,3 +225,60 @@ def test_advice_is_one_that_such_problems_take() -> None:
     (advice,) = [sentence for sentence in plan.warnings if "problem.at(" in sentence]
     assert "problem.at(dt=0.025) " in advice
     assert plan.problem.at(dt=0.025).linear
+
+
+@pytest.mark.parametrize(
+    ("noise", "options"),
+    [
+        (None, {"integrator": vp.Gauss(3)}),
+        (None, {"integrator": vp.Midpoint()}),
+        (vp.StateNoise(0.5, center=[0.0, 0.0]), {"integrator": vp.Gauss(2)}),
+    ],
+    ids=["gauss", "midpoint", "noise"],
+)
+def test_second_order_has_the_hessian_of_the_cost(noise: vp.Noise | None, options: dict) -> None:
+    """One line, so that the pass without feedback is the Hessian in both controls, and that is by differences."""
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1, noise=noise)
+    end = vp.TrackingCost([0.6, -0.4], 1e2) + vp.VelocityCost(1.0)
+    cost = vp.ControlCost(1.0) + vp.VelocityCost(0.1) + vp.Terminal(end)
+    problem = vp.OptimalControlProblem(
+        scene, cost, [0.1, 0.2], [1.0, -2.0], dt=0.1, steps=1, controls="linear", **options
+    )
+    u = np.array([[1.0, -2.0], [3.0, 0.5]])
+    along = Along(problem, problem.simulate(line(problem, u)))
+    plan = backward(problem, along.trajectory, 0.0, second_order=True, along=along)
+    assert plan is not None
+
+    def gradient(changed: np.ndarray) -> np.ndarray:
+        """Of the cost in both controls, with the noise's S held."""
+        motion = problem.simulate(line(problem, changed.reshape(2, 2)))
+        found = np.zeros(4)
+        for c, away in enumerate(1e-4 * np.eye(4)):
+            values = []
+            for sign in (1.0, -1.0):
+                moved = problem.simulate(line(problem, (changed + sign * away).reshape(2, 2)))
+                values.append(problem.cost_of(moved) + noise_shares(problem, moved, plan).sum())
+            found[c] = (values[0] - values[1]) / 2e-4
+        assert motion.steps == 1
+        return found
+
+    at, step = u.ravel(), 1e-3
+    H = np.array([(gradient(at + e) - gradient(at - e)) / (2.0 * step) for e in step * np.eye(4)])
+    # The second decision's gain on the first control, and the value that is left.
+    np.testing.assert_allclose(plan.previous[1], -np.linalg.solve(H[2:, 2:], H[2:, :2]), rtol=2e-5, atol=2e-5)
+    left = H[:2, :2] - H[:2, 2:] @ np.linalg.solve(H[2:, 2:], H[2:, :2])
+    g = gradient(at)
+    ahead = -np.linalg.solve(left, g[:2] - H[:2, 2:] @ np.linalg.solve(H[2:, 2:], g[2:]))
+    np.testing.assert_allclose(plan.feedforward[0], ahead, rtol=2e-5, atol=1e-5)
+    first = backward(problem, along.trajectory, 0.0)
+    assert np.abs(first.previous[1] - plan.previous[1]).max() > 1e-3 * np.abs(plan.previous[1]).max()
+
+
+def test_second_order_converges_in_fewer_iterations() -> None:
+    end = vp.TrackingCost([3.0, 0.0], 1e3) + vp.VelocityCost(1e2)
+    cost = vp.ControlCost(1e-3) + vp.Terminal(end)
+    problem = links(cost=cost, integrator=vp.Gauss(2), steps=20, dt=0.08)
+    plain, newton = (vp.solve(problem, second_order=way, tolerance=1e-13, check=False) for way in (False, True))
+    assert newton.status.converged
+    assert len(newton.history) < len(plain.history)
+    assert newton.cost <= plain.cost * (1.0 + 1e-9)

@@ -189,7 +189,7 @@ def _kicked(scene, q, v, u, k, integrator):
 @pytest.mark.parametrize("speed", [0.0, 1.0, 5.0])
 @pytest.mark.parametrize(
     "integrator",
-    [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Gauss(2), vp.ExplicitEuler(), vp.RungeKutta4()],
+    [vp.Midpoint(kick="split"), vp.Gauss(2), vp.Midpoint(kick="held"), vp.ExplicitEuler(), vp.RungeKutta4()],
     ids=str,
 )
 def test_drift_at_rest_and_moving(integrator, speed):
@@ -202,7 +202,7 @@ def test_drift_at_rest_and_moving(integrator, speed):
     assert found.worst < 1e-8
 
 
-@pytest.mark.parametrize("integrator", [vp.Midpoint(kick="split"), vp.Gauss(2, kick="split")], ids=str)
+@pytest.mark.parametrize("integrator", [vp.Midpoint(kick="split"), vp.Gauss(2, kick="held")], ids=str)
 @pytest.mark.parametrize("custom", [False, True])
 def test_noisy_motions_are_linearized_at_zero_noise(integrator, custom):
     """Each step of one as the step without noise from the same node: a split kick's second half at its end too."""

@@ -167,6 +167,25 @@ def test_refused_states(states, facts):
         vp.solve(reach(), states=states)
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_linear_controls_end_at_their_optimum(given):
+    problem = linear(controls="linear", integrator=vp.Gauss(2))
+    u = np.linspace([1.0], [-1.0], STEPS + 1) if given else None
+    own, found = vp.solve(problem, tolerance=1e-12), vp.solve(problem, u, states=line([1.0, 0.3]), tolerance=1e-12)
+    assert found.status.converged
+    assert found.cost == pytest.approx(own.cost, rel=1e-10)
+    np.testing.assert_allclose(found.controls, own.controls, atol=1e-6)
+
+
+def test_linear_controls_within_rate_limits_and_a_first_control():
+    within = [vp.WithinControlRate(60.0, before=0.0), vp.WithinJointLimits(vp.planar_chain(2), ([-1, -1], [1.05, 0.6]))]
+    problem = reach(vp.ControlRateCost(1e-5), controls="linear", constraints=within)
+    found = vp.solve(problem, states=line([1.0, 0.5]))
+    assert found.status.converged
+    np.testing.assert_array_equal(found.controls[0], 0.0)
+    assert np.abs(np.diff(found.controls, axis=0)).max() <= 60.0 * problem.dt * (1.0 + 1e-6)
+
+
 def test_refused_beside_states():
     problem = reach()
     plan = vp.solve(problem, max_iterations=0, check=False)
@@ -174,8 +193,6 @@ def test_refused_beside_states():
         vp.solve(problem, plan, states=line([1.0, 0.5]))
     with refused(vp.InputError, "states", "resume"):
         vp.solve(problem, resume=plan, states=line([1.0, 0.5]))
-    with refused(vp.InputError, "states", "held"):
-        vp.solve(reach(controls="linear"), states=line([1.0, 0.5]))
     other = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.0], [0.0], dt=0.01, steps=3)
     with refused(vp.InputError, "joints"):
         vp.solve(problem, states=other)

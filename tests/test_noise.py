@@ -253,7 +253,7 @@ def test_what_a_field_returns_is_checked(slots, facts):
         vp.simulate(scene, [0, 0], [0, 0], dt=0.01, steps=3, rng=0)
 
 
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(kick="split"), vp.RungeKutta4()], ids=str)
+@pytest.mark.parametrize("integrator", [vp.Midpoint(kick="held"), vp.Midpoint(kick="split"), vp.RungeKutta4()], ids=str)
 @pytest.mark.parametrize("slot", ["field", "dv"])
 @pytest.mark.parametrize(
     ("value", "facts"),

@@ -52,7 +52,7 @@ def exact(solution: vp.Solution) -> float:
     return total + 0.1 * S[1, 1]
 
 
-@pytest.mark.parametrize("kick", ["left", "split"])
+@pytest.mark.parametrize("kick", ["left", "split", "held"])
 @pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), vp.ControlNoise(0.2) + vp.StateNoise(0.5, center=[0.1, 0.1])])
 def test_it_is_that_of_the_backward_pass(noise, kick):
     scene = vp.Scene(vp.planar_chain(2), damping=0.4, noise=noise)
@@ -79,3 +79,19 @@ def test_one_whose_steps_are_short_does_not():
     short = plan(0.005, hold=20)
     assert short.noise_cost == pytest.approx(exact(short), rel=0.05)
     assert not about(short.warnings, "noise within steps")
+
+
+@pytest.mark.parametrize("damping", [0.0, 2.0, 20.0])
+def test_in_the_long_steps_of_a_plan_it_is_close_to_that_of_fine_steps(damping):
+    """The default's, of position costs; an impulse before each step costs half as much again and more."""
+    noise = vp.AdditiveNoise(0.1) + vp.ControlNoise(0.05)
+    scene = vp.Scene(vp.planar_chain(2), gravity=False, damping=damping, stiffness=5.0, noise=noise)
+    cost = vp.TrackingCost([0.5, 0.2], 10.0) + vp.ControlCost(1e-2)
+    found = vp.solve(vp.OptimalControlProblem(scene, cost, [0.3, 0.1], [0.0, 0.0], dt=0.04, steps=25), check=False)
+    feedback = Feedback(found.gains, found.previous_gains)
+    fine = found.problem.at(dt=0.04 / 16, hold=16)
+    there = noise_cost(fine, fine.simulate(np.repeat(found.trajectory.u, 16, axis=0)), feedback)
+    assert found.problem.integrator.kick == "held"
+    assert found.noise_cost == pytest.approx(there, rel=0.05)
+    left = found.problem.at(integrator=type(found.problem.integrator)(stages=4))
+    assert noise_cost(left, left.simulate(found.trajectory.u), feedback) > 1.02 * there

@@ -227,6 +227,37 @@ def test_robot_of_another_motion_is_refused():
         plots.plot_joints(trajectory, robot=vp.planar_chain(3))
 
 
+def test_what_is_no_motion_record_robot_axes_or_label_is_refused():
+    robot, trajectory = swing(links=2, steps=3, controls=[0.1, 0.2])
+    of_motions = [plots.plot_trajectory, *SINGLE.values()]
+    of_records = {
+        plots.plot_work_precision: "work_precision",
+        plots.plot_advice: "advise",
+        plots.plot_optimal_control_tradeoff: "optimal_control_tradeoff",
+    }
+    for value in (None, 3, "motion.npz", robot):
+        for draw in of_motions:
+            with refused(vp.InputError, "Trajectory", type(value).__name__):
+                draw(value)
+        for draw, maker in of_records.items():
+            with refused(vp.InputError, f"varpin.{maker}", type(value).__name__):
+                draw(value)
+        with refused(vp.InputError, "axes", "matplotlib.figure.Figure"):
+            plots.apply_style(value)
+    for draw in SINGLE.values():
+        with refused(vp.InputError, "axes", "matplotlib.figure.Figure", "'x'"):
+            draw(trajectory, "x")
+    for draw in (plots.plot_trajectory, plots.plot_joints, plots.plot_velocities, plots.plot_controls):
+        with refused(vp.InputError, "robot", "load_robot", "str"):
+            draw(trajectory, robot="ur5")
+    for draw in (plots.plot_trajectory, plots.plot_controls):
+        for labels in (3, "ab", [1, 2]):
+            with refused(vp.InputError, "labels", "2", repr(labels)):
+                draw(trajectory, labels=labels)
+    with refused(vp.InputError, "Solution", ".trajectory"):
+        plots.plot_joints(type("Solution", (), {"trajectory": trajectory})())
+
+
 def test_global_state_is_left_alone():
     before = dict(mpl.rcParams)
     had_pyplot = "matplotlib.pyplot" in sys.modules

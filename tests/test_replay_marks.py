@@ -502,6 +502,8 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
     with refused(vp.UnknownFrame, "trace", "'ur5'", "'fore_link'", "'forearm_link'"):
         replay(ur5, sweep, dt=0.05, html=page, trace="fore_link")
     no("frames", "3", frames=[3])
+    no("frames", "3", frames=3)
+    no("trace", "None", trace=None)
     no("reference", "(K, 3)", "(3,)", reference=[0.0, 0.0, 1.0])
     no("reference['a']", "target", reference={"a": np.ones((4, 3))})
     no("reference[1, 0]", "nan", reference=[[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])

@@ -39,6 +39,23 @@ def test_another_scene_is_refused_by_what_differs(load, change, facts, integrato
     assert named == list(change)
 
 
+@pytest.mark.parametrize("rows", [[], [[0.0, 3.0, 5.0, 0.7]]], ids=["idle", "acting"])
+def test_forces_of_another_core_are_refused_by_name(load, rows, tmp_path):
+    """A core with a force of one's own stores it under its name, without rows where it did not act."""
+    scene = vp.Scene(load("ur5"))
+    motion = motion_of(scene)
+    values = {**motion.scene_values, "RubberBush": np.array(rows)}
+    loaded = vp.Trajectory.load(replace(motion, scene_values=values).save(tmp_path / "motion.npz"))
+    np.testing.assert_array_equal(loaded.scene_values["RubberBush"], rows)
+    if not rows:
+        assert vp.linearize(scene, loaded).A.shape == (5, 12, 12)
+        return
+    with refused(vp.InputError, "RubberBush"):
+        vp.linearize(scene, loaded)
+    with refused(vp.InputError, "RubberBush"):
+        vp.second_order(scene, loaded, np.ones(12))
+
+
 def test_second_order_refuses_too(load):
     robot = load("ur5")
     motion = motion_of(vp.Scene(robot))

@@ -96,7 +96,15 @@ def test_solution_of_another_problem_is_refused(other, facts, tmp_path):
         vp.Solution.load(path, problem_of(**other))
 
 
-@pytest.mark.parametrize("force", [vp.CoulombFriction(0.1), vp.JointStop(9.0, lower=-1.0, upper=1.0), vp.Armature(0.1)])
+@pytest.mark.parametrize(
+    "force",
+    [
+        vp.CoulombFriction(0.1),
+        vp.JointStop(9.0, lower=-1.0, upper=1.0),
+        vp.Armature(0.1),
+        vp.FrameWrench("tip", (0.0, 0.0, 0.1, 0.0, 0.0, 0.0)),
+    ],
+)
 def test_forces_belong_to_the_problem(force, tmp_path):
     problem = problem_of(forces=force)
     plan = vp.solve(problem, max_iterations=2, second_order=True)

@@ -32,7 +32,7 @@ def problem() -> vp.OptimalControlProblem:
     """Of the stored solution."""
     scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=vp.AdditiveNoise(0.1))
     cost = vp.TrackingCost([0.8, 0.1], 10.0) + vp.ControlCost(0.1) + vp.ControlRateCost(0.01)
-    return vp.OptimalControlProblem(scene, cost, [0.4, -0.3], [0.0, 0.0], dt=0.02, steps=8)
+    return vp.OptimalControlProblem(scene, cost, [0.4, -0.3], [0.0, 0.0], dt=0.02, steps=8, integrator=vp.Gauss(4))
 
 
 LOADERS: dict[str, Callable[[Path], Any]] = {

@@ -47,10 +47,11 @@ class Linearization:
         K: Derivative of x1 in a kick (N, 2n, n): a jump of the momentum at the start of the step, with the drift
             unchanged. It is dx1/dp0 if no diffusion field depends on the velocity. Otherwise the drift from
             Stratonovich to Ito, (1/2) sum_i (dF_i/dv) M^-1 F_i, is that of the state before the kick; dx1/dp0 includes
-            the derivative of the drift, and is A[:, :, n:], or A[:, :, n:] M^-1 for integrators on (q, v).
+            the derivative of the drift, and is A[:, :, n:], or A[:, :, n:] M^-1 for integrators on (q, v). With
+            ``kick="held"`` it is the derivative in the impulse of a force that is constant over the step.
         J: The same for a jump of x's second half (N, 2n, n): of p, which is K, or of v.
         F: Diffusion fields (N, n, k).
-        G: dx1/dw (N, 2n, k); K F if the whole kick precedes the step.
+        G: dx1/dw (N, 2n, k); K F if the whole kick precedes the step or is held over it.
         Gx: Derivative of G in x0 through the fields (N, 2n, k, 2n).
         Gu: Derivative of G in u (N, 2n, k, m).
         dt: Time step [s].
@@ -58,6 +59,7 @@ class Linearization:
         ramp: dx1/du for a change of the control that grows linearly from 0 at the start of the step to du at its end
             (N, 2n, m), from :func:`linearize` of a motion whose controls change within steps; else None. For controls
             linear between nodes, dx1 = A dx + (B - ramp) du_k + ramp du_(k+1).
+        Gramp: Derivative of G in such a change (N, 2n, k, m); None where ``ramp`` is.
     """
 
     A: Floats
@@ -71,6 +73,7 @@ class Linearization:
     dt: float
     variational: bool
     ramp: Floats | None = None
+    Gramp: Floats | None = None
 
     def __repr__(self) -> str:
         return f"Linearization({self._size()})"
@@ -117,23 +120,23 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
         LinearizationError: A step has no solution at dw = 0.
     """
     integrator = _matching(require_scene(scene), trajectory, integrator)
-    found = linearize_steps(scene, trajectory, integrator, trajectory.q[0])
-    if not integrator.variational:
-        found = replace(found, K=_kick_columns(scene, trajectory, found.J))
-    if not trajectory.u_stages.shape[1]:
-        return found
-    return replace(found, ramp=integrator.ramps(scene, trajectory) @ scene.transmission)
+    within = trajectory.u_stages.shape[1] > 0
+    found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
+    return found if integrator.variational else replace(found, K=_kick_columns(scene, trajectory, found.J))
 
 
-def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats) -> Linearization:
+def linearize_steps(
+    scene: Scene, trajectory: Trajectory, integrator: Integrator, first: Floats, *, ramps: bool = False
+) -> Linearization:
     """:func:`linearize` without checks, of a part of a motion that began at configuration ``first`` (n,).
 
     For integrators on (q, v), K is empty (N, 2n, 0): it needs the inverses of all mass matrices, and plans do not use
-    it.
+    it. ``ramps`` asks for the derivatives in controls that change within a step.
     """
     n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
     Jx, Jf, Jk = integrator.linearize(scene, trajectory)
     q, v = trajectory.q, trajectory.v
+    ramp = integrator.ramps(scene, trajectory) @ scene.transmission if ramps else None
     if scene.processes == 0:
         return Linearization(
             A=Jx,
@@ -147,12 +150,16 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
             Gu=np.zeros((steps, 2 * n, 0, m)),
             dt=trajectory.dt,
             variational=integrator.variational,
+            ramp=ramp,
+            Gramp=None if ramp is None else np.zeros((steps, 2 * n, 0, m)),
         )
     start = scene.noise.fields(q[:-1], v[:-1], trajectory.u, first)
     A, B = Jx, Jf @ scene.transmission
     if start.Fv is not None:
         drift_x, drift_u = _drift_derivatives(scene, trajectory, first, variational=integrator.variational)
         A, B = A + integrator.drift_share * Jf @ drift_x, B + integrator.drift_share * Jf @ drift_u
+        if ramp is not None:
+            ramp = ramp + 0.5 * integrator.drift_share * Jf @ drift_u
     left = integrator.left
     if integrator.variational:
         jump, jump_x, jump_u = start.F, _in_momentum(scene, q[:-1], v[:-1], start), start.Fu
@@ -162,6 +169,8 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
     G = left * (Jk @ jump)
     Gx = left * _chain(Jk, jump_x)
     Gu = left * _chain(Jk, jump_u)
+    # Noise and drift are of a step's mean control.
+    Gramp = None if ramp is None else 0.5 * Gu
     if left < 1.0:
         # The part of a kick after the step is evaluated at the step's end.
         end_q, end_v = trajectory.q[1:], trajectory.v[1:]
@@ -172,6 +181,8 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
         G[:, n:] += (1.0 - left) * end.F
         Gx[:, n:] += (1.0 - left) * np.einsum("Naib,Nbc->Naic", end_x, A)
         Gu[:, n:] += (1.0 - left) * (end.Fu + np.einsum("Naib,Nbc->Naic", end_x, B))
+        if ramp is not None and Gramp is not None:
+            Gramp[:, n:] += (1.0 - left) * (0.5 * end.Fu + np.einsum("Naib,Nbc->Naic", end_x, ramp))
     return Linearization(
         A=A,
         B=B,
@@ -183,6 +194,8 @@ def linearize_steps(scene: Scene, trajectory: Trajectory, integrator: Integrator
         Gu=Gu,
         dt=trajectory.dt,
         variational=integrator.variational,
+        ramp=ramp,
+        Gramp=Gramp,
     )
 
 

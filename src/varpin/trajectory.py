@@ -17,7 +17,7 @@ from varpin._version import __version__
 from varpin.arrays import Floats, Integers
 from varpin.errors import FileError, InputError
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
-from varpin.model import Robot
+from varpin.model import Robot, require_robot
 from varpin.support.checks import path_like
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, table, warning_count
@@ -26,7 +26,7 @@ Bytes = NDArray[np.uint8]
 
 FORMAT = "varpin.trajectory/2"
 
-_ARRAYS = ("t", "q", "v", "p", "u", "dw", "energy", "masses")
+_SEALED = ("t", "q", "v", "p", "u", "dw", "energy", "masses", "constraint_forces", "u_stages", "u_nodes")
 # Number of parts of steps that are checked at a time.
 _AT_A_TIME = 1_000_000
 
@@ -265,7 +265,20 @@ class Trajectory(Frozen):
                 "u_nodes": (nodes, m if lines != (0,) else 0),
             }
         )
-        for name in (*_ARRAYS, "constraint_forces", "u_stages", "u_nodes"):
+        self._seal()
+
+    @classmethod
+    def assembled(cls, **values: Any) -> Trajectory:
+        """A trajectory of all its attributes, with arrays that are known to fit each other; they become read-only."""
+        made = object.__new__(cls)
+        # The frozen dataclass refuses assignments.
+        vars(made).update(values)
+        made._seal()
+        return made
+
+    def _seal(self) -> None:
+        """Make all arrays read-only."""
+        for name in _SEALED:
             getattr(self, name).setflags(write=False)
         for array in vars(self.statistics).values():
             array.setflags(write=False)
@@ -362,8 +375,8 @@ class Trajectory(Frozen):
                 or NaN, as in the saved motion.
         """
         source = path_like("path", path)
-        if robot is not None and not isinstance(robot, Robot):
-            raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
+        if robot is not None:
+            require_robot(robot)
         return cls.of_members(source, read_npz(source, FORMAT), robot)
 
     @classmethod
@@ -468,6 +481,15 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         warnings=(),
         accuracy=None,
     )
+
+
+def require_trajectory(motion: object) -> Trajectory:
+    """``motion`` itself; an InputError if it is no Trajectory, which names that of a plan or a controller's run."""
+    if isinstance(motion, Trajectory):
+        return motion
+    own = next((name for name in ("trajectory", "motion") if isinstance(getattr(motion, name, None), Trajectory)), None)
+    hint = f"; give its .{own}" if own else ""
+    raise InputError(f"the motion must be a varpin.Trajectory, got {type(motion).__name__}{hint}")
 
 
 def kinematic_input_rows(trajectory: Trajectory) -> Floats:

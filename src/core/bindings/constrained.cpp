@@ -35,8 +35,8 @@ std::shared_ptr<AnyConstrainedStepper> stepper_of(const Mechanism& mechanism, co
 class ConstrainedRollout : public Rollout<AnyConstrainedStepper, ConstrainedState> {
   public:
     ConstrainedRollout(const Mechanism& mechanism, const Tableau& tableau, In<2> places, double tolerance,
-                       const Guards& guards, std::size_t paths)
-        : Rollout(mechanism, tableau, guards, paths,
+                       const Guards& guards, std::size_t paths, bool held)
+        : Rollout(mechanism, tableau, guards, paths, held,
                   stepper_of(mechanism, tableau, places_of(tableau, places), tolerance, guards)) {}
 
     ConstrainedRollout fork(const Guards& guards) const { return forked(*this, guards); }
@@ -83,8 +83,9 @@ std::tuple<Out, Out, Out, std::int64_t, std::size_t> constrained_derivatives(
 
 void register_constrained(nb::module_& m) {
     nb::class_<ConstrainedRollout>(m, "ConstrainedRollout")
-        .def(nb::init<const Mechanism&, const Tableau&, In<2>, double, const Guards&, std::size_t>(), "mechanism"_a,
-             "tableau"_a, "places"_a, "tolerance"_a, "guards"_a, "paths"_a, nb::keep_alive<1, 2>())
+        .def(nb::init<const Mechanism&, const Tableau&, In<2>, double, const Guards&, std::size_t, bool>(),
+             "mechanism"_a, "tableau"_a, "places"_a, "tolerance"_a, "guards"_a, "paths"_a, "held"_a = false,
+             nb::keep_alive<1, 2>())
         .def("fork", &ConstrainedRollout::fork, "guards"_a, nb::keep_alive<0, 1>())
         .def("begin", &ConstrainedRollout::begin, "q"_a, "v"_a)
         .def("roll", &ConstrainedRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a)

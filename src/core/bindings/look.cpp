@@ -10,6 +10,7 @@
 
 #include "arrays.hpp"
 #include "registrations.hpp"
+#include "varpin/clearance.hpp"
 
 namespace varpin::border {
 
@@ -87,6 +88,48 @@ bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> beg
                             again_v.data(), looks, {travel, velocity, little, light, even});
 }
 
+bool clearly_right(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> u, In<3> within, In<1> defect,
+                   Integers<1> substeps, double dt, In<1> points, In<1> weights, In<2> places, double still,
+                   double energy, double damping, std::int64_t damped_at, double travel, double velocity, double little,
+                   double light, double even, std::int64_t window, double whole, double grown, double aligned,
+                   std::int64_t few) {
+    const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
+    const std::size_t steps = u.shape(0), stages = within.shape(1), rule = points.shape(0);
+    if (steps == 0) throw std::invalid_argument("a motion needs at least one step");
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&p, "p"}}) require(*array, name, {steps + 1, n});
+    require(u, "u", {steps, m});
+    require(within, "within", {steps, stages, m});
+    require(defect, "defect", {steps});
+    require(substeps, "substeps", {steps});
+    if (!(dt > 0.0)) throw std::invalid_argument("dt must be positive");
+    if (rule < 2) throw std::invalid_argument("a quadrature needs both ends");
+    require(weights, "weights", {rule});
+    require(places, "places", {stages > 0 ? rule : places.shape(0), stages});
+    if (window < 1 || damped_at < 2) throw std::invalid_argument("window and damped_at must be at least 1 and 2");
+    nb::gil_scoped_release release;
+    const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), p.data(), u.data(), dt};
+    const Quadrature quadrature{{points.data(), rule}, {weights.data(), rule}, places.data(), static_cast<int>(stages)};
+    const Clear clear{still,   energy, damping, whole,     grown,
+                      aligned, window, few,     damped_at, {travel, velocity, little, light, even}};
+    Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, quadrature, clear);
+    return clearance.holds(defect.data(), substeps.data());
+}
+
+std::tuple<bool, bool, bool> inside_bounds(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within,
+                                           In<3> bounds) {
+    const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
+    const std::size_t steps = u.shape(0), stages = within.shape(1);
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {steps + 1, n});
+    require(u, "u", {steps, m});
+    require(within, "within", {steps, stages, m});
+    require(bounds, "bounds", {3, 2, n});
+    nb::gil_scoped_release release;
+    const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), nullptr, u.data(), 0.0};
+    const Inside found =
+        inside_of(mechanism, record, stages > 0 ? within.data() : nullptr, static_cast<int>(stages), bounds.data());
+    return {found.position, found.velocity, found.effort};
+}
+
 std::tuple<std::int64_t, std::int64_t, std::int64_t> alternation(In<2> v, std::optional<In<2>> u, double counts,
                                                                  double idle, double even) {
     if (v.shape(0) == 0) throw std::invalid_argument("a motion needs at least one node");
@@ -106,6 +149,11 @@ void register_look(nb::module_& m) {
     m.def("glance", &glance_at, "mechanism"_a, "q"_a, "v"_a, "u"_a, "substeps"_a, "dt"_a);
     m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "dt"_a, nb::kw_only(),
           "even"_a, "looks"_a);
+    m.def("clearly_right", &clearly_right, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "within"_a, "defect"_a,
+          "substeps"_a, "dt"_a, nb::kw_only(), "points"_a, "weights"_a, "places"_a, "still"_a, "energy"_a, "damping"_a,
+          "damped_at"_a, "travel"_a, "velocity"_a, "little"_a, "light"_a, "even"_a, "window"_a, "whole"_a, "grown"_a,
+          "aligned"_a, "few"_a);
+    m.def("inside_bounds", &inside_bounds, "mechanism"_a, "q"_a, "v"_a, "u"_a, "within"_a, "bounds"_a);
     m.def("windows_agree", &windows_agree, "mechanism"_a, "q"_a, "v"_a, "begins"_a, "length"_a, "dt"_a, "again_q"_a,
           "again_v"_a, nb::kw_only(), "travel"_a, "velocity"_a, "little"_a, "light"_a, "even"_a);
 }

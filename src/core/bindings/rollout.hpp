@@ -23,13 +23,15 @@ namespace varpin::border {
 template <class Stepper, class State>
 class Rollout {
   public:
-    Rollout(const Mechanism& mechanism, const Tableau& tableau, const Guards& guards, std::size_t paths,
+    Rollout(const Mechanism& mechanism, const Tableau& tableau, const Guards& guards, std::size_t paths, bool held,
             std::shared_ptr<Stepper> stepper)
         : mechanism_(&mechanism),
           stepper_(std::move(stepper)),
           guards_(guards),
           stages_(tableau.stages),
-          states_(paths, State(mechanism, tableau.stages)) {}
+          states_(paths, State(mechanism, tableau.stages)) {
+        stepper_->held = held;
+    }
 
     // Start each path at its row of q and v (P, n); false if an M(q) is not positive definite.
     bool begin(In<2> q, In<2> v) {

@@ -52,8 +52,9 @@ std::shared_ptr<Stepper> stepper_of(const Mechanism& mechanism, const Tableau& t
 class VariationalRollout : public Rollout<Stepper, PathState> {
   public:
     VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left, std::size_t paths, Solver solver)
-        : Rollout(mechanism, tableau, guards, paths, stepper_of(mechanism, tableau, tolerance, guards, left, solver)) {}
+                       double left, std::size_t paths, Solver solver, bool held)
+        : Rollout(mechanism, tableau, guards, paths, held,
+                  stepper_of(mechanism, tableau, tolerance, guards, left, solver)) {}
 
     VariationalRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
@@ -129,9 +130,9 @@ void register_rollouts(nb::module_& m) {
         .def_static("make", &guards_of, nb::kw_only(), "active"_a, "branch_margin"_a, "energy_balance"_a,
                     "energy_budget"_a, "most_halvings"_a);
     nb::class_<VariationalRollout>(m, "VariationalRollout")
-        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t, Solver>(),
+        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t, Solver, bool>(),
              "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "left"_a, "paths"_a, "solver"_a = Solver::automatic,
-             nb::keep_alive<1, 2>())
+             "held"_a = false, nb::keep_alive<1, 2>())
         .def("fork", &VariationalRollout::fork, "guards"_a, nb::keep_alive<0, 1>())
         .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
         .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,

@@ -71,10 +71,10 @@ def within_constraints(search: Callable[P, Solution]) -> Callable[P, Solution]:
 
     @functools.wraps(search)
     def solve(*args: P.args, **kwargs: P.kwargs) -> Solution:
-        given = signature.bind(*args, **kwargs)
-        problem = given.arguments.get("problem")
+        problem = args[0] if args else kwargs.get("problem")
         if not (isinstance(problem, OptimalControlProblem) and problem.constraints):
             return search(*args, **kwargs)
+        given = signature.bind(*args, **kwargs)
         options = {name: value for name, value in given.arguments.items() if name not in ("problem", "true_cost")}
         wish = given.arguments.get("true_cost")
         if wish is None:

@@ -15,7 +15,21 @@ from varpin import core
 from varpin.arrays import Floats
 from varpin.control.costs import CostError, Expansion
 from varpin.control.descent import Model, Stake, at_stake
-from varpin.control.linear_controls import RULE, Derivatives, LinearSteps, at_samples, linear_steps, size
+from varpin.control.linear_controls import (
+    RULE,
+    Derivatives,
+    LinearSteps,
+    after_impulse,
+    at_samples,
+    curvature_on_lines,
+    derivatives,
+    in_step,
+    linear_steps,
+    noisy,
+    size,
+    widened,
+    with_pull,
+)
 from varpin.control.moments import noise_gradient
 from varpin.control.penalties import PenalizedProblem, PenalizedRate, flat, rate_columns
 from varpin.control.problem import OptimalControlProblem
@@ -115,8 +129,12 @@ def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floa
     return g
 
 
-def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, costate: Floats) -> Floats:
-    """Second-derivative terms of dynamics and noise fields in the cost to go (N, 2n + m, 2n + m), in (x, u)."""
+def _curvature(along: Along, plan: Plan, costate: Floats) -> Floats:
+    """Second-derivative terms of dynamics and noise fields in the cost to go (N, 2n + m, 2n + m), in (x, u).
+
+    With linear controls they are those of N + 1 steps in (X, u).
+    """
+    problem, trajectory = along.problem, along.trajectory
     scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
     N, samples, rule = problem.steps, len(problem.model_rule), problem.model_rule
     gradient = problem.expand_running(trajectory).gradient.reshape(N, samples, -1)
@@ -133,18 +151,20 @@ def _curvature(problem: OptimalControlProblem, trajectory: Trajectory, plan: Pla
     if after:
         z += np.einsum("Ni,Nix->Nx", pulls[3], velocity_at_nodes(scene, trajectory.q[1:], trajectory.v[1:]))
     second = second_order_steps(scene, trajectory, z, problem.integrator)
-    total = np.block([[second.xx, np.swapaxes(second.ux, 1, 2)], [second.ux, second.uu]])
+    if problem.linear:
+        total = curvature_on_lines(problem, trajectory, z, second.xx)
+    else:
+        total = np.block([[second.xx, np.swapaxes(second.ux, 1, 2)], [second.ux, second.uu]])
     if rule[:, [2, 6]].any():
         total[:, : 2 * n, : 2 * n] += velocity_curvature(scene, trajectory.q[:-1], trajectory.v[:-1], pulls[1])
     if after:
-        lin = _linearize(problem, trajectory, 0)
-        J = np.concatenate([lin.A, lin.B], axis=2)
+        J, _ = in_step(_linearize(problem, trajectory, 0))
         total += np.swapaxes(J, 1, 2) @ velocity_curvature(scene, trajectory.q[1:], trajectory.v[1:], pulls[3]) @ J
     if problem.processes and problem.integrator.variational:
         pull = plan.spread @ impulses(problem, trajectory, plan.jumps)
         weight = problem.integrator.left * np.swapaxes(plan.jumps, 1, 2) @ pull
         total[:, :n, :n] += scene.noise.curvature(weight)
-    return total
+    return widened(total, scene.controls) if problem.linear else total
 
 
 def backward(
@@ -170,7 +190,7 @@ def backward(
     plan, costate = _pass(along, max(regularization, 1e-3), costates=True)
     if plan is None:
         return None
-    return _foreseeing(along, regularization, _curvature(problem, trajectory, plan, costate))
+    return _foreseeing(along, regularization, _curvature(along, plan, costate))
 
 
 def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
@@ -391,6 +411,7 @@ def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
         feedback[:, :, plan.feedback.shape[2] :][:, :, :m] = plan.previous
     expected, moves, state = np.empty((R, x + m)), np.empty((R, m)), np.zeros(x + m)
     previous = np.zeros((0, m, m)) if plan.previous is None or problem.linear else plan.previous
+    spread = np.zeros((R if plan.spread.size else 0, x, x)) if problem.linear else plan.spread
     for begin, end in along.blocks:
         rows = slice(begin // problem.hold, end // problem.hold)
         gains = core.Gains(
@@ -399,7 +420,7 @@ def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
             previous=previous[rows],
             control_gradient=plan.gradient[rows],
             costate=np.zeros((0, x)),
-            spread=plan.spread[begin:end],
+            spread=spread[begin:end],
         )
         steps = along.steps(begin, end, None, _Limits(along.slack, np.zeros((0, x + m))))
         core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows])
@@ -436,7 +457,9 @@ class Along:
             self.blocks, self.states = [(0, problem.decisions)], size(problem)
         self.kept: tuple[Linearization, Floats] | None = None
         # Gradient of the noise cost, added to the cost's gradient at its samples (N s, 2n + m) once it is known.
-        self.added: Floats | float = 0.0
+        self.added: Floats | None = None
+        # With linear controls in (x, w, u) of each step (N, 2n + 2m).
+        self.pulled: Floats | None = None
         self.noise_differentiated = False
 
     @cached_property
@@ -451,10 +474,14 @@ class Along:
     def differentiate_noise(self, plan: Plan, processes: NDArray[np.bool_]) -> None:
         """Add the whole gradient of the noise cost of ``processes`` (k,) under the plan's gains to later passes."""
         problem, N = self.problem, self.problem.steps
-        lin, velocity = self.linearized(0, N)
         feedback = Feedback(plan.feedback, plan.previous)
         pull = noise_gradient(problem, self.trajectory, feedback, self.rate, processes)
+        if problem.linear:
+            self.pulled, self.noise_differentiated = pull, True
+            vars(self).pop("line", None)
+            return
         # A gradient in (x, u) is one in (q, v, u) at the step's first sample.
+        lin, velocity = self.linearized(0, N)
         rule, x, m = problem.model_rule, 2 * problem.scene.robot.dof, problem.scene.controls
         D = np.zeros((N, x + m, x + m))
         D[:, :x] = at_samples(rule[:1], np.concatenate([lin.A, lin.B], axis=2), velocity)[0]
@@ -466,7 +493,7 @@ class Along:
     @property
     def slopes(self) -> Floats:
         """The gradient of the running cost at its samples, with that of the noise cost if it was added."""
-        return self.running.gradient + self.added
+        return self.running.gradient if self.added is None else self.running.gradient + self.added
 
     @cached_property
     def stake(self) -> Stake:
@@ -496,16 +523,18 @@ class Along:
     @cached_property
     def line(self) -> LinearSteps:
         """The steps with the control in the state, where controls are linear between nodes."""
-        found = self.running
-        return linear_steps(self.problem, self.of_lines, found.gradient, found.hessian, self.rate, self.pull)
+        problem, found, lines = self.problem, self.running, self.of_lines
+        steps = linear_steps(problem, lines, found.gradient, found.hessian, self.rate, self.pull)
+        if problem.processes:
+            x = lines.A.shape[1]
+            kicked = after_impulse(problem.model_rule, found.hessian, lines.velocity, problem.steps, x, problem.dt)
+            steps = noisy(steps, lines, kicked)
+        return steps if self.pulled is None else with_pull(steps, self.pulled, problem.dt)
 
     @cached_property
     def of_lines(self) -> Derivatives:
         """Derivatives of the steps whose controls are linear between nodes."""
-        problem = self.problem
-        lin, velocity = self.linearized(0, problem.steps)
-        ramp = problem.integrator.ramps(problem.scene, self.trajectory) @ problem.scene.transmission
-        return Derivatives(lin.A, lin.B - ramp, ramp, velocity)
+        return derivatives(*self.linearized(0, self.problem.steps))
 
     @property
     def maps(self) -> tuple[Floats, Floats]:
@@ -532,7 +561,7 @@ class Along:
     def steps(self, begin: int, end: int, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
         """The expansions of a block of steps for the core."""
         if self.problem.linear:
-            return self._on_lines(limits)
+            return self._on_lines(curvature, limits)
         problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.model_rule)
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
@@ -557,19 +586,19 @@ class Along:
             pull=self.pull[rows],
         )
 
-    def _on_lines(self, limits: _Limits) -> core.ExpandedSteps:
-        N, X, m = self.line.B.shape
+    def _on_lines(self, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
+        X, m = self.line.B.shape[1:]
         return core.ExpandedSteps(
             A=self.line.A,
             B=self.line.B,
-            G=np.zeros((N, X, 0)),
-            Gx=np.zeros((N, X, 0, X)),
-            Gu=np.zeros((N, X, 0, m)),
+            G=self.line.G,
+            Gx=self.line.Gx,
+            Gu=self.line.Gu,
             rule=RULE,
             gradient=self.line.gradient,
             hessian=self.line.hessian,
             velocity=np.zeros((0, X // 2, X)),
-            curvature=np.zeros((0, X + m, X + m)),
+            curvature=np.zeros((0, X + m, X + m)) if curvature is None else curvature,
             slack=limits.slack,
             expected=limits.expected,
             rate=np.zeros((0, m, m)),
@@ -627,7 +656,7 @@ def _one_pass(
         pull = along.terminal.cost.gradient[:, n:]
         by_states = by_states + velocity_curvature(scene, along.trajectory.q[-1:], along.trajectory.v[-1:], pull)[0]
     if problem.linear:
-        return _one_pass_on_lines(along, regularization, limits, roots=roots), np.empty((0, 2 * n))
+        return _one_pass_on_lines(along, regularization, costates, curvature, by_states, limits, roots=roots)
     noisy = N if k else 0
     jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
@@ -688,31 +717,43 @@ def _one_pass(
     return plan, costate
 
 
-def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | None, *, roots: bool) -> Plan | None:
-    """The pass of a plan whose controls are linear between nodes."""
+def _one_pass_on_lines(
+    along: Along,
+    regularization: float,
+    costates: bool,
+    curvature: Floats | None,
+    by_states: Floats,
+    limits: _Limits | None,
+    *,
+    roots: bool,
+) -> tuple[Plan | None, Floats]:
+    """The pass of a plan whose controls are linear between nodes; ``by_states`` is the terminal Hessian (2n, 2n)."""
     problem, X, x = along.problem, along.states, 2 * along.problem.scene.robot.dof
     R, m = problem.decisions, problem.scene.controls
-    cost, D, by_state, by_states = along.terminal
+    cost, D, by_state, _ = along.terminal
     end_gradient, end_hessian = np.zeros(X), np.zeros((X, X))
     end_gradient[:x], end_hessian[:x, :x] = by_state, by_states
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
+    line, k = along.line, problem.processes
+    spread, costate = np.empty((R if k else 0, X, X)), np.empty((R if costates else 0, X))
+    of_states = costate[1:, :x]
     gains = core.Gains(
         feedforward=feedforward,
         feedback=feedback,
         previous=np.empty((0, m, m)),
         control_gradient=gradient,
-        costate=np.empty((0, X)),
-        spread=np.empty((0, X, X)),
+        costate=costate,
+        spread=spread,
     )
-    steps = along.steps(0, R, None, limits or _Limits(np.zeros((0, 2, m)), np.zeros((0, X + m))))
+    steps = along.steps(0, R, curvature, limits or _Limits(np.zeros((0, 2, m)), np.zeros((0, X + m))))
     how = (problem.dt, 1, float(regularization))
     found: core.BackwardPass | core.RootPass
     if roots:
         final = squares_of(cost.gradient, cost.hessian)
-        squares = squares_of(along.line.gradient, along.line.hessian)
+        squares = squares_of(line.gradient, line.hessian)
         change = squares_of(np.zeros((0, m)), np.zeros((0, m, m)))
         if final is None or squares is None or change is None:
-            return None
+            return None, of_states
         wide = np.concatenate([D, np.zeros((x, X - x))], axis=1)
         found = core.RootPass(m, final.after(wide).padded(X).core, end_gradient)
         failed = found.run(*how, steps, gains, squares.core, change.core)
@@ -720,26 +761,32 @@ def _one_pass_on_lines(along: Along, regularization: float, limits: _Limits | No
         found = core.BackwardPass(m, end_gradient, end_hessian)
         failed = found.run(*how, steps, gains)
     if failed >= 0 or not (math.isfinite(found.slope) and math.isfinite(found.curvature)):
-        return None
-    return Plan(
+        return None, of_states
+    jumps, noise = np.empty((0, x, x // 2)), found.noise
+    after = spread[1:, :x, :x] + problem.dt * line.kicked
+    if k:
+        jumps, G = along.linearized(0, problem.steps)[0].J, line.G[1:, :x]
+        noise += 0.5 * problem.dt * float((G * (line.kicked @ G)).sum())
+    plan = Plan(
         feedforward,
         feedback[:, :, :x].copy(),
         feedback[:, :, x : x + m].copy(),
         gradient,
         found.slope,
         found.curvature,
-        0.0,
-        np.empty((0, x, x // 2)),
-        np.empty((0, x, x)),
+        noise,
+        jumps,
+        after,
         limits is not None,
         found.loss,
         along.model,
     )
+    return plan, of_states
 
 
 def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> Linearization:
     try:
-        return linearize_steps(problem.scene, part, problem.integrator, problem.q0)
+        return linearize_steps(problem.scene, part, problem.integrator, problem.q0, ramps=problem.linear)
     except LinearizationError as error:
         step = begin + error.step
         raise LinearizationError(step, step * problem.dt, error.reason) from None

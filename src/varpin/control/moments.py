@@ -1,9 +1,10 @@
 """The noise cost of a motion under feedback, to second order, and its gradient in the motion.
 
 With the gains held, the covariance of (x, u) is propagated forward and the quadratic value function W backward; the
-noise cost is a sum over the steps. The share of a step depends only on the state and the control at its beginning,
+noise cost is a sum over the steps. The share of a step depends only on the state at its beginning and on its control,
 through its derivatives, the Hessians of its costs and its noise. Central differences of the linearized steps give the
-gradient of the shares. Equation (O12) of docs/mathematics.md.
+gradient of the shares. A control that is linear over the step is a pair (w, u), those at its ends. Equation (O12) of
+docs/mathematics.md.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
-from varpin.control.linear_controls import at_samples
+from varpin.control.linear_controls import after_impulse, at_samples, in_step, of_samples, on_lines, shifted_lines
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.spread import Feedback, decision, propagated
+from varpin.control.spread import Feedback, decided, propagated
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
 
@@ -26,12 +27,12 @@ _SHIFT = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """N linearized steps in (x, u) with their costs to second order."""
+    """N linearized steps in their Z variables, (x, u) or (x, w, u), with their costs to second order."""
 
-    J: Floats  # (N, 2n, 2n + m)
+    J: Floats  # (N, 2n, Z)
     g: Floats  # (N, 2n, k) derivative in the noise
-    gz: Floats  # (N, 2n, k, 2n + m) its derivative in (x, u)
-    cost: Floats  # (N, 2n + m, 2n + m) Hessian of the running cost
+    gz: Floats  # (N, 2n, k, Z) its derivative in the variables
+    cost: Floats  # (N, Z, Z) Hessian of the running cost
     kicked: Floats  # (N, 2n, 2n) Hessian of the part sampled after the noise impulse, in the state there
 
 
@@ -42,7 +43,7 @@ def noise_gradient(
     rate: Floats,
     processes: NDArray[np.bool_],
 ) -> Floats:
-    """The gradient (N, 2n + m) of the noise cost in the state and the control at the beginning of each step, (O12).
+    """The gradient (N, Z) of the noise cost in the Z variables of each step, (O12).
 
     It leaves out the part through the strength of the noise, which the backward pass already has.
 
@@ -53,30 +54,32 @@ def noise_gradient(
         rate: Hessian (R, m, m) of the cost of control changes, or (0, m, m).
         processes: Mask of the processes that count (k,).
     """
-    n, m, N = problem.scene.robot.dof, problem.scene.controls, problem.steps
+    n, N = problem.scene.robot.dof, problem.steps
     here = _steps_of(problem, trajectory, processes)
+    Z = here.J.shape[2]
     W = _values(problem, here, feedback, _end_hessian(problem, trajectory), rate)
     C = propagated(here.J, here.g, here.gz, problem, feedback)
     variational = problem.integrator.variational
     x = np.concatenate([trajectory.q, trajectory.p if variational else trajectory.v], axis=1)
-    y = np.concatenate([x[:-1], trajectory.u], axis=1)
+    nodes = trajectory.u_nodes
+    y = np.concatenate([x[:-1], *((nodes[:-1], nodes[1:]) if problem.linear else (trajectory.u,))], axis=1)
     slopes = velocity_at_nodes(problem.scene, trajectory.q, trajectory.v)
     size = np.abs(y).max(axis=0)
     shift = _SHIFT * np.where(size > 0.0, size, 1.0)
-    found = np.empty((N, 2 * n + m))
-    for c in range(2 * n + m):
+    found = np.empty((N, Z))
+    for c in range(Z):
         change = []
         for sign in (1.0, -1.0):
-            step = np.zeros(2 * n + m)
+            step = np.zeros(Z)
             step[c] = sign * shift[c]
             # Every other step begins at a shifted state; the node after it moves accordingly.
             shares = np.empty(N)
             for first in range(min(2, N)):
                 rows = slice(first, N, 2)
-                dx, du = np.zeros((N + 1, 2 * n)), np.zeros((N, m))
+                dx, du = np.zeros((N + 1, 2 * n)), np.zeros((N, Z - 2 * n))
                 dx[:-1][rows], du[rows] = step[: 2 * n], step[2 * n :]
                 dx[1:][rows] = here.J[rows] @ step
-                near = _steps_of(problem, _perturbed(trajectory, dx, du, slopes, variational), processes)
+                near = _steps_of(problem, _perturbed(problem, trajectory, dx, du, slopes), processes)
                 shares[rows] = _shares(problem, near, W, C)[rows]
             change.append(shares)
         found[:, c] = (change[0] - change[1]) / (2.0 * shift[c])
@@ -87,7 +90,7 @@ def noise_gradient(
         for sign in (1.0, -1.0):
             dx = np.zeros((N + 1, 2 * n))
             dx[N, c] = sign * shift[c]
-            end = _perturbed(trajectory, dx, np.zeros((N, m)), slopes, variational)
+            end = _perturbed(problem, trajectory, dx, np.zeros((N, Z - 2 * n)), slopes)
             change.append(0.5 * (_end_hessian(problem, end) * C[N, : 2 * n, : 2 * n]).sum())
         at_end[c] = (change[0] - change[1]) / (2.0 * shift[c])
     found[-1] += here.J[-1].T @ at_end
@@ -119,53 +122,55 @@ def _end_hessian(problem: OptimalControlProblem, trajectory: Trajectory) -> Floa
     return np.asarray(D.T @ H @ D)
 
 
-def _perturbed(trajectory: Trajectory, dx: Floats, du: Floats, slopes: Floats, variational: bool) -> Trajectory:
-    """A trajectory with shifted nodes and controls; its steps do not connect, but each can be linearized."""
+def _perturbed(
+    problem: OptimalControlProblem, trajectory: Trajectory, dx: Floats, du: Floats, slopes: Floats
+) -> Trajectory:
+    """A trajectory with shifted nodes and controls; its steps do not connect, but each can be linearized.
+
+    ``du`` (N, m) are changes of the controls, or (N, 2m) those of the ends of linear ones.
+    """
     n = trajectory.q.shape[1]
     q = trajectory.q + dx[:, :n]
-    if not variational:
-        return replace(trajectory, q=q, v=trajectory.v + dx[:, n:], u=trajectory.u + du)
+    moved = shifted_lines(problem, trajectory, du) if problem.linear else replace(trajectory, u=trajectory.u + du)
+    if not problem.integrator.variational:
+        return replace(moved, q=q, v=trajectory.v + dx[:, n:])
     v = trajectory.v + np.einsum("Nix,Nx->Ni", slopes, dx)
-    return replace(trajectory, q=q, p=trajectory.p + dx[:, n:], v=v, u=trajectory.u + du)
+    return replace(moved, q=q, p=trajectory.p + dx[:, n:], v=v)
 
 
 def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory, processes: NDArray[np.bool_]) -> _Steps:
     scene, n, m, N = problem.scene, problem.scene.robot.dof, problem.scene.controls, problem.steps
     x, h, rule, samples = 2 * n, problem.dt, problem.rule, len(problem.rule)
-    lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0)
+    lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0, ramps=problem.linear)
     velocity = np.zeros((0, n, x))
     if problem.integrator.variational and rule[:, [2, 4, 6, 8]].any():
         velocity = velocity_at_nodes(scene, trajectory.q, trajectory.v)
-    J = np.concatenate([lin.A, lin.B], axis=2)
+    J, gz = in_step(lin)
     hessian = problem.expand_running(trajectory).hessian
-    of_sample = hessian.reshape(-1, samples, x + m, x + m) if len(hessian) > 1 else hessian[:, None]
-    cost, kicked = np.zeros((N, x + m, x + m)), np.zeros((N, x, x))
-    of_controls = np.zeros((N, m, x + m))
-    of_controls[:, :, x:] = np.eye(m)
-    after = np.broadcast_to(np.eye(x), (N, x, x))
-    nothing = rule.copy()
-    nothing[:, [1, 2, 5, 6]] = 0.0
-    for s, (D, P) in enumerate(zip(at_samples(rule, J, velocity), at_samples(nothing, after, velocity), strict=True)):
-        H = of_sample[:, s if of_sample.shape[1] > 1 else 0]
-        whole = np.concatenate([D, of_controls], axis=1)
-        weight = h * rule[s, 0]
-        cost += weight * np.swapaxes(whole, 1, 2) @ H @ whole
-        if nothing[s, 1:].any():
-            kicked += weight * np.swapaxes(P, 1, 2) @ H[:, :x, :x] @ P
-    gz = np.concatenate([lin.Gx, lin.Gu], axis=3)[:, :, processes]
-    return _Steps(J, lin.G[:, :, processes], gz, cost, kicked)
+    cost = np.zeros((N, J.shape[2], J.shape[2]))
+    if problem.linear:
+        wholes = on_lines(rule, problem.places, J, velocity, m)
+    else:
+        of_controls = np.zeros((N, m, x + m))
+        of_controls[:, :, x:] = np.eye(m)
+        wholes = [np.concatenate([D, of_controls], axis=1) for D in at_samples(rule, J, velocity)]
+    for s, whole in enumerate(wholes):
+        cost += h * rule[s, 0] * np.swapaxes(whole, 1, 2) @ of_samples(hessian, samples, s) @ whole
+    kicked = after_impulse(rule, hessian, velocity, N, x, h)
+    return _Steps(J, lin.G[:, :, processes], gz[:, :, processes], cost, kicked)
 
 
 def _hessian(problem: OptimalControlProblem, steps: _Steps, W: Floats, k: int | slice) -> Floats:
-    """Hessian in (x, u) of the cost from step k on, with the value function W after the step."""
+    """Hessian in the step's variables of the cost from step k on, with the value function W after the step."""
     J, gz, x = steps.J[k], steps.gz[k], steps.J.shape[1]
+    after = slice(-problem.scene.controls, None)
     across = W[..., :x, x:]
     spread = problem.dt * (W[..., :x, :x] + steps.kicked[k])
     Y = steps.cost[k] + np.swapaxes(J, -1, -2) @ W[..., :x, :x] @ J
     mixed = np.swapaxes(J, -1, -2) @ across
-    Y[..., :, x:] += mixed
-    Y[..., x:, :] += np.swapaxes(mixed, -1, -2)
-    Y[..., x:, x:] += W[..., x:, x:]
+    Y[..., :, after] += mixed
+    Y[..., after, :] += np.swapaxes(mixed, -1, -2)
+    Y[..., after, after] += W[..., x:, x:]
     added: Floats = np.einsum("...akz,...ab,...bky->...zy", gz, spread, gz, optimize=True)
     return Y + added
 
@@ -187,13 +192,14 @@ def _values(
     W = np.zeros((N + 1, x + m, x + m))
     W[N, :x, :x] = terminal
     for k in range(N - 1, -1, -1):
-        W[k] = _hessian(problem, steps, W[k + 1], k)
-        if k % problem.hold == 0:
-            r = k // problem.hold
-            T = decision(feedback, r, x, m)
-            W[k] = T.T @ W[k] @ T
-            if len(rate):
-                change = T[x:].copy()
-                change[:, x:] -= np.eye(m)
-                W[k] += change.T @ rate[r] @ change
+        Y = _hessian(problem, steps, W[k + 1], k)
+        T = decided(problem, feedback, k, x)
+        if T is None:
+            W[k] = Y
+            continue
+        W[k] = T.T @ Y @ T
+        if len(rate):
+            change = T[-m:].copy()
+            change[:, x:] -= np.eye(m)
+            W[k] += change.T @ rate[k + 1 if problem.linear else k // problem.hold] @ change
     return W

@@ -17,7 +17,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.verification import excess, percent
 from varpin.ensemble.looks import greater, looked_at, looked_at_here
 from varpin.ensemble.paths import Extremes, Shared, Task, chunks, simulate_paths, without_geometry
-from varpin.errors import InputError, VarpinError
+from varpin.errors import VarpinError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.wiener import Children, children
 from varpin.simulation.commands import commands_of
@@ -135,8 +135,6 @@ def monte_carlo(
 ) -> MonteCarlo:
     """See :meth:`Solution.monte_carlo`; for any policy."""
     paths = count("paths", paths, least=2)
-    if problem.linear:
-        raise InputError("monte_carlo draws noise, which linear controls do not support: plan with controls='held'")
     costs: list[Floats] = []
     found: tuple[Finding, ...] = ()
     extremes: Extremes = {}
@@ -204,7 +202,8 @@ def _tasks(problem: OptimalControlProblem, shared: Shared, q0: Floats, v0: Float
 def _together(chunk: _Chunk) -> _Costs:
     part = simulate_paths(chunk.task)
     stored = part.stored
-    return _Costs(chunk.problem.costs(stored["q"], stored["v"], stored["u"]), part.extremes)
+    u = stored["u_nodes" if chunk.problem.linear else "u"]
+    return _Costs(chunk.problem.costs(stored["q"], stored["v"], u), part.extremes)
 
 
 def _alone(given: _Alone) -> _Costs:
@@ -220,9 +219,9 @@ def _look_alone(given: _Alone) -> tuple[Finding, ...]:
     """Findings about the first path."""
     (child,) = given.seeds.generators(given.path, given.path + 1)
     motion = given.problem.simulate(given.policy, rng=child)
-    _, found = examined_in_loop(
-        given.problem.scene, given.problem.integrator, motion, given.policy.hold_at(given.problem.dt)
-    )
+    # The loop's check is for held controls.
+    hold = None if given.problem.linear else given.policy.hold_at(given.problem.dt)
+    _, found = examined_in_loop(given.problem.scene, given.problem.integrator, motion, hold)
     return tuple(Finding(finding.kind, f"path {given.path}: {finding.sentence}") for finding in found)
 
 

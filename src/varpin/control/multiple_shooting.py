@@ -22,7 +22,7 @@ from varpin.arrays import Floats
 from varpin.control.backward import Along, Plan, backward, states
 from varpin.control.costs import CostError, Expansion
 from varpin.control.history import Iteration
-from varpin.control.penalties import PenalizedProblem
+from varpin.control.penalties import PenalizedProblem, PenalizedRate
 from varpin.control.problem import OptimalControlProblem
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError
@@ -88,8 +88,6 @@ def path_of(problem: OptimalControlProblem, given: object) -> Path:
     Raises:
         InputError: The states do not fit the problem, or do not begin at its q0.
     """
-    if problem.linear:
-        raise InputError("states need held controls; the problem's are linear between nodes")
     if problem.scene.inputs:
         raise InputError(
             "states cannot be used with a KinematicInput, whose control is its joint's position: give controls instead"
@@ -163,6 +161,10 @@ class GapClosing:
             StepFailure: The motion cannot be integrated.
             CostError: The cost of the motion is not finite.
         """
+        self._wanted = problem
+        if problem.linear:
+            problem = _held(problem)
+            controls = None if controls is None else 0.5 * (controls[:-1] + controls[1:])
         scene, own = assisted(problem.scene), quiet(problem.scene)
         self.scene, self.problem = scene, problem.changed(scene=own)
         if isinstance(problem, PenalizedProblem):
@@ -208,9 +210,9 @@ class GapClosing:
     def policy(self) -> LinearPolicy:
         """The controls of the motion, with feedback that stabilizes it."""
         problem, motion = self.problem, self.motion.trajectory
-        limits = problem.control_limits
-        return LinearPolicy(
-            problem.decided(motion),
+        limits, u = problem.control_limits, problem.decided(motion)
+        held = LinearPolicy(
+            u,
             self._gains,
             states(problem, motion)[: -1 : problem.hold],
             problem.hold,
@@ -218,6 +220,22 @@ class GapClosing:
             (limits[0], limits[1]),
             period=problem.period,
         )
+        if not self._wanted.linear:
+            return held
+        # Lines through the means of neighbours. A line answers a state half a step later than a held control, so that
+        # its feedback may do harm.
+        nodes = np.vstack([u[:1], 0.5 * (u[:-1] + u[1:]), u[-1:]])
+        line = LinearPolicy(
+            nodes[1:],
+            held.gains,
+            held.reference,
+            on=held.on,
+            limits=(limits[0], limits[1]),
+            before=nodes[0],
+            period=held.period,
+            linear=True,
+        )
+        return min((line, line.without_feedback()), key=lambda policy: _cost_under(self._wanted, policy))
 
     def run(self, iterations: int, deadline: float, report: Callable[[Iteration, Trajectory], None]) -> None:
         """Remove the auxiliary forces, in at most ``iterations``; some may remain."""
@@ -274,14 +292,7 @@ class GapClosing:
 
     def _holding_cost(self) -> float:
         """Cost of the default first motion, under the holding policy; infinite where it fails."""
-        problem, own = self.problem, self.problem.integrator
-        n, m = problem.scene.robot.dof, problem.scene.controls
-        commands = problem.holding_policy().commands(problem.steps, m, n, own.variational, problem.dt, own.stage_times)
-        try:
-            motion, failure = Motions(problem.scene, own, problem.q0, problem.v0, problem.dt).under(commands)
-            return np.inf if failure is not None else float(problem.shares(motion).sum())
-        except _TRIAL_ERRORS:
-            return np.inf
+        return _cost_under(self.problem, self.problem.holding_policy())
 
     def _iterate(self, regularization: float) -> Iteration:
         """Remove all auxiliary forces at once if the motion follows the model; else reduce them."""
@@ -472,6 +483,27 @@ class _Around(Along):
             slope += float((self.pull * change).sum())
             curvature += float(np.einsum("ka,kab,kb->", change, self.rate, change))
         return slope + 0.5 * curvature
+
+
+def _held(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The problem with held controls in the place of linear ones, without penalties of their changes."""
+    if not isinstance(problem, PenalizedProblem):
+        return problem.changed(controls="held")
+    rate = problem.rate.plain if isinstance(problem.rate, PenalizedRate) else problem.rate
+    return problem.changed(controls="held", rate=rate, all_penalties=problem.penalties, given=None)
+
+
+def _cost_under(problem: OptimalControlProblem, policy: LinearPolicy) -> float:
+    """Cost of the motion under a policy, without noise; infinite where it fails."""
+    own, n, m = problem.integrator, problem.scene.robot.dof, problem.scene.controls
+    commands = policy.commands(problem.steps, m, n, own.variational, problem.dt, own.stage_times)
+    if problem.linear:
+        commands = commands._replace(before=problem.begun(commands.before))
+    try:
+        motion, failure = Motions(problem.scene, own, problem.q0, problem.v0, problem.dt).under(commands)
+        return np.inf if failure is not None else float(problem.shares(motion).sum())
+    except _TRIAL_ERRORS:
+        return np.inf
 
 
 def _products(hessian: Floats, z: Floats) -> Floats:

@@ -103,7 +103,8 @@ class OptimalControlProblem(Frozen):
         dt: Time step [s].
         steps: N.
         integrator: Any of varpin's. If left out, ``Gauss(stages=4)``; ``Radau(stages=4)`` where dry friction or dampers
-            are more than 10 times as fast as the step at ``q0`` and rest, and the scene has no constraints.
+            are more than 10 times as fast as the step at ``q0`` and rest, and the scene has no constraints. Both with
+            ``kick="held"`` where the scene has noise.
         sampling: Where in each step running costs are sampled. ``"gauss"``, the default: at its two Gauss points, with
             a cubic motion between the nodes, of fourth order; at four points where a :class:`varpin.KinematicInput` is
             cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of
@@ -168,9 +169,8 @@ class OptimalControlProblem(Frozen):
             UnknownJoint: An unknown joint name, or one of a joint that is not driven, for controls.
             InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
                 reference that does not fit the problem's grid, or a lower limit above the upper one; linear controls
-                with ``hold`` or in a scene with noise; ``hold`` or linear controls with a
-                :class:`KinematicInput`; another ``sampling`` than "gauss" with a cubic one; constraints that are no
-                plan constraints or of another robot.
+                with ``hold``; ``hold`` or linear controls with a :class:`KinematicInput`; another ``sampling`` than
+                "gauss" with a cubic one; constraints that are no plan constraints or of another robot.
             CostError: A reference function fails.
             AssemblyError: The scene's constraints cannot be satisfied near q0.
         """
@@ -198,10 +198,6 @@ class OptimalControlProblem(Frozen):
         if controls == "linear" and hold != 1:
             raise InputError(
                 f"linear controls change at every node: leave hold = {hold} out, or take controls='held'", "controls"
-            )
-        if controls == "linear" and scene.processes:
-            raise InputError(
-                "plans with linear controls take no noise: use controls='held', or leave the noise out", "controls"
             )
         if integrator is not None and not isinstance(integrator, Integrator):
             raise InputError(f"integrator must be one of varpin's, for example varpin.Gauss(4), got {integrator!r}")
@@ -309,7 +305,7 @@ class OptimalControlProblem(Frozen):
         """R, the number of decisions: steps / hold, or steps + 1 where controls are linear between nodes."""
         return self.steps + 1 if self.linear else self.steps // self.hold
 
-    @property
+    @cached_property
     def linear(self) -> bool:
         """Whether controls are linear in time between nodes."""
         return self.controls == "linear"
@@ -681,12 +677,13 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4), and rings after each jump
     of a held control. In reaches of damped arms, plans of the L-stable method lose less from z = 10 on, and those of
     the default up to 5. With constraints of the scene it is always the default, since Radau's methods do not support
-    them.
+    them. Noise is held over the step: in the long steps of plans an impulse costs two to five times as much.
     """
-    stages = default_integrator().stages
+    stages: int = default_integrator().stages
+    kick: Literal["held", "left"] = "held" if scene.processes else "left"
     if scene.constraints or not dt * rate_at_rest(scene, q0) > _STIFF:
-        return default_integrator()
-    return Radau(stages=stages)
+        return Gauss(stages=stages, kick=kick)
+    return Radau(stages=stages, kick=kick)
 
 
 def _control_limits(given: tuple[JointValues, JointValues] | None, scene: Scene) -> Floats:

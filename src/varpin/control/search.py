@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass, replace
@@ -180,9 +181,9 @@ def solve(
             pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of another planner
             will do: auxiliary joint forces hold the first motion on it, and the first iterations remove them (multiple
             shooting). ``controls`` are then those along the states, by default the inverse dynamics' clipped to their
-            limits. Single shooting continues from there. Held controls only, and no :class:`KinematicInput`. A search
-            that ends with auxiliary forces left drops them: resumed, it continues from the controls alone, not as if it
-            had not been interrupted.
+            limits. Single shooting continues from there. Linear controls are held ones until then. There must be no
+            :class:`KinematicInput`. A search that ends with auxiliary forces left drops them: resumed, it continues
+            from the controls alone, not as if it had not been interrupted.
 
     Returns:
         The best motion found, however the search ended. ``status`` and ``reason`` tell how it ended; ``warnings`` lists
@@ -206,8 +207,6 @@ def solve(
     if not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held' or 'whole', got {noise!r}")
     report_all = require_reports(callback, progress)
-    if problem.linear and second_order:
-        raise InputError("second_order is for held controls; the problem's are linear between nodes")
     positive("tolerance", tolerance, "1")
     deadline = time.perf_counter() + checked_time(time_limit)
     fraction("armijo", armijo)
@@ -445,6 +444,10 @@ class _Search:
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
         self.trials = Trials(problem)
+        integrator = problem.integrator
+        # Whether steps may be divided, and the integrator with fewer halvings, by their greatest number.
+        self.divides = isinstance(integrator, Variational) and integrator.guard is not None and is_dataclass(integrator)
+        self.less: dict[int, Integrator] = {}
         self._around: Along | None = None
         self.trajectory: Trajectory
         self.shares: Floats  # the terms of the trajectory's cost
@@ -820,14 +823,16 @@ class _Search:
     def _bounds(self) -> Iterator[_Bounds]:
         """Bounds on trials, from tight to none."""
         integrator = self.problem.integrator
-        guard = integrator.guard if isinstance(integrator, Variational) else None
-        if not (self.bounded and guard is not None and is_dataclass(integrator)):
+        if not (self.bounded and self.divides and isinstance(integrator, Variational)):
             yield _Bounds(integrator, np.inf, watched=False)
             return
         # A step cut into s substeps has taken at most s - 1 halvings.
         few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
         for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
-            yield _Bounds(_cut_less(integrator, halvings), parts, watched=halvings > _HALVINGS)
+            less = self.less.get(halvings)
+            if less is None:
+                less = self.less[halvings] = _cut_less(integrator, halvings)
+            yield _Bounds(less, parts, watched=halvings > _HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
     def _try(self, step: float, plan: Plan, here: _Here, bounds: _Bounds) -> _Trial:
@@ -843,10 +848,10 @@ class _Search:
         u = here.controls + step * plan.feedforward
         if problem.limited:
             u = _onto_limits(u, problem.control_limits)
-        commands = here.feedback._replace(u=u)
+        commands = Commands(u, *here.feedback[1:])
         if problem.linear:
             # The first control has no feedback: its state is given.
-            commands = here.feedback._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
+            commands = commands._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
         try:
             attempt = self.trials.attempt(
                 commands, integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
@@ -864,9 +869,9 @@ class _Search:
         except _TRIAL_ERRORS as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
-        if not np.isfinite(there).all():
-            return _Trial()
         cost = float((there - self.shares).sum())
+        if not math.isfinite(cost):
+            return _Trial()
         return _Trial(attempt, there, cost, cost + noise + more)
 
     def _noise_beyond(self, trial: Trajectory, plan: Plan) -> float:

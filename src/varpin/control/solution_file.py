@@ -242,18 +242,29 @@ def _require_problem(source: Path, members: Members, problem: OptimalControlProb
     given = {name: getattr(problem, name) for name in (*_PROBLEM, "dt")}
     # Files without this entry are older than linear controls.
     members = {"controls": np.array("held"), **members}
-    for name, value in (given | {"problem.integrator": repr(problem.integrator)}).items():
+    for name, value in given.items():
         if name not in members or not np.array_equal(members[name], value):
-            what = name.removeprefix("problem.")
-            raise FileError(f"{source} is of a problem with {what} = {members.get(name, 'unknown')}, not {value}")
+            raise FileError(f"{source} is of a problem with {name} = {members.get(name, 'unknown')}, not {value}")
     described, found = problem.described_constraints, str(members.get("problem.constraints", ""))
     if described != found:
         raise FileError(f"{source} is of a problem with constraints = {found or 'none'}, not {described or 'none'}")
     _require_surroundings(source, members, problem, "noise.")
+    # After the noise, which decides about the default integrator.
+    stored, here = str(members.get("problem.integrator", "unknown")), repr(problem.integrator)
+    if stored != here:
+        raise FileError(f"{source} is of a problem with integrator = {stored}, not {here}: give it as integrator=")
 
 
 def _require_surroundings(source: Path, members: Members, problem: OptimalControlProblem, kind: str) -> None:
-    for name, array in _surroundings(problem).items():
+    """Refuse numbers, of those whose names begin with ``kind``, that differ or are on one side alone."""
+    known = _surroundings(problem)
+    for name, array in members.items():
+        if name.startswith(kind) and name not in known and array.size:
+            raise FileError(
+                f"{source} is of a problem with {name.replace('.', ' ')}, which the given one, or this installation "
+                "of varpin, does not have"
+            )
+    for name, array in known.items():
         found = members.get(name)
         if name.startswith(kind) and (found is None or found.dtype != array.dtype or not same(found, array)):
             raise FileError(f"{source} is of a problem with another {name.replace('.', ' ')}")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.control.linear_controls import in_step
 from varpin.control.problem import OptimalControlProblem
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
@@ -29,46 +30,55 @@ def state_slopes(problem: OptimalControlProblem, motion: Trajectory) -> Floats:
     return slopes
 
 
-def decision(feedback: Feedback, r: int, x: int, m: int) -> Floats:
-    """The matrix from (x, previous control) to (x, u)."""
-    T = np.zeros((x + m, x + m))
-    T[:x, :x], T[x:, :x] = np.eye(x), feedback.state[r]
+def decided(problem: OptimalControlProblem, feedback: Feedback, k: int, x: int) -> Floats | None:
+    """The matrix from (x, previous control) at node k to the variables of the step from it; None within a decision.
+
+    These are (x, u), or (x, w, u) of linear controls, with w the previous control.
+    """
+    m, lines = problem.scene.controls, problem.linear
+    if k % problem.hold:
+        return None
+    r = k + 1 if lines else k // problem.hold
+    T = np.zeros((x + 2 * m if lines else x + m, x + m))
+    T[:x, :x] = np.eye(x)
+    if lines:
+        T[x : x + m, x:] = np.eye(m)
+    T[-m:, :x] = feedback.state[r]
     if feedback.before is not None:
-        T[x:, x:] = feedback.before[r]
+        T[-m:, x:] = feedback.before[r]
     return T
 
 
 def propagated(J: Floats, g: Floats, gz: Floats, problem: OptimalControlProblem, feedback: Feedback) -> Floats:
-    """Covariances of (x, u) at the beginning of each step and at the end (N + 1, 2n + m, 2n + m).
+    """Covariances (N + 1, Z, Z) of the variables of each step, and that of the state at the end.
 
     P' = T P T' + dt sum_i E[g_i g_i'] with each control held over its decision; :func:`varpin.propagate_moments` is the
     same without feedback. Control limits are neglected.
 
     Args:
-        J: Derivatives of the steps in (x, u) (N, 2n, 2n + m).
+        J: Derivatives of the steps in their Z variables (N, 2n, Z): (x, u), or (x, w, u) of linear controls.
         g: Derivatives in the noise (N, 2n, k).
-        gz: Derivatives of g in (x, u) (N, 2n, k, 2n + m).
+        gz: Derivatives of g in the variables (N, 2n, k, Z).
         problem: The problem.
         feedback: The gains.
     """
-    N, x, m = len(J), J.shape[1], J.shape[2] - J.shape[1]
-    C, covariance = np.zeros((N + 1, x + m, x + m)), np.zeros((x + m, x + m))
+    N, x, Z = J.shape
+    m = problem.scene.controls
+    C, covariance = np.zeros((N + 1, Z, Z)), np.zeros((x + m, x + m))
+    through = np.zeros((x + m, Z))
+    through[x:, Z - m :] = np.eye(m)
     for k in range(N):
-        if k % problem.hold == 0:
-            T = decision(feedback, k // problem.hold, x, m)
-            covariance = T @ covariance @ T.T
-        C[k] = covariance
-        through = np.zeros((x + m, x + m))
-        through[:x], through[x:, x:] = J[k], np.eye(m)
-        covariance = through @ covariance @ through.T
+        T = decided(problem, feedback, k, x)
+        C[k] = covariance if T is None else T @ covariance @ T.T
+        through[:x] = J[k]
+        covariance = through @ C[k] @ through.T
         covariance[:x, :x] += problem.dt * (g[k] @ g[k].T + (gz[k] @ C[k]).reshape(x, -1) @ gz[k].reshape(x, -1).T)
-    C[N] = covariance
+    C[N, :x, :x] = covariance[:x, :x]
     return C
 
 
 def covariances(problem: OptimalControlProblem, motion: Trajectory, feedback: Feedback) -> Floats:
     """Covariances of the state at the nodes of a motion under feedback (N + 1, 2n, 2n), see :func:`propagated`."""
-    lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0)
-    J, gz = np.concatenate([lin.A, lin.B], axis=2), np.concatenate([lin.Gx, lin.Gu], axis=3)
-    x = J.shape[1]
+    lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0, ramps=problem.linear)
+    (J, gz), x = in_step(lin), lin.A.shape[1]
     return propagated(J, lin.G, gz, problem, feedback)[:, :x, :x]

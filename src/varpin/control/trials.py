@@ -59,18 +59,21 @@ class Attempt(NamedTuple):
         """The motion up to where it ended."""
         trials, done = self.trials, int(self.written.done[0])
         scene, known = trials.problem.scene, trials.whole
+        for array in (self.written.tally, self.written.quality, self.halvings):
+            # So are the views of them that the statistics have.
+            array.setflags(write=False)
         statistics = statistics_of(self.written, 0, done, self.halvings)
         if known is not None and self.whole and self.line is None:
             # Checked once: all whole motions of a problem have the same shapes.
             q, v, p, energy = self.nodes
             # Views of what does not change: the arrays of each motion are its own objects, pickled or not.
-            changed = {name: getattr(known, name)[:] for name in _SHARED}
-            changed |= {"q": q, "v": v, "p": p, "energy": energy, "u": self.u}
+            own = {"q": q, "v": v, "p": p, "energy": energy, "u": self.u}
             if scene.constraints:
-                changed["constraint_forces"] = self.impulses / trials.problem.dt
-            for array in (*changed.values(), *vars(statistics).values()):
+                own["constraint_forces"] = self.impulses / trials.problem.dt
+            for array in own.values():
                 array.setflags(write=False)
-            return known.changed(**changed, statistics=statistics)
+            shared = {name: getattr(known, name)[:] for name in _SHARED if name not in own}
+            return known.changed(**own, **shared, statistics=statistics)
         q, v, p, energy = (nodes[: done + 1] for nodes in self.nodes)
         made = Trajectory(
             t=trials.times[: done + 1],

@@ -23,6 +23,7 @@ from varpin.core._core import Watch as Watch
 from varpin.core._core import accelerations as accelerations
 from varpin.core._core import box_minimum as box_minimum
 from varpin.core._core import change_values as change_values
+from varpin.core._core import clearly_right as clearly_right
 from varpin.core._core import constrained_derivatives as constrained_derivatives
 from varpin.core._core import coupling_kinds as coupling_kinds
 from varpin.core._core import element_kinds as element_kinds
@@ -31,6 +32,7 @@ from varpin.core._core import expand_changes as expand_changes
 from varpin.core._core import fastest_damping as fastest_damping
 from varpin.core._core import foresee as foresee
 from varpin.core._core import glance as glance
+from varpin.core._core import inside_bounds as inside_bounds
 from varpin.core._core import linearize_explicit as linearize_explicit
 from varpin.core._core import longest_alternation as longest_alternation
 from varpin.core._core import pulls_fast as pulls_fast

@@ -191,6 +191,7 @@ class VariationalRollout(_Rollout):
         left: float,
         paths: int,
         solver: Solver = Solver.automatic,
+        held: bool = False,
     ) -> None: ...
     def fork(self, guards: Guards) -> VariationalRollout:
         """An independent copy of the paths."""
@@ -215,7 +216,14 @@ class ConstrainedRollout(_Rollout):
     """Paths under constraints."""
 
     def __init__(
-        self, mechanism: Mechanism, tableau: Tableau, places: Floats, tolerance: float, guards: Guards, paths: int
+        self,
+        mechanism: Mechanism,
+        tableau: Tableau,
+        places: Floats,
+        tolerance: float,
+        guards: Guards,
+        paths: int,
+        held: bool = False,
     ) -> None: ...
     def fork(self, guards: Guards) -> ConstrainedRollout:
         """An independent copy of the paths."""
@@ -549,6 +557,52 @@ def energy_turnover(
     Returns the largest kinetic energy; the largest accumulated work of all controls, for servos that of their drives;
     and for each coordinate (n,) the kinetic energy of the largest change of its velocity, at least the share ``even``
     of its largest velocity, and the largest accumulated work.
+    """
+
+def clearly_right(
+    mechanism: Mechanism,
+    q: Floats,
+    v: Floats,
+    p: Floats,
+    u: Floats,
+    within: Floats,
+    defect: Floats,
+    substeps: Integers,
+    dt: float,
+    *,
+    points: Floats,
+    weights: Floats,
+    places: Floats,
+    still: float,
+    energy: float,
+    damping: float,
+    damped_at: int,
+    travel: float,
+    velocity: float,
+    little: float,
+    light: float,
+    even: float,
+    window: int,
+    whole: float,
+    grown: float,
+    aligned: float,
+    few: int,
+) -> bool:
+    """Whether the equations of motion hold along the record of a motion far better than any warning needs.
+
+    The arguments are those of :func:`glance` and :func:`energy_turnover`; controls at the stages of each step
+    ``within`` (N, s, m), s = 0 for controls that are constant over each; the error ``defect`` (N,) of the energy
+    balance; ``points`` and ``weights`` (r,) of a quadrature on [0, 1], its ends included; and the factors ``places``
+    (r, s) of the controls at the stages on those at the points. All others are largest errors, see
+    src/core/include/varpin/clearance.hpp.
+    """
+
+def inside_bounds(
+    mechanism: Mechanism, q: Floats, v: Floats, u: Floats, within: Floats, bounds: Floats
+) -> tuple[bool, bool, bool]:
+    """Whether q and v (N + 1, n) and the controls' forces are each within ``bounds`` (3, 2, n), the least and the most.
+
+    The controls are u (N, m), and those at the stages of each step ``within`` (N, s, m).
     """
 
 def windows_agree(

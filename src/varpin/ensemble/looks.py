@@ -67,5 +67,7 @@ def _examine(task: Task) -> tuple[Finding, ...]:
     drawn = generator.standard_normal((shared.steps, shared.scene.processes)) * np.sqrt(shared.dt)
     motions = Motions(shared.scene, shared.integrator, task.q0[0], task.v0[0], shared.dt)
     motion, _ = motions.under(shared.commands, increments=drawn)
-    hold = shared.commands.hold if len(shared.commands.gains) else None
+    # The loop's check is for held controls.
+    held = len(shared.commands.gains) and not len(shared.commands.stage_times)
+    hold = shared.commands.hold if held else None
     return examined_in_loop(shared.scene, shared.integrator, motion, hold)[1]

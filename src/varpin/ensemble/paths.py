@@ -17,7 +17,7 @@ from varpin.ensemble.histogram import count_in_bins
 from varpin.ensemble.record import PathFailure
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator, Segment
-from varpin.integrators.base import Failure, rows
+from varpin.integrators.base import Failure, lines, rows
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.inputs import as_moved
 from varpin.mechanics.scene import Scene
@@ -178,6 +178,8 @@ class _Chunk:
         self.generators = shared.seeds.generators(task.first, task.first + self.paths)
         # The previous control of each path; NaN before the first unless the policy gives one.
         self.before = [np.repeat(shared.commands.before, group.stop - group.start, axis=0) for group in self.groups]
+        # Whether controls are linear between nodes; the stored ones of steps are then their means.
+        self.linear = len(shared.commands.stage_times) > 0
         self.alive = np.ones(self.paths, dtype=bool)
         self.nodes = np.zeros(self.paths, dtype=np.int64)
         self.split = np.zeros(self.paths, dtype=np.int64)
@@ -205,15 +207,18 @@ class _Chunk:
         if task.store:
             self.stored = {name: np.full((self.paths, N + 1, n), np.nan) for name in ("q", "v", "p")}
             self.stored |= {"energy": np.full((self.paths, N + 1), np.nan), "u": np.full((self.paths, N, m), np.nan)}
+            if self.linear:
+                self.stored["u_nodes"] = np.full((self.paths, N + 1, m), np.nan)
+                self.stored["u_nodes"][:, 0] = shared.commands.before
 
     def part(self) -> Part:
         """Simulate all steps."""
         task, shared = self.task, self.shared
         states = []
-        for group in self.groups:
+        for group, before in zip(self.groups, self.before, strict=True):
             state, first = shared.integrator.start(shared.scene, task.q0[group], task.v0[group])
             states.append(state)
-            self._store(0, group, first, [1] * len(first))
+            self._store(0, group, first, [1] * len(first), before)
         self._reduce(0, np.ones(self.paths, dtype=np.int64))
         for begin in range(0, shared.steps, max(1, self.length)):
             end = min(shared.steps, begin + self.length)
@@ -253,7 +258,7 @@ class _Chunk:
             raise self._located(group, error) from error
         alive = self.alive[group]
         done = [len(segment.q) * int(still) for segment, still in zip(segments, alive, strict=True)]
-        self._store(begin + 1, group, segments, done)
+        self._store(begin + 1, group, segments, done, self.before[number])
         lost = np.full(shared.scene.controls, np.nan)
         self.before[number] = np.array([segment.u[-1] if len(segment.u) else lost for segment in segments])
         for i, (k, segment) in enumerate(zip(done, segments, strict=True)):
@@ -280,8 +285,8 @@ class _Chunk:
         self.alive[path] = False
         self.failures.append(PathFailure(self.task.first + path, step, failure.reason))
 
-    def _store(self, first: int, group: slice, segments: list[Segment], done: list[int]) -> None:
-        """Store nodes of a group from node ``first`` on, ``done[i]`` of its i-th path."""
+    def _store(self, first: int, group: slice, segments: list[Segment], done: list[int], before: Floats) -> None:
+        """Store nodes of a group from node ``first`` on, ``done[i]`` of its i-th path after its control ``before``."""
         n, momentum = self.shared.scene.robot.dof, self.shared.integrator.variational
         self.nodes[group] += done
         for i, (segment, k) in enumerate(zip(segments, done, strict=True), group.start):
@@ -291,16 +296,27 @@ class _Chunk:
             if k < len(x):
                 x[k:] = np.nan
             for name, array in self.stored.items():
+                if name in ("q", "v", "p", "energy"):
+                    array[i, first : first + k] = getattr(segment, name)[:k]
+            if self.stored and first > 0:
                 # The control of the step to node k is in row k - 1.
-                row = first - 1 if name == "u" else first
-                if row >= 0:
-                    array[i, row : row + k] = self._controls(segment, k) if name == "u" else getattr(segment, name)[:k]
+                mean, after = self._controls(segment, k, before[i - group.start : i - group.start + 1])
+                self.stored["u"][i, first - 1 : first - 1 + k] = mean
+                if self.linear:
+                    self.stored["u_nodes"][i, first : first + k] = after
 
-    def _controls(self, segment: Segment, steps: int) -> Floats:
-        """The controls of a segment (steps, m); those of kinematic inputs are their positions at the ends of steps."""
-        scene, u = self.shared.scene, segment.u[:steps]
-        moving = scene.inputs and self.shared.commands.hold > 1
-        return as_moved(scene, segment.q[:steps], segment.v[:steps], u) if moving else u
+    def _controls(self, segment: Segment, steps: int, before: Floats) -> tuple[Floats, Floats]:
+        """Mean controls of the steps of a segment and those at their ends (steps, m), after ``before`` (1, m).
+
+        Those of kinematic inputs are their positions at the ends of steps.
+        """
+        shared, u = self.shared, segment.u[:steps]
+        if self.linear:
+            mean, _, nodes = lines(shared.commands._replace(before=before), u, ())
+            return mean, nodes[1:]
+        moving = shared.scene.inputs and shared.commands.hold > 1
+        moved = as_moved(shared.scene, segment.q[:steps], segment.v[:steps], u) if moving else u
+        return moved, moved
 
     def _reduce(self, first: int, done: Integers) -> None:
         """Add the block to the statistics. It begins at node ``first`` and has ``done[i]`` nodes of path i."""

@@ -25,7 +25,8 @@ from varpin.simulation.commands import commands_of
 from varpin.simulation.record import rollout
 from varpin.simulation.soundness import Finding, announce
 from varpin.simulation.start import in_other_units, on_constraints
-from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, positive, require_finite
+from varpin.simulation.time_steps import time_steps
+from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, require_finite
 from varpin.support.executors import executing, in_order
 
 logger = logging.getLogger(__name__)
@@ -39,8 +40,9 @@ def simulate_ensemble(
     q0: JointValues,
     v0: JointValues,
     *,
-    dt: float,
-    steps: int,
+    dt: float | None = None,
+    steps: int | None = None,
+    duration: float | None = None,
     paths: int,
     rng: np.random.Generator | int,
     controls: JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None = None,
@@ -61,7 +63,8 @@ def simulate_ensemble(
         q0: Initial configuration, (n,) or by joint name for all paths, or (P, n) [rad or m].
         v0: Initial velocity, the same [rad/s or m/s].
         dt: Time step [s].
-        steps: N.
+        steps: N, their number.
+        duration: steps * dt [s]. Two of the three are given.
         paths: P.
         rng: Seed or generator.
         controls: None, (N, m), (m,), by joint name, :class:`OpenLoop`, :class:`FirstOrderHold`, or a
@@ -91,7 +94,8 @@ def simulate_ensemble(
         EnsembleInterrupted: Ctrl-C; holds the finished paths. It is a KeyboardInterrupt.
     """
     require_scene(scene)
-    dt, steps, paths = positive("dt", dt, "s"), count("steps", steps), count("paths", paths, least=1)
+    dt, steps = time_steps(dt, steps, duration)
+    paths = count("paths", paths, least=1)
     _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
     if scene.noise.diffusion is None:
@@ -110,8 +114,6 @@ def simulate_ensemble(
     if integrator is None:
         integrator = _usual(scene, start[0], start[1], controls, steps, dt)
     commands = commands_of(scene, integrator, controls, steps, dt)
-    if len(commands.stage_times):
-        raise InputError("an ensemble takes controls that are held; those of the policy are linear between nodes")
     with executing(executor, workers) as pool:
         shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
         sums = Sums(shared, paths, levels, store=store)

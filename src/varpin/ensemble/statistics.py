@@ -79,8 +79,8 @@ class Sums:
         self.failures += part.failures
         self.extremes = greater(self.extremes, part.extremes)
         self.nodes[here] = part.nodes
-        for name, array in part.stored.items():
-            self.stored[name][here] = array
+        for name, array in self.stored.items():
+            array[here] = part.stored[name]
         if self.estimated:
             if self.histogram is None and part.values is not None:
                 self.histogram = Histogram(part.values)

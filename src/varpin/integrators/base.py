@@ -131,6 +131,11 @@ class Integrator(ABC):
         return 1.0
 
     @property
+    def holds_noise(self) -> bool:
+        """Whether the noise of a step is a force that is constant over it, instead of impulses at its ends."""
+        return False
+
+    @property
     def drift_share(self) -> float:
         """The share of the Ito correction that has to be added as a drift.
 
@@ -162,8 +167,11 @@ class Integrator(ABC):
         segments: list[Segment] = []
         for j in range(steps_of(commands)):
             row = rows(commands, j // commands.hold, j // commands.hold + 1, segments[-1].u[None, -1] if j else None)
-            if j % commands.hold > 0:
+            if (taken := j % commands.hold) > 0:
                 row = open_loop(segments[-1].u)
+                if len(commands.stage_times):
+                    first = segments[j - taken - 1].u if j > taken else commands.before[:1]
+                    row = _rest_of_line(row, first, taken, commands)
             segments.append(self.step_in_python(scene, state, row, increments[:, j : j + 1], dt))
             if segments[-1].failure is not None:
                 break
@@ -261,7 +269,8 @@ class Integrator(ABC):
         """Derivatives of each step at dw = 0.
 
         They are taken in the state (N, 2n, 2n), in a constant force (N, 2n, n), and in the noise impulse (N, 2n, n), a
-        jump of the momentum, or of the velocity for integrators on (q, v).
+        jump of the momentum, or of the velocity for integrators on (q, v). For integrators that hold the noise of a
+        step, the last ones are those in the impulse of a constant force.
 
         Raises:
             LinearizationError: A step has no solution at dw = 0.
@@ -342,6 +351,24 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
     return np.array([diffusion_and_drift(scene, q, v, u, trajectory.q[0])[1] for q, v, u in nodes])
 
 
+def held_noise(scene: Scene, trajectory: Trajectory, steps: slice = slice(None)) -> Floats:
+    """The constant forces over some steps of a motion (N, n) whose impulses are those of its noise.
+
+    Zero for joints of kinematic inputs, whose drives absorb the noise.
+    """
+    q, v = trajectory.q[:-1][steps], trajectory.v[:-1][steps]
+    F = scene.noise.fields(q, v, trajectory.u[steps], trajectory.q[0]).F
+    return without_inputs(scene, np.einsum("Nik,Nk->Ni", F, trajectory.dw[steps]) / trajectory.dt)
+
+
+def without_inputs(scene: Scene, values: Floats) -> Floats:
+    """Values (..., n) with zeros for joints of kinematic inputs."""
+    if scene.inputs:
+        values = values.copy()
+        values[..., list(scene.inputs.values())] = 0.0
+    return values
+
+
 def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) -> Floats:
     """Forces of the controls plus a drift (N, n): (N, 1, n), or (N, s, n) for controls that change within steps."""
     drift = drift[:, None] if isinstance(drift, np.ndarray) else drift
@@ -404,22 +431,37 @@ def failure_of(nodes: RolloutArrays, path: int, done: int, reasons: Mapping[int,
 
 def first_nodes(q: Floats, p: Floats, v: Floats, energy: Floats, controls: int) -> list[Segment]:
     """A segment of one node for each of P paths, from q, p and v (P, n) and energies (P,) at their starts."""
-    none, zero, u = np.zeros(1, dtype=np.int64), np.zeros(1), np.zeros((1, controls))
-    statistics = StepStatistics(none, none, none, none, np.zeros(0, dtype=np.uint8), zero, zero, zero)
+    u, statistics = np.zeros((1, controls)), _no_statistics()
     rows = (slice(i, i + 1) for i in range(len(q)))
     return [Segment(q[row], p[row], v[row], u, energy[row], statistics) for row in rows]
 
 
+@functools.cache
+def _no_statistics() -> StepStatistics:
+    """The statistics of a first node, read-only."""
+    none, zero, halvings = np.zeros(1, dtype=np.int64), np.zeros(1), np.zeros(0, dtype=np.uint8)
+    for array in (none, zero, halvings):
+        array.setflags(write=False)
+    return StepStatistics(none, none, none, none, halvings, zero, zero, zero)
+
+
 def open_loop(u: Floats) -> Commands:
     """Controls (N, m) without feedback."""
-    m = u.shape[1]
-    u = np.ascontiguousarray(u)
-    return Commands(u, np.zeros((0, m, 0)), np.zeros((0, 0)), 1, no_limits(m), np.zeros((0, m)))
+    return Commands(np.ascontiguousarray(u), *_without_feedback(u.shape[1]))
 
 
 def open_line(u: Floats, times: Sequence[float]) -> Commands:
     """Controls (N + 1, m) at nodes without feedback, linear between them, for a method with stages at ``times``."""
     return open_loop(u[1:])._replace(before=u[:1].copy(), stage_times=np.array(tuple(times) or (0.5,)))
+
+
+@functools.cache
+def _without_feedback(controls: int) -> tuple[Floats, Floats, int, Floats, Floats]:
+    """Gains, reference, hold, limits and control before the first of :func:`open_loop`, read-only."""
+    gains, reference, before = np.zeros((0, controls, 0)), np.zeros((0, 0)), np.zeros((0, controls))
+    for array in (gains, reference, before):
+        array.setflags(write=False)
+    return gains, reference, 1, no_limits(controls), before
 
 
 @functools.cache
@@ -454,6 +496,20 @@ def lines(commands: Commands, ends: Floats, times: Sequence[float]) -> Lines:
 
     mean, after = at(np.array([0.5, 1.0])).swapaxes(0, 1)
     return Lines(mean.copy(), at(np.array(times)), np.vstack([commands.before[:1], after]))
+
+
+def _rest_of_line(end: Commands, first: Floats, taken: int, commands: Commands) -> Commands:
+    """The line from ``first`` (1, m) to ``end`` over the steps of a decision, after ``taken`` steps."""
+    here = first + taken / commands.hold * (end.u - first)
+    return end._replace(before=here, hold=commands.hold - taken, stage_times=commands.stage_times)
+
+
+def first_of(command: Commands, control: Floats, times: Sequence[float]) -> Commands:
+    """The first step under a decision's ``control`` (m,): its mean, and the values at the stages if they change."""
+    if not len(command.stage_times):
+        return open_loop(control[None])._replace(within=command.within)
+    mean, stages, _ = lines(command, control[None], times)
+    return open_loop(mean) if not stages.size else open_loop(mean)._replace(within=np.ascontiguousarray(stages))
 
 
 def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> Floats:
@@ -492,6 +548,8 @@ def steps_of(commands: Commands) -> int:
 
 def rows(commands: Commands, begin: int, end: int, before: Floats | None = None) -> Commands:
     """The commands of decisions begin, ..., end - 1; ``before`` (P, m) replaces the previous control of each path."""
+    if begin == 0 and end >= len(commands.u) and before is None:
+        return commands
     part = slice(begin, end)
     return commands._replace(
         u=commands.u[part],

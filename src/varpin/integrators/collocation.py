@@ -25,7 +25,7 @@ class Collocation(Variational):
     stages: int = 2
     guard: Guard | None = Guard()  # noqa: RUF009
     tolerance: float = 0.5
-    kick: Literal["left", "split"] = "left"
+    kick: Literal["left", "split", "held"] = "left"
 
     named = ("stages",)
 

@@ -23,8 +23,8 @@ from varpin.integrators.base import (
     drifts,
     failure_of,
     first_nodes,
+    first_of,
     forces,
-    open_loop,
     segments_of,
     steps_of,
 )
@@ -84,16 +84,17 @@ class _Explicit(Integrator):
         the velocity before the step for the other methods.
         """
         q, v = state.paths.q[0], state.paths.v[0]
-        control = control_of(command, 0, np.concatenate([q, v]), command.before)
-        F, drift = diffusion_and_drift(scene, q, v, control, state.start[0])
+        decided = control_of(command, 0, np.concatenate([q, v]), command.before)
+        now = first_of(command, decided, self.stage_times)
+        F, drift = diffusion_and_drift(scene, q, v, now.u[0], state.start[0])
         if len(increment):
             impulse = F @ increment[0, 0]
             if self.method is ExplicitMethod.euler:
                 drift = drift + impulse / dt
             else:
                 v += np.linalg.solve(mass(scene, q), impulse)
-        held = open_loop(control[None])._replace(within=command.within)
-        (segment,) = self.rollout_compiled(scene, state, held, scene.silence, drift[None, None], dt)
+        (segment,) = self.rollout_compiled(scene, state, now, scene.silence, drift[None, None], dt)
+        segment.u[:] = decided
         return segment
 
     def rollout_compiled(

@@ -36,7 +36,7 @@ class Gauss(Collocation):
             ``energy_budget`` by 1/100. That costs few substeps and reduces the energy error by a factor of fifty: in
             chaotic motions, most of it comes from a few violent moments.
         tolerance: Tolerance of the residual, in units of the rounding error of its cancelling terms.
-        kick: When the noise impulse acts: ``"left"`` or ``"split"``, as in :class:`Midpoint`.
+        kick: When the noise impulse acts: ``"left"``, ``"split"`` or ``"held"``, as in :class:`Midpoint`.
     """
 
     @property

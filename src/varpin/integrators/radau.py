@@ -29,7 +29,7 @@ class Radau(Collocation):
         guard: As in :class:`Midpoint`. With more than one stage, its ``energy_budget`` is multiplied by 1/100, so that
             undamped oscillations beside dampers keep their energy.
         tolerance: Tolerance of the residual, in units of the rounding error of its cancelling terms.
-        kick: When the noise impulse acts: ``"left"`` or ``"split"``, as in :class:`Midpoint`.
+        kick: When the noise impulse acts: ``"left"``, ``"split"`` or ``"held"``, as in :class:`Midpoint`.
     """
 
     l_stable = True

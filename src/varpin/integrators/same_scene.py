@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from varpin.errors import InputError
 from varpin.mechanics.scene import Scene, differences, same
-from varpin.trajectory import Trajectory
+from varpin.trajectory import Trajectory, require_trajectory
 
 
 def require_motion(scene: Scene, trajectory: Trajectory) -> None:
@@ -13,8 +13,7 @@ def require_motion(scene: Scene, trajectory: Trajectory) -> None:
     Raises:
         InputError: It is not one; the message tells the difference.
     """
-    if not isinstance(trajectory, Trajectory):
-        raise InputError(f"the motion must be a varpin.Trajectory, got {type(trajectory).__name__}")
+    require_trajectory(trajectory)
     if trajectory.joint_names != scene.robot.joint_names:
         raise InputError(
             f"the trajectory is of joints {', '.join(trajectory.joint_names)}; "

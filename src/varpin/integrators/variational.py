@@ -34,11 +34,12 @@ from varpin.integrators.base import (
     drifts,
     failure_of,
     first_nodes,
+    first_of,
     forces,
-    open_loop,
     parts_of,
     segments_of,
     steps_of,
+    without_inputs,
     written,
 )
 from varpin.mechanics.scene import Scene, refuse_constraints
@@ -122,7 +123,7 @@ class Variational(Integrator):
 
     guard: Guard | None
     tolerance: float
-    kick: Literal["left", "split"]
+    kick: Literal["left", "split", "held"]
 
     variational = True
 
@@ -135,13 +136,18 @@ class Variational(Integrator):
         if not (self.guard is None or isinstance(self.guard, Guard)):
             raise InputError(f"guard must be a varpin.Guard, or None for no guards, got {self.guard!r}")
         positive("tolerance", self.tolerance, "rounding units")
-        if not is_one_of(self.kick, ("left", "split")):
-            raise InputError(f"kick must be 'left' or 'split', got {self.kick!r}")
+        if not is_one_of(self.kick, ("left", "split", "held")):
+            raise InputError(f"kick must be 'left', 'split' or 'held', got {self.kick!r}")
 
     @property
     def left(self) -> float:
         """See :attr:`Integrator.left`."""
-        return 1.0 if self.kick == "left" else 0.5
+        return 0.5 if self.kick == "split" else 1.0
+
+    @property
+    def holds_noise(self) -> bool:
+        """See :attr:`Integrator.holds_noise`."""
+        return self.kick == "held"
 
     @property
     def keeps_constraints(self) -> bool:
@@ -167,10 +173,15 @@ class Variational(Integrator):
             refuse_constraints(scene, str(self))
             raise InputError(f"{self} keeps no constraints")
         if scene.processes and self.left < 1.0:
-            raise InputError("kick='split' does not go with constraints: take kick='left'")
+            raise InputError("kick='split' does not go with constraints: take kick='left' or kick='held'")
         noise = scene.noise.diffusion
-        if scene.inputs and (noise is None or noise.control.any()):
-            raise InputError("noise that depends on the controls does not go with a KinematicInput")
+        if scene.inputs and noise is None:
+            raise InputError("a CustomNoise does not go with a KinematicInput: take ControlNoise or StateNoise")
+        if noise is not None and noise.control[:, :, scene.prescribed].any():
+            raise InputError(
+                "ControlNoise is proportional to forces, and the control of a KinematicInput is a position: its "
+                "intensity (n, k, m) must be 0 there"
+            )
         if scene.noise.velocity_dependent:
             raise InputError("noise whose fields depend on the velocity does not go with constraints")
         return places
@@ -210,10 +221,24 @@ class Variational(Integrator):
         guards = self._guards_of(driven=bool(scene.inputs))
         if scene.constraints:
             rollout = ConstrainedRollout(
-                scene.core, self._tableau(), self._places(scene), float(self.tolerance), guards, len(q0)
+                scene.core,
+                self._tableau(),
+                self._places(scene),
+                float(self.tolerance),
+                guards,
+                len(q0),
+                self.holds_noise,
             )
         else:
-            rollout = VariationalRollout(scene.core, self._tableau(), float(self.tolerance), guards, self.left, len(q0))
+            rollout = VariationalRollout(
+                scene.core,
+                self._tableau(),
+                float(self.tolerance),
+                guards,
+                self.left,
+                len(q0),
+                held=self.holds_noise,
+            )
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return VariationalRun(rollout, q0.copy(), bool(scene.inputs))
@@ -283,23 +308,28 @@ class Variational(Integrator):
     ) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python."""
         q, p, v, _ = state.paths.nodes()
-        control = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
-        F, drift = diffusion_and_drift(scene, q[0], v[0], control, state.start[0])
-        if len(increment):
+        decided = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
+        now = first_of(command, decided, self.stage_times)
+        F, drift = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
+        drift = self.drift_share * drift
+        if len(increment) and self.holds_noise:
+            drift = drift + without_inputs(scene, F @ increment[0, 0]) / dt
+        elif len(increment):
             state.paths.kick(self.left * (F @ increment[0, 0])[None])
         (segment,) = self.rollout_compiled(
             scene,
             state,
-            open_loop(control[None])._replace(within=command.within),
+            now,
             scene.silence,
-            self.drift_share * drift[None, None],
+            drift[None, None],
             dt,
         )
         if len(increment) and self.left < 1.0 and segment.failure is None:
             q, p, v, _ = state.paths.nodes()
-            F, _ = diffusion_and_drift(scene, q[0], v[0], control, state.start[0])
+            F, _ = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
             state.paths.kick((1.0 - self.left) * (F @ increment[0, 0])[None])
             _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
+        segment.u[:] = decided
         return segment
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
@@ -308,7 +338,10 @@ class Variational(Integrator):
         Divided steps are repeated in the same parts, and the derivatives of the parts are multiplied.
         """
         Jx, Jf = self._derivatives(scene, trajectory)
-        kicks = Jx[:, :, scene.robot.dof :]
+        n = scene.robot.dof
+        if self.holds_noise:
+            return Jx, Jf, without_inputs(scene, Jf[:, :, :n] / trajectory.dt)
+        kicks = Jx[:, :, n:]
         if max(scene.rates, default=-1) >= 0:
             # A noise impulse does not change the velocity of a joint with a cubic input.
             kicks = kicks @ _along(scene, trajectory.q[:-1])
@@ -404,11 +437,12 @@ class Variational(Integrator):
     def _steps(self, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         """Arguments of the core, by name, to repeat every step at dw = 0."""
         statistics = trajectory.statistics
-        damage = statistics.damage()
-        if damage is None and (statistics.substeps < 1).any():
-            damage = "statistics.substeps holds numbers of parts that no step has"
-        if damage is not None:
-            raise InputError(f"the trajectory is damaged: {damage}")
+        if statistics.halvings.size or not (statistics.substeps == 1).all():
+            damage = statistics.damage()
+            if damage is None and (statistics.substeps < 1).any():
+                damage = "statistics.substeps holds numbers of parts that no step has"
+            if damage is not None:
+                raise InputError(f"the trajectory is damaged: {damage}")
         drift = self.drift_share * drifts(scene, trajectory) if scene.noise.velocity_dependent else 0.0
         force = forces(scene, trajectory, drift)
         arrays = {
@@ -477,6 +511,7 @@ def _along(scene: Scene, q: Floats) -> Floats:
 
 
 @functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=64)
 def _core_guards(given: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
     guard = given or Guard(max_halvings=0)
     return Guards.make(

@@ -249,7 +249,8 @@ class ControlNoise(Noise):
     """Forces proportional to the controls: F_i = C_i b_i u_i, where b_i is column i of the actuation matrix.
 
     Attributes:
-        intensity: One number or (m,) [s^0.5]; or an array (n, k, m) with F_i = sum_j intensity[:, i, j] u_j.
+        intensity: One number or (m,) [s^0.5]; or an array (n, k, m) with F_i = sum_j intensity[:, i, j] u_j. The
+            control of a :class:`varpin.KinematicInput` is a position, and has no noise.
     """
 
     intensity: ArrayLike

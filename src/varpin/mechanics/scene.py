@@ -45,7 +45,7 @@ from varpin.mechanics.forces import (
     of_kind,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
-from varpin.model import Robot, degrees_hint, require_sound
+from varpin.model import Robot, degrees_hint, require_robot, require_sound
 from varpin.model.tree import block_ends, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
 from varpin.support.frozen import Frozen
@@ -213,8 +213,7 @@ class Scene(Frozen):
             UnknownJoint: An argument names a joint that is no coordinate of the robot.
             UnknownFrame: A force or constraint names a frame that the robot does not have.
         """
-        if not isinstance(robot, Robot):
-            raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
+        require_robot(robot)
         require_sound(robot.tree)
         n = robot.dof
         if robot.tree.armature.size != n:
@@ -230,7 +229,7 @@ class Scene(Frozen):
         bound, order = joined([bound_constraint(constraint, robot) for constraint in values["constraints"]])
         _require_positions(robot, values["actuation"], values["elements"], bound)
         values["actuation"], bound = _with_rates(values["actuation"], bound)
-        values["noise"] = bind(noise, values["actuation"], robot.joint_names)
+        values["noise"] = bind(noise, _of_forces(values["actuation"], bound), robot.joint_names)
         values |= {"bound_constraints": bound, "constraint_order": order, "announced": set()}
         for name, value in values.items():
             if isinstance(value, np.ndarray):
@@ -297,6 +296,17 @@ class Scene(Frozen):
         """Whether any force may dissipate energy."""
         damped = any(map(dissipates, self.elements)) or any(map(dissipates, self.couplings))
         return damped or self.custom is not None
+
+    @cached_property
+    def linear(self) -> bool:
+        """Whether all forces beside the robot's own are linear in a joint's q and v: no constraints, noise or kinks."""
+        if self.constraints or self.couplings or self.processes or self.custom is not None:
+            return False
+        return all(
+            element.kind in ("JointSpring", "JointDamper")
+            or (element.kind == "PositionServo" and bool(np.isinf(element.values[2])))
+            for element in self.elements
+        )
 
     @property
     def conservative(self) -> bool:
@@ -433,7 +443,7 @@ class Scene(Frozen):
         held: Floats = self.holding @ q
         return held
 
-    @property
+    @cached_property
     def processes(self) -> int:
         """k, the number of Wiener processes."""
         return self.noise.processes
@@ -489,6 +499,18 @@ class Scene(Frozen):
             upper[c] = max(upper[c], last + _STOP_DEPTH * width) if last < upper[c] + width else upper[c]
         speed, effort = self.robot.velocity_limit, self.robot.effort_limit
         return Bounds((lower, upper), (-speed, speed), (-effort, effort))
+
+    @cached_property
+    def bound_rows(self) -> Floats:
+        """:attr:`bounds` as an array (3, 2, n)."""
+        rows = np.array(self.bounds)
+        rows.setflags(write=False)
+        return rows
+
+    @cached_property
+    def direct_efforts(self) -> bool:
+        """Whether the motors' forces are those of the controls: there are neither servos nor kinematic inputs."""
+        return not (self.servo_joints or self.inputs)
 
     @cached_property
     def bounded(self) -> tuple[bool, ...]:
@@ -739,8 +761,12 @@ def same(one: Floats, other: Floats) -> bool:
 
 def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> list[str]:
     """Messages on how a scene differs from the one of these :attr:`Scene.values`, with ``noise`` or without."""
-    found = []
-    # A file of another version may have other names.
+    # A file may be of another version, or of a core with forces of one's own.
+    found = [
+        f"the motion depends on {name}, which this installation of varpin does not know"
+        for name, before in values.items()
+        if name not in VALUES and before.size and (noise or not name.startswith("noise."))
+    ]
     for name, before in ((name, values[name]) for name in VALUES if name in values):
         now = scene.values.get(name)
         if name.startswith("noise.") and (not noise or now is None):
@@ -956,6 +982,14 @@ def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Eleme
                 f"the KinematicInput of joint {name!r} needs a control of its own for its position, and this actuation "
                 "has none; name the joint in the actuation, or give it a column with a 1"
             )
+
+
+def _of_forces(actuation: Floats, bound: Bound) -> Floats:
+    """The actuation with zeros for the positions of kinematic inputs, which absorb all forces on their joints."""
+    moved = [tie.follower for tie in bound.rows.ties if tie.follower == tie.leader and not tie.coefficients]
+    forces = actuation.copy()
+    forces[moved] = 0.0
+    return forces
 
 
 def _with_rates(actuation: Floats, bound: Bound) -> tuple[Floats, Bound]:

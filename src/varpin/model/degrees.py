@@ -26,6 +26,8 @@ def degrees_hint(robot: Robot, name: str, q: Floats) -> str:
         name: Name of the configuration, for the sentence.
         q: Configuration (n,) [rad or m].
     """
+    if not looks_like_degrees(float(np.abs(q).max(initial=0.0))):
+        return ""
     lower, upper = robot.position_limits
     bounded = np.isfinite(lower) | np.isfinite(upper)
     hundredths = 100.0 * np.clip(q, -_DEGREES, _DEGREES)

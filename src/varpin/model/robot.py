@@ -122,7 +122,7 @@ class Robot(Frozen):
         head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
         return facts(f"Robot {self.name}", rows, table(head, [(name, *map(float, row)) for name, *row in columns]))
 
-    @property
+    @cached_property
     def dof(self) -> int:
         """n, the number of generalized coordinates."""
         return len(self.joint_names)
@@ -325,6 +325,14 @@ class Robot(Frozen):
             else:
                 configuration[..., joint.idx_q] = q[..., c]
         return configuration
+
+
+def require_robot(robot: object, taker: str = "") -> Robot:
+    """``robot`` itself; an InputError if it is no Robot, which names the taker, if there is one."""
+    if not isinstance(robot, Robot):
+        where = f"{taker}: " if taker else ""
+        raise InputError(f"{where}robot must come from load_robot, got {type(robot).__name__}")
+    return robot
 
 
 def load_robot(

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.model import Robot
-from varpin.trajectory import Trajectory, kinematic_input_rows
+from varpin.model import Robot, require_robot
+from varpin.trajectory import Trajectory, kinematic_input_rows, require_trajectory
 
 if TYPE_CHECKING:
     # Imported for types alone: plotting a joint needs no optimizer.
@@ -56,8 +56,10 @@ def plot_joints(
         The figure and its axes.
 
     Raises:
-        InputError: ``robot`` has other joints than the trajectory.
+        InputError: ``trajectory`` is none, ``axes`` are none of matplotlib's, or ``robot`` is none or has other joints
+            than the trajectory.
     """
+    _require_motion(trajectory, robot)
     limits = None if robot is None else robot.position_limits
     return _plot_nodes(trajectory, trajectory.q, "position", ("rad", "m"), axes, robot, limits)
 
@@ -66,6 +68,7 @@ def plot_velocities(
     trajectory: Trajectory, axes: Axes | None = None, *, robot: Robot | None = None
 ) -> tuple[Figure | SubFigure, Axes]:
     """Joint velocities over time; arguments as for :func:`plot_joints`."""
+    _require_motion(trajectory, robot)
     limits = None if robot is None else (-robot.velocity_limit, robot.velocity_limit)
     return _plot_nodes(trajectory, trajectory.v, "velocity", ("rad/s", "m/s"), axes, robot, limits)
 
@@ -94,12 +97,12 @@ def plot_controls(
         The figure and its axes.
 
     Raises:
-        InputError: ``labels`` are not m, or ``robot`` has other joints than the trajectory.
+        InputError: ``labels`` are not m names, or as for :func:`plot_joints`.
     """
+    _require_motion(trajectory, robot)
     controls = trajectory.u.shape[1]
-    if labels is not None and len(labels) != controls:
-        raise InputError(f"labels must be {controls}, one a control, got {len(labels)}")
-    slides = _slides(trajectory, robot)
+    _require_labels(labels, controls)
+    slides = _slides(robot)
     figure, axes = _axes(axes)
     joints = _served(trajectory)
     served = [joint is not None for joint in joints]
@@ -147,8 +150,9 @@ def plot_energy_error(
         The figure and its axes.
 
     Raises:
-        InputError: ``relative`` is set and the initial energy is 0.
+        InputError: ``relative`` is set and the initial energy is 0, or as for :func:`plot_joints`.
     """
+    _require_motion(trajectory, None)
     start = trajectory.energy[0]
     if relative and start == 0.0:
         raise InputError("the initial energy is 0 J, so nothing is relative to it: plot with relative=False")
@@ -183,6 +187,8 @@ def plot_trajectory(
     Raises:
         InputError: ``axes`` are not four, or as for the single figures.
     """
+    _require_motion(trajectory, robot)
+    _require_labels(labels, trajectory.u.shape[1])
     driven = axes is not None or bool(np.any(trajectory.u))
     if axes is None:
         count = 4 if driven else 3
@@ -197,8 +203,6 @@ def plot_trajectory(
     plot_velocities(trajectory, panels[1], robot=robot)
     if driven:
         plot_controls(trajectory, panels[2], robot=robot, labels=labels)
-    elif labels is not None and len(labels) != trajectory.u.shape[1]:
-        raise InputError(f"labels must be {trajectory.u.shape[1]}, one a control, got {len(labels)}")
     plot_energy_error(trajectory, panels[-1])
     # Joints have the same colours in all panels and share one legend, which also has the key of limits in any panel.
     entries = [dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True)) for panel in panels[:-1]]
@@ -242,8 +246,9 @@ def plot_work_precision(
         The figure and its axes.
 
     Raises:
-        InputError: Another ``quantity``, or no run has such an error.
+        InputError: Another ``record`` or ``quantity``, or no run has such an error.
     """
+    _require_record(record, "WorkPrecision", "work_precision")
     labels = {
         "q": "largest error in q [rad or m]",
         "end": "error in q at the end [rad or m]",
@@ -276,8 +281,9 @@ def plot_advice(advice: Advice, axes: Axes | None = None) -> tuple[Figure | SubF
         The figure and its axes.
 
     Raises:
-        InputError: No choice has a known error.
+        InputError: ``advice`` is none, or no choice has a known error.
     """
+    _require_record(advice, "Advice", "advise")
     points = [
         (f"{choice.integrator}, {choice.dt:.3g} s", choice.seconds, choice.error)
         for choice in (advice.best, *advice.alternatives)
@@ -302,8 +308,9 @@ def plot_optimal_control_tradeoff(
     """True cost of plans over their solve time, with the Pareto front; arguments as for :func:`plot_work_precision`.
 
     Raises:
-        InputError: No run has a true cost.
+        InputError: Another ``record``, or no run has a true cost.
     """
+    _require_record(record, "OptimalControlTradeoff", "optimal_control_tradeoff")
     points = [(run.integrator, run.seconds, run.open_loop_cost) for run in record.runs]
     figure, axes = _plot_trade(points, [(run.seconds, run.open_loop_cost) for run in record.pareto()], axes)
     axes.set_xlabel("solve time [s]")
@@ -312,7 +319,12 @@ def plot_optimal_control_tradeoff(
 
 
 def apply_style(axes: Axes) -> None:
-    """Apply the style of varpin's figures: a faint grid below everything, no frame at the top and the right."""
+    """Apply the style of varpin's figures: a faint grid below everything, no frame at the top and the right.
+
+    Raises:
+        InputError: ``axes`` are none of matplotlib's.
+    """
+    _require_axes(axes)
     axes.set_prop_cycle(color=COLORS)
     axes.grid(visible=True, color="0.92", linewidth=0.8)
     axes.set_axisbelow(True)
@@ -359,7 +371,7 @@ def _plot_nodes(
     limits: tuple[Floats, Floats] | None,
 ) -> tuple[Figure | SubFigure, Axes]:
     """One line for each joint over the nodes; ``units`` are those of a revolute and of a prismatic joint."""
-    slides = _slides(trajectory, robot)
+    slides = _slides(robot)
     figure, axes = _axes(axes)
     names, unit = _labels(trajectory.joint_names, units, slides)
     for row, name, style in zip(values.T, names, _styles(len(names)), strict=True):
@@ -410,19 +422,44 @@ def _axes(axes: Axes | None) -> tuple[Figure | SubFigure, Axes]:
     if axes is None:
         figure = Figure(figsize=(8.0, 4.5), layout="constrained")
         return figure, figure.subplots()
+    _require_axes(axes)
     return axes.figure, axes
 
 
-def _slides(trajectory: Trajectory, robot: Robot | None) -> NDArray[np.bool_] | None:
-    """Whether each coordinate (n,) is prismatic; None without a robot."""
-    if robot is None:
-        return None
-    if robot.joint_names != trajectory.joint_names:
+def _require_axes(axes: object) -> None:
+    if not isinstance(axes, Axes):
+        raise InputError(f"axes must be matplotlib's, such as matplotlib.figure.Figure().subplots(), got {axes!r}")
+
+
+def _require_motion(trajectory: object, robot: Robot | None) -> None:
+    """Refuse anything but a trajectory, and a robot that is not the trajectory's."""
+    motion = require_trajectory(trajectory)
+    if robot is not None and require_robot(robot).joint_names != motion.joint_names:
         raise InputError(
             f"robot {robot.name!r} has joints {', '.join(robot.joint_names)}; "
-            f"the trajectory has {', '.join(trajectory.joint_names)}"
+            f"the trajectory has {', '.join(motion.joint_names)}"
         )
-    return robot.slides
+
+
+def _require_labels(labels: object, controls: int) -> None:
+    """Refuse anything but None or as many names as there are controls."""
+    if labels is None:
+        return
+    if isinstance(labels, str) or not isinstance(labels, Sequence) or not all(isinstance(own, str) for own in labels):
+        raise InputError(f"labels must be a list of {controls} names, one a control, got {labels!r}")
+    if len(labels) != controls:
+        raise InputError(f"labels must be {controls}, one a control, got {len(labels)}")
+
+
+def _require_record(record: object, kind: str, maker: str) -> None:
+    """Refuse a record of another class than ``kind``; by the class's name, so that no study is imported for it."""
+    if type(record).__name__ != kind:
+        raise InputError(f"this figure is of a varpin.{kind}, from varpin.{maker}, got {type(record).__name__}")
+
+
+def _slides(robot: Robot | None) -> NDArray[np.bool_] | None:
+    """Whether each coordinate (n,) is prismatic; None without a robot."""
+    return None if robot is None else robot.slides
 
 
 def _labels(names: Sequence[str], units: tuple[str, str], slides: NDArray[np.bool_] | None) -> tuple[list[str], str]:

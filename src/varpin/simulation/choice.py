@@ -19,7 +19,7 @@ from varpin.simulation.damping import fast_damping, stops_ahead, turns_fast
 from varpin.simulation.refinement import candidates, first_steps
 
 # The default, and the default under noise, where more stages do not raise the strong order.
-_USUAL, _NOISY = Gauss(2), Midpoint()
+_USUAL, _NOISY = Gauss(2), Midpoint(kick="held")
 # The integrator where a mode turns by more than this in a step [rad]: there two stages lose 2e-4 rad a period.
 _SWINGING, _TURNS = Gauss(4), 0.4
 # The integrator where damping is this many times faster than the step: there velocities of other methods lag and ring,
@@ -36,8 +36,8 @@ def usual_integrator(
 ) -> Integrator:
     """The integrator of a motion where none is given; that of a plan is :func:`varpin.control.problem.integrator_for`.
 
-    Under noise it is the midpoint rule. Where damping is faster than the step, its positions have the right
-    distribution and its velocities a warning; Radau's velocities lose nearly all of the noise.
+    Under noise it is the midpoint rule with the noise held over the step, whose stationary distributions are those of
+    the continuous system also where damping is faster than the step; Radau's velocities lose nearly all of the noise.
 
     With ``ahead`` the choice covers all stops that joints may run into, for a motion that cannot be repeated.
     """

@@ -45,11 +45,6 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
                 f"the policy's controls are positions of {', '.join(controls.servos) or 'no joints'} and forces of all "
                 f"others; the scene has servos on {', '.join(scene.servo_joints) or 'no joints'}"
             )
-        if controls.linear and scene.processes:
-            raise InputError(
-                "a policy whose controls are linear between nodes acts in scenes without noise alone: leave the "
-                "scene's noise out, or plan with held controls"
-            )
         return controls.commands(
             steps, scene.controls, scene.robot.dof, integrator.variational, dt, integrator.stage_times
         )
@@ -87,7 +82,9 @@ def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floa
     array = as_floats("controls", controls)
     if array.shape != shape and array.shape != shape[1:]:
         raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
-    return np.broadcast_to(require_finite("controls", array), shape).copy()
+    rows = np.empty(shape)
+    rows[:] = require_finite("controls", array)
+    return rows
 
 
 def held_rows(scene: Scene, controls: JointValues | None) -> Floats:

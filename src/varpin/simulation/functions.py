@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -83,15 +84,18 @@ def evaluated(
     # Kinematic inputs move to the values at the ends of steps.
     fractions = (*(times or (0.5,)), *((1.0,) if scene.inputs else ()))
     at = (numbers[:, None] + np.array(fractions)) * dt
-    called = np.ones(at.shape, dtype=np.bool_)
+    values = _at_all_times if controls.vectorized else _at_times
     if times and times[0] == 0.0 and times[-1] == 1.0:
         # The first stage of a step is the last stage of the step before.
+        called = np.ones(at.shape, dtype=np.bool_)
         called[1:, 0] = np.diff(numbers) != 1
-    found = np.empty((*at.shape, scene.controls))
-    values = _at_all_times if controls.vectorized else _at_times
-    found[called] = values(controls.f, scene, at[called], np.repeat(numbers, called.sum(axis=1)), record)
-    shared = np.flatnonzero(~called[:, 0])
-    found[shared, 0] = found[shared - 1, -1]
+        found = np.empty((*at.shape, scene.controls))
+        found[called] = values(controls.f, scene, at[called], np.repeat(numbers, called.sum(axis=1)), record)
+        shared = np.flatnonzero(~called[:, 0])
+        found[shared, 0] = found[shared - 1, -1]
+    else:
+        found = values(controls.f, scene, at.ravel(), np.repeat(numbers, at.shape[1]), record)
+        found = found.reshape(*at.shape, scene.controls)
     ends, found = found[:, -1], found[:, : len(times) or 1]
     return prescribing(scene, changing(found, times) if times else open_loop(found[:, 0]), ends)
 
@@ -151,6 +155,12 @@ def _at_all_times(
     return np.concatenate(values) if values else np.zeros((0, m))
 
 
+@functools.lru_cache(maxsize=64)
+def _compared(steps: int) -> tuple[int, ...]:
+    """The steps of a motion in which means are compared."""
+    return tuple(np.unique(np.linspace(0, steps - 1, _COMPARED).astype(np.int64)).tolist())
+
+
 def undersampled(
     controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory
 ) -> tuple[Finding, ...]:
@@ -161,14 +171,15 @@ def undersampled(
     dt, times = trajectory.dt, integrator.stage_times
     if not trajectory.steps:
         return ()
-    at = np.unique(np.linspace(0, trajectory.steps - 1, _COMPARED).astype(np.int64))
+    at = _compared(trajectory.steps)
     try:
-        halves = evaluated(controls, scene, integrator, 0.5 * dt, [2 * k + i for k in at.tolist() for i in (0, 1)])
+        halves = evaluated(controls, scene, integrator, 0.5 * dt, [2 * k + i for k in at for i in (0, 1)])
     except ControlError:
         return ()
-    mean = 0.5 * (halves.u[::2] + halves.u[1::2])
-    forces = np.setdiff1d(np.arange(scene.controls), scene.prescribed)
-    mean, taken = mean[:, forces], trajectory.u[at][:, forces]
+    mean, taken = 0.5 * (halves.u[::2] + halves.u[1::2]), trajectory.u[list(at)]
+    if len(scene.prescribed):
+        forces = np.setdiff1d(np.arange(scene.controls), scene.prescribed)
+        mean, taken = mean[:, forces], taken[:, forces]
     total, off = (float(np.abs(part).sum()) for part in (mean, mean - taken))
     if not off > _ALIKE * total:
         return ()

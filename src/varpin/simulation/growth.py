@@ -30,7 +30,7 @@ from varpin.trajectory import Trajectory
 WORDS, ADDED = "disturbances grow here", "errors of steps add up here"
 
 # Number of repeated steps; fewest steps and most joints of an examined motion.
-_NODES, _LEAST, _JOINTS = 6, 8, 60
+_NODES, FEWEST, JOINTS = 6, 8, 60
 # Number of further steps: those with the largest changes of velocity, such as jumps of controls.
 _VIOLENT = 4
 # Most steps with a kink that are repeated one by one, and their parts; also the parts of all of them in a repetition of
@@ -46,7 +46,7 @@ _SHORTEST = 1e-8
 # The share of the fastest mode's exponent by which a disturbance grows: at most half in 60 motions of arms and chains,
 # because modes turn. The exponent is the integral of the rate, which is unsteady: of the nodes the mean counts. And the
 # largest exponent that is computed.
-_ALIGNED, _MOST = 0.5, 60.0
+ALIGNED, _MOST = 0.5, 60.0
 
 
 class Growth(NamedTuple):
@@ -215,12 +215,12 @@ def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], fac
 def _unknown(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether errors of steps are unknown: under noise or Python forces, or for many joints."""
     unknown = scene.custom is not None or trajectory.dw.any() or not trajectory.steps
-    return bool(unknown or scene.robot.dof > _JOINTS)
+    return bool(unknown or scene.robot.dof > JOINTS)
 
 
 def _few(trajectory: Trajectory) -> bool:
     """Whether a motion has too few steps, parts of divided ones included, for disturbances to grow."""
-    return int(np.maximum(trajectory.statistics.substeps, 1).sum()) < _LEAST
+    return int(np.maximum(trajectory.statistics.substeps, 1).sum()) < FEWEST
 
 
 def _nodes(trajectory: Trajectory) -> NDArray[np.int64]:
@@ -249,4 +249,4 @@ def _modes(aq: Floats, av: Floats) -> Floats:
 def _factor(rate: float, trajectory: Trajectory) -> float:
     """The factor by which a disturbance grows over a motion whose fastest mode has this rate [1/s]."""
     length = float(trajectory.t[-1] - trajectory.t[0])
-    return float(np.exp(min(_ALIGNED * rate * length, _MOST)))
+    return float(np.exp(min(ALIGNED * rate * length, _MOST)))

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.core import inside_bounds
 from varpin.mechanics.forces import drive_forces, of_kind
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
@@ -40,10 +41,15 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
         yield LOOPS, f"{LOOPS}, and the motion is that of a tree: {pairs}; {closed} closes them"
     if not any(scene.bounded):
         return
+    q, v, u = trajectory.q, trajectory.v, trajectory.u
+    inside = inside_bounds(scene.core, q, v, u, trajectory.u_stages, scene.bound_rows)
+    if all(inside) and scene.direct_efforts:
+        return
     robot, t = scene.robot, trajectory.t
     stopped = {element.coordinate for element in of_kind(scene.elements, "JointStop")}
-    for bounded, (kind, why, of, (least, most), beyond, units) in zip(
+    for bounded, kept, (kind, why, of, (least, most), beyond, units) in zip(
         scene.bounded,
+        (*inside[:2], inside[2] and scene.direct_efforts),
         (
             (POSITION, "which nothing stops", _positions, scene.bounds.position, _OUTSIDE, ("rad", "m")),
             (VELOCITY, "which nothing holds back", _velocities, scene.bounds.velocity, None, ("rad/s", "m/s")),
@@ -51,19 +57,17 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
         ),
         strict=True,
     ):
-        if not bounded:
+        if kept or not bounded:
             continue
         values = of(scene, trajectory)
-        top, bottom = values.max(axis=0, initial=-np.inf), values.min(axis=0, initial=np.inf)
-        if ((top <= most) & (bottom >= least)).all():
-            continue
         slides = robot.slides
         with np.errstate(invalid="ignore"):
             excess = np.maximum(least - values, values - most)
             excess = np.where(excess > (_SHARE * most if beyond is None else beyond), excess, -np.inf)
-        parts = []
         worst = excess.max(axis=0, initial=-np.inf)
-        joints = [int(c) for c in np.argsort(-worst, kind="stable") if worst[c] > 0.0]
+        if not (worst > 0.0).any():
+            continue
+        parts, joints = [], [int(c) for c in np.argsort(-worst, kind="stable") if worst[c] > 0.0]
         for c in joints[:_NAMED]:
             first, peak = int(np.argmax(excess[:, c] > 0.0)), int(np.argmax(excess[:, c]))
             since = "from the start" if first == 0 else f"from t = {t[first]:.4g} s"
@@ -71,10 +75,9 @@ def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
             amount = f"at most {worst[c]:.3g} {units[int(slides[c])]} {side} {limit:.4g} at t = {t[peak]:.4g} s"
             softly = " (its stop gives way)" if kind == POSITION and c in stopped else ""
             parts.append(f"{robot.joint_names[c]!r} {since}, {amount}{softly}")
-        if parts:
-            more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
-            reason = "" if kind == POSITION and set(joints) <= stopped else f", {why}"
-            yield kind, f"{kind}{reason}: {'; '.join(parts)}{more}"
+        more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
+        reason = "" if kind == POSITION and set(joints) <= stopped else f", {why}"
+        yield kind, f"{kind}{reason}: {'; '.join(parts)}{more}"
 
 
 def _positions(_: Scene, trajectory: Trajectory) -> Floats:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from varpin._version import __version__
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import VarpinError
@@ -109,7 +110,7 @@ def _trajectory(
     u, nodes = steps.u, np.zeros((N + 1, 0))
     if on is not None:
         u, within, nodes = lines(on, steps.u, integrator.stage_times)
-    return Trajectory(
+    return Trajectory.assembled(
         t=np.arange(N + 1, dtype=np.float64) * dt,
         q=np.concatenate([first.q, steps.q]),
         v=np.concatenate([first.v, steps.v]),
@@ -128,6 +129,9 @@ def _trajectory(
         constraint_labels=scene.constraint_labels,
         u_stages=np.zeros((N, 0, scene.controls)) if within is None else within,
         u_nodes=nodes,
+        version=__version__,
+        warnings=(),
+        accuracy=None,
     )
 
 

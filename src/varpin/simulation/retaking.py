@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, RungeKutta4
-from varpin.integrators.base import open_loop
+from varpin.integrators.base import held_noise, open_loop
 from varpin.integrators.collocation import MOST_STAGES
 from varpin.integrators.variational import Variational
 from varpin.integrators.within import Times, changing, in_parts
@@ -45,9 +46,17 @@ class Finer:
     left: float
 
 
-def stopping(scene: Scene, stages: int) -> Integrator:
-    """A method for fast damping: Radau's; under constraints, which Radau's do not keep, Gauss's."""
-    return Gauss(stages) if scene.constraints else Radau(stages)
+def stopping(scene: Scene, stages: int, integrator: Integrator) -> Integrator:
+    """A method for fast damping: Radau's; under constraints, which Radau's do not keep, Gauss's.
+
+    Noise acts as in a motion's ``integrator``.
+    """
+    kick = _kick(integrator)
+    return Gauss(stages, kick=kick) if scene.constraints else Radau(stages, kick=kick)
+
+
+def _kick(integrator: Integrator) -> Literal["left", "split", "held"]:
+    return integrator.kick if isinstance(integrator, Variational) else "left"
 
 
 def finer(
@@ -61,7 +70,7 @@ def finer(
     faster than the step (``pulled``).
     """
     stages = int(getattr(integrator, "stages", 1))
-    kick = integrator.kick if isinstance(integrator, Variational) else "left"
+    kick = _kick(integrator)
     if trajectory.dw.any() and isinstance(integrator, ExplicitEuler):
         # Its kicks come after the step.
         return Finer(integrator, 2, 0.5)
@@ -165,8 +174,10 @@ class Again:
             if self.ended:
                 return
         taken = slice(self._step + begin, self._step + end)
-        drawn = scene.silence
-        if trajectory.dw.any() and scene.noise.diffusion is not None:
+        drawn, drift = scene.silence, scene.no_drift
+        if trajectory.dw.any() and method.holds_noise:
+            drift = np.repeat(held_noise(scene, trajectory, taken), parts, axis=0)[None]
+        elif trajectory.dw.any() and scene.noise.diffusion is not None:
             drawn = np.zeros((1, (end - begin) * parts, trajectory.dw.shape[1]))
             if isinstance(method, ExplicitEuler):
                 # Its kicks come after the step.
@@ -181,8 +192,7 @@ class Again:
             at = method.stage_times
             parted = changing(in_parts(trajectory.u_stages[taken], self._times, parts, at), at)
             commands = prescribing(scene, parted, commands.u)
-        no_drift = np.zeros((0, 0, scene.robot.dof))
-        (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, no_drift, trajectory.dt / parts)
+        (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, drift, trajectory.dt / parts)
         done = len(segment.q) // parts
         for nodes, values in ((self.q, segment.q), (self.v, segment.v)):
             nodes[begin + 1 : begin + done + 1] = values[parts - 1 :: parts][:done]

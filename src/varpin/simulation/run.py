@@ -141,7 +141,7 @@ def simulate(
         early = (*early, *unmet)
         dt = span / steps
     else:
-        dt, steps = time_steps(dt, steps, duration)
+        dt, steps = time_steps(dt, steps, duration, choosable=True)
     period = count("period", period, least=1)
     _require_memory(scene, steps)
     dw = wiener_increments(scene.processes, dt, steps, rng, increments)

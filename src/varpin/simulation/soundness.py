@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats, Integers
 from varpin.core import energy_turnover, glance, windows_agree
 from varpin.integrators import ExplicitEuler, Integrator, Reference
-from varpin.integrators.base import open_loop
+from varpin.integrators.base import held_noise, open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -43,6 +43,7 @@ from varpin.simulation.accuracy import (
     violent_windows,
 )
 from varpin.simulation.chatter import RUN, Alternation, alternation
+from varpin.simulation.clearance import clearly_right
 from varpin.simulation.damping import Fast, damping_at_stop, damping_of, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.growth import ADDED as ADDED_WORDS
@@ -114,8 +115,9 @@ def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tu
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
         trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
+    errors = () if clearly_right(scene, integrator, trajectory) else _errors_found(scene, integrator, trajectory)
     found = (
-        *_errors_found(scene, integrator, trajectory),
+        *errors,
         *alternating(scene, integrator, trajectory),
         *_beyond_limits(scene, trajectory),
     )
@@ -367,7 +369,7 @@ def _wrong_at_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory)
 
 def _velocity_errors(scene: Scene, integrator: Integrator, trajectory: Trajectory, stop: Stop, count: int) -> Floats:
     """The error of a joint's velocity after each step from where it stops, as far as the repetition goes."""
-    off, method = np.zeros(0), stopping(scene, _STOPPING)
+    off, method = np.zeros(0), stopping(scene, _STOPPING, integrator)
     for parts in _REST_PARTS[1:] if scene.constraints else _REST_PARTS:
         again = taken_again(scene, method, trajectory, integrator.stage_times, stop.step, count, parts)
         if again is not None:
@@ -558,7 +560,7 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     jumps = not (steady or trajectory.u_stages.shape[1])
     other, times = integrator, 2
     if damped and not (integrator.l_stable or pulled):
-        other, times = stopping(scene, _STOPPING), 1
+        other, times = stopping(scene, _STOPPING, integrator), 1
     elif pulled or (damped and jumps):
         better = finer(integrator, trajectory, damped=damped, pulled=pulled)
         if better.parts != 1:
@@ -571,9 +573,15 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         # All paths have the same commands; their forces may differ.
         held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
         commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
-    kicks = _kicks_of(scene, integrator, trajectory, begins, length, times) if noisy else None
+    kicks, of_noise = None, scene.no_drift
+    if noisy and integrator.holds_noise:
+        of_noise = held_noise(scene, trajectory)[begins[:, None] + np.arange(length)]
+        of_noise = of_noise.reshape(len(begins), length // times, times, -1).mean(axis=2)
+        drift = drift + of_noise if drift.size else of_noise
+    elif noisy:
+        kicks = _kicks_of(scene, integrator, trajectory, begins, length, times)
     if trajectory.u_stages.shape[1]:
-        again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks)
+        again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks, of_noise)
     else:
         again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt, kicks)
     if times == 1 and not (jumps or pulled) and again is not None:
@@ -705,6 +713,7 @@ def _windows_under(
     other: Integrator,
     times: int,
     kicks: Floats | None,
+    drift: Floats,
 ) -> tuple[Floats, Floats] | None:
     """Windows of a motion with controls that change within steps, repeated by another method or in double steps."""
     at, mine, found = other.stage_times, integrator.stage_times, []
@@ -712,7 +721,7 @@ def _windows_under(
         values = trajectory.u_stages[begin : begin + length]
         commands = changing(in_parts(values, mine, 1, at) if times == 1 else in_pairs(values, mine, at), at)
         node = slice(begin, begin + 1)
-        given = commands, np.zeros((0, 0, scene.robot.dof)), times * trajectory.dt
+        given = commands, drift[window : window + 1], times * trajectory.dt
         kick = None if kicks is None else kicks[window : window + 1]
         again = other.motions(scene, trajectory.q[node], trajectory.v[node], *given, kick)
         if again is None:

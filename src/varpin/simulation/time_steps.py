@@ -30,14 +30,26 @@ from varpin.trajectory import Accuracy
 _REFINED = 16
 
 
-def time_steps(dt: float | None, steps: int | None, duration: float | None) -> tuple[float, int]:
-    """The time step [s] and the number of steps, from two of the three arguments."""
+def time_steps(
+    dt: float | None, steps: int | None, duration: float | None, *, choosable: bool = False
+) -> tuple[float, int]:
+    """The time step [s] and the number of steps, from two of the three arguments.
+
+    Args:
+        dt: Time step [s].
+        steps: Number of steps.
+        duration: Their product [s].
+        choosable: Whether a tolerance may be given instead, for the message.
+
+    Raises:
+        InputError: Not two are given, one is invalid, or the duration is no multiple of the step.
+    """
     given = {name: value for name, value in (("dt", dt), ("steps", steps), ("duration", duration)) if value is not None}
     if len(given) != 2:
         got = " and ".join(given) or "none of them"
+        other = ", or duration and tolerance [rad or m], which chooses dt" if choosable else ""
         raise InputError(
-            f"give two of dt [s], steps and duration [s], or duration and tolerance [rad or m], which chooses dt; "
-            f"got {got if len(given) < 3 else 'all three'}"
+            f"give two of dt [s], steps and duration [s]{other}; got {got if len(given) < 3 else 'all three'}"
         )
     if duration is None:
         return positive("dt", dt, "s"), count("steps", steps)

@@ -83,6 +83,7 @@ class AnyConstrainedStepper {
     virtual ~AnyConstrainedStepper() = default;
 
     Guards guards;
+    bool held = false;  // whether the noise of a step is a force that is constant over it, instead of an impulse
 
     virtual bool begin(const double* q, const double* v, ConstrainedState& state) = 0;
     virtual bool look_at(ConstrainedState& state) = 0;
@@ -300,11 +301,18 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
                 const std::int64_t row = p * steps + s;
                 const double* dw = noisy ? increments + row * k : nullptr;
                 apply_policy(commands, p, s, n, path.q.data(), path.momentum.data(), u);
-                if (noisy) {
-                    noise_impulse(mechanism, 1.0, path.q.data(), path.center.data(), u + s * controls, dw, y.data());
+                const double* extra = drift ? drift + row * n : nullptr;
+                const double* felt = noisy ? mean_control(commands, p, s, u, mean) : nullptr;
+                if (noisy && held) {
+                    held_noise(mechanism, h, extra, path.q.data(), path.center.data(), felt, dw, y.data());
+                    // The entry of a driven joint is its goal, and its drive absorbs the noise.
+                    for (const DrivenRow& own : mechanism.constraints.driven())
+                        y[own.coordinate] = extra ? extra[own.coordinate] : 0.0;
+                    extra = y.data();
+                } else if (noisy) {
+                    noise_impulse(mechanism, 1.0, path.q.data(), path.center.data(), felt, dw, y.data());
                     kick(y.data(), state);
                 }
-                const double* extra = drift ? drift + row * n : nullptr;
                 const double* within = stage_controls(commands, p, s, stages, u, line);
                 stride = within ? static_cast<int>(n) : 0;
                 constant_force(mechanism, extra, u + s * controls, force.data());
@@ -381,6 +389,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     std::array<std::vector<double>, 2> by_rates;  // (2n, 2n) and (2n, n), derivatives in rates at both ends
     std::vector<double> given;                    // (s, n) force at the stages of the whole step, if it varies
     std::vector<double> line;                     // (s, m) controls at the stages, if they are linear in time
+    std::vector<double> mean;                     // (m) and their mean
     std::vector<double> at;                       // (s + 1, s) t_kj
     std::vector<double> weight;                   // (s, s) w_ik
     Trial trial;

@@ -263,13 +263,14 @@ class ExplicitRollout {
         double* u = nodes.u + path * nodes.steps * m;
         apply_policy(commands, path, s, n, at_q.data(), at_v.data(), u);
         const double* within = stage_controls(commands, path, s, stepper_.abscissae(), u, line_);
+        const double* felt = mean_control(commands, path, s, u, mean_);
         u += s * m;
         stage_forces(*mechanism_, drift, within ? within : u, within ? stepper_.abscissae() : 1, force_.data());
         if (!regular) return Outcome::singular;
         const bool beside = method_ == ExplicitMethod::euler;
         if (kicks) kick(kicks);
         if (dw) {
-            noise_impulse(*mechanism_, 1.0, at_q.data(), center(path), u, dw, jump_.data());
+            noise_impulse(*mechanism_, 1.0, at_q.data(), center(path), felt, dw, jump_.data());
             stepper_.dynamics.solve_mass(jump_.data(), jump_.data());
             if (!beside) {
                 add_jump();
@@ -310,7 +311,7 @@ class ExplicitRollout {
     std::int64_t paths_;
     std::vector<double> center_;  // (P, n, k) of the diffusion fields
     ExplicitStepper stepper_;
-    std::vector<double> force_, jump_, line_;
+    std::vector<double> force_, jump_, line_, mean_;
 };
 
 }  // namespace varpin

@@ -178,6 +178,18 @@ template <class T, class Size>
     here.velocity = up + rate * here.axis;
 }
 
+// What a body has by itself for second derivatives: its place, its velocity, and its own inertia and momentum.
+template <class T, class Size>
+[[gnu::always_inline]] inline void enter_body(const Tree& tree, int j, const T* q, const T* v, Jet<T, Size>& w) {
+    const Body& link = tree.bodies[j];
+    auto& here = w.body[j];
+    place_body(tree, j, q, w);
+    move(tree, j, v, w);
+    here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
+    here.momentum = here.inertia * here.velocity;
+    here.columns = {here.axis, here.axis_rate};
+}
+
 template <class Size>
 [[gnu::always_inline]] inline void measure(const Tree& tree, int j, const double* v, Jet<double, Size>& w) {
     const Body& link = tree.bodies[j];
@@ -387,13 +399,7 @@ void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, S
     detail::clear_first(w);
     for (auto* matrix : {&w.M, &w.A, &w.Lqq}) detail::clear_blocks(tree, w.dof, *matrix);
     for (int j = 0; j < bodies; ++j) {
-        const Body& link = tree.bodies[j];
-        auto& here = w.body[j];
-        detail::place_body(tree, j, q, w);
-        detail::move(tree, j, v, w);
-        here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
-        here.momentum = here.inertia * here.velocity;
-        here.columns = {here.axis, here.axis_rate};
+        detail::enter_body(tree, j, q, v, w);
         if constexpr (Jet<T, Size>::scaled) detail::measure(tree, j, v, w);
     }
     for (int j = bodies - 1; j >= 0; --j) {
@@ -417,15 +423,7 @@ void momentum_slopes(const Mechanism& mechanism, const double* q, const double* 
     const Tree& tree = mechanism.tree;
     const int bodies = bodies_of(tree, w.dof);
     for (auto* matrix : {&w.M, &w.A}) detail::clear_blocks(tree, w.dof, *matrix);
-    for (int j = 0; j < bodies; ++j) {
-        const Body& link = tree.bodies[j];
-        auto& here = w.body[j];
-        detail::place_body(tree, j, q, w);
-        detail::move(tree, j, v, w);
-        here.inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
-        here.momentum = here.inertia * here.velocity;
-        here.columns = {here.axis, here.axis_rate};
-    }
+    for (int j = 0; j < bodies; ++j) detail::enter_body(tree, j, q, v, w);
     for (int j = bodies - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];
         detail::project_second<false>(mechanism, j, w);

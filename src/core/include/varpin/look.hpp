@@ -11,6 +11,7 @@
 #include "varpin/dense.hpp"
 #include "varpin/forces.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/policy.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {
@@ -52,7 +53,8 @@ class Inertias {
         at(q);
         sum_forces(mechanism_, q, v, f, forces_.data(), jet_.couplings, by_q_.data(), by_v_.data());
     }
-    double diagonal(int c) const { return jet_.M[c * jet_.dof + c]; }
+    double diagonal(int c) const { return mass(c, c); }
+    double mass(int row, int column) const { return jet_.M[row * jet_.dof + column]; }
 
     // Whether rate M - D, D = -dF/dv, is positive definite: all damping is slower than the rate. Friction that
     // decreases with the velocity does not damp.
@@ -141,6 +143,34 @@ struct Record {
     const double* u = nullptr;  // (N, m)
     double h = 0.0;             // [s]
 };
+
+// Whether q of all nodes, v of all nodes and the controls' forces of all steps are each within bounds (3, 2, n), the
+// least and the most. `within` (N, stages, m), the controls at the stages of each step, may be null. NaN is beyond
+// them.
+struct Inside {
+    bool position = true, velocity = true, effort = true;
+};
+inline Inside inside_of(const Mechanism& mechanism, const Record& record, const double* within, int stages,
+                        const double* bounds) {
+    const int n = mechanism.dof(), m = mechanism.controls;
+    Inside found;
+    const auto look = [&](const double* values, int kind, bool& inside) {
+        const double *least = bounds + 2 * kind * n, *most = least + n;
+        for (int c = 0; c < n; ++c) inside = inside && values[c] >= least[c] && values[c] <= most[c];
+    };
+    for (std::int64_t k = 0; k <= record.steps; ++k) {
+        look(record.q + k * n, 0, found.position);
+        look(record.v + k * n, 1, found.velocity);
+    }
+    std::vector<double> force(n);
+    const auto push = [&](const double* u) {
+        constant_force(mechanism, nullptr, u, force.data());
+        look(force.data(), 2, found.effort);
+    };
+    for (std::int64_t k = 0; k < record.steps; ++k) push(record.u + k * m);
+    for (std::int64_t row = 0; within && row < record.steps * stages; ++row) push(within + row * m);
+    return found;
+}
 
 // The energy that a motion turns over [J].
 struct Turnover {
@@ -243,44 +273,96 @@ struct Allowed {
     double even = 0.0;  // as in Extent::change
 };
 
+// Units of the errors of a motion over a window of its steps: each joint's travel and its largest velocity there, with
+// the lower bounds of Allowed.
+class Yardstick {
+  public:
+    explicit Yardstick(const Mechanism& mechanism)
+        : slides_(mechanism.dof()),
+          inertias_(mechanism),
+          position_(mechanism.dof()),
+          speed_(mechanism.dof()),
+          root_(mechanism.dof()),
+          unit_(mechanism.dof()) {
+        for (const Body& body : mechanism.tree.bodies) {
+            if (body.prismatic) slides_[body.coordinate] = true;
+        }
+    }
+
+    // The window of `length` steps of h [s] that begins at q and v (length + 1, n).
+    void lay(const double* q, const double* v, std::size_t length, double h, const Allowed& allowed) {
+        const std::size_t n = unit_.size();
+        std::fill(position_.begin(), position_.end(), Extent{});
+        std::fill(speed_.begin(), speed_.end(), Extent{});
+        for (std::size_t k = 0; k <= length; ++k) {
+            for (std::size_t c = 0; c < n; ++c) {
+                position_[c].add(q[k * n + c]);
+                speed_[c].add(v[k * n + c]);
+            }
+        }
+        inertias_.at(q);
+        energy_ = 0.0;
+        double far = 0.0;
+        for (std::size_t c = 0; c < n; ++c) {
+            root_[c] = std::sqrt(inertias_.diagonal(static_cast<int>(c)));
+            energy_ = larger(energy_, root_[c] * speed_[c].change(allowed.even));
+            far = larger(far, std::abs(q[c]));
+        }
+        rounding_ = 1e3 * std::numeric_limits<double>::epsilon() * (1.0 + far);
+        time_ = static_cast<double>(length) * h;
+    }
+
+    // The largest error of q (n) in units of the travel. Rounding is no error.
+    double of_travel(std::vector<double>& off, const Allowed& allowed) {
+        for (std::size_t c = 0; c < off.size(); ++c) {
+            if (off[c] <= rounding_) off[c] = 0.0;
+            unit_[c] = position_[c].width();
+        }
+        return largest_share(off, time_, allowed);
+    }
+
+    // The largest error of v (n) in units of the largest velocity.
+    double of_speed(const std::vector<double>& off, const Allowed& allowed) {
+        for (std::size_t c = 0; c < off.size(); ++c) unit_[c] = speed_[c].magnitude;
+        return largest_share(off, 1.0, allowed);
+    }
+
+  private:
+    std::vector<char> slides_;
+    Inertias inertias_;
+    std::vector<Extent> position_, speed_;
+    std::vector<double> root_, unit_;
+    double energy_ = 0.0, rounding_ = 0.0, time_ = 0.0;
+
+    double largest_share(const std::vector<double>& off, double time, const Allowed& allowed) const {
+        double largest[2] = {0.0, 0.0}, share = 0.0;
+        for (std::size_t c = 0; c < off.size(); ++c) {
+            double& of_kind = largest[int{slides_[c]}];
+            of_kind = larger(of_kind, unit_[c]);
+        }
+        for (std::size_t c = 0; c < off.size(); ++c) {
+            const double least = allowed.light * energy_ / root_[c] * time;
+            const double size = larger(unit_[c], std::min(allowed.little * largest[int{slides_[c]}], least));
+            if (off[c] == 0.0) continue;
+            share = larger(share, off[c] / size);
+        }
+        return share;
+    }
+};
+
 // Whether windows of a motion, `length` steps of h [s] from the nodes `begins` on, agree with the results `again_q` and
 // `again_v` (windows, looks, n) of other steps, at `looks` evenly spaced nodes of each window.
 inline bool agree_in_windows(const Mechanism& mechanism, const double* q, const double* v, const std::int64_t* begins,
                              std::size_t windows, std::size_t length, double h, const double* again_q,
                              const double* again_v, std::size_t looks, const Allowed& allowed) {
     const int n = mechanism.dof();
-    std::vector<char> slides(n);
-    for (const Body& body : mechanism.tree.bodies) {
-        if (body.prismatic) slides[body.coordinate] = true;
-    }
-    Inertias inertias(mechanism);
-    std::vector<Extent> position(n), speed(n);
-    std::vector<double> off_q(n), off_v(n), root(n), unit(n);
-    // Whether errors are within the allowed share of `unit`, which has lower bounds: `least`, and a share of the
-    // largest unit of the same kind.
-    const auto within = [&](const std::vector<double>& off, double part, double energy, double time) {
-        double largest[2] = {0.0, 0.0};
-        for (int c = 0; c < n; ++c) largest[int{slides[c]}] = larger(largest[int{slides[c]}], unit[c]);
-        for (int c = 0; c < n; ++c) {
-            const double least = allowed.light * energy / root[c] * time;
-            const double size = larger(unit[c], std::min(allowed.little * largest[int{slides[c]}], least));
-            if (!(off[c] <= part * size)) return false;
-        }
-        return true;
-    };
+    Yardstick yardstick(mechanism);
+    std::vector<double> off_q(n), off_v(n);
     for (std::size_t w = 0; w < windows; ++w) {
         const double* const first_q = q + begins[w] * n;
         const double* const first_v = v + begins[w] * n;
-        std::fill(position.begin(), position.end(), Extent{});
-        std::fill(speed.begin(), speed.end(), Extent{});
         std::fill(off_q.begin(), off_q.end(), 0.0);
         std::fill(off_v.begin(), off_v.end(), 0.0);
-        for (std::size_t k = 0; k <= length; ++k) {
-            for (int c = 0; c < n; ++c) {
-                position[c].add(first_q[k * n + c]);
-                speed[c].add(first_v[k * n + c]);
-            }
-        }
         for (std::size_t k = 0; k < looks; ++k) {
             const std::size_t row = (w * looks + k) * n, whole = (k + 1) * (length / looks) * n;
             for (int c = 0; c < n; ++c) {
@@ -288,21 +370,9 @@ inline bool agree_in_windows(const Mechanism& mechanism, const double* q, const 
                 off_v[c] = larger(off_v[c], std::abs(again_v[row + c] - first_v[whole + c]));
             }
         }
-        inertias.at(first_q);
-        double energy = 0.0, far = 0.0;
-        for (int c = 0; c < n; ++c) {
-            root[c] = std::sqrt(inertias.diagonal(c));
-            energy = larger(energy, root[c] * speed[c].change(allowed.even));
-            far = larger(far, std::abs(first_q[c]));
-        }
-        const double rounding = 1e3 * std::numeric_limits<double>::epsilon() * (1.0 + far);
-        for (int c = 0; c < n; ++c) {
-            if (off_q[c] <= rounding) off_q[c] = 0.0;
-            unit[c] = position[c].width();
-        }
-        if (!within(off_q, allowed.travel, energy, static_cast<double>(length) * h)) return false;
-        for (int c = 0; c < n; ++c) unit[c] = speed[c].magnitude;
-        if (!within(off_v, allowed.velocity, energy, 1.0)) return false;
+        yardstick.lay(first_q, first_v, length, h, allowed);
+        if (!(yardstick.of_travel(off_q, allowed) <= allowed.travel)) return false;
+        if (!(yardstick.of_speed(off_v, allowed) <= allowed.velocity)) return false;
     }
     return true;
 }

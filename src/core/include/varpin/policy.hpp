@@ -76,6 +76,21 @@ inline const double* stage_controls(const Commands& commands, std::ptrdiff_t pat
     return line.data();
 }
 
+// The control (m) of step s of a path that its noise sees, after apply_policy: the mean over the step. That of a linear
+// control is written to `mean`.
+inline const double* mean_control(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, const double* u,
+                                  std::vector<double>& mean) {
+    const int m = commands.controls;
+    const double* to = u + s * m;
+    if (!commands.stage_times) return to;
+    const std::ptrdiff_t first = s - s % commands.hold;
+    const double* from = first > 0 ? u + (first - 1) * m : commands.before + path * m;
+    const double share = (static_cast<double>(s - first) + 0.5) / commands.hold;
+    mean.resize(m);
+    for (int c = 0; c < m; ++c) mean[c] = (1.0 - share) * from[c] + share * to[c];
+    return mean.data();
+}
+
 // The force drift + B u of a step with constant controls; drift (n) may be null.
 inline void constant_force(const Mechanism& mechanism, const double* drift, const double* u, double* force) {
     for (int r = 0; r < mechanism.dof(); ++r) force[r] = drift ? drift[r] : 0.0;
@@ -104,6 +119,13 @@ inline void noise_impulse(const Mechanism& mechanism, double part, const double*
         }
         impulse[i] = part * total;
     }
+}
+
+// The constant force over a step of length h whose impulse is that of the noise, plus a drift (n), which may be null.
+inline void held_noise(const Mechanism& mechanism, double h, const double* drift, const double* q, const double* center,
+                       const double* u, const double* increments, double* force) {
+    noise_impulse(mechanism, 1.0 / h, q, center, u, increments, force);
+    for (int i = 0; drift && i < mechanism.dof(); ++i) force[i] += drift[i];
 }
 
 // The centres of the diffusion fields for a rollout from q.

@@ -1,6 +1,6 @@
 // The variational stepper: collocation steps that the guards accept or that are halved, repeatedly if need be; noise
-// impulses (kicks) before the step, or one half before and one half after. docs/mathematics.md, "The principal branch"
-// and "Noise".
+// impulses (kicks) before the step, or one half before and one half after, or held over it as a force.
+// docs/mathematics.md, "The principal branch" and "Noise".
 // Equations (C2) and (N2) of docs/mathematics.md.
 #pragma once
 
@@ -101,6 +101,7 @@ class Stepper {
     virtual ~Stepper() = default;
 
     Guards guards;
+    bool held = false;  // whether the noise of a step is a force that is constant over it, instead of impulses
 
     virtual bool begin(const double* q, const double* v, PathState& state) = 0;
     virtual bool look_at(PathState& state) = 0;
@@ -250,21 +251,27 @@ class VariationalStepper final : public Stepper {
                 const std::int64_t row = path * steps + s;
                 const double* dw = noisy ? increments + row * k : nullptr;
                 apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
-                if (noisy) noise_kick(left, u + s * m, dw, state);
+                const double* felt = noisy ? mean_control(commands, path, s, u, mean) : nullptr;
+                if (noisy && !held) noise_kick(left, felt, dw, state);
                 if (impulses) kick(impulses + 2 * row * n, state);
                 const double* within = stage_controls(commands, path, s, stages, u, line);
+                const double* extra = drift ? drift + row * n : nullptr;
+                if (noisy && held) {
+                    held_noise(mechanism, h, extra, state.q.data(), state.center.data(), felt, dw, bend.data());
+                    extra = bend.data();
+                }
                 stride = within ? static_cast<int>(n) : 0;
                 if (within) {
-                    stage_forces(mechanism, drift ? drift + row * n : nullptr, within, stages, given.data());
+                    stage_forces(mechanism, extra, within, stages, given.data());
                 } else {
-                    constant_force(mechanism, drift ? drift + row * n : nullptr, u + s * m, force.data());
+                    constant_force(mechanism, extra, u + s * m, force.data());
                 }
                 const Outcome outcome = step(h, state);
                 record_effort(effort, nodes, row);
                 nodes.ended[path] = static_cast<std::int64_t>(outcome);
                 if (outcome != Outcome::solved) break;
                 state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
-                if (noisy && left < 1.0) noise_kick(1.0 - left, u + s * m, dw, state);
+                if (noisy && !held && left < 1.0) noise_kick(1.0 - left, felt, dw, state);
                 if (impulses) kick(impulses + (2 * row + 1) * n, state);
                 record_node(state, n, nodes, row);
                 nodes.done[path] = s + 1;
@@ -286,6 +293,7 @@ class VariationalStepper final : public Stepper {
     Trial trial;
     std::vector<double> given;  // (s, n) varying force at the stages of the whole step
     std::vector<double> line;   // (s, m) linear controls at these stages
+    std::vector<double> mean;   // (m) and their mean
     std::vector<double> guess;  // (s, n) extrapolated stage velocities
     std::vector<double> bend;   // (2, n)
     std::vector<double> at;     // (n)

@@ -132,14 +132,6 @@ def _argument(value: object) -> str:
     return repr(value.tolist() if isinstance(value, np.ndarray) else value)
 
 
-def require_robot(constraint: PlanConstraint, robot: object) -> Robot:
-    """``robot`` if it is a Robot; else an InputError that names the argument's owner."""
-    if not isinstance(robot, Robot):
-        name = type(constraint).__name__
-        raise InputError(f"{name} takes a robot from load_robot, got {type(robot).__name__}")
-    return robot
-
-
 def require_same(constraint: PlanConstraint, made_for: Robot, horizon: Horizon) -> None:
     """Raise an InputError for a constraint that was made for another robot than the problem's."""
     robot = horizon.robot

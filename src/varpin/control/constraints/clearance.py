@@ -16,11 +16,10 @@ from varpin.control.constraints.base import (
     PlanConstraint,
     checked_margin,
     nodes_after,
-    require_robot,
     require_same,
 )
 from varpin.errors import InputError
-from varpin.model import Robot
+from varpin.model import Robot, require_robot
 from varpin.model.clearance import Clearance, Obstacle, clearance
 from varpin.support.checks import finite, path_like
 
@@ -86,7 +85,7 @@ class KeepClear(PlanConstraint):
             UnknownFrame: The robot has no such link.
             InputError: There are no pairs, a link has no shapes, or a value is invalid.
         """
-        self.robot = require_robot(self, robot)
+        self.robot = require_robot(robot, type(self).__name__)
         if isinstance(obstacles, Obstacle) or not all(isinstance(item, Obstacle) for item in obstacles):
             raise InputError(f"KeepClear obstacles must be a list of varpin.Obstacle, got {obstacles!r}")
         self.obstacles = tuple(obstacles)

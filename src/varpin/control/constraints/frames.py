@@ -17,11 +17,10 @@ from varpin.control.constraints.base import (
     PlanConstraint,
     checked_margin,
     nodes_after,
-    require_robot,
     require_same,
 )
 from varpin.errors import InputError
-from varpin.model import Robot
+from varpin.model import Robot, require_robot
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.support.checks import as_floats, checked_limits, finite, finite_array, over_time, positive, rotation_matrix
 
@@ -35,7 +34,7 @@ class _OfFrame(PlanConstraint):
     frame: str
 
     def _take(self, robot: Robot, frame: str) -> None:
-        self.robot = require_robot(self, robot)
+        self.robot = require_robot(robot, type(self).__name__)
         if not isinstance(frame, str):
             raise InputError(f"{type(self).__name__} frame must be the name of a frame, got {frame!r}")
         self.frame = frame

@@ -15,11 +15,10 @@ from varpin.control.constraints.base import (
     PlanConstraint,
     checked_margin,
     nodes_after,
-    require_robot,
     require_same,
 )
 from varpin.errors import InputError
-from varpin.model import Robot
+from varpin.model import Robot, require_robot
 from varpin.support.checks import JointValues, as_floats, control_array, finite_array, named_limits, real
 
 # Scales of joints without a finite range [rad or m; rad/s or m/s].
@@ -65,7 +64,7 @@ class _WithinLimits(PlanConstraint):
             UnknownJoint: An unknown joint name.
             InputError: There is no limit, or an argument has a wrong shape or value.
         """
-        self.robot = require_robot(self, robot)
+        self.robot = require_robot(robot, type(self).__name__)
         name = type(self).__name__
         given = self._limits_of(robot) if limits is None else limits
         self.limits = named_limits(f"{name} limits", given, robot.joint_names, robot.dof)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, Cost, Points, checked_weight, weight_matrix
 from varpin.errors import InputError
-from varpin.model import Robot
+from varpin.model import Robot, require_robot
 
 
 class TaskCost(Cost):
@@ -28,9 +28,7 @@ class TaskCost(Cost):
     _rank: ClassVar[int] = 1
 
     def __init__(self, robot: Robot, weight: ArrayLike) -> None:
-        if not isinstance(robot, Robot):
-            raise InputError(f"{type(self).__name__} takes a robot from load_robot, got {type(robot).__name__}")
-        self.robot = robot
+        self.robot = require_robot(robot, type(self).__name__)
         self.weight = checked_weight(type(self).__name__, weight)
         weight_matrix(type(self).__name__, self.weight, self.size)
 

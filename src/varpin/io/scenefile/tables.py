@@ -374,7 +374,7 @@ class TypedKeys(Keys):
 _OPTIONS = {
     "alpha": Annotated[float, number(least=0.0, most=1.0)],
     "stages": Annotated[int, whole(1)],
-    "kick": Annotated[str, word("left", "split")],
+    "kick": Annotated[str, word("left", "split", "held")],
 }
 INTEGRATORS: Mapping[str, Callable[..., Integrator]] = {
     word_of(name): kind for name, kind in BY_NAME.items() if name != "Reference"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -38,12 +38,12 @@ def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequen
         names: One or several names, of which each robot takes those it has; True for its end effector.
 
     Raises:
-        InputError: A name is no string.
+        InputError: They are no names.
         UnknownFrame: No robot has a frame of that name.
     """
     if isinstance(names, bool | np.bool_):
         return [(robot.end_effector,) if names else () for robot in robots]
-    wanted = (names,) if isinstance(names, str) else tuple(names)
+    wanted = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else tuple(names)
     for name in wanted:
         if not isinstance(name, str):
             raise InputError(f"{option} must be names of frames, got {name!r}")

@@ -265,7 +265,9 @@ def _pairs(robot: Robot | Sequence[tuple[Robot, Motion]], motion: Motion | None)
             raise InputError("give the robot's motion: a trajectory, or configurations with dt")
         return [(robot, motion)]
     if not isinstance(robot, list | tuple) or not robot:
-        raise InputError(f"robot must come from load_robot, got {type(robot).__name__}")
+        raise InputError(
+            f"robot must come from load_robot, or be pairs of a robot and its motion, got {reprlib.repr(robot)}"
+        )
     if motion is not None:
         raise InputError("for several robots, give pairs of a robot and its motion, and no other motion")
     for pair in robot:

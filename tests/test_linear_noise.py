@@ -1,0 +1,171 @@
+"""Plans with linear controls under noise: the expected cost, its gradient, and paths."""
+
+import numpy as np
+import pytest
+
+import varpin as vp
+from varpin.control.backward import Along, backward
+from varpin.control.moments import noise_cost
+from varpin.control.spread import Feedback, covariances
+
+CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
+SLIDING = vp.CustomNoise(
+    lambda q, v, u: np.array([[0.2 * v[0] + 0.1 * u[1]], [0.3 + 0.1 * v[1]]]),
+    1,
+    dv=lambda q, v, u: np.array([[[0.2, 0.0]], [[0.0, 0.1]]]),
+    du=lambda q, v, u: np.array([[[0.0, 0.1]], [[0.0, 0.0]]]),
+)
+
+
+def reach(noise: object, *, steps: int = 5, dt: float = 0.08, rate: float = 0.0, joints: int = 2, **options: object):
+    cost = vp.ControlCost(0.05) + vp.VelocityCost(0.1)
+    cost += vp.Terminal(vp.TrackingCost([0.5, -0.5][:joints], 20.0) + vp.VelocityCost(5.0))
+    if rate:
+        cost += vp.ControlRateCost(rate)
+    scene = vp.Scene(vp.planar_chain(joints), damping=0.2, noise=noise)
+    at, still = np.full(joints, 0.2), np.zeros(joints)
+    return vp.OptimalControlProblem(scene, cost, at, still, dt=dt, steps=steps, controls="linear", **options)
+
+
+def line(problem: vp.OptimalControlProblem, u: np.ndarray) -> vp.LinearPolicy:
+    N, (n, m) = problem.steps, (problem.scene.robot.dof, problem.scene.controls)
+    return vp.LinearPolicy(u[1:], np.zeros((N, m, 2 * n)), np.zeros((N, 2 * n)), before=u[0], linear=True)
+
+
+@pytest.mark.parametrize(
+    ("noise", "options"),
+    [
+        (CONTROL, {"integrator": vp.Gauss(2)}),
+        (CONTROL, {"integrator": vp.Midpoint(), "sampling": "midpoint", "joints": 1}),
+        (CONTROL, {"integrator": vp.RungeKutta4(), "rate": 1e-2}),
+        (STATE, {"integrator": vp.Gauss(2, kick="split")}),
+        (CONTROL + STATE, {"integrator": vp.Gauss(2, kick="split"), "sampling": "start"}),
+    ],
+)
+def test_the_gradient_is_that_of_the_expected_cost(noise: object, options: dict) -> None:
+    """By differences of the cost and the noise's share, each with a backward pass of its own."""
+    if options.get("joints") == 1:
+        noise = vp.ControlNoise(0.3)
+    problem = reach(noise, **options)
+    m = problem.scene.controls
+    u = 2.0 * np.random.default_rng(0).normal(size=(problem.decisions, m))
+
+    def made(controls: np.ndarray):
+        motion = problem.simulate(line(problem, controls))
+        plan = backward(problem, motion, 0.0)
+        return problem.cost_of(motion) + plan.noise, motion, plan
+
+    _, motion, plan = made(u)
+    along = Along(problem, motion)
+    along.differentiate_noise(plan, np.ones(problem.scene.processes, dtype=bool))
+    whole, step, found = backward(problem, motion, 0.0, along=along).gradient, 1e-4, np.empty_like(u)
+    for index in np.ndindex(u.shape):
+        away = np.zeros_like(u)
+        away[index] = step
+        near, far = (made(u + k * away)[0] - made(u - k * away)[0] for k in (1, 2))
+        found[index] = (8.0 * near - far) / (12.0 * step)
+    np.testing.assert_allclose(whole, found, atol=5e-8 * np.abs(found).max())
+    assert np.abs(plan.gradient - found).max() > 1e-5 * np.abs(found).max()
+
+
+@pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), CONTROL + STATE, SLIDING])
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_the_noise_cost_is_that_of_the_covariance(noise: object, kick: str) -> None:
+    """Forward by covariances in plain loops, backward by the value function: two ways to the same number."""
+    weight = 1e-3
+    problem = reach(noise, integrator=vp.Gauss(2, kick=kick), rate=weight)
+    motion = problem.simulate(line(problem, np.random.default_rng(1).normal(size=(problem.decisions, 2))))
+    plan = backward(problem, motion, 0.0)
+    feedback = Feedback(plan.feedback, plan.previous)
+    lin, C, changes, x = vp.linearize(problem.scene, motion), np.zeros((6, 6)), 0.0, 4
+    nodes = covariances(problem, motion, feedback)
+    for k in range(problem.steps):
+        np.testing.assert_allclose(nodes[k], C[:x, :x], atol=1e-12)
+        K = np.hstack([plan.feedback[k + 1], plan.previous[k + 1]])
+        change = K - np.eye(2, 6, 4)
+        changes += 2.0 * weight / problem.dt * np.trace(change @ C @ change.T) / 2.0
+        T = np.vstack([np.eye(6), K])
+        J = np.hstack([lin.A[k], lin.B[k] - lin.ramp[k], lin.ramp[k]])
+        Z, C = T @ C @ T.T, np.zeros((6, 6))
+        C[:x, :x], C[:x, x:], C[x:, x:] = J @ Z @ J.T, J @ Z[:, 6:], Z[6:, 6:]
+        C[x:, :x] = C[:x, x:].T
+        for i in range(problem.scene.processes):
+            D = np.hstack([lin.Gx[k, :, i], lin.Gu[k, :, i] - lin.Gramp[k, :, i], lin.Gramp[k, :, i]])
+            C[:x, :x] += problem.dt * (np.outer(lin.G[k, :, i], lin.G[k, :, i]) + D @ Z @ D.T)
+    assert plan.noise == pytest.approx(noise_cost(problem, motion, feedback) + changes, rel=1e-10)
+
+
+@pytest.mark.parametrize("noise", [CONTROL + STATE, SLIDING], ids=["core", "python"])
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_the_effect_of_noise_along_a_line(noise: object, kick: str) -> None:
+    """Its derivatives in the controls at both ends, by differences of the fields before and after a quiet step."""
+    integrator = vp.Gauss(2, kick=kick)
+    problem = reach(noise, steps=1, integrator=integrator).at(q0=[0.3, -0.2], v0=[0.4, 0.7])
+    scene, n, left = problem.scene, 2, integrator.left
+    at, size = np.array([1.0, -2.0, 3.0, 0.5]), 1e-4
+    motion = problem.simulate(line(problem, at.reshape(2, 2)))
+    lin = vp.linearize(scene, motion)
+
+    def effect(ends: np.ndarray) -> np.ndarray:
+        moved = problem.simulate(line(problem, ends.reshape(2, 2)))
+        mean = 0.5 * (ends[:2] + ends[2:])[None]
+        before, after = (scene.noise.fields(moved.q[k, None], moved.v[k, None], mean, problem.q0).F[0] for k in (0, 1))
+        found = left * lin.J[0] @ before
+        found[n:] += (1.0 - left) * after
+        return found
+
+    np.testing.assert_allclose(lin.G[0], effect(at), atol=1e-12)
+    derivatives = np.concatenate([lin.Gu - lin.Gramp, lin.Gramp], axis=3)[0]
+    for c, away in enumerate(size * np.eye(4)):
+        found = (effect(at + away) - effect(at - away)) / (2.0 * size)
+        np.testing.assert_allclose(derivatives[:, :, c], found, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("noise", "integrator"), [(CONTROL, vp.Gauss(2)), (SLIDING, vp.RungeKutta4())], ids=["core", "python"]
+)
+def test_paths_cost_what_the_plan_expects(noise: object, integrator: vp.Integrator) -> None:
+    problem = reach(noise, integrator=integrator)
+    plan = vp.solve(problem, check=False)
+    assert plan.noise_cost > 0.0
+    paths = 1500 if noise is CONTROL else 100
+    told = plan.monte_carlo(paths, rng=0)
+    assert abs(told.cost - told.predicted) < 3.0 * told.standard_error
+    # Path by path, from the recorded controls at the nodes.
+    children = np.random.default_rng(0).spawn(2)
+    again = [problem.cost_of(problem.simulate(plan.policy, rng=child)) for child in children]
+    first = plan.monte_carlo(2, rng=0)
+    assert first.cost == pytest.approx(np.mean(again), rel=1e-12)
+
+
+def test_plans_with_the_whole_gradient_end_lower() -> None:
+    problem = reach(vp.ControlNoise(0.6), steps=8, dt=0.05, integrator=vp.Gauss(2))
+    held = vp.solve(problem, tolerance=1e-9, check=False)
+    whole = vp.solve(problem, noise="whole", tolerance=1e-9, check=False)
+    assert whole.expected_cost < held.expected_cost
+
+
+def test_an_ensemble_stores_the_controls_of_lines() -> None:
+    problem = reach(CONTROL, integrator=vp.Gauss(2))
+    plan = vp.solve(problem, check=False)
+    given = {"dt": problem.dt, "steps": problem.steps, "controls": plan.policy, "integrator": problem.integrator}
+    paths = vp.simulate_ensemble(problem.scene, problem.q0, problem.v0, paths=3, rng=1, store=True, **given)
+    for path, child in enumerate(np.random.default_rng(1).spawn(3)):
+        alone = problem.simulate(plan.policy, rng=child)
+        np.testing.assert_allclose(paths.q[path], alone.q, atol=1e-13)
+        np.testing.assert_allclose(paths.u[path], alone.u, atol=1e-12)
+
+
+def test_lines_over_several_steps_with_fields_in_python() -> None:
+    """Noise that Python evaluates takes lines over several steps as the core does."""
+    problem = reach(vp.AdditiveNoise(0.1), integrator=vp.Gauss(2))
+    plan = vp.solve(problem, check=False)
+    fields = vp.CustomNoise(lambda q, v, u: np.array([[0.2], [1.0]]), 1)
+    own = vp.Scene(vp.planar_chain(2), damping=0.2, noise=fields)
+    given = {"dt": problem.dt / 4, "steps": 4 * problem.steps, "controls": plan.policy, "increments": 0.0}
+    fine = [
+        vp.simulate(scene, problem.q0, problem.v0, integrator=problem.integrator, check=False, **given)
+        for scene in (problem.scene, own)
+    ]
+    np.testing.assert_allclose(fine[0].u_nodes, fine[1].u_nodes, atol=1e-12)
+    np.testing.assert_allclose(fine[0].q, fine[1].q, atol=1e-12)
