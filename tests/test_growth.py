@@ -7,6 +7,8 @@ import pytest
 from findings import about
 
 import varpin as vp
+from varpin.model import longest_reach
+from varpin.simulation.accuracy import travel_scales
 
 
 def jumping(robot, seed, steps, share):
@@ -80,3 +82,18 @@ def test_errors_that_only_add_up_are_told_of_as_such(dt, wrong):
     assert not about(motion.warnings, "growth")
     if wrong:
         assert f"{100 * share:.2g}% of the largest joint travel" in told[0]
+
+
+def test_the_scale_of_a_joint_that_hardly_moves_is_that_of_the_others(load):
+    """A lift under an arm: a hundredth of what the arm moves at its reach, unless the lift moves more."""
+    scene = vp.Scene(load("tiago_no_hand"))
+    slides, reach = scene.robot.slides, longest_reach(scene.robot)
+    q = np.zeros((3, scene.robot.dof))
+    q[1, ~slides], q[1, slides] = 0.5, 1e-5
+    np.testing.assert_allclose(travel_scales(scene, q), np.where(slides, 0.005 * reach, 0.5))
+    q[1, slides] = 0.3
+    np.testing.assert_allclose(travel_scales(scene, q), np.where(slides, 0.3, 0.5))
+    q[1, ~slides] = 1e-5
+    np.testing.assert_allclose(travel_scales(scene, q), np.where(slides, 0.3, 0.003 / reach))
+    chain = vp.Scene(vp.planar_chain(2))
+    np.testing.assert_array_equal(travel_scales(chain, np.array([[0.0, 0.0], [1.0, 2.0]])), [2.0, 2.0])

@@ -209,7 +209,7 @@ def test_a_plant_that_fails_keeps_the_motion():
     assert caught.value.trajectory.dt == pytest.approx(0.02)
 
 
-@pytest.mark.parametrize("whose", ["simulate", "replan"])
+@pytest.mark.parametrize("whose", ["simulated", "replan"])
 def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whose, monkeypatch):
     """In the third tick's simulation, or in the search of the fourth."""
     mpc, calls, real = vp.Mpc(tracking(), iterations=1), [], getattr(varpin.control.mpc, whose)
@@ -228,7 +228,7 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
     with pytest.raises(vp.StepFailure) as caught:
         mpc.run(duration=0.1)
     part = caught.value.trajectory
-    ticks = 2 if whose == "simulate" else 3
+    ticks = 2 if whose == "simulated" else 3
     np.testing.assert_array_equal(part.q[: 10 * ticks + 1], whole.q[: 10 * ticks + 1])
     assert (caught.value.step, caught.value.time) == (part.steps, pytest.approx(0.02 * ticks))
     if whose == "solve":
@@ -511,3 +511,40 @@ def test_an_arm_follows_as_closely_with_linear_controls_as_with_held_ones():
     assert not about(run.warnings, "alternating ticks")
     assert error["linear", "alike"] <= error["held", "alike"] < 0.01
     assert error["linear", "other"] <= error["held", "other"] < 0.05
+
+
+def test_a_plant_that_needs_another_integrator_says_from_when_on(caplog):
+    """The arm falls beside its plan, and stretches: at its damped shoulder the inertia falls to less than half."""
+    robot, dt, begin = vp.planar_chain(2), 0.02, np.array([1.0, np.pi / 2.0])
+
+    def inverse(q):
+        return np.linalg.inv(vp.lagrangian_jet(vp.Scene(robot), q, np.zeros(2)).Lvv)[0, 0]
+
+    damper = 1.8 / (0.5 * dt) / inverse(begin)
+    planned, real = (vp.Scene(robot, gravity=pulls, damping=[damper, 0.0]) for pulls in (False, True))
+    problem = vp.OptimalControlProblem(planned, vp.ControlCost(1.0), begin, np.zeros(2), dt=dt, steps=4)
+    run = vp.Mpc(problem, iterations=1).run(vp.Plant(real, substeps=2), duration=0.4)
+    assert run.motion.integrator == str(vp.Gauss(2))
+    (told,) = [sentence for sentence in run.warnings if "the plant needs" in sentence]
+    too_fast = next(k for k, q in enumerate(run.motion.q) if 0.5 * dt * damper * inverse(q) > 2.0)
+    assert not unnamed(
+        told, f"from t = {dt * ((too_fast - 1) // 2):.4g} s on", "varpin.Radau(stages=4)", "Gauss(stages=2)"
+    )
+    assert sum("the plant needs" in record.message for record in caplog.records) == 1
+    steady = vp.Mpc(problem, iterations=1).run(vp.Plant(planned, substeps=2), duration=0.1)
+    given = vp.Mpc(problem, iterations=1).run(vp.Plant(real, vp.Gauss(2), substeps=2), duration=0.4)
+    assert not any("the plant needs" in sentence for sentence in (*steady.warnings, *given.warnings))
+
+
+def test_a_fault_of_the_plant_is_logged_once(caplog):
+    """Of the whole run, not of its first tick as well."""
+    robot = vp.planar_chain(2)
+    plain, rough = (vp.Scene(robot, gravity=False, friction=level) for level in (0.0, 0.5))
+    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.6, -0.4], 1e3) + vp.VelocityCost(10.0))
+    problem = vp.OptimalControlProblem(plain, cost, np.zeros(2), np.zeros(2), dt=0.05, steps=8)
+    run = vp.Mpc(problem, iterations=1).run(vp.Plant(rough, vp.Gauss(2), substeps=1), duration=0.4)
+    assert about(run.warnings, "dry friction")
+    logged = [record.message for record in caplog.records]
+    for joint in robot.joint_names:
+        assert sum("dry friction is faster" in told and repr(joint) in told for told in logged) <= 1
+    assert not [record for record in caplog.records if record.name == "varpin.simulation.run"]

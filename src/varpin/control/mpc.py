@@ -27,7 +27,7 @@ from varpin.simulation.choice import changes_along, integrator_along, usual_inte
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.loop_stability import examined_in_loop
 from varpin.simulation.progress import Progress
-from varpin.simulation.run import noise_forgotten, simulate
+from varpin.simulation.run import noise_forgotten, simulated
 from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen
@@ -48,7 +48,7 @@ class Plant:
         scene: Its scene, with the controls of the planned one; masses, friction and noise may differ.
         integrator: Any of varpin's. By default each run takes the one that :func:`varpin.simulate` chooses at the
             plant's step for the start and along the first plan, all joint stops included; ``motion.integrator`` names
-            it.
+            it, and a warning the tick from which on the plant needs another.
         substeps: Steps per decision of the controller.
     """
 
@@ -335,7 +335,11 @@ class Mpc:
         q, v = problem.q0, problem.v0
         before = applied = problem.before
         (active, of_plan), age = self._first_plan(problem), 0
-        method = _method(plant, active.trajectory, dt, noisy=generator is not None and plant.scene.processes > 0)
+        noisy = generator is not None and plant.scene.processes > 0
+        method = _method(plant, active.trajectory, dt, noisy=noisy)
+        # The integrator was chosen for the first plan: the plant may leave it.
+        watched = plant.integrator is None and not noisy and changes_along(plant.scene)
+        unfit: tuple[Finding, ...] = ()
         parts: list[Trajectory] = []
         plans, seconds, iterations, late = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64), np.zeros(ticks, bool)
         try:
@@ -359,6 +363,8 @@ class Mpc:
                     begun = active.controls[0] if age == 0 or applied is None else applied
                 applied = _decision(active, age, q, v, before if begun is None else begun)
                 parts.append(_simulated(plant, method, dt, q, v, applied, generator, parts, begun))
+                if watched and not unfit:
+                    unfit = _unfit(plant.scene, method, parts[-1], tick * self.period)
                 q, v = parts[-1].q[-1], parts[-1].v[-1]
                 before = applied if problem.remembers else None
                 if moving:
@@ -370,7 +376,7 @@ class Mpc:
                 raise
             raise Interrupted(_so_far(plant, method, parts)) from None
         motion, found = examined_in_loop(plant.scene, method, chained(parts), plant.substeps)
-        found = (*noise_forgotten(plant.scene, rng), *found, *_alternating(motion, plant.substeps))
+        found = (*noise_forgotten(plant.scene, rng), *unfit, *found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
         found = (*found, *_whole_ticks(duration, ticks, self.period))
         held = kept(problem, tuple(plans), motion, plant.substeps)
@@ -508,6 +514,19 @@ def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integr
     return integrator_along(scene, chosen, plan.q, plan.v, plan.u, dt)
 
 
+def _unfit(scene: Scene, method: Integrator, part: Trajectory, begin: float) -> tuple[Finding, ...]:
+    """A finding if the plant's motion in a tick that begins at ``begin`` [s] needs another integrator."""
+    other = integrator_along(scene, method, part.q, part.v, part.u, part.dt)
+    if other.same_map(method):
+        return ()
+    sentence = (
+        f"from t = {begin:.4g} s on the plant needs varpin.{other}: damping, friction or stops are faster than its "
+        f"steps of {part.dt:g} s there, and were not along the first plan, for which {method} was chosen and goes on; "
+        f"Plant(integrator=varpin.{other}) takes the other from the start"
+    )
+    return (Finding("unfit integrator", sentence),)
+
+
 def _inputs(scene: Scene, *, cubic: bool) -> tuple[str, ...]:
     """Names of the joints with linear, or with cubic, kinematic inputs."""
     inputs = zip(scene.inputs.values(), scene.rates, strict=True)
@@ -540,7 +559,8 @@ def _simulated(
     options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": controls, "integrator": method}
     options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}
     try:
-        return simulate(plant.scene, q, v, **options, check=False)
+        # The whole run is examined, and its findings logged, at the end.
+        return simulated(plant.scene, q, v, **options, check=False)[0]
     except StepFailure as failure:
         whole = _so_far(plant, method, [*before, failure.trajectory])
         raise StepFailure(whole.steps, whole.t[-1], Failure(failure.reason, failure.residual), whole) from None

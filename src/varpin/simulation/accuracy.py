@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.mechanics.scene import Scene
+from varpin.model import longest_reach
 from varpin.trajectory import Trajectory
 
 # Thresholds of errors. Energy balance: share of the energy turned over. Position: share of the joint's travel over a
@@ -261,6 +262,24 @@ def largest_of_its_kind(scene: Scene, values: Floats) -> Floats:
     largest = [values[..., kind].max(axis=-1, initial=0.0, keepdims=True) for kind in (sliding, ~sliding)]
     each: Floats = np.where(sliding, *largest)
     return each
+
+
+def travel_scales(scene: Scene, q: Floats) -> Floats:
+    """For each coordinate (n,), the travel of which errors are shares: the largest of its kind over nodes (K, n).
+
+    Joints of one kind that hardly move are compared with the others: their scale is at least ``LITTLE`` times what
+    those move at the robot's reach.
+    """
+    travel = largest_of_its_kind(scene, np.ptp(q, axis=0))
+    sliding = scene.robot.slides
+    if sliding.all() or not sliding.any():
+        return travel
+    reach = longest_reach(scene.robot)
+    # On rails without ends: a metre.
+    lever = reach if 0.0 < reach < np.inf else 1.0
+    turns, slides = float(travel[~sliding].max()), float(travel[sliding].max())
+    scales: Floats = np.maximum(travel, LITTLE * np.where(sliding, turns * lever, slides / lever))
+    return scales
 
 
 def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.bool_]]:

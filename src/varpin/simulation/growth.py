@@ -20,7 +20,7 @@ from varpin.integrators import Gauss, Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
 from varpin.integrators.collocation import MOST_STAGES
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
+from varpin.simulation.accuracy import ROUNDING, travel_scales
 from varpin.simulation.kinks import kinks
 from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bounds
 from varpin.simulation.retaking import Finer, finer, shortest_parts, taken_again
@@ -55,7 +55,7 @@ class Growth(NamedTuple):
     Attributes:
         joint: The coordinate with the largest error.
         off: The error [rad or m].
-        share: The error as a share of the largest joint travel.
+        share: The error as a share of the joint's scale, see :func:`travel_scales`.
         time: When the error reaches the threshold of the warning [s].
         step: The largest error of a single step [rad or m].
         causes: What happens in steps with a kink, in words, if most of the error comes from them; else empty.
@@ -105,7 +105,7 @@ def grown_error(
     if not (even or len(kinked.steps)):
         return None
     other = finer(integrator, trajectory, damped=False, pulled=False)
-    travel = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
+    travel = travel_scales(scene, trajectory.q)
     # Rounding alone is no motion.
     travel = np.maximum(travel, max(_SHORTEST, ROUNDING * (1.0 + float(np.abs(trajectory.q).max()))))
     at = _nodes(trajectory)

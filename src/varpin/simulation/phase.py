@@ -18,7 +18,7 @@ from varpin.arrays import Floats
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import ROUNDING, largest_of_its_kind
+from varpin.simulation.accuracy import ROUNDING, travel_scales
 from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bounds
 from varpin.trajectory import Trajectory
 
@@ -26,7 +26,7 @@ Complexes = NDArray[np.complex128]
 
 # Number of nodes with a linearization, and the most joints of a robot that is examined.
 _NODES, _JOINTS = 9, 60
-# Threshold of the warning, as a share of the largest joint travel.
+# Threshold of the warning, as a share of the joint's scale, see :func:`travel_scales`.
 WARNED = 0.01
 # Least phase of an oscillation over the motion [rad]. Slower ones lose little; and a free joint has the eigenvalue zero
 # twice, which rounding splits into slow modes of any amplitude.
@@ -43,7 +43,7 @@ class Loss(NamedTuple):
     Attributes:
         joint: The coordinate with the largest error.
         off: The error [rad or m].
-        share: The error as a share of the largest joint travel.
+        share: The error as a share of the joint's scale, see :func:`travel_scales`.
         rate: Of the oscillation [rad/s].
         turned: The error of the oscillation, in units of its amplitude.
     """
@@ -80,7 +80,7 @@ def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> 
     drift = _drift(integrator, np.array([1j * fastest]), h)
     if drift is None or (h * fastest < 1.0 and abs(drift[0]) * trajectory.t[-1] < WARNED):
         return None
-    travel = largest_of_its_kind(scene, np.ptp(trajectory.q, axis=0))
+    travel = travel_scales(scene, trajectory.q)
     # In equilibrium accelerations and amplitudes are rounding.
     rounding = ROUNDING * (1.0 + np.abs(q).max())
     worst, most, ends = None, 0.0, (0, len(at) - 1)

@@ -123,6 +123,44 @@ def simulate(
         Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt; during the search of a tolerance
             a plain one is raised.
     """
+    trajectory, found = simulated(
+        scene,
+        q0,
+        v0,
+        dt=dt,
+        steps=steps,
+        duration=duration,
+        tolerance=tolerance,
+        controls=controls,
+        period=period,
+        integrator=integrator,
+        rng=rng,
+        increments=increments,
+        check=check,
+        progress=progress,
+    )
+    announce(logger, scene, trajectory.dt, found)
+    return trajectory
+
+
+def simulated(
+    scene: Scene,
+    q0: JointValues,
+    v0: JointValues,
+    *,
+    dt: float | None = None,
+    steps: int | None = None,
+    duration: float | None = None,
+    tolerance: float | Accuracy | None = None,
+    controls: Controls | ControlLaw = None,
+    period: int = 1,
+    integrator: Integrator | None = None,
+    rng: np.random.Generator | int | None = None,
+    increments: ArrayLike | None = None,
+    check: bool = True,
+    progress: Progress | None = None,
+) -> tuple[Trajectory, tuple[Finding, ...]]:
+    """The motion of :func:`simulate`, and its findings, which are not logged."""
     joints = require_scene(scene).robot.joint_names
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
     if integrator is not None and not isinstance(integrator, Integrator):
@@ -183,8 +221,7 @@ def simulate(
         raise Interrupted(replace(record.trajectory(), accuracy=accuracy)) from None
     if interrupted:
         raise Interrupted(trajectory)
-    announce(logger, scene, dt, found)
-    return trajectory
+    return trajectory, found
 
 
 class _Task(NamedTuple):

@@ -307,8 +307,8 @@ def _growing(
     if found is None:
         return ()
     off = (
-        f"joint {trajectory.joint_names[found.joint]!r} by up to {found.off:.2g} rad or m, "
-        f"{100 * found.share:.2g}% of the largest joint travel, from t = {found.time:.4g} s on"
+        f"joint {trajectory.joint_names[found.joint]!r} by up to {_share(scene, found.joint, found.off, found.share)}, "
+        f"from t = {found.time:.4g} s on"
     )
     if found.causes:
         sentence = (
@@ -324,6 +324,16 @@ def _growing(
     return (Finding("growing errors", sentence, found.joint),)
 
 
+def _share(scene: Scene, joint: int, off: float, share: float) -> str:
+    """An error of a joint in words, with its unit and its share of the joint's scale."""
+    sliding = scene.robot.slides
+    unit = "m" if sliding[joint] else "rad"
+    if sliding.all() or not sliding.any():
+        return f"{off:.2g} {unit}, {100 * share:.2g}% of the largest joint travel"
+    kind = "slide" if sliding[joint] else "turn"
+    return f"{off:.2g} {unit}, {100 * share:.2g}% of {off / share:.2g} {unit}, the scale of joints that {kind}"
+
+
 def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
     """A warning if errors in phase and amplitude of oscillations on springs add up over the whole motion."""
     lost = phase_lost(scene, integrator, trajectory)
@@ -332,8 +342,8 @@ def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     sentence = (
         f"oscillations of {lost.rate / (2.0 * np.pi):.3g} Hz lose phase or amplitude: over the motion, steps of "
         f"dt = {trajectory.dt:g} s by {integrator} make an error of about {100 * lost.turned:.2g}% of their amplitude, "
-        f"and joint {trajectory.joint_names[lost.joint]!r} by {lost.off:.2g} rad or m, {100 * lost.share:.2g}% of the "
-        "largest joint travel; smaller steps or more stages reduce it"
+        f"and joint {trajectory.joint_names[lost.joint]!r} by {_share(scene, lost.joint, lost.off, lost.share)}; "
+        "smaller steps or more stages reduce it"
     )
     return (Finding("phase", sentence, lost.joint),)
 
