@@ -185,3 +185,14 @@ def test_what_nodes_do_not_tell_is_never_cleared(options):
     scene = vp.Scene(vp.planar_chain(3), **options)
     motion = vp.simulate(scene, REST, REST, dt=1e-3, steps=20, integrator=vp.Gauss(3), check=False)
     assert not clearance.clearly_right(scene, vp.Gauss(3), motion)
+
+
+def test_a_known_error_stands_for_the_residual():
+    """Of a motion whose steps are too coarse for the polynomials through its nodes."""
+    motion = vp.simulate(CHAIN, REST, REST, duration=1.0, steps=20, integrator=vp.Gauss(5), check=False)
+    assert not clearance.clearly_right(CHAIN, vp.Gauss(5), motion)
+    error = np.abs(
+        vp.simulate(CHAIN, REST, REST, duration=1.0, steps=40, integrator=vp.Gauss(5), check=False).q[::2] - motion.q
+    ).max()
+    assert clearance.clearly_right(CHAIN, vp.Gauss(5), motion, error)
+    assert not clearance.clearly_right(CHAIN, vp.Gauss(5), motion, 1e-2)

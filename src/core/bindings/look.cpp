@@ -92,7 +92,7 @@ bool clearly_right(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> 
                    Integers<1> substeps, double dt, In<1> points, In<1> weights, In<2> places, double still,
                    double energy, double damping, std::int64_t damped_at, double travel, double velocity, double little,
                    double light, double even, std::int64_t window, double whole, double grown, double aligned,
-                   std::int64_t few) {
+                   std::int64_t few, double known) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
     const std::size_t steps = u.shape(0), stages = within.shape(1), rule = points.shape(0);
     if (steps == 0) throw std::invalid_argument("a motion needs at least one step");
@@ -109,8 +109,17 @@ bool clearly_right(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> 
     nb::gil_scoped_release release;
     const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), p.data(), u.data(), dt};
     const Quadrature quadrature{{points.data(), rule}, {weights.data(), rule}, places.data(), static_cast<int>(stages)};
-    const Clear clear{still,   energy, damping, whole,     grown,
-                      aligned, window, few,     damped_at, {travel, velocity, little, light, even}};
+    const Clear clear{still,
+                      energy,
+                      damping,
+                      whole,
+                      grown,
+                      aligned,
+                      window,
+                      few,
+                      damped_at,
+                      known,
+                      {travel, velocity, little, light, even}};
     Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, quadrature, clear);
     return clearance.holds(defect.data(), substeps.data());
 }
@@ -152,7 +161,7 @@ void register_look(nb::module_& m) {
     m.def("clearly_right", &clearly_right, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "within"_a, "defect"_a,
           "substeps"_a, "dt"_a, nb::kw_only(), "points"_a, "weights"_a, "places"_a, "still"_a, "energy"_a, "damping"_a,
           "damped_at"_a, "travel"_a, "velocity"_a, "little"_a, "light"_a, "even"_a, "window"_a, "whole"_a, "grown"_a,
-          "aligned"_a, "few"_a);
+          "aligned"_a, "few"_a, "known"_a);
     m.def("inside_bounds", &inside_bounds, "mechanism"_a, "q"_a, "v"_a, "u"_a, "within"_a, "bounds"_a);
     m.def("windows_agree", &windows_agree, "mechanism"_a, "q"_a, "v"_a, "begins"_a, "length"_a, "dt"_a, "again_q"_a,
           "again_v"_a, nb::kw_only(), "travel"_a, "velocity"_a, "little"_a, "light"_a, "even"_a);

@@ -587,6 +587,7 @@ def clearly_right(
     grown: float,
     aligned: float,
     few: int,
+    known: float,
 ) -> bool:
     """Whether the equations of motion hold along the record of a motion far better than any warning needs.
 

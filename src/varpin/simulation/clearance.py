@@ -41,8 +41,11 @@ _FOUR = np.array([0.0, 0.5 - 0.5 * _FAR, 0.5 + 0.5 * _FAR, 1.0]), np.array([1.0,
 _SHORT_STEPS = 4
 
 
-def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
+def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory, error: float | None = None) -> bool:
     """Whether a motion certainly has no error that the check of its steps would find.
+
+    ``error`` is the largest error of q at all nodes [rad or m], where it is known, as of a motion with a tolerance: the
+    equations of motion are not evaluated then.
 
     False also where this cannot be told from its nodes alone: under constraints and noise, with forces that have kinks,
     with forces in Python, and for integrators that choose their own steps.
@@ -80,6 +83,7 @@ def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         grown=_SHARE * NEAR * GROWTH_WARNED,
         aligned=ALIGNED,
         few=FEWEST,
+        known=-1.0 if error is None else error,
     )
 
 

@@ -8,6 +8,7 @@ within a step.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +49,9 @@ def fast_damping(scene: Scene, q: Floats, v: Floats, u: Floats, dt: float) -> Fa
     if not scene.dissipates or not len(u):
         return Fast(0.0)
     least = _RESOLVED / dt
-    at = np.union1d(_spread(len(v) - 1), _slowest(scene, v))
+    at, slowest = _spread(len(v) - 1), _slowest(scene, v)
+    if len(slowest):
+        at = np.union1d(at, slowest)
     fastest = Fast(fastest_damping(scene.core, q[at], v[at], _forces(scene, u, at), least))
     nodes, reached = _in_stops(scene, q, v, dt)
     if len(nodes):
@@ -120,10 +123,12 @@ def stops_ahead(scene: Scene, q: Floats) -> Floats:
     return np.array(rows).reshape(-1, q.size)
 
 
+@functools.lru_cache(maxsize=64)
 def _spread(steps: int) -> Integers:
-    """Nodes spread over a motion, with its ends."""
+    """Nodes spread over a motion, with its ends; read-only."""
     count = min(max(steps // _OF, _LEAST), _MOST, steps + 1)
     nodes: Integers = np.linspace(0, steps, count).astype(np.int64)
+    nodes.setflags(write=False)
     return nodes
 
 

@@ -157,13 +157,13 @@ class Loop:
 
 
 def examined_in_loop(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, error: float | None = None
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
     """:func:`varpin.simulation.soundness.examined`, and the check of the control loop.
 
-    ``hold`` is the period of the loop in steps, None without feedback.
+    ``hold`` is the period of the loop in steps, None without feedback; ``error`` the largest of q [rad or m], if known.
     """
-    trajectory, found = examined(scene, integrator, trajectory)
+    trajectory, found = examined(scene, integrator, trajectory, error)
     if hold is not None:
         loop = unstable_loop(scene, trajectory, hold) or _flipping(scene, trajectory, hold)
         found = (*(loop or _cycling(scene, trajectory, hold)), *found)

@@ -97,9 +97,9 @@ def simulate(
         increments: The increments themselves, (N, k) [s^0.5], to replay or refine a path, see
             :mod:`varpin.mechanics.wiener`. 0 gives the motion without noise and without the warning.
         check: Examine the finished motion for ``Trajectory.warnings`` and the log: does its energy balance close, do
-            its steps resolve it, is its control loop stable? The check takes about half as long as the motion, and
-            0.1 ms (0.2 ms from 8 steps on); several times as long as the motion where its steps are coarse, and twice
-            as long where small disturbances may grow.
+            its steps resolve it, is its control loop stable? The check takes about half as long as the motion where
+            the motion is clearly right, and 0.1 to 0.3 ms more where it is not; several times as long as the motion
+            where its steps are coarse, and twice as long where small disturbances may grow.
         progress: Called now and then with (steps done, steps in all). A function with three required arguments, such
             as :class:`varpin.LiveView`, also gets a :class:`varpin.Nodes` with the nodes since the last call, whose
             last node comes first again. The count begins anew where a motion is repeated with another integrator.
@@ -204,7 +204,7 @@ def simulated(
         integrator = other
     try:
         try:
-            trajectory, found = _checked(scene, integrator, record.trajectory(), hold, check=check)
+            trajectory, found = _checked(scene, integrator, record.trajectory(), hold, accuracy, check=check)
         except (CustomForceError, CustomConstraintError) as error:
             # Steps that the check repeats may go where the function is not defined. The motion itself is valid.
             sentence = f"the motion was not checked: {error}"
@@ -332,11 +332,17 @@ def _step_failure(
 
 
 def _checked(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, *, check: bool
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    hold: int | None,
+    accuracy: Accuracy | None,
+    *,
+    check: bool,
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
     """A motion with its warnings; ``hold`` is the period of its feedback in steps, None for none."""
     if check:
-        return examined_in_loop(scene, integrator, trajectory, hold)
+        return examined_in_loop(scene, integrator, trajectory, hold, None if accuracy is None else accuracy.error)
     found = findings_from_record(scene, integrator, trajectory)
     return with_warnings(trajectory, found), found
 

@@ -109,13 +109,19 @@ class Finding:
     joint: int | None = None
 
 
-def examined(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """The motion with its energy balance, if the integrator keeps none, and its warnings; and the findings."""
+def examined(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, error: float | None = None
+) -> tuple[Trajectory, tuple[Finding, ...]]:
+    """The motion with its energy balance, if the integrator keeps none, and its warnings; and the findings.
+
+    ``error`` is the largest error of q at all nodes [rad or m], where it is known.
+    """
     if not integrator.variational:
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
         trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
-    errors = () if clearly_right(scene, integrator, trajectory) else _errors_found(scene, integrator, trajectory)
+    right = clearly_right(scene, integrator, trajectory, error)
+    errors = () if right else _errors_found(scene, integrator, trajectory)
     found = (
         *errors,
         *alternating(scene, integrator, trajectory),

@@ -139,6 +139,16 @@ def _unmet(record: Accuracy, floor: float) -> Finding:
     )
 
 
+def _members(motion: Motion, controls: Controls, integrator: Integrator | None) -> tuple[Integrator, ...]:
+    """The integrators to choose from; only the given one, if there is one."""
+    if integrator is not None:
+        return (integrator,)
+    found = tolerance_candidates(motion.scene, motion.q0, motion.v0, motion.duration)
+    if isinstance(controls, LinearPolicy):
+        found = tuple(member for member in found if member.variational != (controls.on == "velocity"))
+    return found
+
+
 def steps_for_tolerance(
     scene: Scene,
     q0: Floats,
@@ -167,15 +177,12 @@ def steps_for_tolerance(
     earlier = tolerance if isinstance(tolerance, Accuracy) else None
     wish = positive("tolerance", tolerance.tolerance if isinstance(tolerance, Accuracy) else tolerance, "rad or m")
     controls = _require_choice(scene, wanted, integrator)
-    members = tolerance_candidates(scene, q0, v0, duration) if integrator is None else (integrator,)
     parts = 1
     given: Callable[[Integrator, int], Commands]
     held = np.zeros((0, 0))
     if isinstance(controls, LinearPolicy):
         policy = controls
         parts = _intervals(policy, duration)
-        if integrator is None:
-            members = tuple(member for member in members if member.variational != (controls.on == "velocity"))
 
         def given(member: Integrator, steps: int) -> Commands:
             return commands_of(scene, member, policy, steps, duration / steps)
@@ -207,9 +214,8 @@ def steps_for_tolerance(
     if earlier is not None:
         known = integrator_of(earlier.integrator)
         # A given integrator keeps its own guard and solver tolerance.
-        same = known if integrator is None else next((member for member in members if member.same_map(known)), None)
-        if same is not None:
-            first = same, earlier.dt
+        if integrator is None or integrator.same_map(known):
+            first = integrator or known, earlier.dt
 
     def failure_of(run: Raised) -> VarpinError:
         """The error with its failing step, found in smaller steps or, failing that, in those of the run."""
@@ -221,7 +227,7 @@ def steps_for_tolerance(
         return run.error
 
     try:
-        choice = choose(motion, members, wish, first)
+        choice = choose(motion, lambda: _members(motion, controls, integrator), wish, first)
     except Raised as run:
         raise failure_of(run) from run.error
     record = Accuracy(

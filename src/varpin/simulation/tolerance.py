@@ -229,13 +229,16 @@ class Choice:
 
 
 def choose(
-    motion: Motion, integrators: Sequence[Integrator], tolerance: float, first: tuple[Integrator, float] | None = None
+    motion: Motion,
+    candidates: Callable[[], Sequence[Integrator]],
+    tolerance: float,
+    first: tuple[Integrator, float] | None = None,
 ) -> Choice:
     """The cheapest of some integrators, and its number of steps, for an error in q of at most ``tolerance``.
 
     Args:
         motion: To integrate.
-        integrators: To choose from.
+        candidates: The integrators to choose from, called if the first one does not do.
         tolerance: At all nodes [rad or m].
         first: An integrator and a step [s] to try first: taken if they, or somewhat smaller steps, meet the tolerance.
 
@@ -244,14 +247,13 @@ def choose(
         VarpinError: No integrator gets to the end.
         Raised: A function of a custom force or constraint fails in all runs.
     """
-    # Raises for states from which no motion can start.
-    integrators[0].start(motion.scene, motion.q0[None], motion.v0[None])
     runs = _Runs(motion)
 
     def of(integrator: Integrator, least: int) -> Method:
         return Method(runs, integrator, least, motion.parts, integrator.order)
 
     if first is not None and motion.duration / first[1] < runs.most:
+        _require_start(motion, first[0])
         method = of(first[0], motion.parts)
         steps = method.rounded(motion.duration / first[1] * (1.0 - 1e-9))
         for _ in range(CHECKS):
@@ -264,6 +266,8 @@ def choose(
             if error > _FAR * tolerance:
                 break
             steps = method.more(steps, error, tolerance)
+    integrators = candidates()
+    _require_start(motion, integrators[0])
     coarse = first_steps(motion.scene, motion.q0, motion.v0, motion.duration, motion.parts)
     if coarse > runs.most:
         return Choice(integrators[0], coarse, math.inf, 0, 0, 0.0)
@@ -272,3 +276,8 @@ def choose(
     search = _CheckedSearch([of(member, least) for member in integrators], runs)
     (best, *_), _ = search.for_tolerance(tolerance / SAFETY)
     return Choice(best.integrator, best.steps, best.error, runs.steps, runs.evaluations, search.floor, runs.raised)
+
+
+def _require_start(motion: Motion, integrator: Integrator) -> None:
+    """Raise for a state from which no motion can start."""
+    integrator.start(motion.scene, motion.q0[None], motion.v0[None])

@@ -44,6 +44,7 @@ struct Clear {
     std::int64_t window = 0;     // most steps of a window
     std::int64_t few = 0;        // number of steps below which errors do not grow
     std::int64_t damped_at = 0;  // nodes at which dampers are looked at
+    double known = -1.0;         // error of q at all nodes, if it is known, else negative
     Allowed allowed;             // in each window
 };
 
@@ -128,14 +129,16 @@ class Clearance {
     // Whether errors are small in each window, and in the whole motion after they have grown.
     bool small() {
         const std::int64_t steps = record_.steps, pieces = (steps + clear_.window - 1) / clear_.window;
+        const bool known = clear_.known >= 0.0;
         Yardstick yardstick(mechanism_);
         double total = 0.0;
         bool first = true;
         for (std::int64_t piece = 0; piece < pieces; ++piece) {
             const std::int64_t begin = piece * steps / pieces, end = (piece + 1) * steps / pieces;
-            std::fill(off_q_.begin(), off_q_.end(), 0.0);
-            std::fill(off_v_.begin(), off_v_.end(), 0.0);
-            for (std::int64_t k = begin; k < end; ++k, first = false) {
+            std::fill(off_q_.begin(), off_q_.end(), known ? clear_.known : 0.0);
+            // No mode turns or decays by much in a step here.
+            std::fill(off_v_.begin(), off_v_.end(), known ? 2.0 * clear_.known / record_.h : 0.0);
+            for (std::int64_t k = begin; k < end && !known; ++k, first = false) {
                 if (!step(k, first, record_.h * static_cast<double>(end - k - 1))) return false;
             }
             const double* q = record_.q + begin * n_;
@@ -146,6 +149,7 @@ class Clearance {
             if (!(yardstick.of_speed(off_v_, clear_.allowed) <= clear_.allowed.velocity)) return false;
             total = larger(total, travel * static_cast<double>(steps) / static_cast<double>(length));
         }
+        if (known) return true;
         if (!(total <= clear_.whole)) return false;
         return steps < clear_.few || total == 0.0 || grows_less(clear_.grown / total);
     }
