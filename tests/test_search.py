@@ -1,7 +1,9 @@
 """The search for a plan: what its trials may take, when it ends; constants, scales and steady noise change nothing."""
 
+import importlib
 import logging
 import re
+from collections import Counter
 
 import numpy as np
 import pinocchio as pin
@@ -309,6 +311,30 @@ def work(monkeypatch, problem, **options):
     with monkeypatch.context() as patch:
         patch.setattr(type(problem.integrator), "watched", counted)
         return vp.solve(problem, **options), sum(parts)
+
+
+def test_an_iteration_linearizes_once_and_integrates_each_trial_once(monkeypatch):
+    calls = Counter()
+
+    def count(holder, name):
+        own = getattr(holder, name)
+
+        def counted(*args, **kwargs):
+            calls[name] += 1
+            return own(*args, **kwargs)
+
+        monkeypatch.setattr(holder, name, counted)
+
+    count(importlib.import_module("varpin.integrators.variational"), "variational_derivatives")
+    count(importlib.import_module("varpin.control.backward"), "velocity_at_nodes")
+    count(vp.OptimalControlProblem, "expand_running")
+    count(Trials, "attempt")
+    plan = vp.solve(reach(), check=False)
+    assert plan.status.converged
+    iterations, trials = len(plan.history), sum(item.rollouts for item in plan.history)
+    assert 3 < iterations <= trials + 1
+    assert calls["variational_derivatives"] == calls["velocity_at_nodes"] == calls["expand_running"] == iterations
+    assert calls["attempt"] == 1 + trials
 
 
 def test_trials_that_are_cut_to_pieces_are_given_up(monkeypatch):

@@ -99,7 +99,7 @@ class Plan:
 def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
     """X (N + 1, 2n): (q, p) or (q, v)."""
     second = trajectory.p if problem.integrator.variational else trajectory.v
-    return np.hstack([trajectory.q, second])
+    return np.concatenate((trajectory.q, second), axis=1)
 
 
 def noise_shares(
@@ -578,7 +578,7 @@ class Along:
             return self.kept
         problem, part = self.problem, self.trajectory.part(begin, end)
         # dv/dx is needed where the cost samples velocities of nodes and x holds momenta.
-        nodes = problem.integrator.variational and bool(problem.model_rule[:, 2::2].any())
+        nodes = problem.integrator.variational and problem.at_velocities
         lin = _linearize(problem, part, begin)
         n = problem.scene.robot.dof
         velocity = velocity_at_nodes(problem.scene, part.q, part.v) if nodes else np.zeros((0, n, 2 * n))

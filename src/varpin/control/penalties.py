@@ -184,6 +184,11 @@ class PenalizedProblem(OptimalControlProblem):
         return np.vstack([self.rule, node])
 
     @property
+    def at_velocities(self) -> bool:
+        """See :attr:`OptimalControlProblem.at_velocities`."""
+        return True
+
+    @property
     def model_places(self) -> Floats:
         """See :attr:`OptimalControlProblem.model_places`."""
         return np.append(self.places, 1.0)

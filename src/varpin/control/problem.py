@@ -488,6 +488,11 @@ class OptimalControlProblem(Frozen):
         """Sample points of the cost's quadratic model in a step, as :attr:`rule`."""
         return self.rule
 
+    @cached_property
+    def at_velocities(self) -> bool:
+        """Whether sample points of :attr:`model_rule` depend on the velocities of nodes."""
+        return bool(self.rule[:, 2::2].any())
+
     def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """States and controls at the sample points :attr:`model_rule`, in the form of :meth:`samples`."""
         return self.samples(q, v, u)

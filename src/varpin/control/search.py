@@ -834,7 +834,7 @@ class _Search:
             self.problem.decided(self.trajectory),
             with_feedback(self.problem, self.trajectory, self.plan, closed=self.forward == "closed"),
             added,
-            float(self.shares.sum() + added.sum()),
+            self.cost + (float(added.sum()) if added.size else 0.0),
         )
         left: Sequence[float] = _lengths(self.backtracking)
         for bounds in self._bounds():
@@ -874,7 +874,8 @@ class _Search:
             yield _Bounds(integrator, np.inf, watched=False)
             return
         # A step cut into s substeps has taken at most s - 1 halvings.
-        few = max(_HALVINGS, int(self.trajectory.statistics.substeps.max()) - 1)
+        statistics = self.trajectory.statistics
+        few = max(_HALVINGS, int(statistics.substeps.max()) - 1) if statistics.halvings.size else _HALVINGS
         for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
             less = self.less.get(halvings)
             if less is None:

@@ -10,10 +10,9 @@ from varpin.arrays import Floats, Integers
 
 Bytes = NDArray[np.uint8]
 
+# Not read-only, which has nothing to protect in an empty array and makes each call of the core longer.
 _HELD: Floats = np.zeros((0, 0, 0))
-_HELD.setflags(write=False)
 _NO_TIMES: Floats = np.zeros(0)
-_NO_TIMES.setflags(write=False)
 
 
 class Tree(NamedTuple):

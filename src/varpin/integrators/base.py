@@ -529,8 +529,13 @@ def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> 
 
 def contiguous(commands: Commands) -> Commands:
     """Commands with C-contiguous arrays, as the core requires."""
-    arrays = commands.u, commands.gains, commands.reference, commands.limits, commands.within
-    if all(array.flags.c_contiguous for array in arrays):
+    if (
+        commands.u.flags.c_contiguous
+        and commands.gains.flags.c_contiguous
+        and commands.reference.flags.c_contiguous
+        and commands.limits.flags.c_contiguous
+        and commands.within.flags.c_contiguous
+    ):
         return commands
     return commands._replace(
         u=np.ascontiguousarray(commands.u),

@@ -562,16 +562,13 @@ class Scene(Frozen):
     @cached_property
     def silence(self) -> Floats:
         """Wiener increments (0, 0, k) of a rollout without noise."""
-        none = np.zeros((0, 0, self.diffusion.constant.shape[1]))
-        none.setflags(write=False)
-        return none
+        # Not read-only, which has nothing to protect here and makes each call of the core longer.
+        return np.zeros((0, 0, self.diffusion.constant.shape[1]))
 
     @cached_property
     def no_drift(self) -> Floats:
         """Additional forces (0, 0, n) of a rollout without any."""
-        none = np.zeros((0, 0, self.robot.dof))
-        none.setflags(write=False)
-        return none
+        return np.zeros((0, 0, self.robot.dof))
 
     def holding_torque(self, q: JointValues) -> Floats:
         """The generalized forces (n,) that hold the robot at rest at ``q`` [N m or N].

@@ -34,19 +34,21 @@ struct Stake {
     }
 
   private:
-    // z' H z.
-    static double form(const double* H, const double* z, std::size_t size) {
-        double total = 0.0;
+    // z' H z. The sum z' H goes row by row of H, since a compiler may not reorder the sums of H z.
+    double form(const double* H, const double* z, std::size_t size) {
+        sums_.assign(size, 0.0);
+        double* __restrict sums = sums_.data();
         for (std::size_t i = 0; i < size; ++i) {
             if (z[i] == 0.0) continue;
-            double row = 0.0;
-            for (std::size_t j = 0; j < size; ++j) row += H[i * size + j] * z[j];
-            total += z[i] * row;
+            const double* __restrict row = H + i * size;
+            for (std::size_t j = 0; j < size; ++j) sums[j] += z[i] * row[j];
         }
+        double total = 0.0;
+        for (std::size_t j = 0; j < size; ++j) total += sums[j] * z[j];
         return total;
     }
 
-    std::vector<double> step_;
+    std::vector<double> step_, sums_;
 };
 
 }  // namespace varpin
