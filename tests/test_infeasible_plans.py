@@ -85,3 +85,31 @@ def test_no_plan(name):
     assert plan.reason.startswith(worst.label)
     assert worst.violation > 1e-3
     assert np.isfinite(plan.trajectory.q).all()
+
+
+def test_a_search_that_jumps_does_not_call_a_plan_infeasible():
+    """Gauss(2) divides steps of fast dampers, and a motion of other parts is another one; Radau has a plan."""
+    goal = np.array([0.019, 0.721])
+    cost = vp.ControlCost(1e-4) + vp.Terminal(vp.TrackingCost(goal, 1e3) + vp.VelocityCost(10.0))
+
+    def plan(integrator):
+        return vp.solve(
+            vp.OptimalControlProblem(
+                vp.Scene(ROBOT, damping=[100.0, 10.0]),
+                cost,
+                np.zeros(2),
+                np.zeros(2),
+                dt=0.1,
+                steps=6,
+                integrator=integrator,
+                constraints=[vp.WithinVelocityLimits(ROBOT, (-1.2, 1.2))],
+            ),
+            check=False,
+        )
+
+    jumping = plan(vp.Gauss(2))
+    assert jumping.status is vp.Status.STALLED
+    assert jumping.violation > 1e-3
+    for fact in ("WithinVelocityLimits is violated", "divide other steps", "Radau"):
+        assert fact in jumping.reason
+    assert plan(vp.Radau(2)).status.converged

@@ -28,7 +28,7 @@ from varpin.control.penalties import PenalizedProblem, flat, penalized
 from varpin.control.polish import deviations, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import refine
-from varpin.control.search import NOTHING, checked_time, closing_of, require_reports
+from varpin.control.search import NOTHING, PATIENCE, checked_time, closing_of, require_reports
 from varpin.control.solution import Solution
 from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
@@ -58,6 +58,8 @@ _HEAVIEST = 1e9
 _MOVING, _SETTLED = 12, 1e-3
 # A plan is infeasible when _STUCK rounds in a row have left more than _LOWERED of the worst violation.
 _STUCK, _LOWERED = 3, 0.9
+# Expected decrease, relative to the cost with penalties, with which a stalled search has not shown infeasibility.
+_MUCH = 1e-2
 # Violation at which penalties stop growing; the last step removes the rest.
 _AIM = 1e-8
 
@@ -323,6 +325,8 @@ class _Rounds:
         stuck = begun.stuck + 1 if stays else 0
         heavy = bool((begun.weights >= _HEAVIEST * begun.first_weights).any())
         if not feasible and (stuck >= _STUCK or begun.round + 1 >= _ROUNDS or (heavy and stuck)):
+            if _blocked(found):
+                return found.status, f"{state}; {found.reason}"
             return Status.INFEASIBLE, _infeasible(worst)
         if feasible and begun.round + 1 >= _ROUNDS:
             return found.status, found.reason
@@ -410,6 +414,14 @@ class _Rounds:
             else np.zeros(item.shape)
             for item in self.bound
         ]
+
+
+def _blocked(found: Solution) -> bool:
+    """Whether a round's search ended although its model expects much less, which says nothing about constraints."""
+    if found.status in (Status.INDEFINITE, Status.NOT_DIFFERENTIABLE):
+        return True
+    expected = max((item.expected_decrease for item in found.history[-PATIENCE:]), default=0.0)
+    return found.status is Status.STALLED and expected > _MUCH * abs(found.cost)
 
 
 def _infeasible(worst: ConstraintReport) -> str:

@@ -74,7 +74,7 @@ _LITTLE = 1e-4
 # Relative rounding error of Quu above which the gains are reported as unreliable.
 _LOSSY = 1e-8
 # Iterations without significant decrease before the search stalls. The cost is discontinuous where guards cut steps.
-_PATIENCE = 15
+PATIENCE = 15
 # Share of the first motion's cost at stake that is added to the current one: an optimum of cost zero has none.
 NOTHING = 1e-9
 # Approximate shortest step of a line search, and its greatest number of trials.
@@ -466,6 +466,8 @@ class _Search:
         self.cut = False  # whether one did
         # The motion before the last step, its shares, cost, and cost above the best one.
         self.before: tuple[Trajectory, Floats, float, float] | None = None
+        # Whether short trials of the last line searches were rejected where they divide other steps than the motion.
+        self.jumps = False
         self.gains: list[float] = []  # decrease of the least expected cost in each iteration
         self.reason = ""
         self.anew = anew  # whether the final motion gets a backward pass of its own
@@ -595,7 +597,7 @@ class _Search:
             if step.length >= _LONG:
                 self._relax()
             elif self._steps_short() and not self._stiffen() and not self._lift():
-                self.reason = "no step lowers the cost, whatever the regularization; "
+                self.reason = f"no step lowers the cost, whatever the regularization; {self._jump()}"
                 self.reason += self._numbers(tolerance, afresh=True)
                 return Status.STALLED
 
@@ -675,10 +677,11 @@ class _Search:
         """The status of a search that ends without convergence and the reason; None if it continues."""
         if len(self.history) >= last:
             return self._out_of(last, deadline), ""
-        if len(self.gains) > _PATIENCE:
-            recent = sum(self.gains[-_PATIENCE:])
+        if len(self.gains) > PATIENCE:
+            recent = sum(self.gains[-PATIENCE:])
             if recent <= self._share(tolerance):
-                return Status.STALLED, f"{_PATIENCE} iterations have lowered the expected cost by {recent:.1e}; "
+                lowered = f"{PATIENCE} iterations have lowered the expected cost by {recent:.1e}; "
+                return Status.STALLED, lowered + self._jump()
         return self._out_of(last, deadline), ""
 
     def _out_of(self, last: int, deadline: float) -> Status | None:
@@ -768,7 +771,7 @@ class _Search:
         logger.info("%s: no progress with bounded substeps: trials from now on have no bound", self.label)
         self.bounded, self.regularization, self.growth = False, 0.0, 1.0
         # One line search without bounds before the search can stall again.
-        self.gains = self.gains[1 - _PATIENCE :]
+        self.gains = self.gains[1 - PATIENCE :]
         return True
 
     def _plan(self, *, exact: bool | None = None) -> int:
@@ -829,7 +832,7 @@ class _Search:
         if self.plan is None:
             return _Step(0.0, 0, 0.0, 0.0)
         added = noise_shares(self.problem, self.trajectory, self.plan)
-        taken, length, tried, trials = _Trial(), 0.0, None, 0
+        taken, length, tried, trials, jumps = _Trial(), 0.0, None, 0, False
         here = _Here(
             self.problem.decided(self.trajectory),
             with_feedback(self.problem, self.trajectory, self.plan, closed=self.forward == "closed"),
@@ -854,9 +857,12 @@ class _Search:
                     self.cut = True
                 elif trial.shares is not None:
                     tried = trial.shares
+                if step <= _VERY_SHORT:
+                    jumps = jumps or trial.cut or self._divides_others(trial)
             left = [step for step in cut if step > length]
             if not left or length > (_VERY_SHORT if bounds.parts == _PARTS else 0.0):
                 break
+        self.jumps = length < _LONG and (self.jumps or jumps)
         hidden = 0.0
         if taken.motion is not None and taken.shares is not None:
             self.before = self.trajectory, self.shares, self.cost, self.above
@@ -866,6 +872,21 @@ class _Search:
         elif tried is not None:
             hidden = rounding(self.problem, self.trajectory, self.shares, tried, self.plan.model)
         return _Step(length, trials, -taken.expected if length > 0.0 else 0.0, hidden)
+
+    def _divides_others(self, trial: _Trial) -> bool:
+        """Whether a trial divides other steps into parts than the motion."""
+        if trial.motion is None:
+            return False
+        return not np.array_equal(trial.motion.written.tally[0, :, 3], self.trajectory.statistics.substeps)
+
+    def _jump(self) -> str:
+        """What makes the motion jump, if it does."""
+        if not self.jumps:
+            return ""
+        return (
+            "motions close by divide other steps into parts, and differ by a jump that no derivative shows: a smaller "
+            "dt, or a Radau integrator where dampers are fast, avoids that; "
+        )
 
     def _bounds(self) -> Iterator[_Bounds]:
         """Bounds on trials, from tight to none."""
