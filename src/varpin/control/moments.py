@@ -113,10 +113,11 @@ def left_within_steps(problem: OptimalControlProblem, trajectory: Trajectory) ->
 
     Without the step's springs a momentum decays as exp(-Z s) over a unit step, with 1 - A = Z J for the derivatives of
     the step's end in the momentum, A, and in the held impulse, J. The mean of its covariance over the step is
-    dt sum_ij x_i x_j' phi(z_i + z_j), with phi(s) = (1 - (1 - exp(-s)) / s) / s, in modes z of Z.
+    dt sum_ij x_i x_j' phi(z_i + z_j), with phi(s) = (1 - (1 - exp(-s)) / s) / s, in modes z of Z. Zero under
+    constraints of the scene, and for impulses.
     """
     scene, n, h, rule = problem.scene, problem.scene.robot.dof, problem.dt, problem.rule
-    if not problem.integrator.holds_noise:
+    if not (problem.processes and problem.integrator.holds_noise) or scene.constraints:
         return 0.0
     lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0)
     velocity = velocity_at_nodes(scene, trajectory.q, trajectory.v)
@@ -126,7 +127,7 @@ def left_within_steps(problem: OptimalControlProblem, trajectory: Trajectory) ->
     nothing[:, [1, 2, 5, 6]] = 0.0
     after = np.broadcast_to(np.eye(2 * n), (len(lin.A), 2 * n, 2 * n))
     z, X = np.linalg.eig((np.eye(n) - lin.A[:, n:, n:]) @ np.linalg.pinv(lin.K[:, n:]))
-    modes = np.linalg.solve(X, lin.F.astype(np.complex128))
+    modes = np.linalg.pinv(X) @ lin.F
     s = z[:, :, None] + z[:, None, :].conj()
     s = np.where(np.abs(s) < 1e-3, 1e-3, s)
     spread = h * (modes @ np.swapaxes(modes, 1, 2).conj()) * ((1.0 + np.expm1(-s) / s) / s)
