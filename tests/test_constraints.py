@@ -328,7 +328,7 @@ def test_noise_across_the_constraints_is_absorbed():
     along = noisy.noise.diffusion.constant
     dw = np.zeros((1, noisy.processes))
     dw[0] = np.linalg.lstsq(along, C.T @ [3.0, -2.0], rcond=None)[0]
-    kicked = vp.simulate(noisy, q, v, dt=0.01, steps=1, increments=dw)
+    kicked = vp.simulate(noisy, q, v, dt=0.01, steps=1, increments=dw, integrator=vp.Midpoint())
     plain = vp.simulate(quiet, q, v, dt=0.01, steps=1, integrator=vp.Midpoint())
     np.testing.assert_allclose(kicked.p[1], plain.p[1], atol=1e-12)
     lin = vp.linearize(noisy, motion, integrator=vp.Gauss(2))

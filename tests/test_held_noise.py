@@ -98,3 +98,23 @@ def test_linearization_under_constraints_and_beside_inputs(integrator, drive):
     found = np.stack([(end(step * e) - end(-step * e)) / (2.0 * step) for e in np.eye(scene.processes)], axis=1)
     np.testing.assert_allclose(lin.G[0], found, rtol=0, atol=1e-8 * np.abs(found).max())
     assert lin.G[0][:, 1].any() == (drive is None)
+
+
+@pytest.mark.parametrize(
+    "integrator", [vp.Midpoint(), vp.Gauss(2, kick="held"), vp.Radau(4, kick="held"), vp.RungeKutta4()]
+)
+def test_moments_of_velocities_that_are_wrong_have_a_warning(integrator, caplog):
+    """From where the stationary variance is wrong by a fifth, and the midpoint rule's, which is right, has none."""
+    for damping in (1e-3, 0.3, 3.0, 10.0):
+        scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, noise=vp.AdditiveNoise(0.3))
+        inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
+        still = {"q0": [0.0], "v0": [0.0], "dt": 0.1, "steps": 1, "increments": 0, "check": False}
+        lin = vp.linearize(scene, vp.simulate(scene, **still, integrator=integrator))
+        by_speed = 1.0 if integrator.variational else inertia
+        variance = 0.1 * (by_speed * lin.G[0, 1, 0]) ** 2 / (1.0 - lin.A[0, 1, 1] ** 2)
+        ratio = variance / (0.3**2 * inertia / (2.0 * damping))
+        moments = vp.propagate_moments(lin)
+        assert bool(moments.warnings) == (abs(ratio - 1.0) > 0.2)
+        usual = vp.simulate(scene, **still, integrator=vp.Midpoint(kick="held"))
+        assert vp.propagate_moments(vp.linearize(scene, usual)).warnings == ()
+    assert len(caplog.messages) >= 1

@@ -7,7 +7,7 @@ from findings import about
 from scipy.linalg import expm
 
 import varpin as vp
-from varpin.control.moments import noise_cost
+from varpin.control.moments import left_within_steps, noise_cost
 from varpin.control.spread import Feedback
 
 LEVEL, DAMPING = 0.3, 1.5
@@ -95,3 +95,20 @@ def test_in_the_long_steps_of_a_plan_it_is_close_to_that_of_fine_steps(damping):
     assert found.noise_cost == pytest.approx(there, rel=0.05)
     left = found.problem.at(integrator=type(found.problem.integrator)(stages=4))
     assert noise_cost(left, left.simulate(found.trajectory.u), feedback) > 1.02 * there
+
+
+@pytest.mark.parametrize("damping", [0.05, 1.5, 30.0])
+def test_what_velocities_cost_within_steps(damping):
+    """At rest, with the share of the samples, it is their exact mean variance after a step from a known state."""
+    level, dt = 0.3, 0.1
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, noise=vp.AdditiveNoise(level))
+    cost = vp.VelocityCost(1.0) + vp.ControlCost(1.0)
+    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=dt, steps=1)
+    motion = problem.simulate(np.zeros((1, 1)))
+    still = Feedback(np.zeros((1, 1, 2)), None)
+    found = noise_cost(problem, motion, still) + left_within_steps(problem, motion)
+    inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
+    rate = damping / inertia
+    variance = (level / inertia) ** 2 / (2.0 * rate)
+    mean = dt - (1.0 - np.exp(-2.0 * rate * dt)) / (2.0 * rate)
+    assert found == pytest.approx(variance * mean, rel=1e-5)

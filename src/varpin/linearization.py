@@ -5,6 +5,7 @@ Equation (L3) of docs/mathematics.md; (1.7) and (1.10) of the paper.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -13,11 +14,12 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.integrators import Integrator, integrator_of
+from varpin.integrators import Integrator, Midpoint, integrator_of
 from varpin.integrators.base import diffusion_and_drift, open_loop
 from varpin.integrators.same_scene import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
+from varpin.simulation.damping import fast_damping
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory
@@ -25,6 +27,11 @@ from varpin.trajectory import Trajectory
 # Number of steps that are repeated to check the scene of a motion without scene values, and tolerances as shares of
 # the largest change of velocity in the step and of the largest velocity.
 _RETAKEN, _OF_CHANGE, _OF_SPEED = 8, 1e-5, 1e-8
+# Rates of damping, times the step, from which the stationary variance of a damped velocity is wrong by a fifth: where
+# the whole impulse precedes the step, and where it is held over the step or split.
+_BEFORE, _WITHIN = 0.2, 2.0
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +67,7 @@ class Linearization:
             (N, 2n, m), from :func:`linearize` of a motion whose controls change within steps; else None. For controls
             linear between nodes, dx1 = A dx + (B - ramp) du_k + ramp du_(k+1).
         Gramp: Derivative of G in such a change (N, 2n, k, m); None where ``ramp`` is.
+        warnings: Where moments of velocities are wrong, as damping is fast for the step; from :func:`linearize`.
     """
 
     A: Floats
@@ -74,6 +82,7 @@ class Linearization:
     variational: bool
     ramp: Floats | None = None
     Gramp: Floats | None = None
+    warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"Linearization({self._size()})"
@@ -122,7 +131,28 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     integrator = _matching(require_scene(scene), trajectory, integrator)
     within = trajectory.u_stages.shape[1] > 0
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
-    return found if integrator.variational else replace(found, K=_kick_columns(scene, trajectory, found.J))
+    if not integrator.variational:
+        found = replace(found, K=_kick_columns(scene, trajectory, found.J))
+    return replace(found, warnings=_of_velocities(scene, trajectory, integrator))
+
+
+def _of_velocities(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> tuple[str, ...]:
+    """A warning where damping is so fast for the step that variances of velocities are wrong by a fifth and more."""
+    if not scene.processes:
+        return ()
+    midpoint = isinstance(integrator, Midpoint) and integrator.alpha == 0.5
+    if midpoint and (integrator.holds_noise or integrator.left < 1.0):
+        return ()
+    rates = _WITHIN if integrator.holds_noise or integrator.left < 1.0 else _BEFORE
+    dt = trajectory.dt
+    rate = fast_damping(scene, trajectory.q, trajectory.v, trajectory.u, 2.0 * dt / rates).rate
+    if not rate:
+        return ()
+    return (
+        f"damping is fast for the step (dt * {rate:.3g}/s = {dt * rate:.2g} > {rates:g}): with {integrator} predicted "
+        "variances of velocities are wrong there, by a fifth and more; those of varpin.Midpoint(kick='held') are right "
+        "in equilibrium at every step, and smaller steps are right throughout",
+    )
 
 
 def linearize_steps(
@@ -439,10 +469,12 @@ class Moments:
     Attributes:
         mean: Mean (N + 1, 2n).
         covariance: Covariance (N + 1, 2n, 2n).
+        warnings: Where they are wrong, from the linearization.
     """
 
     mean: Floats
     covariance: Floats
+    warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         nodes, states = self.mean.shape
@@ -488,7 +520,9 @@ def propagate_moments(
         g = linearization.G[j] + np.einsum("aib,b->ai", Gx, m)
         means[j + 1] = A @ m
         covariances[j + 1] = A @ P @ A.T + linearization.dt * (np.einsum("aib,bc,dic->ad", Gx, P, Gx) + g @ g.T)
-    return Moments(means, covariances)
+    for sentence in linearization.warnings:
+        logger.warning(sentence)
+    return Moments(means, covariances, linearization.warnings)
 
 
 def _require_covariance(P: Floats) -> Floats:

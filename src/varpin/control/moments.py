@@ -111,6 +111,39 @@ def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, feedback:
     return 0.5 * float(over_time + at_end + kicks)
 
 
+def left_within_steps(problem: OptimalControlProblem, trajectory: Trajectory) -> float:
+    """What velocities cost by the noise of their own step, beyond what its samples see of a force held over the step.
+
+    Without the step's springs a momentum decays as exp(-Z s) over a unit step, with 1 - A = Z J for the derivatives of
+    the step's end in the momentum, A, and in the held impulse, J. The mean of its covariance over the step is
+    dt sum_ij x_i x_j' phi(z_i + z_j), with phi(s) = (1 - (1 - exp(-s)) / s) / s, in modes z of Z. Zero under
+    constraints of the scene, and for impulses.
+    """
+    scene, n, h, rule = problem.scene, problem.scene.robot.dof, problem.dt, problem.rule
+    if not (problem.processes and problem.integrator.holds_noise) or scene.constraints:
+        return 0.0
+    lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0)
+    velocity = velocity_at_nodes(scene, trajectory.q, trajectory.v)
+    hessian = problem.expand_running(trajectory).hessian
+    of_sample = hessian.reshape(-1, len(rule), *hessian.shape[1:]) if len(hessian) > 1 else hessian[:, None]
+    nothing = rule.copy()
+    nothing[:, [1, 2, 5, 6]] = 0.0
+    after = np.broadcast_to(np.eye(2 * n), (len(lin.A), 2 * n, 2 * n))
+    z, X = np.linalg.eig((np.eye(n) - lin.A[:, n:, n:]) @ np.linalg.pinv(lin.K[:, n:]))
+    modes = np.linalg.pinv(X) @ lin.F
+    s = z[:, :, None] + z[:, None, :].conj()
+    s = np.where(np.abs(s) < 1e-3, 1e-3, s)
+    spread = h * (modes @ np.swapaxes(modes, 1, 2).conj()) * ((1.0 + np.expm1(-s) / s) / s)
+    own = (X @ spread @ np.swapaxes(X, 1, 2).conj()).real
+    slope = velocity[:-1, :, n:]
+    whole, total = slope @ own @ np.swapaxes(slope, 1, 2), 0.0
+    for k, P in enumerate(at_samples(nothing, after, velocity)):
+        H = of_sample[:, k if of_sample.shape[1] > 1 else 0, n : 2 * n, n : 2 * n]
+        seen = P[:, n:] @ lin.G
+        total += 0.5 * h * rule[k, 0] * float((H * (whole - h * seen @ np.swapaxes(seen, 1, 2))).sum())
+    return total
+
+
 def _end_hessian(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
     """Hessian of the terminal cost in x (2n, 2n)."""
     n = problem.scene.robot.dof

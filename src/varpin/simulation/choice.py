@@ -7,6 +7,7 @@ is repeated with another integrator.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
@@ -45,8 +46,13 @@ def usual_integrator(
         return _NOISY
     # Radau's methods do not keep constraints.
     if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt, ahead=ahead):
-        return _STOPPING
-    return _SWINGING if _swings_faster(scene, q0, _TURNS / dt, ahead=ahead) else _USUAL
+        return _of(_STOPPING, scene)
+    return _of(_SWINGING if _swings_faster(scene, q0, _TURNS / dt, ahead=ahead) else _USUAL, scene)
+
+
+def _of(chosen: Gauss | Radau, scene: Scene) -> Integrator:
+    """The choice with noise held over the step in scenes with noise: a motion without it may be linearized."""
+    return replace(chosen, kick="held") if scene.processes else chosen
 
 
 def changes_along(scene: Scene) -> bool:
@@ -62,12 +68,12 @@ def integrator_along(scene: Scene, integrator: Integrator, q: Floats, v: Floats,
 
     q and v (N + 1, n) are those of the nodes, u (N, m) of the steps, of a scene for which :func:`changes_along` holds.
     """
-    if integrator.same_map(_STOPPING):
+    if integrator.same_map(_of(_STOPPING, scene)):
         return integrator
     if not scene.constraints and fast_damping(scene, q, v, u, dt).rate:
-        return _STOPPING
-    if integrator.same_map(_USUAL) and turns_fast(scene, q, v, u, dt / _TURNS):
-        return _SWINGING
+        return _of(_STOPPING, scene)
+    if integrator.same_map(_of(_USUAL, scene)) and turns_fast(scene, q, v, u, dt / _TURNS):
+        return _of(_SWINGING, scene)
     return integrator
 
 
