@@ -88,11 +88,11 @@ bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> beg
                             again_v.data(), looks, {travel, velocity, little, light, even});
 }
 
-bool clearly_right(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> u, In<3> within, In<1> defect,
-                   Integers<1> substeps, double dt, In<1> points, In<1> weights, In<2> places, double still,
-                   double energy, double damping, std::int64_t damped_at, double travel, double velocity, double little,
-                   double light, double even, std::int64_t window, double whole, double grown, double aligned,
-                   std::int64_t few, double known) {
+double clear_growth(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> u, In<3> within, In<1> defect,
+                    Integers<1> substeps, double dt, In<1> points, In<1> weights, In<2> places, double still,
+                    double energy, double damping, std::int64_t damped_at, double travel, double velocity,
+                    double little, double light, double even, std::int64_t window, double whole, double grown,
+                    double aligned, std::int64_t few, double known) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
     const std::size_t steps = u.shape(0), stages = within.shape(1), rule = points.shape(0);
     if (steps == 0) throw std::invalid_argument("a motion needs at least one step");
@@ -121,7 +121,7 @@ bool clearly_right(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> 
                       known,
                       {travel, velocity, little, light, even}};
     Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, quadrature, clear);
-    return clearance.holds(defect.data(), substeps.data());
+    return clearance.growth(defect.data(), substeps.data());
 }
 
 std::tuple<bool, bool, bool> inside_bounds(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within,
@@ -158,7 +158,7 @@ void register_look(nb::module_& m) {
     m.def("glance", &glance_at, "mechanism"_a, "q"_a, "v"_a, "u"_a, "substeps"_a, "dt"_a);
     m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "dt"_a, nb::kw_only(),
           "even"_a, "looks"_a);
-    m.def("clearly_right", &clearly_right, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "within"_a, "defect"_a,
+    m.def("clear_growth", &clear_growth, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "within"_a, "defect"_a,
           "substeps"_a, "dt"_a, nb::kw_only(), "points"_a, "weights"_a, "places"_a, "still"_a, "energy"_a, "damping"_a,
           "damped_at"_a, "travel"_a, "velocity"_a, "little"_a, "light"_a, "even"_a, "window"_a, "whole"_a, "grown"_a,
           "aligned"_a, "few"_a, "known"_a);

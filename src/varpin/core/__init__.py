@@ -23,7 +23,7 @@ from varpin.core._core import Watch as Watch
 from varpin.core._core import accelerations as accelerations
 from varpin.core._core import box_minimum as box_minimum
 from varpin.core._core import change_values as change_values
-from varpin.core._core import clearly_right as clearly_right
+from varpin.core._core import clear_growth as clear_growth
 from varpin.core._core import constrained_derivatives as constrained_derivatives
 from varpin.core._core import coupling_kinds as coupling_kinds
 from varpin.core._core import element_kinds as element_kinds

@@ -559,7 +559,7 @@ def energy_turnover(
     of its largest velocity, and the largest accumulated work.
     """
 
-def clearly_right(
+def clear_growth(
     mechanism: Mechanism,
     q: Floats,
     v: Floats,
@@ -588,8 +588,11 @@ def clearly_right(
     aligned: float,
     few: int,
     known: float,
-) -> bool:
-    """Whether the equations of motion hold along the record of a motion far better than any warning needs.
+) -> float:
+    """The factor up to which disturbances may grow over a motion for it to be clearly right.
+
+    It is infinite where they grow less: the equations of motion hold along the record far better than any warning
+    needs. It is 0 where they do not.
 
     The arguments are those of :func:`glance` and :func:`energy_turnover`; controls at the stages of each step
     ``within`` (N, s, m), s = 0 for controls that are constant over each; the error ``defect`` (N,) of the energy

@@ -8,17 +8,18 @@ find nothing, and is left out. All other motions go through it: only that check 
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.core import clearly_right as shown_by_residuals
+from varpin.core import clear_growth
 from varpin.integrators import Integrator, Reference
 from varpin.integrators.tableau import interpolation
 from varpin.integrators.within import Times
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import EVEN, LIGHT, LITTLE, WINDOW, WRONG_ENERGY, WRONG_MOTION, WRONG_VELOCITY
-from varpin.simulation.growth import ALIGNED, FEWEST, JOINTS, NEAR
+from varpin.simulation.growth import ALIGNED, FEWEST, JOINTS, NEAR, growth_bound
 from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.trajectory import Trajectory
@@ -56,7 +57,7 @@ def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory, 
         return False
     points, weights = _FOUR if integrator.order > _SHORT_STEPS else _THREE
     times = integrator.stage_times if trajectory.u_stages.shape[1] else ()
-    return shown_by_residuals(
+    allowed = clear_growth(
         scene.core,
         trajectory.q,
         trajectory.v,
@@ -85,6 +86,8 @@ def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory, 
         few=FEWEST,
         known=-1.0 if error is None else error,
     )
+    # The core has a bound of the growth only.
+    return math.isinf(allowed) or (allowed > 1.0 and growth_bound(scene, trajectory) <= allowed)
 
 
 @functools.cache

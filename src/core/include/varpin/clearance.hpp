@@ -14,6 +14,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 #include <span>
 #include <vector>
 
@@ -70,10 +71,13 @@ class Clearance {
         for (double t : rule.points) basis_.push_back(Basis::at(t));
     }
 
-    // `defect` (N) is the error of the energy balance, `substeps` (N) the number of parts of each step.
-    bool holds(const double* defect, const std::int64_t* substeps) {
+    // The factor up to which disturbances may grow over the motion for it to be clearly right: infinite where they grow
+    // less, 0 where it is not. `defect` (N) is the error of the energy balance, `substeps` (N) the number of parts of
+    // each step.
+    double growth(const double* defect, const std::int64_t* substeps) {
         const Glance seen = glance(mechanism_, record_, substeps);
-        return seen.fastest > clear_.still && !seen.split && !seen.pulled && balanced(defect) && !damped() && small();
+        const bool plain = seen.fastest > clear_.still && !seen.split && !seen.pulled && balanced(defect) && !damped();
+        return plain ? growth_of_errors() : 0.0;
     }
 
   private:
@@ -126,8 +130,8 @@ class Clearance {
         return false;
     }
 
-    // Whether errors are small in each window, and in the whole motion after they have grown.
-    bool small() {
+    // `growth` from the errors in each window and in the whole motion.
+    double growth_of_errors() {
         const std::int64_t steps = record_.steps, pieces = (steps + clear_.window - 1) / clear_.window;
         const bool known = clear_.known >= 0.0;
         Yardstick yardstick(mechanism_);
@@ -139,19 +143,20 @@ class Clearance {
             // No mode turns or decays by much in a step here.
             std::fill(off_v_.begin(), off_v_.end(), known ? 2.0 * clear_.known / record_.h : 0.0);
             for (std::int64_t k = begin; k < end && !known; ++k, first = false) {
-                if (!step(k, first, record_.h * static_cast<double>(end - k - 1))) return false;
+                if (!step(k, first, record_.h * static_cast<double>(end - k - 1))) return 0.0;
             }
             const double* q = record_.q + begin * n_;
             const auto length = static_cast<std::size_t>(end - begin);
             yardstick.lay(q, record_.v + begin * n_, length, record_.h, clear_.allowed);
             const double travel = yardstick.of_travel(off_q_, clear_.allowed);
-            if (!(travel <= clear_.allowed.travel)) return false;
-            if (!(yardstick.of_speed(off_v_, clear_.allowed) <= clear_.allowed.velocity)) return false;
+            if (!(travel <= clear_.allowed.travel)) return 0.0;
+            if (!(yardstick.of_speed(off_v_, clear_.allowed) <= clear_.allowed.velocity)) return 0.0;
             total = larger(total, travel * static_cast<double>(steps) / static_cast<double>(length));
         }
-        if (known) return true;
-        if (!(total <= clear_.whole)) return false;
-        return steps < clear_.few || total == 0.0 || grows_less(clear_.grown / total);
+        if (known) return std::numeric_limits<double>::infinity();
+        if (!(total <= clear_.whole)) return 0.0;
+        const double factor = total > 0.0 ? clear_.grown / total : std::numeric_limits<double>::infinity();
+        return steps < clear_.few || grows_less(factor) ? std::numeric_limits<double>::infinity() : factor;
     }
 
     // Adds the errors of a step to those of its window, of which `left` [s] follows; false where a mass matrix is not
@@ -223,6 +228,7 @@ class Clearance {
     // at two of its nodes, and so above the rates of all modes, for errors that grow as exp(aligned r t). Of (dq, dv)
     // the norm is r^2 dq'M dq + dv'M dv.
     bool grows_less(double factor) {
+        if (!(factor < std::numeric_limits<double>::infinity())) return true;
         const double r = std::log(factor) / (clear_.aligned * record_.h * static_cast<double>(record_.steps));
         if (!(r > 0.0)) return false;
         const int n = n_, size = 2 * n;
