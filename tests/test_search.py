@@ -459,3 +459,21 @@ def test_each_line_of_the_log_names_its_search(caplog):
     lines = [f"finger, 5 steps of 0.01 s from t = 0 s: {item}" for item in plans[0].history]
     lines += [f"finger, 10 steps of 0.005 s from t = 1.5 s: {item}" for item in plans[1].history]
     assert [record.getMessage() for record in caplog.records] == lines
+
+
+def test_a_step_is_extended_while_the_cost_falls_on():
+    """A swing-up, whose model without second derivatives of the dynamics is too steep."""
+    robot = vp.planar_chain(2)
+    swing = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
+    swing += vp.Terminal(vp.TrackingCost([np.pi / 2, 0.0], 1e3) + vp.VelocityCost(1e2))
+    options = {"dt": 2.0 / 28, "steps": 28, "integrator": vp.RungeKutta4(), "control_limits": (-20.0, 20.0)}
+    problem = vp.OptimalControlProblem(vp.Scene(robot), swing, [-np.pi / 2, 0.0], np.zeros(2), **options)
+    plan = vp.solve(problem, tolerance=1e-4, check=False)
+    assert plan.status.converged
+    extended = [row for row in plan.history if row.step > 1.0]
+    assert extended
+    assert all(row.step in (4.0, 16.0) for row in extended)
+    # More than twice what the model expects.
+    assert all(row.decrease > 2.0 * row.expected_decrease for row in extended)
+    costs = [row.cost for row in plan.history]
+    assert costs == sorted(costs, reverse=True)

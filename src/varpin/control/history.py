@@ -54,7 +54,7 @@ class Iteration:
         noise_cost: Cost added by noise to the motion before the iteration.
         expected_decrease: Decrease of the expected cost by the quadratic model with a full step.
         decrease: Actual decrease of the expected cost, with the plan's model of the noise; 0 without a step.
-        step: Length of the accepted step, in (0, 1]; 0 if there is none.
+        step: Length of the accepted step, 0 if there is none; above 1 where the cost falls on beyond.
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
         backward_passes: Number of backward passes with different regularizations. Those that determine the controls at

@@ -63,6 +63,9 @@ logger = logging.getLogger(__name__)
 ARMIJO, BACKTRACKING = 1e-5, 0.5
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
+# A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
+# half. The step is extended by a factor while that lowers the cost.
+_EARLY, _EXTENSION = 0.85, 4.0
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it decreases after
 # long steps and increases after a very short one, or after two short ones in a row.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
@@ -862,6 +865,12 @@ class _Search:
             left = [step for step in cut if step > length]
             if not left or length > (_VERY_SHORT if bounds.parts == _PARTS else 0.0):
                 break
+        while self.anew and length >= 1.0 and taken.expected <= _EARLY * length * self.plan.slope:
+            trials += 1
+            trial = self._try(_EXTENSION * length, self.plan, here, bounds)
+            if not trial.expected < taken.expected:
+                break
+            taken, length = trial, _EXTENSION * length
         self.jumps = length < _LONG and (self.jumps or jumps)
         hidden = 0.0
         if taken.motion is not None and taken.shares is not None:

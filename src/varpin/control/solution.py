@@ -70,7 +70,8 @@ class Solution(Frozen):
     decrease   Actual decrease; near the expected one where the model is good.
     grad       Largest entry of the expected cost's gradient in the controls.
     reg        Regularization, relative to the diagonal of Quu; 0 where the model needs none.
-    step       Length of the accepted step, in (0, 1]; 0 where there is none, as at the end.
+    step       Length of the accepted step, 0 where there is none, as at the end; above 1 where the cost
+               falls on beyond the model's minimum.
     rollouts   Number of trials of the line search.
     ========== =====================================================================================
 
