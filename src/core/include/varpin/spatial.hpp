@@ -42,7 +42,7 @@ struct Mat3 {
 };
 
 template <class T, class U>
-constexpr auto operator*(const Mat3<T>& R, const Vec3<U>& a) -> Vec3<decltype(R.x.x * a.x)> {
+[[gnu::always_inline]] constexpr auto operator*(const Mat3<T>& R, const Vec3<U>& a) -> Vec3<decltype(R.x.x * a.x)> {
     return {R.x.x * a.x + R.y.x * a.y + R.z.x * a.z, R.x.y * a.x + R.y.y * a.y + R.z.y * a.z,
             R.x.z * a.x + R.y.z * a.y + R.z.z * a.z};
 }
@@ -121,7 +121,7 @@ constexpr auto dot(const Motion<T>& a, const Force<U>& f) -> decltype(a.linear.x
 }
 // a x b, the rate of a motion that is fixed to a body with velocity a.
 template <class T>
-constexpr Motion<T> cross(const Motion<T>& a, const Motion<T>& b) {
+[[gnu::always_inline]] constexpr Motion<T> cross(const Motion<T>& a, const Motion<T>& b) {
     return {cross(a.angular, b.linear) + cross(a.linear, b.angular), cross(a.angular, b.angular)};
 }
 // a x* f, the rate of a force that is fixed to a body with velocity a.
@@ -139,7 +139,8 @@ struct Inertia {
 };
 
 template <class T, class U>
-constexpr auto operator*(const Inertia<T>& Y, const Motion<U>& a) -> Force<decltype(Y.mass * a.linear.x)> {
+[[gnu::always_inline]] constexpr auto operator*(const Inertia<T>& Y, const Motion<U>& a)
+    -> Force<decltype(Y.mass * a.linear.x)> {
     return {Y.mass * a.linear + cross(a.angular, Y.moment), Y.second * a.angular + cross(Y.moment, a.linear)};
 }
 
