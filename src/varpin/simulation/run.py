@@ -88,7 +88,8 @@ def simulate(
             ``Gauss(stages=4)`` where springs turn a mode by more than 0.4 rad in a step; else ``Gauss(stages=2)``.
             If such rates occur only later in the motion, in a joint stop for example, the motion is repeated with the
             other integrator, which ``Trajectory.integrator`` names. The motion of a law is not repeated, for the law
-            is called once a period; its integrator is chosen for all stops from the start. A CustomForce has no part
+            is called once a period, and may have a state that more calls would change; its integrator is chosen for
+            all stops from the start, and the check tells where it was not enough. A CustomForce has no part
             in the choice. ``Midpoint()`` where noise is drawn; with a tolerance, the cheapest of all.
 
     Other Args:
