@@ -7,7 +7,7 @@ from findings import about
 from scipy.linalg import expm
 
 import varpin as vp
-from varpin.control.moments import left_within_steps, noise_cost
+from varpin.control.moments import noise_cost
 from varpin.control.spread import Feedback
 
 LEVEL, DAMPING = 0.3, 1.5
@@ -66,8 +66,18 @@ def test_it_is_that_of_the_backward_pass(noise, kick):
     assert own == pytest.approx(found.noise_cost, rel=1e-9)
 
 
-def test_a_plan_whose_steps_are_long_for_the_noise_says_so():
+def test_costs_of_velocities_are_close_in_long_steps_too():
+    """Of the default, without and with control noise; monte_carlo has the same share within steps."""
     long = plan(0.1)
+    assert long.noise_cost == pytest.approx(exact(long), rel=0.05)
+    assert not about(long.warnings, "noise within steps")
+    estimate = long.monte_carlo(400, rng=0)
+    assert abs(estimate.cost - estimate.predicted) < 4.0 * estimate.standard_error
+
+
+def test_a_plan_whose_steps_are_long_for_the_noise_says_so():
+    """With the paper's impulse."""
+    long = plan(0.1, integrator=vp.Gauss(4))
     assert abs(long.noise_cost / exact(long) - 1.0) > 0.15
     (sentence,) = about(long.warnings, "noise within steps")
     halves = float(sentence.split()[2])
@@ -106,7 +116,7 @@ def test_what_velocities_cost_within_steps(damping):
     problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=dt, steps=1)
     motion = problem.simulate(np.zeros((1, 1)))
     still = Feedback(np.zeros((1, 1, 2)), None)
-    found = noise_cost(problem, motion, still) + left_within_steps(problem, motion)
+    found = noise_cost(problem, motion, still)
     inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
     rate = damping / inertia
     variance = (level / inertia) ** 2 / (2.0 * rate)

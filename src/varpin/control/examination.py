@@ -11,7 +11,7 @@ from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
-from varpin.control.moments import left_within_steps, noise_cost
+from varpin.control.moments import noise_cost
 from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
@@ -238,7 +238,7 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
 
 
 def _noise_in_halves(solution: Solution) -> list[Finding]:
-    """A finding if noise costs other than planned in steps of half the length, with what velocities do within them.
+    """A finding if noise costs other than planned in steps of half the length.
 
     One impulse a step is right to first order in the step, one held force to second order.
     """
@@ -252,7 +252,6 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
             return []
         in_halves = problem.at(dt=dt, hold=hold, integrator=problem.integrator)
         planned, fine = noise_cost(problem, solution.trajectory, feedback), noise_cost(in_halves, finer, feedback)
-        fine += left_within_steps(in_halves, finer)
     except VarpinError:
         # A custom noise or cost, or the linearization, may fail off the plan.
         return []
@@ -261,7 +260,7 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
     return [
         Finding(
             "noise within steps",
-            f"noise costs {fine:.3g} in halves of dt = {problem.dt:g} s, with the motion of velocities within them, "
+            f"noise costs {fine:.3g} in halves of dt = {problem.dt:g} s, "
             f"and {planned:.3g} in the plan's steps, which are long for it: on the robot noise_cost is another, "
             "although plan.monte_carlo(), in the same steps, "
             f"agrees with it; problem.at(dt={dt:g}, hold={hold}) is closer",

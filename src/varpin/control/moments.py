@@ -100,7 +100,7 @@ def noise_gradient(
 
 
 def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback) -> float:
-    """The noise cost of a motion under feedback, without that of control changes."""
+    """The noise cost of a motion under feedback, without that of control changes, with :func:`left_within_steps`."""
     here = _steps_of(problem, trajectory, np.ones(problem.scene.processes, dtype=bool))
     C = propagated(here.J, here.g, here.gz, problem, feedback)
     x = here.J.shape[1]
@@ -108,7 +108,7 @@ def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, feedback:
     at_end = (_end_hessian(problem, trajectory) * C[-1, :x, :x]).sum()
     kicks = problem.dt * np.einsum("Nak,Nab,Nbk->", here.g, here.kicked, here.g, optimize=True)
     kicks += problem.dt * np.einsum("Nakz,Nab,Nbky,Nzy->", here.gz, here.kicked, here.gz, C[:-1], optimize=True)
-    return 0.5 * float(over_time + at_end + kicks)
+    return 0.5 * float(over_time + at_end + kicks) + left_within_steps(problem, trajectory)
 
 
 def left_within_steps(problem: OptimalControlProblem, trajectory: Trajectory) -> float:

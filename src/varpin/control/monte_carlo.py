@@ -129,11 +129,12 @@ def monte_carlo(
     paths: int,
     rng: np.random.Generator | int,
     *,
+    within: float,
     workers: int | None,
     executor: Executor | None,
     progress: Callable[[int, int], None] | None,
 ) -> MonteCarlo:
-    """See :meth:`Solution.monte_carlo`; for any policy."""
+    """See :meth:`Solution.monte_carlo`; for any policy. ``within`` is what no path shows of the noise within steps."""
     paths = count("paths", paths, least=2)
     costs: list[Floats] = []
     found: tuple[Finding, ...] = ()
@@ -168,7 +169,7 @@ def monte_carlo(
             elif np.isfinite(costs[0]).all():
                 found = _look_alone(_Alone(sent, policy, seeds, 0))
         except KeyboardInterrupt:
-            so_far = _mean(costs, predicted)
+            so_far = _mean(costs, predicted, within)
             if so_far is None:
                 raise MonteCarloInterrupted(None) from None
             if shared is not None:
@@ -178,7 +179,7 @@ def monte_carlo(
                 with suppress(KeyboardInterrupt):
                     found = _look_alone(_Alone(sent, policy, seeds, 0))
             raise MonteCarloInterrupted(_warned(so_far, (*_lost(so_far), *found))) from None
-    result = _mean(costs, predicted)
+    result = _mean(costs, predicted, within)
     if result is None:
         raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
     found = (*_lost(result), *found)
@@ -237,13 +238,13 @@ def _warned(result: MonteCarlo, found: Sequence[Finding]) -> MonteCarlo:
     return replace(result, warnings=tuple(finding.sentence for finding in found))
 
 
-def _mean(costs: Sequence[Floats], predicted: float) -> MonteCarlo | None:
+def _mean(costs: Sequence[Floats], predicted: float, within: float) -> MonteCarlo | None:
     values = np.concatenate([np.zeros(0), *costs])
     good = values[np.isfinite(values)]
     if len(good) < 2:
         return None
     return MonteCarlo(
-        cost=float(good.mean()),
+        cost=float(good.mean()) + within,
         standard_error=float(good.std(ddof=1) / np.sqrt(len(good))),
         predicted=predicted,
         paths=len(good),

@@ -15,6 +15,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.costs import barriers_of
 from varpin.control.history import Iteration, SearchState, Status
+from varpin.control.moments import left_within_steps
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.problem import OptimalControlProblem
@@ -91,7 +92,7 @@ class Solution(Frozen):
         gradient: Gradient of the expected cost in the controls (R, m), under the solver's model of the noise. At an
             optimum it is zero except where it pushes a control against its limit.
         cost: Cost of the motion without noise.
-        noise_cost: Cost added by noise, by the solver's model.
+        noise_cost: Cost added by noise, by the solver's model, with what velocities do within steps of held noise.
         status: How the solver ended.
         reason: Why it ended, with numbers.
         history: One entry for each iteration.
@@ -364,6 +365,7 @@ class Solution(Frozen):
             self.expected_cost,
             paths,
             rng,
+            within=left_within_steps(self.problem, self.trajectory) if np.isfinite(self.noise_cost) else 0.0,
             workers=workers,
             executor=executor,
             progress=progress,
