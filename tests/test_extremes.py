@@ -54,6 +54,18 @@ def run_one(setup, dt=1e-2, steps=100, integrator=None, **options):
 
 
 @pytest.fixture
+def worried(monkeypatch):
+    """A function after which every motion has a warning, also one that is clearly right."""
+
+    def worry():
+        monkeypatch.setattr("varpin.simulation.soundness.clearly_right", lambda *_: False)
+        found = (Finding("test", "all is not well"),)
+        monkeypatch.setattr("varpin.simulation.soundness._errors_found", lambda *_: found)
+
+    return worry
+
+
+@pytest.fixture
 def hasty(monkeypatch):
     """Little time for the exact motions over periods, which decide nothing here."""
     monkeypatch.setattr("battery.exact._PATIENCE_PERIODS", 0.1)
@@ -218,14 +230,17 @@ def test_kicks_of_noise_are_in_the_reference():
     trial, given = BY_NAME["noise of 1 N m s^0.5"], {"dt": 1e-2, "steps": 40}
     setup = trial.build()
     setup = dataclasses.replace(setup, increments=setup.increments[:40])
-    exact = exact_motion(setup, **given, window=trial.window)
-    motion = vp.simulate(setup.scene, setup.q0, setup.v0, **given, increments=setup.increments)
-    quiet = vp.simulate(setup.scene, setup.q0, setup.v0, **given)
-    assert error_of("error", exact, motion) < 1e-2
-    assert error_of("error", exact, quiet) > LEVELS["error"]
-    assert period_error(setup.scene, vp.Midpoint(), motion) < 1.0
-    unkicked = tampered(quiet, dw=motion.dw)
-    assert period_error(setup.scene, vp.Midpoint(), unkicked) > 1.0
+    quiet = vp.simulate(setup.scene, setup.q0, setup.v0, **given, integrator=vp.Midpoint())
+    for integrator, left in ((vp.Midpoint(), 1.0), (vp.Midpoint(kick="held"), None)):
+        exact = exact_motion(setup, **given, window=trial.window, left=left)
+        options = {"increments": setup.increments, "integrator": integrator}
+        motion = vp.simulate(setup.scene, setup.q0, setup.v0, **given, **options)
+        assert error_of("error", exact, motion) < 1e-2
+        assert error_of("error", exact, quiet) > LEVELS["error"]
+        assert period_error(setup.scene, integrator, motion) < 1.0
+        unkicked = tampered(quiet, dw=motion.dw)
+        assert period_error(setup.scene, integrator, unkicked) > 1.0
+        assert robot_checks.exact_motion(setup.scene, integrator, motion, trial.window).errors(motion)["error"] < 1e-2
 
 
 def test_kicks_come_before_or_after_their_steps():
@@ -234,7 +249,7 @@ def test_kicks_come_before_or_after_their_steps():
     setup = Setup(scene, np.zeros(1), np.zeros(1), increments=wiener_increments(1, 1e-2, 50, 0))
     given = {"dt": 1e-2, "steps": 50, "increments": setup.increments}
     motion = vp.simulate(scene, setup.q0, setup.v0, integrator=vp.ExplicitEuler(), **given)
-    assert error_of("error", exact_motion(setup, 1e-2, 50, 1.0, late=True), motion) < 1e-9
+    assert error_of("error", exact_motion(setup, 1e-2, 50, 1.0, left=0.0), motion) < 1e-9
     assert error_of("error", exact_motion(setup, 1e-2, 50, 1.0), motion) > 1e-2
     assert run_one(setup, 1e-2, 50, vp.ExplicitEuler()).error < 1e-9
     assert run_one(setup, 1e-2, 50, vp.Midpoint()).error < 1e-9
@@ -269,7 +284,7 @@ def test_rounding_excuses_no_more_than_rounding():
 # --- the kinds -----------------------------------------------------------------------------------------------------
 
 
-def test_what_is_wrong_and_unsaid_is_silent_wrong(monkeypatch):
+def test_what_is_wrong_and_unsaid_is_silent_wrong(worried):
     # The bench believes in a motion of the pendulum that is none.
     rod = vp.Scene(rod_chain([1.0], [1.0]))
     lie = Setup(rod, np.zeros(1), np.zeros(1), exact=lambda t: (np.array([-7.0 * t * t]), np.array([-14.0 * t])))
@@ -277,7 +292,7 @@ def test_what_is_wrong_and_unsaid_is_silent_wrong(monkeypatch):
     assert cell.kind is Kind.WRONG
     assert "error" in cell.found[0]
     # The same error, but spoken of.
-    monkeypatch.setattr("varpin.simulation.soundness._errors_found", lambda *_: (Finding("test", "all is not well"),))
+    worried()
     assert run_one(lie, window=0.5).kind is Kind.DEGRADED
 
 
@@ -590,10 +605,10 @@ def test_nothing_on_robots_and_trees_is_silent_wrong(benchmark, name):
     assert record.counts()[Kind.ACCURATE] > 0
 
 
-def test_needless_warnings_are_counted(monkeypatch):
+def test_needless_warnings_are_counted(worried):
     setup, _ = falling()
     assert run_one(setup, 1e-3).kind is Kind.ACCURATE
-    monkeypatch.setattr("varpin.simulation.soundness._errors_found", lambda *_: (Finding("test", "all is not well"),))
+    worried()
     cell = run_one(setup, 1e-3)
     assert cell.warned
     assert cell.needless

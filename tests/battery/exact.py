@@ -28,7 +28,17 @@ from varpin.simulation.accuracy import (
     inertias,
     nodes_between,
 )
-from varpin.study.extremes.exact import NODES, PATIENCE, START, EndsHereError, Exact, in_units, integrated, kicked
+from varpin.study.extremes.exact import (
+    NODES,
+    PATIENCE,
+    START,
+    EndsHereError,
+    Exact,
+    impulse,
+    in_units,
+    integrated,
+    kicked,
+)
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -42,7 +52,7 @@ _PATIENCE_PERIODS, _PATIENCE_PERIOD = 4.0, 1.0
 
 
 def motion_of(
-    scene: Scene, x: Floats, u: Floats, dt: float, *, dw: Floats | None, left: float, origin: Floats, end: float
+    scene: Scene, x: Floats, u: Floats, dt: float, *, dw: Floats | None, left: float | None, origin: Floats, end: float
 ) -> Iterator[Floats]:
     """States (K, 2n) of the exact motion, the first itself, then step by step or many at once.
 
@@ -54,24 +64,30 @@ def motion_of(
         u: Controls of each step (N, m).
         dt: Time step [s].
         dw: Increments of the Wiener processes (N, k), or None.
-        left: Part of each kick that comes before its step; the rest comes after it.
+        left: Part of each kick that comes before its step; the rest comes after it. None for a constant force over the
+            step instead.
         origin: Configuration that diffusion fields are relative to (n,).
         end: Processor time at which it ends [s].
     """
     dynamics, done, length = ForwardDynamics(scene.core), 0, 1
+    before, after = (0.0, 0.0) if left is None else (left, 1.0 - left)
 
     def after_kick(x: Floats, part: float) -> Floats:
         return x if dw is None or not part else kicked(scene, x, u[done], part * dw[done], origin)
+
+    def force(x: Floats) -> Floats:
+        of_noise = impulse(scene, x, u[done], dw[done], origin) / dt if left is None and dw is not None else 0.0
+        return scene.actuation @ u[done] + of_noise
 
     yield x[None]
     while done < len(u):
         same = (u[done : done + length] == u[done]).all(axis=1)
         ahead = 1 if dw is not None else len(same) if same.all() else int(same.argmin())
         try:
-            states = integrated(dynamics, scene.actuation @ u[done], after_kick(x, left), dt, ahead, end)
+            states = integrated(dynamics, force(x), after_kick(x, before), dt, ahead, end)
         except EndsHereError:
             return
-        states[-1] = after_kick(states[-1], 1.0 - left)
+        states[-1] = after_kick(states[-1], after)
         yield states
         x, done, length = states[-1], done + ahead, min(2 * length, _CHUNK)
 
@@ -91,14 +107,22 @@ def _predictable(plain: Iterator[Floats], disturbed: Iterator[Floats], by: float
     return states, known
 
 
+def before_step(integrator: Integrator) -> float | None:
+    """The part of the noise's kicks that comes before an integrator's steps; None where it is held over them."""
+    if integrator.holds_noise:
+        return None
+    # Explicit Euler's kicks come after the step.
+    return 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
+
+
 # --- from the start ------------------------------------------------------------------------------------------------
 
 
-def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, late: bool = False) -> Exact:
+def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, left: float | None = 1.0) -> Exact:
     """The exact motion over a window, as far as a small disturbance does not grow out of hand.
 
-    In closed form where there is one. A kick comes before its step, or after it if ``late``: to strong order one,
-    which is what is promised of additive noise, that is the same motion.
+    In closed form where there is one. ``left`` is that of :func:`motion_of`: to strong order one, which is what is
+    promised of additive noise, all are the same motion.
 
     Raises:
         VarpinError: It cannot be integrated over a single step.
@@ -113,7 +137,7 @@ def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, late: bo
         q, v = (np.array(part) for part in zip(*(setup.exact(k * dt) for k in nodes), strict=True))
         known = steps
     else:
-        states, known = _reference(setup, dt, int(nodes[-1]), late)
+        states, known = _reference(setup, dt, int(nodes[-1]), left)
         if not known:
             raise VarpinError("there is no exact motion of a single step")
         q, v = np.split(states[nodes[nodes < len(states)]], 2, axis=1)
@@ -123,14 +147,14 @@ def exact_motion(setup: Setup, dt: float, steps: int, window: float, *, late: bo
     return in_units(setup.scene, setup.q0, setup.v0, dt, nodes[:count], q[:count], v[:count], cut=count < len(nodes))
 
 
-def _reference(setup: Setup, dt: float, steps: int, late: bool) -> tuple[Floats, int]:
+def _reference(setup: Setup, dt: float, steps: int, left: float | None) -> tuple[Floats, int]:
     scene = setup.scene if setup.twin is None else setup.twin
     origin, end = setup.q0 - setup.shift, time.process_time() + PATIENCE
     controls = np.zeros(scene.controls) if setup.controls is None else setup.controls
     u = np.broadcast_to(controls, (steps, scene.controls)) if controls.ndim == 1 else controls[:steps]
 
     def path(by: float) -> Iterator[Floats]:
-        x, left = np.append(origin + by, setup.v0), 0.0 if late else 1.0
+        x = np.append(origin + by, setup.v0)
         return motion_of(scene, x, u, dt, dw=setup.increments, left=left, origin=setup.q0, end=end)
 
     return _predictable(path(0.0), path(DISTURBANCE), DISTURBANCE)
@@ -177,9 +201,7 @@ def _error_from(scene: Scene, integrator: Integrator, trajectory: Trajectory, st
     def path(in_q: float, in_v: float) -> Iterator[Floats]:
         x = np.concatenate([trajectory.q[step] + in_q, trajectory.v[step] + in_v])
         dw = trajectory.dw[ahead] if trajectory.dw.any() else None
-        # Explicit Euler's kicks come after the step.
-        left = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
-        u, dt = trajectory.u[ahead], trajectory.dt
+        u, dt, left = trajectory.u[ahead], trajectory.dt, before_step(integrator)
         return motion_of(scene, x, u, dt, dw=dw, left=left, origin=trajectory.q[0], end=end)
 
     plain, known = _predictable(path(0.0, 0.0), path(*by), by[0])

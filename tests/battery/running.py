@@ -11,12 +11,12 @@ from functools import cache, cached_property
 from pathlib import Path
 
 import varpin
-from battery.exact import exact_motion, period_error
+from battery.exact import before_step, exact_motion, period_error
 from battery.plans import PLANS, Plan, judge_plan
 from battery.scenes import TRIALS, trials_on
 from battery.trial import Outcome, Setup, Trial
 from varpin.errors import VarpinError
-from varpin.integrators import ExplicitEuler, Integrator
+from varpin.integrators import Integrator
 from varpin.model import Robot
 from varpin.study.extremes import checks
 from varpin.study.extremes.checks import condition, findings
@@ -135,7 +135,7 @@ class Bench:
 
     def __init__(self, trial: Trial | Plan) -> None:
         self.trial = trial
-        self._exact: dict[bool, Exact | None] = {}
+        self._exact: dict[float | None, Exact | None] = {}
 
     def run(self, integrator: Integrator, patience: float, key: str = "") -> Cell:
         """The trial with one integrator."""
@@ -178,11 +178,10 @@ class Bench:
 
     def _exact_motion(self, trial: Trial, integrator: Integrator) -> Exact | None:
         """The exact motion, computed once; None where even that cannot be integrated."""
-        # The explicit Euler method kicks beside its step: the way of that step does not know of it.
-        late = isinstance(integrator, ExplicitEuler) and self._setup.increments is not None
-        if late not in self._exact:
+        left = 1.0 if self._setup.increments is None else before_step(integrator)
+        if left not in self._exact:
             try:
-                self._exact[late] = exact_motion(self._setup, trial.dt, trial.steps, trial.window, late=late)
+                self._exact[left] = exact_motion(self._setup, trial.dt, trial.steps, trial.window, left=left)
             except VarpinError:
-                self._exact[late] = None
-        return self._exact[late]
+                self._exact[left] = None
+        return self._exact[left]

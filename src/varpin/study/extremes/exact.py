@@ -101,8 +101,14 @@ class Exact:
 def kicked(scene: Scene, x: Floats, u: Floats, dw: Floats, origin: Floats) -> Floats:
     """A state (2n,) after the kick of a step's increments (k,); diffusion fields are relative to ``origin`` (n,)."""
     q, v = np.split(x, 2)
-    field = scene.noise.fields(q[None], v[None], u[None], origin).F[0]
-    return np.append(q, v + np.linalg.solve(masses(scene, q[None])[0], field @ dw))
+    return np.append(q, v + np.linalg.solve(masses(scene, q[None])[0], impulse(scene, x, u, dw, origin)))
+
+
+def impulse(scene: Scene, x: Floats, u: Floats, dw: Floats, origin: Floats) -> Floats:
+    """The impulse (n,) of a step's increments (k,) at a state (2n,), as for :func:`kicked`."""
+    q, v = np.split(x, 2)
+    force: Floats = scene.noise.fields(q[None], v[None], u[None], origin).F[0] @ dw
+    return force
 
 
 def exact_motion(
@@ -111,14 +117,15 @@ def exact_motion(
     """The exact motion from a trajectory's start over a window [s], as far as a small disturbance does not grow.
 
     Where q is ``ahead`` by whole turns it is computed without them. A kick comes before its step, or after the step of
-    the explicit Euler method, which does not know of it. None where it cannot be integrated over a single step.
+    the explicit Euler method, which does not know of it; an integrator that holds the noise has the impulse as a
+    constant force. None where it cannot be integrated over a single step.
     """
     dt, steps = trajectory.dt, min(trajectory.steps, max(1, round(window / trajectory.dt)))
     if not trajectory.steps:
         return None
     u, dw, q0, v0 = trajectory.u[:steps], trajectory.dw[:steps], trajectory.q[0] - ahead, trajectory.v[0]
     # The first of the steps that each control is held for.
-    noisy, late = bool(dw.any()), isinstance(integrator, ExplicitEuler)
+    noisy, late, held = bool(dw.any()), isinstance(integrator, ExplicitEuler), integrator.holds_noise
     first = np.flatnonzero(np.append(True, (u[1:] != u[:-1]).any(axis=1) | noisy))
     if len(first) > 1:
         steps = min(steps, 2 * NODES)
@@ -127,11 +134,13 @@ def exact_motion(
     for by in (0.0, DISTURBANCE):
         states = np.append(q0 + by, v0)[None]
         for begin, after in zip(first, np.append(first[1:], steps), strict=True):
-            x, given = states[-1], (u[begin], dw[begin], trajectory.q[0])
-            if noisy and not late:
+            x, force, given = states[-1], scene.actuation @ u[begin], (u[begin], dw[begin], trajectory.q[0])
+            if noisy and held:
+                force = force + impulse(scene, x, *given) / dt
+            elif noisy and not late:
                 x = kicked(scene, x, *given)
             try:
-                more = integrated(dynamics, scene.actuation @ u[begin], x, dt, int(after - begin), end)
+                more = integrated(dynamics, force, x, dt, int(after - begin), end)
             except EndsHereError:
                 break
             if noisy and late:
