@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cache, cached_property
 from types import MappingProxyType
 from typing import Any, Self
 
@@ -18,19 +18,18 @@ class Frozen:
     """
 
     def changed(self, **values: Any) -> Self:
-        """A copy with other values of attributes, which are not checked."""
+        """A copy with other values of attributes, which are not checked; cached properties are computed anew."""
         copy = object.__new__(type(self))
+        own = vars(copy)
         # The frozen dataclass refuses assignments.
-        vars(copy).update(vars(self) | values)
+        own.update(vars(self))
+        for name in _cached(type(self)):
+            own.pop(name, None)
+        own.update(values)
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
-        cached = {
-            name
-            for kind in type(self).__mro__
-            for name, value in vars(kind).items()
-            if isinstance(value, cached_property)
-        }
+        cached = _cached(type(self))
         values = {name: value for name, value in vars(self).items() if name not in cached}
         views = {name: dict(value) for name, value in values.items() if isinstance(value, MappingProxyType)}
         return {
@@ -43,6 +42,14 @@ class Frozen:
         values = {name: _restored(value, state["writable"][name]) for name, value in state["values"].items()}
         # The frozen dataclass refuses assignments.
         vars(self).update(values | {name: MappingProxyType(values[name]) for name in state["views"]})
+
+
+@cache
+def _cached(kind: type) -> frozenset[str]:
+    """Names of a class's cached properties."""
+    return frozenset(
+        name for each in kind.__mro__ for name, value in vars(each).items() if isinstance(value, cached_property)
+    )
 
 
 def _writable(value: Any) -> Any:
