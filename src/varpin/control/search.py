@@ -837,8 +837,8 @@ class _Search:
 
     def _saturates(self) -> bool:
         """Whether drives of servos are at their limits for the first time."""
-        # A controller's ticks keep to first derivatives, and so do controls that are linear between nodes.
-        watched = self.anew and not (self.saturated or self.problem.linear or self.wants_whole)
+        # A controller's ticks keep to first derivatives.
+        watched = self.anew and not (self.saturated or self.wants_whole)
         return watched and saturates(self.problem.scene, self.trajectory)
 
     def _take_saturation(self) -> None:

@@ -91,7 +91,7 @@ def simulate(
             other integrator, which ``Trajectory.integrator`` names. The motion of a law is not repeated, for the law
             is called once a period, and may have a state that more calls would change; its integrator is chosen for
             all stops from the start, and the check tells where it was not enough. A CustomForce has no part
-            in the choice. ``Midpoint()`` where noise is drawn; with a tolerance, the cheapest of all.
+            in the choice. ``Midpoint(kick="held")`` where noise is drawn; with a tolerance, the cheapest of all.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, with a
