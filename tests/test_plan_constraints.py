@@ -320,6 +320,32 @@ def test_rounds_go_on_where_they_stopped(tmp_path):
         vp.solve(two_links(FAMILIES["velocities"], steps=20), resume=whole)
 
 
+def test_a_file_of_other_constraints_is_refused_in_few_words(tmp_path):
+    """The error names what differs, not everything there is: capsules alone take a thousand characters."""
+    robot = vp.planar_chain(2)
+    arm = {name: ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 0.05) for name in robot.joint_names}
+
+    def problem(distance, *more):
+        balls = [vp.Obstacle.sphere([9.0, 0.1 * k, 0.0], 0.1, name=f"ball {k}") for k in range(20)]
+        clear = vp.KeepClear(robot, balls, distance, capsules=arm)
+        start = {"q0": [0.0, 0.0], "v0": [0.0, 0.0], "dt": 0.02, "steps": 4}
+        return vp.OptimalControlProblem(
+            vp.Scene(robot, gravity=False), vp.ControlCost(1.0), **start, constraints=[clear, *more]
+        )
+
+    limits = vp.WithinVelocityLimits(robot, (-1.0, 1.0))
+    path = vp.solve(problem(0.02, limits), check=False).save(tmp_path / "plan.npz")
+    with pytest.raises(vp.FileError) as error:
+        vp.Solution.load(path, problem(0.02))
+    assert str(error.value).endswith("constraints = KeepClear, WithinVelocityLimits, not KeepClear")
+    with pytest.raises(vp.FileError) as error:
+        vp.Solution.load(path, problem(0.03, limits))
+    assert "distance=0.02" in str(error.value)
+    assert "not ..." in str(error.value)
+    assert "distance=0.03" in str(error.value)
+    assert len(str(error.value)) < 600
+
+
 def test_a_round_that_was_cut_is_as_long_as_one_that_was_not(monkeypatch):
     """A round ends after so many iterations, those before the cut included."""
     monkeypatch.setattr("varpin.control.augmented._OF_ROUND", 4)
