@@ -32,6 +32,7 @@ MARKS = {
     "look interrupted": "interrupted before the plan was replayed",
     "late plans": "planning took",
     "two goals": "two goals",
+    "goal out of reach": "from there at most",
     "left limits": "leave their limits",
     "outside limits": "outside its limits",
     "open loops": "are open",

@@ -320,6 +320,32 @@ def test_rounds_go_on_where_they_stopped(tmp_path):
         vp.solve(two_links(FAMILIES["velocities"], steps=20), resume=whole)
 
 
+def test_a_file_of_other_constraints_is_refused_in_few_words(tmp_path):
+    """The error names what differs, not everything there is: capsules alone take a thousand characters."""
+    robot = vp.planar_chain(2)
+    arm = {name: ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 0.05) for name in robot.joint_names}
+
+    def problem(distance, *more):
+        balls = [vp.Obstacle.sphere([9.0, 0.1 * k, 0.0], 0.1, name=f"ball {k}") for k in range(20)]
+        clear = vp.KeepClear(robot, balls, distance, capsules=arm)
+        start = {"q0": [0.0, 0.0], "v0": [0.0, 0.0], "dt": 0.02, "steps": 4}
+        return vp.OptimalControlProblem(
+            vp.Scene(robot, gravity=False), vp.ControlCost(1.0), **start, constraints=[clear, *more]
+        )
+
+    limits = vp.WithinVelocityLimits(robot, (-1.0, 1.0))
+    path = vp.solve(problem(0.02, limits), check=False).save(tmp_path / "plan.npz")
+    with pytest.raises(vp.FileError) as error:
+        vp.Solution.load(path, problem(0.02))
+    assert str(error.value).endswith("constraints = KeepClear, WithinVelocityLimits, not KeepClear")
+    with pytest.raises(vp.FileError) as error:
+        vp.Solution.load(path, problem(0.03, limits))
+    assert "distance=0.02" in str(error.value)
+    assert "not ..." in str(error.value)
+    assert "distance=0.03" in str(error.value)
+    assert len(str(error.value)) < 600
+
+
 def test_a_round_that_was_cut_is_as_long_as_one_that_was_not(monkeypatch):
     """A round ends after so many iterations, those before the cut included."""
     monkeypatch.setattr("varpin.control.augmented._OF_ROUND", 4)
@@ -753,16 +779,49 @@ def test_wide_limits_of_the_description_are_in_radians():
         assert [found.kind for found in hints(problem)] == ["limits in degrees"] * told
 
 
-def test_reach_bounds_where_a_frame_gets():
-    """Of many postures, rails included."""
-    for name, frame in (("ur5", "tool0"), ("tiago_no_hand", "wrist_ft_tool_link")):
-        robot = vp.load_robot(name)
-        kinematics = frame_kinematics(robot, frame)
-        lower, upper = robot.position_limits
-        rng = np.random.default_rng(0)
-        q = rng.uniform(np.maximum(lower, -7.0), np.minimum(upper, 7.0), (2000, robot.dof))
-        away = np.linalg.norm(kinematics.placements(q)[1] - kinematics.links.translation[0], axis=1)
-        assert away.max() <= hints_reach(robot, kinematics) < 2.5 * away.max()
+ARMS = ("ur3", "ur5", "ur10", "panda", "z1", "xarm7", "kinova", "so100", "talos_arm", "finger")
+
+
+@pytest.mark.parametrize("name", [*ARMS, "tiago_no_hand"])
+def test_reach_bounds_where_a_frame_gets(name):
+    """Of many postures, rails included; targets there are not called out of reach, and farther ones are."""
+    robot = vp.load_robot(name)
+    frame = "wrist_ft_tool_link" if name == "tiago_no_hand" else robot.model.frames[robot.model.nframes - 1].name
+    kinematics = frame_kinematics(robot, frame)
+    lower, upper = robot.position_limits
+    rng = np.random.default_rng(0)
+    q = rng.uniform(np.maximum(lower, -7.0), np.minimum(upper, 7.0), (4000, robot.dof))
+    places = kinematics.placements(q)[1]
+    root = kinematics.links.translation[0]
+    away = np.linalg.norm(places - root, axis=1)
+    most = hints_reach(robot, kinematics)
+    assert away.max() <= most < 1.4 * away.max()
+    farthest = places[away.argmax()]
+    scene = vp.Scene(robot)
+    for target, reached in ((farthest, True), (places[0], True), (root + 1.01 * most * np.eye(3)[2], False)):
+        cost = vp.ControlCost(1e-3) + vp.Terminal(2.0 * vp.FramePositionCost(robot, frame, target, 10.0))
+        problem = vp.OptimalControlProblem(scene, cost, q[0], np.zeros(robot.dof), dt=0.1, steps=2)
+        told = [finding for finding in hints(problem) if finding.kind == "goal out of reach"]
+        assert len(told) == (not reached)
+        assert reached or not unnamed(told[0].sentence, (frame, f"{1.01 * most:.4g} m", f"{most:.4g} m"))
+
+
+def test_targets_out_of_reach():
+    """Rows count, too, but only directions with a weight; a base on free rails gets anywhere."""
+
+    def told(robot, target, **options):
+        cost = vp.ControlCost(1e-3) + vp.FramePositionCost(robot, "tip", target, **options)
+        rest = np.zeros(robot.dof)
+        plan = vp.solve(vp.OptimalControlProblem(vp.Scene(robot), cost, rest, rest, dt=0.1, steps=2), max_iterations=1)
+        return about(plan.warnings, "goal out of reach")
+
+    robot, mobile = vp.planar_chain(2), vp.load_robot(vp.planar_chain(2).model, base="planar")
+    assert told(robot, [2.1, 0.0, 0.0])
+    assert told(robot, [2.1, 5.0, 0.0], weight=[1.0, 0.0, 1.0])
+    assert not told(robot, [1.9, 5.0, 0.0], weight=[1.0, 0.0, 1.0])
+    assert told(robot, np.linspace([1.0, 0.0, 0.0], [2.1, 0.0, 0.0], 3))
+    assert not told(robot, np.linspace([1.0, 0.0, 0.0], [1.9, 0.0, 0.0], 3))
+    assert not told(mobile, [30.0, 5.0, 0.0])
 
 
 def test_references_of_rows_go_with_constraints():

@@ -64,14 +64,33 @@ def test_a_search_goes_on_from_a_file(plan, tmp_path):
     assert vp.solve(plan.problem, resume=read, check=False).cost == plan.cost
 
 
-def test_squares_of_changes_of_demands(plan):
-    """Of the demands at the begin of steps; by differences, for states (q, p)."""
-    problem, motion, j = plan.problem, plan.trajectory, 7
-    x = np.concatenate([motion.q[j], motion.p[j], motion.u[j]])
+def demands_differentiated(problem, motion, u, j):
+    """The squares of changes of demands at the begin of step j in the state (q, p) and controls, by differences.
+
+    Of several rows of ``u`` the mean acts.
+    """
+    x = np.concatenate([motion.q[j], motion.p[j], *u])
 
     def demand(x):
         M = vp.lagrangian_jet(problem.scene, x[:2], np.zeros(2)).Lvv
-        return (STIFFNESS * (x[4:] - x[:2]) - DAMPING * np.linalg.solve(M, x[2:4])) / [105.0, 35.0]
+        mean = x[4:].reshape(-1, 2).mean(axis=0)
+        return (STIFFNESS * (mean - x[:2]) - DAMPING * np.linalg.solve(M, x[2:4])) / [105.0, 35.0]
 
-    J = np.stack([(demand(x + 1e-5 * e) - demand(x - 1e-5 * e)) / 2e-5 for e in np.eye(6)], axis=1)
-    np.testing.assert_allclose(Along(problem, motion).demands[j], J.T @ J, rtol=1e-6, atol=1e-6)
+    J = np.stack([(demand(x + 1e-5 * e) - demand(x - 1e-5 * e)) / 2e-5 for e in np.eye(len(x))], axis=1)
+    return J.T @ J
+
+
+def test_squares_of_changes_of_demands(plan):
+    problem, motion, j = plan.problem, plan.trajectory, 7
+    expected = demands_differentiated(problem, motion, motion.u[j : j + 1], j)
+    np.testing.assert_allclose(Along(problem, motion).demands[j], expected, rtol=1e-6, atol=1e-6)
+
+
+def test_linear_controls_at_the_limits_of_drives():
+    """By first derivatives alone 200 iterations are not enough."""
+    found = vp.solve(reach(35.0, controls="linear"), check=False, max_iterations=100)
+    assert found.status.converged
+    assert found.history[-1].second_order
+    problem, motion, j = found.problem, found.trajectory, 7
+    expected = demands_differentiated(problem, motion, motion.u_nodes[j : j + 2], j)
+    np.testing.assert_allclose(Along(problem, motion).demands[j + 1], expected, rtol=1e-6, atol=1e-6)

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 import varpin as vp
 from varpin.cli import main
-from varpin.integrators import integrator_of
+from varpin.integrators import Integrator, integrator_of
 from varpin.simulation import tolerance as search
 
 REST = np.zeros(3)
@@ -179,6 +179,51 @@ def test_what_an_earlier_motion_found_is_tried_first():
     # Nor is it taken where the user has fixed another integrator.
     fixed = vp.simulate(scene, REST, REST, duration=0.5, tolerance=first.accuracy, integrator=vp.Midpoint())
     assert fixed.integrator == "Midpoint(alpha=0.5)"
+
+
+SHAKEN = np.random.default_rng(0).normal(size=(5, 3))
+
+
+@pytest.mark.parametrize(
+    ("facts", "controls"),
+    [
+        ({}, SHAKEN),
+        ({}, vp.OpenLoop(shake)),
+        ({}, vp.FirstOrderHold(SHAKEN)),
+        ({}, policy("momentum")),
+        ({"forces": [vp.CustomForce(lambda _, v: -v)]}, SHAKEN),
+        ({"forces": [vp.PositionServo(20.0, 2.0)]}, SHAKEN),
+        (
+            {"constraints": [vp.KinematicInput("joint2")]},
+            vp.FirstOrderHold(np.linspace(0.0, 0.2, 5)[:, None] * np.ones(3)),
+        ),
+    ],
+    ids=["rows", "of time", "lines", "policy", "force in Python", "servos", "kinematic input"],
+)
+def test_the_run_of_the_search_is_the_motion(facts, controls, monkeypatch):
+    """And not integrated again."""
+    scene = chain(**facts)
+    options = {"duration": 0.5, "tolerance": 1e-5, "controls": controls}
+    first = vp.simulate(scene, REST, REST, **options)
+    taken, plain = [], Integrator.rollout
+
+    def rollout(self, scene, state, commands, increments, dt):
+        taken.append(len(commands.u) * commands.hold)
+        return plain(self, scene, state, commands, increments, dt)
+
+    monkeypatch.setattr(Integrator, "rollout", rollout)
+    options |= {"tolerance": first.accuracy, "check": False}
+    found = vp.simulate(scene, REST, REST, **options)
+    spent = found.accuracy.search_steps
+    assert sum(taken) == spent
+    monkeypatch.setattr("varpin.simulation.tolerance._Runs.whole", lambda *_: ())
+    again = vp.simulate(scene, REST, REST, **options)
+    assert sum(taken) == 2 * spent + found.steps
+    for name in ("q", "v", "p", "u", "u_stages", "u_nodes", "energy", "constraint_forces"):
+        assert getattr(found, name).tobytes() == getattr(again, name).tobytes()
+    for name, values in vars(found.statistics).items():
+        assert np.array_equal(values, getattr(again.statistics, name)), name
+    assert found.accuracy == again.accuracy
 
 
 def test_beyond_rounding_it_says_what_is_reached(caplog):

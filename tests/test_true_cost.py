@@ -8,7 +8,7 @@ from findings import about
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control.refinement import _halved, refine
+from varpin.control.refinement import _halved, refine, start_of
 
 
 def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
@@ -59,10 +59,62 @@ def test_halvings_go_on_until_they_resolve_the_dampers() -> None:
     cost = vp.ControlCost(1e-4) + vp.VelocityCost(1.0)
     cost += vp.Terminal(vp.TrackingCost([0.0, 0.3], 1e4) + vp.VelocityCost(1e3))
     scene = vp.Scene(vp.planar_chain(2), damping=1300.0 / rate)
-    found = vp.solve(vp.OptimalControlProblem(scene, cost, begin, rest, dt=0.1, steps=5), true_cost=0.01).refinement
+    found = vp.solve(vp.OptimalControlProblem(scene, cost, begin, rest, dt=0.1, steps=5), true_cost=0.03).refinement
     losses = [row.loss for row in found.tried]
     assert found.met
     assert min(losses[1:4]) > losses[0]
+    # The last halving has changed the cost by so little that no comparison with half the step is needed.
+    last, before = found.tried[-1], found.tried[-2]
+    assert before.cost - last.cost < 3e-3 * last.cost
+    fine = vp.solve(
+        vp.OptimalControlProblem(scene, cost, begin, rest, dt=last.dt / 4, steps=4 * last.steps), check=False
+    )
+    above = last.true_cost / fine.cost - 1.0
+    assert above <= last.excess <= 1.5 * above
+
+
+@pytest.mark.parametrize(("wish", "halvings"), [(0.2, 0), (0.02, 2)])
+def test_searches_that_end_early_are_finished_with_the_last_step(wish: float, halvings: int) -> None:
+    """Held controls cost 14, 3 and 1 % more with 3, 6 and 12 nodes: only the accepted plan needs to converge."""
+    finished = []
+
+    def some(problem: vp.OptimalControlProblem, start: object, iterations: int) -> vp.Solution:
+        resumed = {"resume": start} if isinstance(start, vp.Solution) else {"controls": start}
+        return vp.solve(problem, **resumed, max_iterations=iterations, tolerance=1e-5, check=False)
+
+    def finish(problem: vp.OptimalControlProblem, start: object) -> vp.Solution:
+        finished.append(problem.steps)
+        return some(problem, start, 100)
+
+    def few(problem: vp.OptimalControlProblem, start: object) -> vp.Solution:
+        return some(problem, start, 5 if start is None else 1)
+
+    plan = refine(reach(3), few, wish, lambda: np.inf, few, finish)
+    assert plan.refinement.met
+    assert plan.status.converged
+    steps = plan.problem.steps
+    assert steps == 3 * 2**halvings
+    assert set(finished) <= {steps}
+    assert plan.cost == pytest.approx(vp.solve(reach(steps), check=False).cost, rel=1e-4)
+
+
+def test_slow_progress_ends_the_searches_of_coarse_steps() -> None:
+    """The swing-up by the elbow creeps with 20 nodes, and half the step leads on."""
+    up, down = np.array([-np.pi / 2, 0.0]), np.array([np.pi / 2, 0.0])
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost(up, 1e3) + vp.VelocityCost(1e2))
+    scene = vp.Scene(vp.planar_chain(2), actuation=["joint2"], damping=0.02)
+    limits = (-10.0, 10.0)
+    problem = vp.OptimalControlProblem(scene, cost, down, np.zeros(2), dt=0.2, steps=20, control_limits=limits)
+    plan = vp.solve(problem, true_cost=0.01, check=False)
+    first = plan.refinement.tried[0]
+    assert first.status is vp.Status.MAX_ITERATIONS
+    assert first.iterations < 100
+    assert plan.refinement.met
+    assert plan.status.converged
+    finer = plan.problem.at(dt=plan.problem.dt / 2)
+    fine = vp.solve(finer, start_of(finer, plan), check=False)
+    assert plan.refinement.tried[-1].true_cost <= 1.01 * fine.cost
 
 
 def test_a_warm_start_is_the_plan_before() -> None:

@@ -88,13 +88,28 @@ bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> beg
                             again_v.data(), looks, {travel, velocity, little, light, even});
 }
 
+Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
+    const std::size_t steps = sums.shape(1), points = sums.shape(2), all = places.shape(1);
+    if (steps == 0 || points < 2 || (points - 1) % steps != 0 || all % steps != 0)
+        throw std::invalid_argument("a stretch needs its nodes evenly among its points, and its steps the same stages");
+    require(curves, "curves", {2, points, 3 * (steps + 1)});
+    require(sums, "sums", {2, steps, points});
+    require(places, "places", {points, all});
+    const auto copied = [](const auto& array) {
+        return std::vector<double>(array.data(), array.data() + array.size());
+    };
+    return {
+        static_cast<int>(steps), static_cast<int>(points), static_cast<int>(all / steps), copied(curves), copied(sums),
+        copied(places)};
+}
+
 double clear_growth(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> u, In<3> within, In<1> defect,
-                    Integers<1> substeps, double dt, In<1> points, In<1> weights, In<2> places, double still,
+                    Integers<1> substeps, double dt, const Stretch& narrow, const Stretch* wide, double still,
                     double energy, double damping, std::int64_t damped_at, double travel, double velocity,
                     double little, double light, double even, std::int64_t window, double whole, double grown,
                     double aligned, std::int64_t few, double known) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
-    const std::size_t steps = u.shape(0), stages = within.shape(1), rule = points.shape(0);
+    const std::size_t steps = u.shape(0), stages = within.shape(1);
     if (steps == 0) throw std::invalid_argument("a motion needs at least one step");
     for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&p, "p"}}) require(*array, name, {steps + 1, n});
     require(u, "u", {steps, m});
@@ -102,13 +117,13 @@ double clear_growth(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2>
     require(defect, "defect", {steps});
     require(substeps, "substeps", {steps});
     if (!(dt > 0.0)) throw std::invalid_argument("dt must be positive");
-    if (rule < 2) throw std::invalid_argument("a quadrature needs both ends");
-    require(weights, "weights", {rule});
-    require(places, "places", {stages > 0 ? rule : places.shape(0), stages});
+    if (narrow.steps != 1 || (wide && wide->steps != 2))
+        throw std::invalid_argument("narrow and wide must be stretches of one step and of two");
+    if (static_cast<std::size_t>(narrow.stages) != stages || (wide && wide->stages != narrow.stages))
+        throw std::invalid_argument("narrow and wide must have the stages of the controls");
     if (window < 1 || damped_at < 2) throw std::invalid_argument("window and damped_at must be at least 1 and 2");
     nb::gil_scoped_release release;
     const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), p.data(), u.data(), dt};
-    const Quadrature quadrature{{points.data(), rule}, {weights.data(), rule}, places.data(), static_cast<int>(stages)};
     const Clear clear{still,
                       energy,
                       damping,
@@ -120,7 +135,7 @@ double clear_growth(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2>
                       damped_at,
                       known,
                       {travel, velocity, little, light, even}};
-    Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, quadrature, clear);
+    Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, narrow, wide, clear);
     return clearance.growth(defect.data(), substeps.data());
 }
 
@@ -158,8 +173,9 @@ void register_look(nb::module_& m) {
     m.def("glance", &glance_at, "mechanism"_a, "q"_a, "v"_a, "u"_a, "substeps"_a, "dt"_a);
     m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "dt"_a, nb::kw_only(),
           "even"_a, "looks"_a);
+    nb::class_<Stretch>(m, "Stretch").def_static("make", &stretch_of, nb::kw_only(), "curves"_a, "sums"_a, "places"_a);
     m.def("clear_growth", &clear_growth, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "within"_a, "defect"_a,
-          "substeps"_a, "dt"_a, nb::kw_only(), "points"_a, "weights"_a, "places"_a, "still"_a, "energy"_a, "damping"_a,
+          "substeps"_a, "dt"_a, nb::kw_only(), "narrow"_a, "wide"_a.none(), "still"_a, "energy"_a, "damping"_a,
           "damped_at"_a, "travel"_a, "velocity"_a, "little"_a, "light"_a, "even"_a, "window"_a, "whole"_a, "grown"_a,
           "aligned"_a, "few"_a, "known"_a);
     m.def("inside_bounds", &inside_bounds, "mechanism"_a, "q"_a, "v"_a, "u"_a, "within"_a, "bounds"_a);

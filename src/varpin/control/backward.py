@@ -547,22 +547,24 @@ class Along:
     def demands(self) -> Floats:
         """Hessians (N, 2n + m, 2n + m) in (x, u) of the squared changes of what servos demand of their drives.
 
-        The demand is that at the begin of a step, in units of the effort limit.
+        The demand is that at the begin of a step, with linear controls of the step's mean control, in units of the
+        effort limit. With linear controls they are those of N + 1 steps in (X, u).
         """
         problem, motion, scene = self.problem, self.trajectory, self.problem.scene
-        n, N = scene.robot.dof, problem.steps
+        n, m, N = problem.scene.robot.dof, problem.scene.controls, problem.steps
         speed = np.tile(np.eye(n, 2 * n, n), (N, 1, 1))
         if problem.integrator.variational:
             speed = velocity_at_nodes(scene, motion.q[:-1], motion.v[:-1])
-        found = np.zeros((N, 2 * n + scene.controls, 2 * n + scene.controls))
+        ends = 2 if problem.linear else 1
+        found = np.zeros((N, 2 * n + ends * m, 2 * n + ends * m))
         for servo in limited_servos(scene.elements):
             c, (stiffness, damping, effort) = servo.coordinate, servo.values
-            row = np.zeros((N, 2 * n + scene.controls))
+            row = np.zeros((N, 2 * n + ends * m))
             row[:, : 2 * n] = -damping * speed[:, c]
             row[:, c] -= stiffness
-            row[:, 2 * n :] = scene.actuation[c]
+            row[:, 2 * n :] = np.tile(scene.actuation[c] / ends, ends)
             found += np.einsum("Na,Nb->Nab", row, row) / effort**2
-        return found
+        return widened(found, m) if problem.linear else found
 
     @property
     def maps(self) -> tuple[Floats, Floats]:

@@ -20,7 +20,7 @@ from varpin.control.constraints import (
     WithinJointLimits,
 )
 from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
-from varpin.control.costs.base import Scaled
+from varpin.control.costs.base import Scaled, weight_matrix
 from varpin.control.problem import OptimalControlProblem
 from varpin.model import ADVICE, AFAR, IN_MILLIMETRES, Robot, degrees_hint, looks_like_degrees, millimetres_hint
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
@@ -56,14 +56,25 @@ def hints(problem: OptimalControlProblem) -> list[Finding]:
 
 
 def reach(robot: Robot, frame: FrameKinematics) -> float:
-    """Upper bound on a frame's distance from its first joint [m], the sum of all lengths; infinite on free rails."""
+    """Upper bound on a frame's distance from its first joint [m]; infinite on free rails.
+
+    It is the shortest chain of hops from joint to joint, or over one revolute joint to the next but one.
+    """
     links = frame.links
-    total = float(np.linalg.norm(links.translation[1:], axis=1).sum() + np.linalg.norm(frame.translation))
+    hops = [*links.translation[1:], frame.translation]
     lower, upper = robot.position_limits
-    for joint in np.flatnonzero(links.prismatic):
-        c, ratio, offset = links.coordinate[joint], links.ratio[joint], links.offset[joint]
-        total += float(np.abs(ratio * np.array([lower[c], upper[c]]) + offset).max())
-    return total
+    ends = np.array([lower, upper])[:, links.coordinate]
+    slides = np.where(links.prismatic, np.abs(links.ratio * ends + links.offset).max(axis=0), 0.0)
+    most = [0.0]
+    for k, hop in enumerate(hops):
+        ways = [most[k] + slides[k] + np.linalg.norm(hop)]
+        if k > 0 and not links.prismatic[k]:
+            # Turned about joint k, the hop leads farthest away where it points away from its axis as the one before.
+            before = links.rotation[k].T @ hops[k - 1]
+            across = np.hypot(*before[:2]) + np.hypot(*hop[:2])
+            ways.append(most[k - 1] + slides[k - 1] + np.hypot(across, before[2] + hop[2]))
+        most.append(float(min(ways)))
+    return most[-1]
 
 
 def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
@@ -76,7 +87,7 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
             continue
         most = reach(goal.robot, goal.kinematics)
         away = float(np.linalg.norm(goal.position - goal.kinematics.links.translation[0]))
-        if away > most:
+        if away > most * (1.0 + _SAME):
             far = away > AFAR * most
             yield Finding(
                 "goal in millimetres" if far else "goal out of reach",
@@ -117,21 +128,30 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 
 def _targets(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Constant targets of costs on a frame's position that look like millimetres."""
+    """Targets of costs on a frame's position that are out of reach, or look like millimetres."""
     robot, named = problem.scene.robot, set()
     for term in _parts(problem.cost):
-        if not isinstance(term, FramePositionCost) or callable(term.target) or np.ndim(term.target) != 1:
+        if not isinstance(term, FramePositionCost) or callable(term.target) or term.frame in named:
             continue
         frame = frame_kinematics(robot, term.frame)
         most = reach(robot, frame)
-        away = float(np.linalg.norm(np.asarray(term.target) - frame.links.translation[0]))
-        if away > AFAR * most and term.frame not in named:
+        away = _away(term, frame.links.translation[0])
+        if away > most * (1.0 + _SAME):
             named.add(term.frame)
+            far = away > AFAR * most
             yield Finding(
-                "goal in millimetres",
+                "goal in millimetres" if far else "goal out of reach",
                 f"FramePositionCost({term.frame!r}) has its target {away:.4g} m from the first joint, and the frame "
-                f"gets {most:.4g} m from there at most{_MILLIMETRES}",
+                f"gets {most:.4g} m from there at most{_MILLIMETRES if far else ''}: no motion gets there",
             )
+
+
+def _away(term: FramePositionCost, root: Floats) -> float:
+    """Largest distance of a target from the root in the directions that have a weight [m]."""
+    off = np.atleast_2d(np.asarray(term.target)) - root
+    strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, term.size))
+    off = off @ axes[:, strengths > _SAME * strengths[-1]]
+    return float(np.linalg.norm(off, axis=1).max())
 
 
 def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:

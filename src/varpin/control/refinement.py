@@ -26,7 +26,10 @@ logger = logging.getLogger(__name__)
 
 # Tolerance of the searches, relative to the allowed loss.
 SUFFICIENT = 0.01
-# Accuracy of true costs, relative to the allowed loss.
+# Decrease in a few iterations, relative to the allowed loss and the cost at stake, at which searches end early for slow
+# progress. They are finished where half the step does not lower the cost by more than the wish.
+SLOW = 0.3
+# Accuracy of true costs, and changes of the cost that do not count, relative to the allowed loss.
 _KNOWN = 0.1
 # Iterations of a comparison with half the step.
 COMPARISON = 3
@@ -47,92 +50,174 @@ def refine(
     wish: float,
     time_left: Callable[[], float],
     compare: Search | None = None,
+    finish: Search | None = None,
 ) -> Solution:
     """Plan with the problem's step, then halve the step, each time from the plan before, until the loss is small.
 
     Args:
         problem: The problem with the coarsest step.
-        search: Makes a plan from first controls; interrupted, it returns one with status INTERRUPTED.
+        search: Makes a plan from first controls, or continues one; interrupted, it returns one with status INTERRUPTED.
         wish: Greatest allowed :attr:`Verification.closed_loop_loss`, and excess over the optimum.
         time_left: Returns the time left [s].
         compare: A search of :data:`COMPARISON` iterations. With it, half the step must not lower the cost by more than
             the wish.
+        finish: Continues a plan of ``search`` to the end; None where ``search`` never ends early.
     """
-    tried: list[Refined] = []
-    best: Solution | None = None
-    chosen = 0
-    start: LinearPolicy | Solution | None = None
-    while True:
-        began = time.perf_counter()
-        solution: Solution | None = None
-        try:
+    return _Refining(search, wish, time_left, compare, finish).run(problem)
+
+
+class _Refining:
+    """The state of a refinement: the steps tried, and the best plan."""
+
+    def __init__(
+        self,
+        search: Search,
+        wish: float,
+        time_left: Callable[[], float],
+        compare: Search | None,
+        finish: Search | None,
+    ) -> None:
+        self.search, self.wish, self.time_left = search, wish, time_left
+        self.compare, self.finish = compare, finish
+        self.tried: list[Refined] = []
+        self.best: Solution | None = None
+        self.chosen = 0
+        self.unconverged = 0  # searches in a row that have not converged, though their losses are within the wish
+
+    def run(self, problem: OptimalControlProblem) -> Solution:
+        start: LinearPolicy | Solution | None = None
+        while True:
+            began = time.perf_counter()
             # A comparison that has converged is the plan of its step.
-            done = isinstance(start, Solution) and start.status.converged
-            solution = start if isinstance(start, Solution) and done else search(problem, start)
-            costs = None if solution.status is Status.INTERRUPTED else _true_costs(solution, wish)
-        except KeyboardInterrupt:
-            if solution is None:
-                if best is None:
+            known = start if isinstance(start, Solution) and start.status.converged else None
+            try:
+                solution, costs = self._attempt(self.search, problem, start, known)
+            except VarpinError as error:
+                if self.best is None:
                     raise
-                solution = best
-            solution, costs = replace(solution, status=Status.INTERRUPTED), None
-        except VarpinError as error:
-            if best is None:
-                raise
-            return _with(best, wish, tried, chosen, f"with dt = {problem.dt:g} s there is no plan: {error}")
-        if costs is None:
-            ended = f"interrupted with dt = {problem.dt:g} s"
-            if best is None:
-                return _with(solution, wish, tried, 0, ended)
-            return _with(replace(best, status=Status.INTERRUPTED, reason=ended), wish, tried, chosen, ended)
-        tried.append(_row(solution, costs, time.perf_counter() - began))
-        logger.info("%s: true cost: %s", problem.scene.robot.name, tried[-1])
-        meets = _within(tried[-1], wish) and solution.status.converged
-        if best is None or meets or not abs(tried[-1].loss) >= abs(tried[chosen].loss):
-            best, chosen = solution, len(tried) - 1
-        finer = None
-        if meets and (compare is None or (len(tried) <= _HALVINGS and time_left() > 0.0)):
-            finer = compare and _in_half(problem, solution, compare)
-            if finer is not None:
-                if finer.status is Status.INTERRUPTED:
+                return self._given_up(f"with dt = {problem.dt:g} s there is no plan: {error}")
+            if solution is None or costs is None:
+                return self._interrupted(solution, f"interrupted with dt = {problem.dt:g} s")
+            self.tried.append(_row(solution, costs, time.perf_counter() - began))
+            finer, compared, waits = None, self.compare is None, False
+            if _within(self.tried[-1], self.wish) and self.compare is not None and self._may_go_on():
+                above = self._foreseen()
+                finer = None if np.isfinite(above) else _in_half(problem, solution, self.compare)
+                compared, waits = True, self.finish is not None and solution.status is Status.MAX_ITERATIONS
+                if waits and self._promises(solution, finer):
+                    waits, before = False, solution.cost
+                    made, costs = self._attempt(self.finish, problem, solution)
+                    if made is None or costs is None:
+                        return self._interrupted(made or solution, f"interrupted with dt = {problem.dt:g} s")
+                    solution, self.tried[-1] = made, _row(made, costs, 0.0)
+                    if before - solution.cost > _KNOWN * self.wish * abs(solution.cost):
+                        finer = _in_half(problem, solution, self.compare)
+                if finer is not None and finer.status is Status.INTERRUPTED:
                     ended = f"interrupted while dt = {problem.dt:g} s was compared with half of it"
                     left = replace(solution, status=Status.INTERRUPTED, reason=ended)
-                    return _with(left, wish, tried, chosen, ended)
-                seconds = time.perf_counter() - began
-                tried[-1] = replace(tried[-1], excess=_excess(tried, finer), seconds=seconds)
-            if finer is None or tried[-1].excess <= wish:
-                return _with(solution, wish, tried, chosen, "", met=True)
-        ended = _ended(problem, solution, tried, chosen, wish, time_left())
-        if ended:
-            return _with(best, wish, tried, chosen, ended)
-        if finer is not None:
-            problem, start = finer.problem, finer
-            continue
+                    return _with(left, self.wish, self.tried, len(self.tried) - 1, ended)
+                above = above if finer is None else _excess(self.tried, finer)
+                self.tried[-1] = replace(self.tried[-1], excess=above, seconds=time.perf_counter() - began)
+            row = self.tried[-1]
+            within = _within(row, self.wish)
+            meets = within and solution.status.converged
+            if self.best is None or meets or not abs(row.loss) >= abs(self.tried[self.chosen].loss):
+                self.best, self.chosen = solution, len(self.tried) - 1
+            if meets and compared and (finer is None or row.excess <= self.wish):
+                return _with(solution, self.wish, self.tried, self.chosen, "", met=True)
+            self.unconverged = self.unconverged + 1 if within and not (solution.status.converged or waits) else 0
+            ended = self._ended(problem, solution)
+            if ended:
+                return self._given_up(ended)
+            if finer is not None:
+                problem, start = finer.problem, finer
+                continue
+            try:
+                problem = _halved(problem)
+                start = start_of(problem, solution)
+            except VarpinError as error:
+                return self._given_up(f"half the step cannot be taken: {error}")
+
+    def _attempt(
+        self,
+        search: Search | None,
+        problem: OptimalControlProblem,
+        start: LinearPolicy | Solution | None,
+        known: Solution | None = None,
+    ) -> tuple[Solution | None, tuple[float, float, bool] | None]:
+        """A plan and its true costs; None for what an interrupt prevented."""
+        solution = known
         try:
-            problem = _halved(problem)
-            start = start_of(problem, solution)
-        except VarpinError as error:
-            return _with(best, wish, tried, chosen, f"half the step cannot be taken: {error}")
+            if solution is None and search is not None:
+                solution = search(problem, start)
+            if solution is None or solution.status is Status.INTERRUPTED:
+                return solution, None
+            return solution, _true_costs(solution, self.wish)
+        except KeyboardInterrupt:
+            return solution, None
 
+    def _may_go_on(self) -> bool:
+        return len(self.tried) <= _HALVINGS and self.time_left() > 0.0
 
-def _ended(
-    problem: OptimalControlProblem, solution: Solution, tried: list[Refined], chosen: int, wish: float, left: float
-) -> str:
-    """Why the refinement ends here; empty if it continues."""
-    if solution.status is Status.INFEASIBLE:
-        return f"with dt = {problem.dt:g} s there is no plan within the constraints: {solution.reason}"
-    if left <= 0.0:
-        return f"the time limit came after dt = {problem.dt:g} s"
-    if len(tried) > _HALVINGS:
-        return f"the step has been halved {_HALVINGS} times"
-    resolved = problem.dt * rate_at_rest(problem.scene, problem.q0) <= _RESOLVED
-    if resolved and len(tried) - 1 - chosen >= _PATIENCE:
-        return f"the last {_PATIENCE} halvings of the step have not lowered the loss"
-    if _within(tried[-1], wish) and solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE):
-        return f"the loss is within the wish, but the search ended {solution.status.name}"
-    if len(tried) >= _PATIENCE and all(_within(row, wish) and not row.status.converged for row in tried[-_PATIENCE:]):
-        return f"losses are within the wish for {_PATIENCE} steps, but the searches ended {solution.status.name}"
-    return ""
+    def _foreseen(self) -> float:
+        """Excess of the last row, where the halving before has lowered the cost by little; else infinite."""
+        if len(self.tried) < 2 or not all(row.status.converged for row in self.tried[-2:]):
+            return np.inf
+        before, last = self.tried[-2:]
+        gained = before.cost - last.cost
+        if not 0.0 <= gained <= _KNOWN * self.wish * abs(last.cost):
+            return np.inf
+        return excess(last.true_cost, last.cost - gained * _FALLS[0] / (1.0 - _FALLS[0]))
+
+    def _promises(self, solution: Solution, finer: Solution | None) -> bool:
+        """Whether a plan whose search ended early would be within the wish once it is finished."""
+        if finer is None or finer.status is Status.INTERRUPTED:
+            return finer is None
+        rest = max(solution.history[-1].expected_decrease, 0.0) if solution.history else 0.0
+        return _excess(self.tried, finer, rest) <= self.wish
+
+    def _given_up(self, ended: str) -> Solution:
+        """The best plan, its search finished."""
+        assert self.best is not None
+        if self.finish is not None and self.best.status is Status.MAX_ITERATIONS:
+            began, row = time.perf_counter(), self.tried[self.chosen]
+            made, costs = self._attempt(self.finish, self.best.problem, self.best)
+            if made is None or costs is None:
+                return self._interrupted(None, f"interrupted with dt = {row.dt:g} s")
+            seconds = row.seconds + time.perf_counter() - began
+            self.tried[self.chosen] = replace(_row(made, costs, seconds), excess=row.excess)
+            self.best = made
+        return _with(self.best, self.wish, self.tried, self.chosen, ended)
+
+    def _interrupted(self, solution: Solution | None, ended: str) -> Solution:
+        """The best plan of an interrupted refinement, or the only one."""
+        if self.best is not None:
+            best = replace(self.best, status=Status.INTERRUPTED, reason=ended)
+        elif solution is not None:
+            best = replace(solution, status=Status.INTERRUPTED)
+        else:
+            raise KeyboardInterrupt
+        return _with(best, self.wish, self.tried, self.chosen, ended)
+
+    def _ended(self, problem: OptimalControlProblem, solution: Solution) -> str:
+        """Why the refinement ends here; empty if it continues."""
+        tried, row = self.tried, self.tried[-1]
+        if solution.status is Status.INFEASIBLE:
+            return f"with dt = {problem.dt:g} s there is no plan within the constraints: {solution.reason}"
+        if self.time_left() <= 0.0:
+            return f"the time limit came after dt = {problem.dt:g} s"
+        if len(tried) > _HALVINGS:
+            return f"the step has been halved {_HALVINGS} times"
+        resolved = problem.dt * rate_at_rest(problem.scene, problem.q0) <= _RESOLVED
+        if resolved and len(tried) - 1 - self.chosen >= _PATIENCE:
+            return f"the last {_PATIENCE} halvings of the step have not lowered the loss"
+        coarse = self.wish < row.excess < np.inf
+        stuck = solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE)
+        if _within(row, self.wish) and stuck and not coarse:
+            return f"the loss is within the wish, but the search ended {solution.status.name}"
+        if self.unconverged >= _PATIENCE:
+            return f"losses are within the wish for {_PATIENCE} steps, but the searches ended {solution.status.name}"
+        return ""
 
 
 def _in_half(problem: OptimalControlProblem, solution: Solution, compare: Search) -> Solution | None:
@@ -146,16 +231,16 @@ def _in_half(problem: OptimalControlProblem, solution: Solution, compare: Search
         return replace(solution, status=Status.INTERRUPTED)
 
 
-def _excess(tried: list[Refined], finer: Solution) -> float:
-    """Excess of the last row's true cost over the optimum, by a search with half the step."""
+def _excess(tried: list[Refined], finer: Solution, rest: float = 0.0) -> float:
+    """Excess of the last row's true cost, less ``rest``, over the optimum, by a search with half the step."""
     optimum = finer.cost
     if not finer.status.converged and finer.history:
         optimum -= max(finer.history[-1].expected_decrease, 0.0)
     # Finer controls lower the planned cost further, by a geometric series.
-    gained, falls = tried[-1].cost - optimum, _FALLS[0]
+    gained, falls = tried[-1].cost - rest - optimum, _FALLS[0]
     if len(tried) > 1 and tried[-2].cost > tried[-1].cost:
         falls = float(np.clip(gained / (tried[-2].cost - tried[-1].cost), *_FALLS))
-    return excess(tried[-1].true_cost, optimum - max(gained, 0.0) * falls / (1.0 - falls))
+    return excess(tried[-1].true_cost - rest, optimum - max(gained, 0.0) * falls / (1.0 - falls))
 
 
 def _true_costs(solution: Solution, wish: float) -> tuple[float, float, bool]:

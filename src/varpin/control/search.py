@@ -28,7 +28,7 @@ from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.control.moments import left_within_steps
 from varpin.control.multiple_shooting import GapClosing, Path, path_of
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.refinement import COMPARISON, SUFFICIENT, refine
+from varpin.control.refinement import COMPARISON, SLOW, SUFFICIENT, refine
 from varpin.control.solution import Solution
 from varpin.control.trials import Attempt, Trials
 from varpin.core import Watch
@@ -79,6 +79,8 @@ _LITTLE = 1e-4
 _LOSSY = 1e-8
 # Iterations without significant decrease before the search stalls. The cost is discontinuous where guards cut steps.
 PATIENCE = 15
+# Iterations by whose decrease a search that may end early is judged.
+_SLOW = 8
 # Share of the first motion's cost at stake that is added to the current one: an optimum of cost zero has none.
 NOTHING = 1e-9
 # Approximate shortest step of a line search, and its greatest number of trials.
@@ -174,9 +176,10 @@ def solve(
             ``Solution.problem`` has the plan's step. ``Solution.refinement`` lists the steps tried, or why the accuracy
             cannot be reached; a warning reports that, too. Controls that are held over several steps keep their period,
             and their optimum is that of the period. ``max_iterations`` is for each step, ``time_limit`` for all;
-            without constraints, ``tolerance`` is at least a hundredth of ``true_cost``. Ctrl-C keeps the best plan so
-            far. Where dampers are far faster than the step, ``controls="linear"`` in the problem reaches the accuracy
-            at much larger steps.
+            without constraints, ``tolerance`` is at least a hundredth of ``true_cost``, and a search whose progress is
+            slow leaves the rest to half the step, where that lowers the cost by more than ``true_cost``. Ctrl-C keeps
+            the best plan so far. Where dampers are far faster than the step, ``controls="linear"`` in the problem
+            reaches the accuracy at much larger steps.
         noise: Gradient of the noise cost, where the noise's strength depends on the state or the control. ``"held"``:
             as in the paper, with the Hessian of the value function held; it neglects the derivatives of that Hessian,
             and ends next to the minimum of the expected cost. ``"whole"``: the search continues from there to that
@@ -220,13 +223,42 @@ def solve(
     if states is not None and resume is not None:
         raise InputError("resume goes on from the solution's own states: leave out either states or resume")
     path = None if states is None else path_of(problem, states)
-    known = len(resume.search.history) if isinstance(resume, Solution) and resume.search is not None else 0
 
-    def report(item: Iteration, motion: Trajectory) -> None:
-        report_all(item, motion)
-        if progress is not None:
-            # A converged search reports once more after its last iteration.
-            progress(min(item.index + 1 - known, max_iterations), max_iterations)
+    def searched(
+        problem: OptimalControlProblem,
+        controls: JointValues | LinearPolicy | Solution | None,
+        resume: Solution | None,
+        *,
+        path: Path | None = None,
+        tolerance: float = tolerance,
+        most: int = max_iterations,
+        slow: float | None = None,
+    ) -> Solution:
+        """One search, of at most ``most`` iterations after those of ``resume``."""
+        search = _Search(
+            problem, second_order, forward, armijo, backtracking, regularization, whole_noise=noise == "whole"
+        )
+        if resume is not None:
+            search.resume(_search_of(problem, controls, resume))
+        elif path is None:
+            search.begin(first_commands(problem, controls))
+        closing = None if path is None else closing_of(problem, path, controls)
+        known = len(search.history)
+
+        def report(item: Iteration, motion: Trajectory) -> None:
+            report_all(item, motion)
+            if progress is not None:
+                # A converged search reports once more after its last iteration.
+                progress(min(item.index + 1 - known, max_iterations), max_iterations)
+
+        try:
+            if closing is not None:
+                search.close(closing, most, deadline, report)
+            left = most - (len(search.history) - known)
+            status = search.run(tolerance, left, deadline, report, slow=slow)
+        except KeyboardInterrupt:
+            status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
+        return search.solution(status)
 
     if true_cost is not None:
         if resume is not None:
@@ -236,43 +268,30 @@ def solve(
         sufficient = max(tolerance, SUFFICIENT * wish)
 
         def once(
-            finer: OptimalControlProblem, start: LinearPolicy | Solution | None, most: int = max_iterations
+            finer: OptimalControlProblem,
+            start: LinearPolicy | Solution | None,
+            most: int = max_iterations,
+            slow: float | None = None,
         ) -> Solution:
-            return solve(
+            own = start if isinstance(start, Solution) else None
+            given = controls if start is None else None if own is not None else start
+            done = 0 if own is None or own.search is None else len(own.search.history)
+            return searched(
                 finer,
-                controls if start is None else start,
+                given,
+                own,
+                path=path if start is None else None,
                 tolerance=sufficient,
-                max_iterations=most,
-                second_order=second_order,
-                forward=forward,
-                armijo=armijo,
-                backtracking=backtracking,
-                regularization=regularization,
-                time_limit=max(deadline - time.perf_counter(), 1e-9),
-                callback=callback,
-                progress=progress,
-                check=False,
-                noise=noise,
-                states=states if start is None else None,
+                most=max(most - done, 0),
+                slow=slow,
             )
 
+        hasty = functools.partial(once, slow=SLOW * wish)
         compare = functools.partial(once, most=min(COMPARISON, max_iterations))
-        refined = refine(problem, once, wish, lambda: deadline - time.perf_counter(), compare)
+        refined = refine(problem, hasty, wish, lambda: deadline - time.perf_counter(), compare, once)
         return looked_at(refined)[0] if check else refined
 
-    search = _Search(problem, second_order, forward, armijo, backtracking, regularization, whole_noise=noise == "whole")
-    if resume is not None:
-        search.resume(_search_of(problem, controls, resume))
-    elif path is None:
-        search.begin(first_commands(problem, controls))
-    closing = None if path is None else closing_of(problem, path, controls)
-    try:
-        if closing is not None:
-            search.close(closing, max_iterations, deadline, report)
-        status = search.run(tolerance, max_iterations - (len(search.history) - known), deadline, report)
-    except KeyboardInterrupt:
-        status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
-    solution = search.solution(status)
+    solution = searched(problem, controls, resume, path=path)
     return looked_at(solution)[0] if check else solution
 
 
@@ -546,7 +565,10 @@ class _Search:
             saturated=self.saturated,
         )
 
-    def run(self, tolerance: float, max_iterations: int, deadline: float, report: Report) -> Status:
+    def run(
+        self, tolerance: float, max_iterations: int, deadline: float, report: Report, *, slow: float | None = None
+    ) -> Status:
+        """Iterate to the end; with ``slow``, no longer than progress is faster than that, :meth:`_is_slow`."""
         last, longest = len(self.history) + max_iterations, 0.0
         while True:
             self.state = self._state()
@@ -575,6 +597,10 @@ class _Search:
                 self._note(report, started, passes)
                 self.reason = self._numbers(tolerance)
                 return Status.CONVERGED
+            if slow is not None and self._is_slow(slow):
+                self._note(report, started, passes)
+                self.reason = "ended early for slow progress; " + self._numbers(tolerance)
+                return Status.MAX_ITERATIONS
             ended, why = self._ended(tolerance, last, deadline)
             if ended is Status.STALLED and self._lift():
                 continue
@@ -676,6 +702,10 @@ class _Search:
             self.plan = self._least_regularized()[0] or plan
             return True
         return self._decrease_at_most(self._share(tolerance))
+
+    def _is_slow(self, tolerance: float) -> bool:
+        """Whether the last :data:`_SLOW` iterations have lowered the cost by no more than a tolerance."""
+        return len(self.gains) > _SLOW and sum(self.gains[-_SLOW:]) <= self._share(tolerance)
 
     def _ended(self, tolerance: float, last: int, deadline: float) -> tuple[Status | None, str]:
         """The status of a search that ends without convergence and the reason; None if it continues."""
@@ -807,8 +837,8 @@ class _Search:
 
     def _saturates(self) -> bool:
         """Whether drives of servos are at their limits for the first time."""
-        # A controller's ticks keep to first derivatives, and so do controls that are linear between nodes.
-        watched = self.anew and not (self.saturated or self.problem.linear or self.wants_whole)
+        # A controller's ticks keep to first derivatives.
+        watched = self.anew and not (self.saturated or self.wants_whole)
         return watched and saturates(self.problem.scene, self.trajectory)
 
     def _take_saturation(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -253,12 +254,26 @@ def _require_problem(source: Path, members: Members, problem: OptimalControlProb
             raise FileError(f"{source} is of a problem with {name} = {members.get(name, 'unknown')}, not {value}")
     described, found = problem.described_constraints, str(members.get("problem.constraints", ""))
     if described != found:
-        raise FileError(f"{source} is of a problem with constraints = {found or 'none'}, not {described or 'none'}")
+        theirs, ours = _apart(found, described)
+        raise FileError(f"{source} is of a problem with constraints = {theirs}, not {ours}")
     _require_surroundings(source, members, problem, "noise.")
     # After the noise, which decides about the default integrator.
     stored, here = str(members.get("problem.integrator", "unknown")), repr(problem.integrator)
     if stored != here:
         raise FileError(f"{source} is of a problem with integrator = {stored}, not {here}: give it as integrator=")
+
+
+def _apart(there: str, here: str) -> tuple[str, str]:
+    """Two different descriptions of constraints, each in short: their kinds, or where the first difference is."""
+    kinds = [", ".join(re.findall(r"(?:^|; )(\w+)\(", text)) or "none" for text in (there, here)]
+    if kinds[0] != kinds[1]:
+        return kinds[0], kinds[1]
+    pairs = zip(there, here, strict=False)
+    at = next((k for k, (a, b) in enumerate(pairs) if a != b), min(len(there), len(here)))
+    first = max(0, at - 60)
+    dots = "..." if first else ""
+    short = [dots + text[first : at + 60] + ("..." if len(text) > at + 60 else "") for text in (there, here)]
+    return short[0], short[1]
 
 
 def _require_surroundings(source: Path, members: Members, problem: OptimalControlProblem, kind: str) -> None:

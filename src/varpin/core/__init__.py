@@ -16,6 +16,7 @@ from varpin.core._core import Outcome as Outcome
 from varpin.core._core import RootPass as RootPass
 from varpin.core._core import Solver as Solver
 from varpin.core._core import Squares as Squares
+from varpin.core._core import Stretch as Stretch
 from varpin.core._core import Subject as Subject
 from varpin.core._core import Tableau as Tableau
 from varpin.core._core import VariationalRollout as VariationalRollout

@@ -559,6 +559,13 @@ def energy_turnover(
     of its largest velocity, and the largest accumulated work.
     """
 
+class Stretch:
+    """Polynomials over consecutive steps, and a quadrature on them; see src/core/include/varpin/clearance.hpp."""
+
+    @staticmethod
+    def make(*, curves: Floats, sums: Floats, places: Floats) -> Stretch:
+        """Raises ValueError for arrays that do not fit each other."""
+
 def clear_growth(
     mechanism: Mechanism,
     q: Floats,
@@ -570,9 +577,8 @@ def clear_growth(
     substeps: Integers,
     dt: float,
     *,
-    points: Floats,
-    weights: Floats,
-    places: Floats,
+    narrow: Stretch,
+    wide: Stretch | None,
     still: float,
     energy: float,
     damping: float,
@@ -596,8 +602,7 @@ def clear_growth(
 
     The arguments are those of :func:`glance` and :func:`energy_turnover`; controls at the stages of each step
     ``within`` (N, s, m), s = 0 for controls that are constant over each; the error ``defect`` (N,) of the energy
-    balance; ``points`` and ``weights`` (r,) of a quadrature on [0, 1], its ends included; and the factors ``places``
-    (r, s) of the controls at the stages on those at the points. All others are largest errors, see
+    balance; and stretches of one step, ``narrow``, and of two. All others are largest errors, see
     src/core/include/varpin/clearance.hpp.
     """
 

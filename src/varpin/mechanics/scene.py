@@ -246,6 +246,7 @@ class Scene(Frozen):
         parts += [name for name in ("damping", "stiffness") if getattr(self, name).any()]
         parts += [name for name, _ in self._other_forces()]
         parts += [type(constraint).__name__ for constraint in self.constraints]
+        parts += [f"noise of {self.processes} processes"] if self.processes else []
         return f"Scene({self.robot.name}: {', '.join(parts)}, {self.controls} controls)"
 
     def _repr_html_(self) -> str:

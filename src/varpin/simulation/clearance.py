@@ -11,9 +11,10 @@ import functools
 import math
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 
 from varpin.arrays import Floats
-from varpin.core import clear_growth
+from varpin.core import Stretch, clear_growth
 from varpin.integrators import Integrator, Reference
 from varpin.integrators.tableau import interpolation
 from varpin.integrators.within import Times
@@ -32,13 +33,12 @@ _SHARE, _RATE = 0.5, 1.8
 _PERIOD, _ADDS = 0.125, 0.25
 # Velocities below this count as zero [rad/s or m/s].
 _STILL = 1e-9
+# Squared distances from the middle of two steps at which to look, with one or with two on either side: the integrals
+# over either step are then exact for polynomials of degree 5 and 8.
+_SQUARES = np.array([1.0 / 3.0, 0.13564321619, 0.61435678381])
 # Number of nodes at which dampers are looked at.
 _DAMPERS = 6
-# Points of quadratures on [0, 1], Lobatto's with three and with four, and their weights.
-_FAR = np.sqrt(0.2)
-_THREE = np.array([0.0, 0.5, 1.0]), np.array([1.0, 4.0, 1.0]) / 6.0
-_FOUR = np.array([0.0, 0.5 - 0.5 * _FAR, 0.5 + 0.5 * _FAR, 1.0]), np.array([1.0, 5.0, 5.0, 1.0]) / 12.0
-# Largest order of methods whose steps are short enough for the first.
+# Largest order of methods whose steps are short enough for quadratures with fewer points.
 _SHORT_STEPS = 4
 
 
@@ -55,8 +55,8 @@ def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory, 
         return False
     if not scene.linear or scene.robot.dof > JOINTS or scene.group.any():
         return False
-    points, weights = _FOUR if integrator.order > _SHORT_STEPS else _THREE
     times = integrator.stage_times if trajectory.u_stages.shape[1] else ()
+    narrow, wide = _stretches(times, integrator.order <= _SHORT_STEPS)
     allowed = clear_growth(
         scene.core,
         trajectory.q,
@@ -67,9 +67,8 @@ def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory, 
         trajectory.statistics.energy_defect,
         trajectory.statistics.substeps,
         trajectory.dt,
-        points=points,
-        weights=weights,
-        places=_places(times, len(points)),
+        narrow=narrow,
+        wide=wide,
         still=_STILL,
         energy=_SHARE * WRONG_ENERGY,
         damping=_RATE,
@@ -91,9 +90,43 @@ def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory, 
 
 
 @functools.cache
-def _places(times: Times, points: int) -> Floats:
-    """Factors (points, s) of controls at stages on those at the points of a quadrature; read-only."""
-    at = (_THREE if points == len(_THREE[0]) else _FOUR)[0]
-    factors = interpolation(np.array(times), at)
-    factors.setflags(write=False)
-    return factors
+def _stretches(times: Times, short: bool) -> tuple[Stretch, Stretch | None]:
+    """Polynomials over a step and over two, with ``short`` ones on fewer points, for controls at ``times`` of each.
+
+    There are none over two where the end of a step is the begin of the next one.
+    """
+    inner = np.polynomial.legendre.Legendre.basis(2 if short else 3).deriv().roots()
+    points = 0.5 + 0.5 * np.array([-1.0, *inner, 1.0])
+    gains = _integrals(points, 0.0)
+    # Lobatto's rule is exact for this product, too.
+    narrow = _stretch(points, np.array([[gains], [(1.0 - points) * gains]]), np.array(times))
+    if {0.0, 1.0} <= set(times):
+        return narrow, None
+    around = np.sqrt(_SQUARES[:1] if short else _SQUARES[1:])
+    points = 1.0 + np.array([-1.0, *-around[::-1], 0.0, *around, 1.0])
+    sums = np.array([[_integrals(points, begin, power) for begin in (0.0, 1.0)] for power in (0, 1)])
+    return narrow, _stretch(points, sums, np.append(times, 1.0 + np.array(times)))
+
+
+def _stretch(points: Floats, sums: Floats, times: Floats) -> Stretch:
+    """A stretch with points (r,), weights (2, steps, r) and controls at times (s,), in steps of unit length."""
+    nodes = np.arange(sums.shape[1] + 1.0)
+    size = 3 * len(nodes)
+    # Rows for q, v and a of each node, of polynomials about the middle.
+    middle, powers = 0.5 * nodes[-1], np.eye(size)
+    given = [polyval(node - middle, polyder(powers, order)) for node in nodes for order in range(3)]
+    basis = np.linalg.inv(given)
+    curves = [polyval(points - middle, polyder(basis, order)).T for order in (0, 1)]
+    return Stretch.make(
+        curves=np.ascontiguousarray(curves),
+        sums=np.ascontiguousarray(sums),
+        places=np.ascontiguousarray(interpolation(times, points)),
+    )
+
+
+def _integrals(points: Floats, begin: float, power: int = 0) -> Floats:
+    """Integrals (r,) of (1 - t)^power times the Lagrange polynomials on points (r,) over a step that begins there."""
+    x, weights = np.polynomial.legendre.leggauss(len(points))
+    at = 0.5 * (1.0 + x)
+    integrals: Floats = 0.5 * (weights * (1.0 - at) ** power) @ interpolation(points, begin + at)
+    return integrals

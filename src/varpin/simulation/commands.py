@@ -60,7 +60,7 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
     if callable(controls):
         raise InputError(
             "controls must be rows, a varpin.LinearPolicy, a varpin.OpenLoop or a varpin.FirstOrderHold here; only "
-            "simulate takes a control law"
+            "simulate takes a control law: call it with rng= for each path, or give a linear law as a LinearPolicy"
         )
     return open_loop(control_rows(scene, controls, steps))
 

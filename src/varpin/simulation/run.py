@@ -29,6 +29,7 @@ from varpin.simulation.record import MotionRecord, function_error
 from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
 from varpin.simulation.start import in_other_units, on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
+from varpin.simulation.tolerance import Steps
 from varpin.support.checks import JointValues, count, joint_array
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 
@@ -90,7 +91,7 @@ def simulate(
             other integrator, which ``Trajectory.integrator`` names. The motion of a law is not repeated, for the law
             is called once a period, and may have a state that more calls would change; its integrator is chosen for
             all stops from the start, and the check tells where it was not enough. A CustomForce has no part
-            in the choice. ``Midpoint()`` where noise is drawn; with a tolerance, the cheapest of all.
+            in the choice. ``Midpoint(kick="held")`` where noise is drawn; with a tolerance, the cheapest of all.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, with a
@@ -169,6 +170,7 @@ def simulated(
     if controls is None and (scene.servo_joints or scene.inputs):
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
+    known: Steps = ()
     early = in_other_units(scene, q0)
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
@@ -176,7 +178,7 @@ def simulated(
     if tolerance is not None:
         span = duration_for_tolerance(dt, steps, duration)
         chosen = steps_for_tolerance(scene, q0, v0, span, tolerance, controls, integrator)
-        integrator, steps, controls, accuracy, unmet = chosen
+        integrator, steps, controls, accuracy, unmet, known = chosen
         early = (*early, *unmet)
         dt = span / steps
     else:
@@ -199,7 +201,7 @@ def simulated(
         integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0, ahead=law is not None)
     task = _Task(scene, q0, v0, controls, period, dt, steps, dw, check)
     while True:
-        record, hold, other, interrupted = _integrated(task, integrator, reporter, replaceable=replaceable)
+        record, hold, other, interrupted = _integrated(task, integrator, reporter, replaceable=replaceable, known=known)
         if other is None:
             break
         integrator = other
@@ -240,9 +242,9 @@ class _Task(NamedTuple):
 
 
 def _integrated(
-    task: _Task, integrator: Integrator, reporter: Reporter, *, replaceable: bool
+    task: _Task, integrator: Integrator, reporter: Reporter, *, replaceable: bool, known: Steps = ()
 ) -> tuple[MotionRecord, int | None, Integrator | None, bool]:
-    """Integrate a motion.
+    """Integrate a motion, or take its ``known`` steps.
 
     Returns:
         The steps; the period of the feedback in steps, None for none; if ``replaceable``, another integrator that the
@@ -268,6 +270,10 @@ def _integrated(
     stepwise = scene.noise.diffusion is None or scene.custom is not None or bool(scene.bound_constraints.rows.customs)
     try:
         reporter.begin(start)
+        for segment, block in known:
+            done = record.steps
+            record.add(segment, block.within)
+            reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
         while record.steps < steps:
             done = record.steps
             block = next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)

@@ -22,7 +22,7 @@ from varpin.simulation.functions import ControlLaw, require_law
 from varpin.simulation.record import located
 from varpin.simulation.refinement import SENSIBLE
 from varpin.simulation.soundness import Finding
-from varpin.simulation.tolerance import Motion, Raised, choose
+from varpin.simulation.tolerance import Motion, Raised, Steps, choose
 from varpin.support.checks import count, positive
 from varpin.trajectory import Accuracy
 
@@ -157,8 +157,10 @@ def steps_for_tolerance(
     tolerance: float | Accuracy,
     wanted: Controls | ControlLaw,
     integrator: Integrator | None,
-) -> tuple[Integrator, int, Controls, Accuracy, tuple[Finding, ...]]:
+) -> tuple[Integrator, int, Controls, Accuracy, tuple[Finding, ...], Steps]:
     """Integrator, number of steps and controls for a tolerance, with the estimated accuracy and warnings.
+
+    The last value are the steps of this motion, if the search has kept them; else it is empty.
 
     Args:
         scene: The scene, without noise.
@@ -247,4 +249,4 @@ def steps_for_tolerance(
         controls = _line_in_parts(scene, controls, q0, v0, duration, choice.steps // parts)
     elif not isinstance(controls, LinearPolicy | OpenLoop):
         controls = held_in_parts(scene, held, q0, v0, duration / parts, choice.steps // parts)
-    return choice.integrator, choice.steps, controls, record, found
+    return choice.integrator, choice.steps, controls, record, found, choice.motion

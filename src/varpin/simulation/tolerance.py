@@ -13,7 +13,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
-from varpin.integrators import Integrator
+from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import rows, steps_of
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
@@ -33,7 +33,7 @@ from varpin.simulation.refinement import (
 
 # Work between two checks for Ctrl-C, in steps of one joint.
 _CHUNK = 100_000
-# About the number of nodes of a run that are kept.
+# About the number of nodes of a run that are kept; of runs with no more steps, all that the core gives is.
 _NODES = 4096
 # Number of evaluations, times the number of joints, after which no further run begins.
 _MOST_WORK = 50_000_000
@@ -73,6 +73,10 @@ class Motion:
     sampled: bool = False
 
 
+# Consecutive steps, with their commands.
+Steps = tuple[tuple[Segment, Commands], ...]
+
+
 class Raised(Exception):
     """A run in which a function of a custom force or constraint failed.
 
@@ -97,6 +101,11 @@ class _Runs:
         self.raised: Raised | None = None
         self._raises, self._passed = 0, False
         self._done: dict[tuple[str, int], Sample] = {}
+        self._whole: dict[tuple[str, int], Steps] = {}
+
+    def whole(self, integrator: Integrator, steps: int) -> Steps:
+        """All steps of an earlier run; empty for a long one, which is not kept."""
+        return self._whole.get((str(integrator), steps), ())
 
     def __call__(self, integrator: Integrator, steps: int) -> Sample:
         key = str(integrator), steps
@@ -116,6 +125,7 @@ class _Runs:
         commands = given.commands(integrator, steps)
         state, (last,) = integrator.start(given.scene, given.q0[None], given.v0[None])
         q, done, evaluations, pure = np.full((steps // stride, n), np.nan), 0, 0, True
+        parts: list[tuple[Segment, Commands]] = []
         chunk = max(1, _CHUNK // n // commands.hold)
         while done < steps and pure:
             first = done // commands.hold
@@ -137,6 +147,10 @@ class _Runs:
             evaluations += int(statistics.sweeps.sum() + statistics.jets.sum())
             pure = last.failure is None and statistics.split_steps == 0
             done += steps_of(block)
+            if steps <= _NODES:
+                parts.append((last, block))
+        if pure:
+            self._whole[str(integrator), steps] = tuple(parts)
         self.steps += done
         self.evaluations += evaluations
         self._passed = self._passed or pure
@@ -217,6 +231,7 @@ class Choice:
         search_evaluations: Evaluations in them.
         floor: The smallest error that rounding allows [rad or m].
         raised: The last run in which a function of a custom force or constraint failed, if one did.
+        motion: All steps of the chosen run; empty if it is long, or was not run.
     """
 
     integrator: Integrator
@@ -226,6 +241,7 @@ class Choice:
     search_evaluations: int
     floor: float
     raised: Raised | None = None
+    motion: Steps = ()
 
 
 def choose(
@@ -262,7 +278,8 @@ def choose(
             if not (runs(first[0], steps).pure and math.isfinite(error) and error < SENSIBLE):
                 break
             if max(error, floor) <= tolerance:
-                return Choice(first[0], steps, max(error, floor), runs.steps, runs.evaluations, floor)
+                found = runs.whole(first[0], steps)
+                return Choice(first[0], steps, max(error, floor), runs.steps, runs.evaluations, floor, motion=found)
             if error > _FAR * tolerance:
                 break
             steps = method.more(steps, error, tolerance)
@@ -275,7 +292,8 @@ def choose(
     least = motion.parts * 2 ** math.ceil(math.log2(coarse // motion.parts))
     search = _CheckedSearch([of(member, least) for member in integrators], runs)
     (best, *_), _ = search.for_tolerance(tolerance / SAFETY)
-    return Choice(best.integrator, best.steps, best.error, runs.steps, runs.evaluations, search.floor, runs.raised)
+    found, spent = runs.whole(best.integrator, best.steps), (runs.steps, runs.evaluations)
+    return Choice(best.integrator, best.steps, best.error, *spent, search.floor, runs.raised, found)
 
 
 def _require_start(motion: Motion, integrator: Integrator) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -17,21 +17,27 @@ class Frozen:
     pickled as mappings. Cached properties are left out and computed again on use.
     """
 
+    _cached: ClassVar[frozenset[str]] = frozenset()  # names of the cached properties
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Collect the names of the cached properties."""
+        super().__init_subclass__(**options)
+        own = (name for name, value in vars(cls).items() if isinstance(value, cached_property))
+        cls._cached = cls._cached.union(own)
+
     def changed(self, **values: Any) -> Self:
-        """A copy with other values of attributes, which are not checked."""
+        """A copy with other values of attributes, which are not checked; cached properties are computed anew."""
         copy = object.__new__(type(self))
+        own = vars(copy)
         # The frozen dataclass refuses assignments.
-        vars(copy).update(vars(self) | values)
+        own.update(vars(self))
+        for name in self._cached:
+            own.pop(name, None)
+        own.update(values)
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
-        cached = {
-            name
-            for kind in type(self).__mro__
-            for name, value in vars(kind).items()
-            if isinstance(value, cached_property)
-        }
-        values = {name: value for name, value in vars(self).items() if name not in cached}
+        values = {name: value for name, value in vars(self).items() if name not in self._cached}
         views = {name: dict(value) for name, value in values.items() if isinstance(value, MappingProxyType)}
         return {
             "values": values | views,

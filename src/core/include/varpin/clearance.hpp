@@ -1,11 +1,10 @@
 // Motions that are clearly right, from the residual of the equations of motion along their record. docs/limits.md, "The
 // warnings".
 //
-// Through the nodes of a step goes the polynomial of fifth degree with their q, v and accelerations a. With the
-// accelerations a_i of the scene on it at the points c_i of a quadrature (c_1 = 0, c_r = 1, weights w_i) the step is
-// off by
+// Through the nodes of one step or of two goes the polynomial with their q, v and accelerations a, of degree 5 or 8.
+// With the accelerations a(t) of the scene on it, each of its steps is off by
 //
-//     dv = v1 - v0 - h sum_i w_i a_i        dq = q1 - q0 - h v0 - h^2 sum_i w_i (1 - c_i) a_i
+//     dv = v1 - v0 - integral of a(t)        dq = q1 - q0 - h v0 - integral of (t1 - t) a(t)
 //
 // and by the error of the quadrature. Either is small for small errors in steps that resolve the motion, and not for
 // others.
@@ -26,12 +25,19 @@
 
 namespace varpin {
 
-// Points and weights of a quadrature on [0, 1], its ends included; and the factors of the controls at `stages` stages
-// of a step on those at the points (points, stages).
-struct Quadrature {
-    std::span<const double> points, weights;
-    const double* places = nullptr;
-    int stages = 0;
+// Polynomials over some consecutive steps of unit length, and a quadrature on them. The first of the points is the
+// start of the steps, the last one is their end, and all nodes between are evenly spaced among them.
+struct Stretch {
+    int steps = 0, points = 0, stages = 0;
+    // (2, points, 3 (steps + 1)): values and slopes at the points of the polynomials that belong to q, v, a of each
+    // node.
+    std::vector<double> curves;
+    // (2, steps, points): weights of the integrals of a and of (t1 - t) a over each step to t1.
+    std::vector<double> sums;
+    // (points, steps stages): factors of the controls at the stages of the steps on those at the points.
+    std::vector<double> places;
+
+    int node(int j) const { return j * (points - 1) / steps; }
 };
 
 // Largest errors of a motion that is clearly right.
@@ -51,24 +57,28 @@ struct Clear {
 
 class Clearance {
   public:
-    Clearance(const Mechanism& mechanism, const Record& record, const double* within, const Quadrature& rule,
-              const Clear& clear)
+    // `wide` is a stretch of two steps, or null.
+    Clearance(const Mechanism& mechanism, const Record& record, const double* within, const Stretch& narrow,
+              const Stretch* wide, const Clear& clear)
         : mechanism_(mechanism),
           record_(record),
           within_(within),
-          rule_(rule),
+          narrow_(narrow),
+          wide_(wide),
           clear_(clear),
           n_(mechanism.dof()),
           dynamics_(mechanism, false),
           inertias_(mechanism),
-          force_(rule.points.size() * n_),
           before_(n_),
-          a_(rule.points.size() * n_),
+          last_(n_),
           q_(n_),
           v_(n_),
           off_q_(n_),
           off_v_(n_) {
-        for (double t : rule.points) basis_.push_back(Basis::at(t));
+        const int points = std::max(narrow.points, wide ? wide->points : 0);
+        const int steps = std::max(narrow.steps, wide ? wide->steps : 0);
+        for (auto* rows : {&force_, &a_}) rows->resize(points * n_);
+        for (auto* rows : {&step_q_, &step_v_}) rows->resize(steps * n_);
     }
 
     // The factor up to which disturbances may grow over the motion for it to be clearly right: infinite where they grow
@@ -77,35 +87,30 @@ class Clearance {
     double growth(const double* defect, const std::int64_t* substeps) {
         const Glance seen = glance(mechanism_, record_, substeps);
         const bool plain = seen.fastest > clear_.still && !seen.split && !seen.pulled && balanced(defect) && !damped();
-        return plain ? growth_of_errors() : 0.0;
+        if (!plain) return 0.0;
+        double found = growth_of_errors();
+        // Controls may have kinks at the nodes.
+        if (found < std::numeric_limits<double>::infinity() && wide_ && within_) {
+            wide_ = nullptr;
+            found = larger(found, growth_of_errors());
+        }
+        return found;
     }
 
   private:
-    // Values and slopes on [0, 1] of the polynomials that belong to q1 - q0, v0, v1, a0, a1.
-    struct Basis {
-        double value[5], slope[5];
-
-        static Basis at(double t) {
-            const double s = t * t, c = s * t;
-            return {{c * (10.0 - 15.0 * t + 6.0 * s), t - c * (6.0 - 8.0 * t + 3.0 * s), -c * (4.0 - 7.0 * t + 3.0 * s),
-                     0.5 * s * (1.0 - 3.0 * t + 3.0 * s - c), 0.5 * c * (1.0 - 2.0 * t + s)},
-                    {30.0 * s * (1.0 - 2.0 * t + s), 1.0 - s * (18.0 - 32.0 * t + 15.0 * s),
-                     -s * (12.0 - 28.0 * t + 15.0 * s), t - 4.5 * s + 6.0 * c - 2.5 * s * s,
-                     s * (1.5 - 4.0 * t + 2.5 * s)}};
-        }
-    };
-
     const Mechanism& mechanism_;
     const Record& record_;
     const double* within_;  // (N, s, m) controls at the stages; null for controls that are constant over each step
-    const Quadrature& rule_;
+    const Stretch& narrow_;
+    const Stretch* wide_;
     const Clear& clear_;
     int n_;
     ForwardDynamics dynamics_;
     Inertias inertias_;
-    std::vector<Basis> basis_;
-    std::vector<double> force_, before_;  // (r, n) of the controls at the points; at the end of the step before
-    std::vector<double> a_;               // (r, n)
+    std::vector<double> force_, a_;        // (points, n) of a stretch: of the controls, and accelerations
+    std::vector<double> before_, last_;    // the same at the end of the stretch before
+    std::vector<double> step_q_, step_v_;  // errors of the steps of a stretch (steps, n)
+    std::int64_t from_ = 0, until_ = 0;    // its nodes
     std::vector<double> q_, v_, off_q_, off_v_;
 
     bool balanced(const double* defect) const {
@@ -136,14 +141,20 @@ class Clearance {
         const bool known = clear_.known >= 0.0;
         Yardstick yardstick(mechanism_);
         double total = 0.0;
-        bool first = true;
+        from_ = until_ = -1;
         for (std::int64_t piece = 0; piece < pieces; ++piece) {
             const std::int64_t begin = piece * steps / pieces, end = (piece + 1) * steps / pieces;
             std::fill(off_q_.begin(), off_q_.end(), known ? clear_.known : 0.0);
             // No mode turns or decays by much in a step here.
             std::fill(off_v_.begin(), off_v_.end(), known ? 2.0 * clear_.known / record_.h : 0.0);
-            for (std::int64_t k = begin; k < end && !known; ++k, first = false) {
-                if (!step(k, first, record_.h * static_cast<double>(end - k - 1))) return 0.0;
+            for (std::int64_t k = begin; k < end && !known; ++k) {
+                if (k >= until_ && !examine(k)) return 0.0;
+                const double left = record_.h * static_cast<double>(end - k - 1);
+                for (int c = 0; c < n_; ++c) {
+                    const double dv = step_v_[(k - from_) * n_ + c];
+                    off_v_[c] += dv;
+                    off_q_[c] += step_q_[(k - from_) * n_ + c] + left * dv;
+                }
             }
             const double* q = record_.q + begin * n_;
             const auto length = static_cast<std::size_t>(end - begin);
@@ -159,62 +170,90 @@ class Clearance {
         return steps < clear_.few || grows_less(factor) ? std::numeric_limits<double>::infinity() : factor;
     }
 
-    // Adds the errors of a step to those of its window, of which `left` [s] follows; false where a mass matrix is not
-    // positive definite.
-    bool step(std::int64_t k, bool first, double left) {
-        const double *q0 = record_.q + k * n_, *v0 = record_.v + k * n_, *q1 = q0 + n_, *v1 = v0 + n_, h = record_.h;
-        const std::size_t last = rule_.points.size() - 1;
-        if (within_ && rule_.stages > 0) {
-            const int m = mechanism_.controls;
-            for (std::size_t i = 0; i <= last; ++i) {
-                double* force = &force_[i * n_];
-                std::fill(force, force + n_, 0.0);
-                for (int s = 0; s < rule_.stages; ++s) {
-                    const double* u = within_ + (k * rule_.stages + s) * m;
-                    const double share = rule_.places[i * rule_.stages + s];
-                    for (const Transmission& own : mechanism_.actuation)
-                        force[own.coordinate] += share * own.ratio * u[own.control];
-                }
-            }
-        } else {
-            force_at(k, force_.data());
-            for (std::size_t i = 1; i <= last; ++i) std::copy_n(force_.data(), n_, &force_[i * n_]);
-        }
-        // The acceleration at the first node is the last one, unless the controls jump.
-        if (!first && std::equal(before_.begin(), before_.end(), force_.begin())) {
-            std::copy_n(&a_[last * n_], n_, a_.data());
-        } else if (!accelerate(q0, v0, 0)) {
+    // The errors of the steps of a stretch with step k; false where a mass matrix is not positive definite.
+    bool examine(std::int64_t k) {
+        const bool pair = wide_ && record_.steps > 1;
+        if (pair && k + 1 < record_.steps && alike(k)) return examine(*wide_, k);
+        if (pair && k > 0 && alike(k - 1)) return examine(*wide_, k - 1);
+        return examine(narrow_, k);
+    }
+
+    // Whether the controls of steps k and k + 1 do not jump between them.
+    bool alike(std::int64_t k) const {
+        const int m = mechanism_.controls;
+        const double* u = record_.u + k * m;
+        return within_ || std::equal(u, u + m, u + m);
+    }
+
+    bool examine(const Stretch& rule, std::int64_t k) {
+        const double *q = record_.q + k * n_, *v = record_.v + k * n_, h = record_.h;
+        const int last = rule.points - 1, terms = 3 * (rule.steps + 1);
+        apply_controls(rule, k);
+        // The acceleration at the first node is the last one, unless the controls differ.
+        if (k == until_ && std::equal(before_.begin(), before_.end(), force_.begin())) {
+            std::copy(last_.begin(), last_.end(), a_.begin());
+        } else if (!accelerate(q, v, 0)) {
             return false;
         }
-        if (!accelerate(q1, v1, last)) return false;
-        std::copy_n(&force_[last * n_], n_, before_.data());
-        for (std::size_t i = 1; i < last; ++i) {
-            const auto& [value, slope] = basis_[i];
-            for (int c = 0; c < n_; ++c) {
-                const double move = q1[c] - q0[c], rate = h * h;
-                const double bend0 = rate * a_[c], bend1 = rate * a_[last * n_ + c];
-                q_[c] = q0[c] + value[0] * move + h * (value[1] * v0[c] + value[2] * v1[c]) + value[3] * bend0 +
-                        value[4] * bend1;
-                v_[c] =
-                    (slope[0] * move + slope[3] * bend0 + slope[4] * bend1) / h + slope[1] * v0[c] + slope[2] * v1[c];
+        for (int j = 1; j <= rule.steps; ++j) {
+            if (!accelerate(q + j * n_, v + j * n_, rule.node(j))) return false;
+        }
+        for (int i = 1; i < last; ++i) {
+            if (i * rule.steps % last == 0) continue;
+            const double* value = &rule.curves[i * terms];
+            const double* slope = value + rule.points * terms;
+            std::copy_n(q, n_, q_.begin());
+            std::fill(v_.begin(), v_.end(), 0.0);
+            for (int j = 0; j <= rule.steps; ++j, value += 3, slope += 3) {
+                const double* a = &a_[rule.node(j) * n_];
+                for (int c = 0; c < n_; ++c) {
+                    const double moved = q[j * n_ + c] - q[c], speed = h * v[j * n_ + c], bend = h * h * a[c];
+                    q_[c] += value[0] * moved + value[1] * speed + value[2] * bend;
+                    v_[c] += (slope[0] * moved + slope[1] * speed + slope[2] * bend) / h;
+                }
             }
             if (!accelerate(q_.data(), v_.data(), i)) return false;
         }
-        for (int c = 0; c < n_; ++c) {
-            double gained = 0.0, moved = 0.0;
-            for (std::size_t i = 0; i <= last; ++i) {
-                const double part = rule_.weights[i] * a_[i * n_ + c];
-                gained += part;
-                moved += (1.0 - rule_.points[i]) * part;
+        for (int j = 0; j < rule.steps; ++j, q += n_, v += n_) {
+            const double* gains = &rule.sums[j * rule.points];
+            const double* moves = gains + rule.steps * rule.points;
+            for (int c = 0; c < n_; ++c) {
+                double gained = 0.0, moved = 0.0;
+                for (int i = 0; i <= last; ++i) {
+                    gained += gains[i] * a_[i * n_ + c];
+                    moved += moves[i] * a_[i * n_ + c];
+                }
+                step_v_[j * n_ + c] = std::abs(v[n_ + c] - v[c] - h * gained);
+                step_q_[j * n_ + c] = std::abs(q[n_ + c] - q[c] - h * (v[c] + h * moved));
             }
-            const double dv = std::abs(v1[c] - v0[c] - h * gained);
-            off_v_[c] += dv;
-            off_q_[c] += std::abs(q1[c] - q0[c] - h * (v0[c] + h * moved)) + left * dv;
         }
+        std::copy_n(&force_[last * n_], n_, before_.begin());
+        std::copy_n(&a_[last * n_], n_, last_.begin());
+        from_ = k;
+        until_ = k + rule.steps;
         return true;
     }
 
-    bool accelerate(const double* q, const double* v, std::size_t point) {
+    // The forces of the controls at the points of a stretch.
+    void apply_controls(const Stretch& rule, std::int64_t k) {
+        if (!within_) {
+            force_at(k, force_.data());
+            for (int i = 1; i < rule.points; ++i) std::copy_n(force_.data(), n_, &force_[i * n_]);
+            return;
+        }
+        const int m = mechanism_.controls, stages = rule.steps * rule.stages;
+        const double* u = within_ + k * rule.stages * m;
+        std::fill(force_.begin(), force_.end(), 0.0);
+        for (int i = 0; i < rule.points; ++i) {
+            for (int s = 0; s < stages; ++s) {
+                const double share = rule.places[i * stages + s];
+                for (const Transmission& own : mechanism_.actuation)
+                    force_[i * n_ + own.coordinate] += share * own.ratio * u[s * m + own.control];
+            }
+        }
+    }
+
+    bool accelerate(const double* q, const double* v, int point) {
         if (!dynamics_.at(q, v)) return false;
         dynamics_.acceleration(&force_[point * n_], &a_[point * n_]);
         return true;
