@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from findings import about
+from mechanisms import slider
 from refusals import refused
 from scipy.integrate import solve_ivp
 
@@ -323,6 +324,24 @@ def test_controls_that_change_too_fast_for_the_step_are_told_of(integrator):
     assert vp.simulate(scene, CHAIN_Q, np.zeros(3), steps=400, **options).warnings == ()
 
 
+@pytest.mark.parametrize("turned", [0.8, 0.2])
+def test_what_steps_see_of_a_swinging_force_is_told_where_it_moves_a_joint(turned):
+    """A mass under a sine: values in the middles of steps push it by (h w / 2) / sin(h w / 2) too far."""
+    rate = 20.0
+    dt = turned / rate
+    swing = vp.OpenLoop(lambda t: np.array([np.cos(rate * t)]))
+    motion = vp.simulate(
+        vp.Scene(slider(1.0), gravity=False), [0.0], [0.0], dt=dt, steps=60, controls=swing, integrator=vp.Midpoint()
+    )
+    true = (1.0 - np.cos(rate * motion.t)) / rate**2
+    off = np.abs(motion.q[:, 0] - true).max() / np.ptp(true)
+    told = about(motion.warnings, "fast controls")
+    assert bool(told) == (off > 0.01) == (turned > 0.5)
+    if told:
+        percent = float(told[0].split("% of the largest joint travel")[0].split()[-1])
+        assert percent == pytest.approx(100.0 * np.abs(motion.q[:, 0] - true).max() / np.ptp(motion.q), rel=0.02)
+
+
 def test_lines_between_nodes():
     """A first-order hold is the function of time that NumPy interpolates."""
     scene, steps, dt = stiff_scene(), 12, 0.02
@@ -459,7 +478,8 @@ def test_a_function_of_many_times_makes_the_motion_of_one_of_each(integrator):
         again = vp.simulate(scene, CHAIN_Q, CHAIN_V, controls=controls, **options)
         np.testing.assert_array_equal(again.u, motion.u)
         np.testing.assert_array_equal(again.q, motion.q)
-    assert len(called) <= 4
+    # For the motion, for its means, and for its repetition: the first time of each is alone.
+    assert len(called) <= 6
 
 
 def test_where_a_function_of_many_times_fails():

@@ -20,8 +20,9 @@ from varpin.mechanics.inputs import as_moved, prescribing
 from varpin.mechanics.policy import FirstOrderHold, OpenLoop
 from varpin.mechanics.scene import Scene
 from varpin.simulation.failures import ControlError
+from varpin.simulation.growth import WARNED, better, growth_bound, whole_error
 from varpin.simulation.record import MotionRecord
-from varpin.simulation.soundness import Finding
+from varpin.simulation.soundness import Finding, share_in_words
 from varpin.support.checks import JointValues, control_values, finite_array, takes
 from varpin.trajectory import Trajectory
 
@@ -29,6 +30,9 @@ ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Number of steps in which the mean of a function of time is compared with that of two half steps, and the largest
 # difference without a warning, as a share of the mean.
 _COMPARED, _ALIKE = 16, 0.05
+# The difference, as a share of what the function changes by and grown as the motion's fastest mode grows, from which on
+# the motion is repeated with its values at the stages of a better method; and the part of it that may be rounding.
+_SEEN, _ROUNDING = 2e-4, 1e-8
 # Distance of a kinematic input from its control at the start [rad or m, rad/s or m/s] without a warning.
 _ELSEWHERE = 1e-6
 # Name of a function of time in errors.
@@ -162,11 +166,12 @@ def _compared(steps: int) -> tuple[int, ...]:
 
 
 def undersampled(
-    controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory
+    controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory, *, right: bool
 ) -> tuple[Finding, ...]:
     """A warning if the mean of a function of time over a step differs from that of two half steps.
 
-    A motion has the function's values at its stages alone.
+    A motion has the function's values at its stages alone. If it is ``right`` with these, it is repeated with those at
+    the stages of a better method wherever the means differ at all.
     """
     dt, times = trajectory.dt, integrator.stage_times
     if not trajectory.steps:
@@ -182,7 +187,9 @@ def undersampled(
         mean, taken = mean[:, forces], taken[:, forces]
     total, off = (float(np.abs(part).sum()) for part in (mean, mean - taken))
     if not off > _ALIKE * total:
-        return ()
+        least = _SEEN * float(np.abs(mean - mean.mean(axis=0)).sum())
+        may_matter = right and off > _ROUNDING * least and off * growth_bound(scene, trajectory) > least
+        return _moved_within(controls, scene, integrator, trajectory) if may_matter else ()
     stages = f"{len(times)} stages of a step" if times else "middle of a step"
     return (
         Finding(
@@ -191,6 +198,34 @@ def undersampled(
             f"are off by {100.0 * off / total:.3g}% of those in half the step"
             if total > 0.0
             else f"the controls of OpenLoop change too fast for dt = {dt:g} s: half the step sees none of them",
+        ),
+    )
+
+
+def _moved_within(
+    controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory
+) -> tuple[Finding, ...]:
+    """A warning if values of a function of time at the stages of a better method move the joints elsewhere."""
+    other, dt = better(integrator, trajectory), trajectory.dt
+    times = other.method.stage_times
+    if scene.inputs or not times:
+        return ()
+    try:
+        values = evaluated(controls, scene, other.method, dt, range(trajectory.steps)).within
+    except ControlError:
+        return ()
+    found = whole_error(scene, trajectory.changed(u_stages=values), other, times)
+    if found is None or found[2] < WARNED:
+        return ()
+    joint, off, share = found
+    name = trajectory.joint_names[joint]
+    return (
+        Finding(
+            "fast controls",
+            f"the controls of OpenLoop change too fast for dt = {dt:g} s: with their values at {len(times)} instants "
+            f"of each step a method of more stages moves joint {name!r} by up to "
+            f"{share_in_words(scene, joint, off, share)}",
+            joint,
         ),
     )
 

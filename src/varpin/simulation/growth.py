@@ -19,6 +19,7 @@ from varpin.errors import LinearizationError
 from varpin.integrators import Gauss, Integrator, Radau, Reference
 from varpin.integrators.base import held_noise, open_loop
 from varpin.integrators.collocation import MOST_STAGES
+from varpin.integrators.within import Times
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, travel_scales
 from varpin.simulation.kinks import kinks
@@ -140,7 +141,7 @@ def grown_error(
     mostly_kinks = by_kinks > by_steps
     least = _KINKED if mostly_kinks else WARNED
     for closer in (other, _closer(other)):
-        found = _whole_off(scene, integrator, trajectory, closer, kinked.steps)
+        found = _whole_off(scene, trajectory, closer, integrator.stage_times, kinked.steps)
         if found is None:
             return None
         apart = found
@@ -158,14 +159,20 @@ def grown_error(
     return Growth(joint, float(apart[:, joint].max()), share, first, largest, causes, len(kinked.steps), grows)
 
 
-def whole_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[int, float, float] | None:
+def better(integrator: Integrator, trajectory: Trajectory) -> Finer:
+    """A method of far more stages than a motion's, for :func:`whole_error`."""
+    return _closer(finer(integrator, trajectory, damped=False, pulled=False))
+
+
+def whole_error(scene: Scene, trajectory: Trajectory, other: Finer, times: Times) -> tuple[int, float, float] | None:
     """The largest error of a motion by repeating all of it: its coordinate, the error [rad or m], and its share.
 
-    The method has far more stages; the share is that of the joint's scale, see :func:`travel_scales`. None where the
-    motion cannot be repeated.
+    The share is that of the joint's scale, see :func:`travel_scales`. ``times`` are those of the motion's controls at
+    stages. None where the motion cannot be repeated, as under noise in Python.
     """
-    other = _closer(finer(integrator, trajectory, damped=False, pulled=False))
-    apart = _whole_off(scene, integrator, trajectory, other, kinks(scene, trajectory).steps)
+    if _in_python(scene, trajectory):
+        return None
+    apart = _whole_off(scene, trajectory, other, times, kinks(scene, trajectory).steps)
     if apart is None:
         return None
     most = apart.max(axis=0)
@@ -174,13 +181,11 @@ def whole_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) ->
     return joint, float(most[joint]), float(shares[joint])
 
 
-def _whole_off(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, other: Finer, kinked: Integers
-) -> Floats | None:
+def _whole_off(scene: Scene, trajectory: Trajectory, other: Finer, times: Times, kinked: Integers) -> Floats | None:
     """Errors of q at all nodes (N + 1, n), with ``kinked`` steps in more parts; None if the first step fails."""
     parts = other.parts * shortest_parts(trajectory)
     parts[kinked] = np.maximum(parts[kinked], _PARTS)
-    again = taken_again(scene, other.method, trajectory, integrator.stage_times, 0, trajectory.steps, parts)
+    again = taken_again(scene, other.method, trajectory, times, 0, trajectory.steps, parts)
     # Unknown from where a step of the repetition fails.
     return None if again is None else np.nan_to_num(np.abs(again[0] - trajectory.q)) / (1.0 - other.left)
 
@@ -251,9 +256,13 @@ def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], fac
 
 def _unknown(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether errors of steps are unknown: with noise or forces in Python, or for many joints."""
-    in_python = trajectory.dw.any() and scene.noise.diffusion is None
-    unknown = scene.custom is not None or in_python or not trajectory.steps
-    return bool(unknown or scene.robot.dof > JOINTS)
+    unknown = scene.custom is not None or _in_python(scene, trajectory) or not trajectory.steps
+    return unknown or scene.robot.dof > JOINTS
+
+
+def _in_python(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether a motion has noise that only Python can evaluate."""
+    return scene.noise.diffusion is None and bool(trajectory.dw.any())
 
 
 def _few(trajectory: Trajectory) -> bool:

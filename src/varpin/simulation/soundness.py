@@ -46,7 +46,7 @@ from varpin.simulation.clearance import clearly_right
 from varpin.simulation.damping import Fast, damping_at_stop, damping_of, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.growth import ADDED as ADDED_WORDS
-from varpin.simulation.growth import NEAR, grown_error, growth_bound, whole_error
+from varpin.simulation.growth import NEAR, better, grown_error, growth_bound, whole_error
 from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.growth import WORDS as GROWTH_WORDS
 from varpin.simulation.limits import left as limits_left
@@ -311,10 +311,8 @@ def _growing(
     found = grown_error(scene, integrator, trajectory, predictable=resolution.predictable)
     if found is None:
         return ()
-    off = (
-        f"joint {trajectory.joint_names[found.joint]!r} by up to {_share(scene, found.joint, found.off, found.share)}, "
-        f"from t = {found.time:.4g} s on"
-    )
+    share = share_in_words(scene, found.joint, found.off, found.share)
+    off = f"joint {trajectory.joint_names[found.joint]!r} by up to {share}, from t = {found.time:.4g} s on"
     if found.causes:
         sentence = (
             f"{' and '.join(found.causes)} in {found.kinks} steps: dt = {trajectory.dt:g} s is coarse for {integrator} "
@@ -329,7 +327,7 @@ def _growing(
     return (Finding("growing errors", sentence, found.joint),)
 
 
-def _share(scene: Scene, joint: int, off: float, share: float) -> str:
+def share_in_words(scene: Scene, joint: int, off: float, share: float) -> str:
     """An error of a joint in words, with its unit and its share of the joint's scale."""
     sliding = scene.robot.slides
     unit = "m" if sliding[joint] else "rad"
@@ -347,14 +345,15 @@ def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     lost = phase_lost(scene, integrator, trajectory)
     if lost is None:
         return ()
-    joint, off, share = whole_error(scene, integrator, trajectory) or (lost.joint, lost.off, lost.share)
+    found = whole_error(scene, trajectory, better(integrator, trajectory), integrator.stage_times)
+    joint, off, share = found or (lost.joint, lost.off, lost.share)
     if share < PHASE_WARNED:
         return ()
     sentence = (
         f"oscillations of {lost.rate / (2.0 * np.pi):.3g} Hz lose phase or amplitude: over the motion, steps of "
         f"dt = {trajectory.dt:g} s by {integrator} make an error of about {100 * lost.turned:.2g}% of their amplitude, "
         f"and a method of more stages moves joint {trajectory.joint_names[joint]!r} by up to "
-        f"{_share(scene, joint, off, share)}; smaller steps or more stages reduce it"
+        f"{share_in_words(scene, joint, off, share)}; smaller steps or more stages reduce it"
     )
     return (Finding("phase", sentence, joint),)
 
