@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from mechanisms import slider
+from refusals import refused
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 import varpin as vp
+from varpin.control.problem import integrator_for
 
 HELD = [vp.Midpoint(kick="held"), vp.Gauss(2, kick="held"), vp.Radau(2, kick="held")]
 
@@ -118,3 +121,16 @@ def test_moments_of_velocities_that_are_wrong_have_a_warning(integrator, caplog)
         usual = vp.simulate(scene, **still, integrator=vp.Midpoint(kick="held"))
         assert vp.propagate_moments(vp.linearize(scene, usual)).warnings == ()
     assert len(caplog.messages) >= 1
+
+
+def test_drives_at_their_limits_do_not_cut_noise_off():
+    """A mass under noise far above what its drive has: its velocity is that of the impulses; held noise is refused."""
+    mass, strength = 2.0, 3.0
+    servo = vp.PositionServo(1e-9, 1e-9, 0.1)
+    scene = vp.Scene(slider(mass), gravity=False, forces=[servo], noise=vp.AdditiveNoise(strength))
+    start = {"q0": [0.0], "v0": [0.0], "dt": 0.01, "steps": 50, "rng": 0}
+    motion = vp.simulate(scene, **start)
+    np.testing.assert_allclose(motion.v[-1], strength * motion.dw.sum(axis=0) / mass, rtol=1e-6)
+    assert integrator_for(scene, np.zeros(1), 0.1).kick == "left"
+    with refused(vp.InputError, "kick='held'", "effort limit"):
+        vp.simulate(scene, **start, integrator=vp.Midpoint(kick="held"))

@@ -37,6 +37,7 @@ from varpin.mechanics.inputs import as_moved
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
+from varpin.simulation.choice import usual_kick
 from varpin.simulation.friction import rate_at_rest
 from varpin.simulation.run import simulate
 from varpin.simulation.soundness import announce
@@ -694,10 +695,11 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4), and rings after each jump
     of a held control. In reaches of damped arms, plans of the L-stable method lose less from z = 10 on, and those of
     the default up to 5. With constraints of the scene it is always the default, since Radau's methods do not support
-    them. Noise is held over the step: in the long steps of plans an impulse costs two to five times as much.
+    them. Noise is held over the step where :func:`usual_kick` allows it: in the long steps of plans an impulse costs
+    two to five times as much.
     """
     stages: int = default_integrator().stages
-    kick: Literal["held", "left"] = "held" if scene.processes else "left"
+    kick = usual_kick(scene)
     if scene.constraints or not dt * rate_at_rest(scene, q0) > _STIFF:
         return Gauss(stages=stages, kick=kick)
     return Radau(stages=stages, kick=kick)

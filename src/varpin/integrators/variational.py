@@ -42,6 +42,7 @@ from varpin.integrators.base import (
     without_inputs,
     written,
 )
+from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.support.checks import count, fraction, is_one_of, positive
 from varpin.trajectory import MOST_HALVINGS, Bytes, Trajectory
@@ -219,6 +220,11 @@ class Variational(Integrator):
     def _begun(self, scene: Scene, q0: Floats, v0: Floats) -> VariationalRun:
         rollout: VariationalRollout | ConstrainedRollout
         guards = self._guards_of(driven=bool(scene.inputs))
+        if self.holds_noise and scene.processes and limited_servos(scene.elements):
+            raise InputError(
+                "kick='held' does not go with a PositionServo with an effort limit, which would cut the noise off with "
+                "its command: take kick='left' or kick='split'"
+            )
         if scene.constraints:
             rollout = ConstrainedRollout(
                 scene.core,

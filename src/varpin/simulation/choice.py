@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from varpin.arrays import Floats
 from varpin.core import fastest_damping, pulls_fast
 from varpin.integrators import Gauss, Integrator, Midpoint, Radau
-from varpin.mechanics.forces import of_kind
+from varpin.mechanics.forces import limited_servos, of_kind
 from varpin.mechanics.scene import Scene
 from varpin.simulation.damping import fast_damping, stops_ahead, turns_fast
 from varpin.simulation.refinement import candidates, first_steps
@@ -43,7 +44,7 @@ def usual_integrator(
     With ``ahead`` the choice covers all stops that joints may run into, for a motion that cannot be repeated.
     """
     if noisy:
-        return _NOISY
+        return replace(_NOISY, kick=usual_kick(scene))
     # Radau's methods do not keep constraints.
     if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt, ahead=ahead):
         return _of(_STOPPING, scene)
@@ -52,7 +53,15 @@ def usual_integrator(
 
 def _of(chosen: Gauss | Radau, scene: Scene) -> Integrator:
     """The choice with noise held over the step in scenes with noise: a motion without it may be linearized."""
-    return replace(chosen, kick="held") if scene.processes else chosen
+    return replace(chosen, kick=usual_kick(scene))
+
+
+def usual_kick(scene: Scene) -> Literal["left", "held"]:
+    """How noise acts where no integrator is given: held over the step, but for drives at their limits.
+
+    A servo with an effort limit takes a force that is held on its joint for a part of its command, and cuts it off.
+    """
+    return "held" if scene.processes and not limited_servos(scene.elements) else "left"
 
 
 def changes_along(scene: Scene) -> bool:
