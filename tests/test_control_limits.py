@@ -184,7 +184,7 @@ def around_the_nominal_states(problem, motion, second_order):
     curvature = None
     if second_order:
         plan, costate = passes._pass(along, 1e-3, costates=True)
-        curvature = passes._curvature(problem, motion, plan, costate)
+        curvature = passes._curvature(along, plan, costate)
     limits = passes._Limits(along.slack, np.zeros((0, 18)))
     return passes._pass(along, 0.0, curvature=curvature, limits=limits)[0]
 
