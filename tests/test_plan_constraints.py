@@ -673,6 +673,21 @@ def test_noise_that_depends_on_the_motion_does_not_move_a_plan_within_constraint
     assert about(plan.warnings, "noise left out")
 
 
+@pytest.mark.parametrize("family", ["velocities", "positions"])
+@pytest.mark.parametrize(("damping", "fast"), [(200.0, True), (0.5, False)])
+def test_a_margin_of_velocities_under_fast_damping_is_told_of(family, damping, fast):
+    """The variances of velocities are too small there; those of positions are not."""
+    scene = vp.Scene(ROBOT, damping=damping, noise=vp.AdditiveNoise(0.1))
+    bound = {
+        "velocities": vp.WithinVelocityLimits(ROBOT, (-20.0, 20.0), margin=2.0),
+        "positions": vp.WithinJointLimits(ROBOT, (-20.0, 20.0), margin=2.0),
+    }[family]
+    plan = vp.solve(two_links([bound], steps=8, scene=scene, integrator=vp.Radau(2, kick="held")))
+    assert bool(naming(plan.warnings, "WithinVelocityLimits", "margin", "damping is fast")) == (
+        fast and family == "velocities"
+    )
+
+
 def test_a_margin_without_noise_is_told_of():
     plan = vp.solve(two_links([vp.WithinVelocityLimits(ROBOT, (-1.2, 1.2), margin=2.0)], steps=8))
     assert naming(plan.warnings, "margin", "noise")

@@ -21,6 +21,7 @@ from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, VarpinError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
+from varpin.linearization import wrong_variances
 from varpin.mechanics.forces import of_kind
 from varpin.simulation.chatter import alternation, restlessness
 from varpin.simulation.record import rollout
@@ -88,6 +89,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     warnings += (
         _unfinished(solution)
         + _noise_left_out(solution)
+        + _margins_of_velocities(solution)
         + _friction_under_noise(solution)
         + _noise_in_halves(solution)
         + (_alternating(solution) or _restless(solution))
@@ -293,6 +295,22 @@ def _noise_left_out(solution: Solution) -> list[Finding]:
             "constraints=, solve lowers it, too",
         )
     ]
+
+
+def _margins_of_velocities(solution: Solution) -> list[Finding]:
+    """A finding where margins of velocities are wrong, as damping is fast for the step."""
+    problem, motion = solution.problem, solution.trajectory
+    n = problem.scene.robot.dof
+    labels = {
+        bound.source.label
+        for bound in problem.bound_constraints
+        if bound.source.margin > 0.0 and bound.jacobian(motion.q, motion.v)[:, :, n:].any()
+    }
+    if not labels:
+        return []
+    wrong = wrong_variances(problem.scene, motion, problem.integrator)
+    where = ", ".join(sorted(labels))
+    return [Finding("margins of velocities", f"{where}: a margin= of velocities is as wrong: {why}") for why in wrong]
 
 
 def _between(solution: Solution) -> list[Finding]:
