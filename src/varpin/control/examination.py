@@ -39,8 +39,9 @@ _OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
 _LITTLE = 1e-3
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
 _LINEAR_FRICTION = 0.25
-# Part of the expected cost by which noise may cost other than planned in half steps without a warning.
-_NOISE_OFF = 0.05
+# Parts of the expected cost and of the noise cost by which noise may cost other than planned in half steps without a
+# warning, and the part of the expected cost that the noise cost has to have for the latter.
+_NOISE_OFF, _OF_NOISE, _MATTERS = 0.05, 0.1, 0.01
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
@@ -257,7 +258,9 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
     except VarpinError:
         # A custom noise or cost, or the linearization, may fail off the plan.
         return []
-    if abs(fine - planned) <= _NOISE_OFF * (abs(solution.cost) + max(planned, fine)):
+    off, most = abs(fine - planned), max(planned, fine)
+    expected = abs(solution.cost) + most
+    if off <= _NOISE_OFF * expected and (off <= _OF_NOISE * most or most <= _MATTERS * expected):
         return []
     return [
         Finding(
