@@ -133,10 +133,10 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
     if not integrator.variational:
         found = replace(found, K=_kick_columns(scene, trajectory, found.J))
-    return replace(found, warnings=_of_velocities(scene, trajectory, integrator))
+    return replace(found, warnings=wrong_variances(scene, trajectory, integrator))
 
 
-def _of_velocities(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> tuple[str, ...]:
+def wrong_variances(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> tuple[str, ...]:
     """A warning where damping is so fast for the step that variances of velocities are wrong by a fifth and more."""
     if not scene.processes:
         return ()

@@ -21,6 +21,7 @@ from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, VarpinError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
+from varpin.linearization import wrong_variances
 from varpin.mechanics.forces import of_kind
 from varpin.simulation.chatter import alternation, restlessness
 from varpin.simulation.record import rollout
@@ -38,8 +39,9 @@ _OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
 _LITTLE = 1e-3
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
 _LINEAR_FRICTION = 0.25
-# Part of the expected cost by which noise may cost other than planned in half steps without a warning.
-_NOISE_OFF = 0.05
+# Parts of the expected cost and of the noise cost by which noise may cost other than planned in half steps without a
+# warning, and the part of the expected cost that the noise cost has to have for the latter.
+_NOISE_OFF, _OF_NOISE, _MATTERS = 0.05, 0.1, 0.01
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
@@ -88,6 +90,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     warnings += (
         _unfinished(solution)
         + _noise_left_out(solution)
+        + _margins_of_velocities(solution)
         + _friction_under_noise(solution)
         + _noise_in_halves(solution)
         + (_alternating(solution) or _restless(solution))
@@ -255,7 +258,9 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
     except VarpinError:
         # A custom noise or cost, or the linearization, may fail off the plan.
         return []
-    if abs(fine - planned) <= _NOISE_OFF * (abs(solution.cost) + max(planned, fine)):
+    off, most = abs(fine - planned), max(planned, fine)
+    expected = abs(solution.cost) + most
+    if off <= _NOISE_OFF * expected and (off <= _OF_NOISE * most or most <= _MATTERS * expected):
         return []
     return [
         Finding(
@@ -293,6 +298,22 @@ def _noise_left_out(solution: Solution) -> list[Finding]:
             "constraints=, solve lowers it, too",
         )
     ]
+
+
+def _margins_of_velocities(solution: Solution) -> list[Finding]:
+    """A finding where margins of velocities are wrong, as damping is fast for the step."""
+    problem, motion = solution.problem, solution.trajectory
+    n = problem.scene.robot.dof
+    labels = {
+        bound.source.label
+        for bound in problem.bound_constraints
+        if bound.source.margin > 0.0 and bound.jacobian(motion.q, motion.v)[:, :, n:].any()
+    }
+    if not labels:
+        return []
+    wrong = wrong_variances(problem.scene, motion, problem.integrator)
+    where = ", ".join(sorted(labels))
+    return [Finding("margins of velocities", f"{where}: a margin= of velocities is as wrong: {why}") for why in wrong]
 
 
 def _between(solution: Solution) -> list[Finding]:
