@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from findings import about
 
 import varpin as vp
 from varpin.model import longest_reach
-from varpin.simulation.accuracy import travel_scales
+from varpin.simulation.accuracy import Window, travel_scales
 
 
 def jumping(robot, seed, steps, share):
@@ -97,3 +98,51 @@ def test_the_scale_of_a_joint_that_hardly_moves_is_that_of_the_others(load):
     np.testing.assert_allclose(travel_scales(scene, q), np.where(slides, 0.3, 0.003 / reach))
     chain = vp.Scene(vp.planar_chain(2))
     np.testing.assert_array_equal(travel_scales(chain, np.array([[0.0, 0.0], [1.0, 2.0]])), [2.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    "integrator", [vp.Midpoint(kick="held"), vp.Midpoint(), vp.SemiImplicitEuler(), vp.ExplicitEuler()], ids=str
+)
+@pytest.mark.parametrize("q0", [[2.0, -1.0, 1.5], [0.1, 0.0, -0.1]], ids=["high", "low"])
+@pytest.mark.parametrize(("dt", "steps"), [(0.01, 600), (0.002, 500)])
+def test_motions_under_noise(integrator, q0, dt, steps):
+    """A chain that falls from high up, or swings; true is the motion under the same forces or kicks in fine steps."""
+    robot, parts = vp.planar_chain(3), 8
+    scene, plain = vp.Scene(robot, noise=vp.AdditiveNoise(0.02)), vp.Scene(robot)
+    motion = vp.simulate(scene, q0, np.zeros(3), dt=dt, steps=steps, rng=1, integrator=integrator)
+    fine = {"dt": dt / parts, "steps": steps * parts, "integrator": vp.Gauss(4), "check": False}
+    if integrator.holds_noise:
+        forces = np.repeat(0.02 * motion.dw / dt, parts, axis=0)
+        true = vp.simulate(plain, q0, np.zeros(3), controls=forces, **fine).q[::parts]
+    else:
+        # A kick after a step is one before the next.
+        late = integrator == vp.ExplicitEuler()
+        kicks = np.zeros((steps * parts, 3))
+        kicks[::parts] = np.roll(motion.dw, 1, axis=0) if late else motion.dw
+        kicks[0] *= not late
+        true = vp.simulate(scene, q0, np.zeros(3), increments=kicks, **fine).q[::parts]
+    wrong = np.abs(motion.q - true).max() / np.ptp(true, axis=0).max()
+    told = about(motion.warnings, "growth", "adding up", "coarse steps", "energy")
+    assert (wrong > 0.01) == bool(told)
+    assert integrator.order == 1 or (wrong > 0.01) == (dt > 0.005)
+
+
+@pytest.mark.parametrize("far", [0.02, 30.0])
+def test_errors_of_joints_that_slide_are_no_shares_of_what_others_turn(far):
+    """A cart with a pendulum: 7 % of the way of either is wrong, however far the other one moves."""
+    model = pin.Model()
+    for k, kind in enumerate((pin.JointModelPX(), pin.JointModelRY())):
+        joint = model.addJoint(k, kind, pin.SE3.Identity(), f"joint{k}")
+        model.appendBodyToJoint(
+            joint, pin.Inertia(1.0, np.array([0.0, 0.0, -0.5]), 0.1 * np.eye(3)), pin.SE3.Identity()
+        )
+    scene = vp.Scene(vp.load_robot(model), gravity=False)
+    motion = vp.simulate(scene, [0.0, 0.0], [far, 1.0], dt=0.01, steps=100, check=False)
+    window, travel = Window.at(scene, motion, 0), np.ptp(motion.q, axis=0)
+    for joint in (0, 1):
+        off = np.zeros((2, 101, 2))
+        off[0, -1, joint] = 0.07 * travel[joint]
+        error = window.error(scene, motion, np.ones(2), tuple(off), cut=False)
+        assert error.joint == joint
+        assert error.motion == pytest.approx(0.07, rel=1e-9)
+        assert error.worst > 1.0

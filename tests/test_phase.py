@@ -120,11 +120,12 @@ def test_a_joint_that_nothing_holds_is_no_oscillation(seed):
 
 
 def test_nothing_is_said_of_what_is_not_known():
-    """Gravity alone, noise, and methods whose stability function nobody has worked out."""
+    """Gravity alone, noise in Python, and methods whose stability function nobody has worked out."""
     chain = vp.planar_chain(2)
+    trembling = vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)
     for scene, integrator, rng in (
         (vp.Scene(chain), vp.Midpoint(), None),
-        (vp.Scene(chain, stiffness=1e3, noise=vp.AdditiveNoise(0.1)), vp.Midpoint(), 0),
+        (vp.Scene(chain, stiffness=1e3, noise=trembling), vp.Midpoint(), 0),
         (vp.Scene(chain, stiffness=1e3), vp.Midpoint(alpha=0.3), None),
     ):
         motion = vp.simulate(scene, [0.3, 0.3], [0, 0], dt=1e-2, steps=200, integrator=integrator, rng=rng, check=False)
@@ -182,3 +183,40 @@ def test_a_loop_on_springs_is_told_when_it_loses_phase(inputs, integrator, dt, t
     assert bool(about(motion.warnings, "phase")) == told
     if told:
         assert lost.off == pytest.approx(off, rel=0.35)
+
+
+@pytest.mark.parametrize(("seed", "told"), [(64, True), (92, False)])
+def test_what_is_told_is_the_error_of_the_motion(seed, told):
+    """Servos of two links: the estimate is 1.6 and 1.9 times the error, of which one is above the threshold."""
+    rng, robot = np.random.default_rng(seed), vp.planar_chain(2)
+    q0 = rng.uniform(-1.0, 1.0, 2)
+    inertia = np.diag(vp.lagrangian_jet(vp.Scene(robot), q0, np.zeros(2)).Lvv)
+    rate, ratio = rng.uniform(10.0, 120.0), rng.choice([0.05, 0.3, 0.7, 1.0])
+    scene = vp.Scene(robot, forces=[vp.PositionServo(inertia * rate**2, 2.0 * ratio * inertia * rate)])
+    dt = rng.choice([0.1, 0.2, 0.4, 0.8]) / rate
+    steps, goal = int(rng.uniform(0.3, 2.0) / dt) + 8, q0 + rng.uniform(-0.5, 0.5, 2)
+    start = {"q0": q0, "v0": np.zeros(2), "controls": goal}
+    motion = vp.simulate(scene, **start, dt=dt, steps=steps, integrator=vp.Midpoint())
+    fine = vp.simulate(scene, **start, dt=dt / 16, steps=16 * steps, integrator=vp.Gauss(5), check=False).q[::16]
+    off = np.abs(motion.q - fine).max() / np.ptp(fine, axis=0).max()
+    assert phase_lost(scene, vp.Midpoint(), motion).share > 1.4 * off
+    found = about(motion.warnings, "phase")
+    assert bool(found) == told == (off > 0.01)
+    if told:
+        percent = float(found[0].split("% of the largest joint travel")[0].split()[-1])
+        assert percent == pytest.approx(100.0 * off, rel=0.05)
+
+
+def test_oscillations_under_noise_lose_phase_as_others_do():
+    """One joint on a spring, under the forces of its noise, against finer steps."""
+    rate, robot = 100.0, vp.planar_chain(1)
+    inertia = vp.lagrangian_jet(vp.Scene(robot), np.zeros(1), np.zeros(1)).Lvv[0, 0]
+    scene = vp.Scene(robot, gravity=False, stiffness=inertia * rate**2, noise=vp.AdditiveNoise(inertia))
+    for dt, told in ((2e-3, True), (2e-4, False)):
+        motion = vp.simulate(scene, [0.1], [0.0], dt=dt, duration=1.0, rng=0)
+        held = np.repeat(inertia * motion.dw / dt, 8, axis=0)
+        plain = vp.Scene(robot, gravity=False, stiffness=inertia * rate**2)
+        fine = {"dt": dt / 8, "steps": 8 * motion.steps, "integrator": vp.Gauss(4), "check": False}
+        true = vp.simulate(plain, [0.1], [0.0], controls=held, **fine).q[::8]
+        assert (np.abs(motion.q - true).max() > 0.01 * np.ptp(true)) == told
+        assert bool(about(motion.warnings, "phase")) == told

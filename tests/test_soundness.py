@@ -699,11 +699,13 @@ def test_noisy_motions_pass_where_smaller_steps_under_the_same_kicks_agree(integ
     assert 0.002 in passed or integrator.order == 1
 
 
-def test_the_look_at_a_noisy_motion_takes_less_than_the_motion(evaluations):
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(kick="held")], ids=str)
+def test_the_look_at_a_noisy_motion_takes_less_than_the_motion(evaluations, integrator):
     scene = vp.Scene(vp.planar_chain(3), noise=vp.AdditiveNoise(1e-2))
-    motion = vp.simulate(scene, np.full(3, 0.4), np.zeros(3), dt=1e-3, steps=2000, rng=0, check=False)
+    start = np.full(3, 0.4), np.zeros(3)
+    motion = vp.simulate(scene, *start, dt=1e-3, steps=2000, rng=0, integrator=integrator, check=False)
     evaluations()
-    assert examined(scene, vp.Midpoint(), motion)[1] == ()
+    assert examined(scene, integrator, motion)[1] == ()
     assert evaluations() <= 0.75 * int((motion.statistics.jets + motion.statistics.sweeps).sum())
 
 

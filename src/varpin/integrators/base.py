@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.core import Watch
 from varpin.core.arrays import Commands, RolloutArrays
 from varpin.errors import InputError, SingularMassMatrix
@@ -351,7 +351,7 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
     return np.array([diffusion_and_drift(scene, q, v, u, trajectory.q[0])[1] for q, v, u in nodes])
 
 
-def held_noise(scene: Scene, trajectory: Trajectory, steps: slice = slice(None)) -> Floats:
+def held_noise(scene: Scene, trajectory: Trajectory, steps: slice | Integers = slice(None)) -> Floats:
     """The constant forces over some steps of a motion (N, n) whose impulses are those of its noise.
 
     Zero for joints of kinematic inputs, whose drives absorb the noise.

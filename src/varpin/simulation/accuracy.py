@@ -17,7 +17,7 @@ from varpin.model import longest_reach
 from varpin.trajectory import Trajectory
 
 # Thresholds of errors. Energy balance: share of the energy turned over. Position: share of the joint's travel over a
-# period (the range that q covers), and of the largest joint travel. Velocity: share of the joint's
+# period (the range that q covers), and of the largest joint travel of its kind. Velocity: share of the joint's
 # largest, with a larger threshold, for a small shift in time changes a peak of the velocity by much.
 WRONG_ENERGY = 0.1
 WRONG_POSITION, WRONG_MOTION, WRONG_VELOCITY = 0.1, 0.05, 0.25
@@ -56,7 +56,7 @@ class MotionError:
         joint: The coordinate.
         position: Error of q there over a period, as a share of the joint's travel over it.
         velocity: Error of v, in units of the joint's largest.
-        motion: Error of q, as a share of the largest joint travel.
+        motion: Error of q, as a share of the joint's scale, see :func:`scales`.
         settled: Whether the estimate is accurate to about a tenth; else only to a factor of two.
     """
 
@@ -80,7 +80,8 @@ class Window:
 
     Attributes:
         step: The first node.
-        span: Number of steps in which each joint oscillates one and a half times, or makes a full turn (n,).
+        span: Number of steps in which each joint oscillates one and a half times, or makes a full turn (n,); under
+            noise at least ``WINDOW``.
         whole: Whether it does so; else ``span`` is the number of all steps (n,).
         judged: Number of steps in which errors count (n,): a period.
         varied: Total variation of v after each step (K, n).
@@ -100,6 +101,10 @@ class Window:
         span, whole = _periods(scene, q, v)
         # A period is two thirds of the span.
         judged = np.where(whole, (2 * span + 2) // 3, span)
+        if trajectory.dw.any():
+            # What the noise does from step to step is no oscillation.
+            least = min(WINDOW, len(q) - 1)
+            span, judged = np.maximum(span, least), np.maximum(judged, least)
         return cls(step, span, whole, judged, np.abs(np.diff(v, axis=0)).cumsum(axis=0))
 
     def units(self, scene: Scene, trajectory: Trajectory, inertia: Floats) -> Floats:
@@ -149,7 +154,7 @@ class Window:
             fastest = np.abs(trajectory.v[self.step : self.step + until + 1]).max(axis=0)
             rounding = np.maximum(rounding / (trajectory.dt * here), ROUNDING * (root * fastest).max() / root)
             velocity = np.where(fast <= np.maximum(rounding, 1e-9 * speed), 0.0, fast / speed)
-            motion = position * travel / travel.max()
+            motion = position * travel / scales(scene, travel)
             shares = np.array([position / WRONG_POSITION, velocity / WRONG_VELOCITY, motion / WRONG_MOTION])
         joint = int(np.argmax(np.where(np.isnan(shares), np.inf, shares).max(axis=0)))
         return MotionError(self.step, joint, float(position[joint]), float(velocity[joint]), float(motion[joint]))
@@ -265,12 +270,17 @@ def largest_of_its_kind(scene: Scene, values: Floats) -> Floats:
 
 
 def travel_scales(scene: Scene, q: Floats) -> Floats:
-    """For each coordinate (n,), the travel of which errors are shares: the largest of its kind over nodes (K, n).
+    """:func:`scales` of the travels over nodes (K, n)."""
+    return scales(scene, np.ptp(q, axis=0))
+
+
+def scales(scene: Scene, travel: Floats) -> Floats:
+    """For each coordinate (n,), the travel of which errors are shares: the largest of its kind among travels (n,).
 
     Joints of one kind that hardly move are compared with the others: their scale is at least ``LITTLE`` times what
     those move at the robot's reach.
     """
-    travel = largest_of_its_kind(scene, np.ptp(q, axis=0))
+    travel = largest_of_its_kind(scene, travel)
     sliding = scene.robot.slides
     if sliding.all() or not sliding.any():
         return travel
@@ -278,8 +288,8 @@ def travel_scales(scene: Scene, q: Floats) -> Floats:
     # On rails without ends: a metre.
     lever = reach if 0.0 < reach < np.inf else 1.0
     turns, slides = float(travel[~sliding].max()), float(travel[sliding].max())
-    scales: Floats = np.maximum(travel, LITTLE * np.where(sliding, turns * lever, slides / lever))
-    return scales
+    least = LITTLE * np.where(sliding, turns * lever, slides / lever)
+    return np.maximum(travel, least)
 
 
 def _periods(scene: Scene, q: Floats, v: Floats) -> tuple[Integers, NDArray[np.bool_]]:

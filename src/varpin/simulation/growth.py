@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats, Integers
 from varpin.errors import LinearizationError
 from varpin.integrators import Gauss, Integrator, Radau, Reference
-from varpin.integrators.base import open_loop
+from varpin.integrators.base import held_noise, open_loop
 from varpin.integrators.collocation import MOST_STAGES
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, travel_scales
 from varpin.simulation.kinks import kinks
 from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bounds
-from varpin.simulation.retaking import Finer, finer, shortest_parts, taken_again
+from varpin.simulation.retaking import Finer, finer, impulses_at, shortest_parts, taken_again
 from varpin.trajectory import Trajectory
 
 # First words of the warning, where errors grow and where they only add up.
@@ -95,8 +95,9 @@ def grown_error(
 ) -> Growth | None:
     """The error of a motion after errors of its steps have added up or grown; None below the threshold of the warning.
 
-    If the motion is known to be ``predictable`` apart from kinks, only steps with kinks are examined. Also None under
-    noise, with forces in Python, and for an integrator that chooses its own steps.
+    If the motion is known to be ``predictable`` apart from kinks, only steps with kinks are examined. All steps are
+    repeated with the noise of the motion. Also None with forces or noise in Python, and for an integrator that chooses
+    its own steps.
     """
     if isinstance(integrator, Reference) or _unknown(scene, trajectory):
         return None
@@ -105,9 +106,7 @@ def grown_error(
     if not (even or len(kinked.steps)):
         return None
     other = finer(integrator, trajectory, damped=False, pulled=False)
-    travel = travel_scales(scene, trajectory.q)
-    # Rounding alone is no motion.
-    travel = np.maximum(travel, max(_SHORTEST, ROUNDING * (1.0 + float(np.abs(trajectory.q).max()))))
+    travel = _travel(scene, trajectory)
     at = _nodes(trajectory)
     by_steps, by_kinks, largest = 0.0, 0.0, 0.0
     if even:
@@ -141,13 +140,10 @@ def grown_error(
     mostly_kinks = by_kinks > by_steps
     least = _KINKED if mostly_kinks else WARNED
     for closer in (other, _closer(other)):
-        parts = closer.parts * shortest_parts(trajectory)
-        parts[kinked.steps] = np.maximum(parts[kinked.steps], _PARTS)
-        again = taken_again(scene, closer.method, trajectory, integrator.stage_times, 0, trajectory.steps, parts)
-        if again is None:
+        found = _whole_off(scene, integrator, trajectory, closer, kinked.steps)
+        if found is None:
             return None
-        # Unknown from where a step of the repetition fails.
-        apart = np.nan_to_num(np.abs(again[0] - trajectory.q))
+        apart = found
         shares = apart / travel
         joint = int(shares.max(axis=0).argmax())
         share = float(shares[:, joint].max())
@@ -162,11 +158,44 @@ def grown_error(
     return Growth(joint, float(apart[:, joint].max()), share, first, largest, causes, len(kinked.steps), grows)
 
 
+def whole_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[int, float, float] | None:
+    """The largest error of a motion by repeating all of it: its coordinate, the error [rad or m], and its share.
+
+    The method has far more stages; the share is that of the joint's scale, see :func:`travel_scales`. None where the
+    motion cannot be repeated.
+    """
+    other = _closer(finer(integrator, trajectory, damped=False, pulled=False))
+    apart = _whole_off(scene, integrator, trajectory, other, kinks(scene, trajectory).steps)
+    if apart is None:
+        return None
+    most = apart.max(axis=0)
+    shares = most / _travel(scene, trajectory)
+    joint = int(shares.argmax())
+    return joint, float(most[joint]), float(shares[joint])
+
+
+def _whole_off(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, other: Finer, kinked: Integers
+) -> Floats | None:
+    """Errors of q at all nodes (N + 1, n), with ``kinked`` steps in more parts; None if the first step fails."""
+    parts = other.parts * shortest_parts(trajectory)
+    parts[kinked] = np.maximum(parts[kinked], _PARTS)
+    again = taken_again(scene, other.method, trajectory, integrator.stage_times, 0, trajectory.steps, parts)
+    # Unknown from where a step of the repetition fails.
+    return None if again is None else np.nan_to_num(np.abs(again[0] - trajectory.q)) / (1.0 - other.left)
+
+
+def _travel(scene: Scene, trajectory: Trajectory) -> Floats:
+    """Scales of errors (n,), see :func:`travel_scales`: rounding alone is no motion."""
+    rounding = ROUNDING * (1.0 + float(np.abs(trajectory.q).max()))
+    return np.maximum(travel_scales(scene, trajectory.q), max(_SHORTEST, rounding))
+
+
 def _closer(other: Finer) -> Finer:
     """A method with two stages more than another, or in half its steps."""
     method = other.method
     if not isinstance(method, Gauss | Radau) or method.stages + 2 > MOST_STAGES:
-        return Finer(method, 2 * other.parts, 0.0)
+        return Finer(method, 2 * other.parts, 0.5 * other.left)
     return Finer(replace(method, stages=method.stages + 2), other.parts, 0.0)
 
 
@@ -183,13 +212,21 @@ def _steps_off(
         after_q, after_v = np.array([q for q, _ in ends]), np.array([v for _, v in ends])
     else:
         # The mean control of the step stands for controls that change within it.
-        forces = np.repeat((trajectory.u[at] @ scene.actuation.T)[:, None], parts, axis=1)
+        forces, kicks, parts = trajectory.u[at] @ scene.actuation.T, None, parts * other.parts
+        if trajectory.dw.any() and integrator.holds_noise:
+            forces = forces + held_noise(scene, trajectory, at)
+        elif trajectory.dw.any():
+            kicks = np.zeros((len(at), parts, 2, scene.robot.dof))
+            kicks[:, 0, 0], kicks[:, -1, 1] = impulses_at(scene, integrator, trajectory, at)
+        held = np.repeat(forces[:, None], parts, axis=1)
         nothing = open_loop(np.zeros((parts, scene.controls)))
-        once = other.method.motions(scene, q[at], v[at], nothing, forces, trajectory.dt / parts)
+        once = other.method.motions(scene, q[at], v[at], nothing, held, trajectory.dt / parts, kicks)
         if once is None:
             return None
         after_q, after_v = once[0][:, -1], once[1][:, -1]
-    return np.abs(after_q - q[at + 1]), np.abs(after_v - v[at + 1])
+    # With impulses, Euler's own method in halves is the better one.
+    share = 1.0 - other.left
+    return np.abs(after_q - q[at + 1]) / share, np.abs(after_v - v[at + 1]) / share
 
 
 def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], factor: float) -> bool:
@@ -213,8 +250,9 @@ def _grows_less(scene: Scene, trajectory: Trajectory, at: NDArray[np.int64], fac
 
 
 def _unknown(scene: Scene, trajectory: Trajectory) -> bool:
-    """Whether errors of steps are unknown: under noise or Python forces, or for many joints."""
-    unknown = scene.custom is not None or trajectory.dw.any() or not trajectory.steps
+    """Whether errors of steps are unknown: with noise or forces in Python, or for many joints."""
+    in_python = trajectory.dw.any() and scene.noise.diffusion is None
+    unknown = scene.custom is not None or in_python or not trajectory.steps
     return bool(unknown or scene.robot.dof > JOINTS)
 
 

@@ -58,7 +58,8 @@ class Loss(NamedTuple):
 def phase_lost(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> Loss | None:
     """The error by phase and amplitude of oscillations on springs, if it exceeds the threshold of the warning.
 
-    None, too, where it is unknown: under noise and forces in Python, and for methods without a stability function.
+    Forces of noise are no part of the oscillation. None, too, where it is unknown: with forces or noise in Python, and
+    for methods without a stability function.
     """
     if not _applies(scene, trajectory):
         return None
@@ -141,7 +142,8 @@ def _damped_alike(scene: Scene, av: Floats) -> bool:
 
 def _applies(scene: Scene, trajectory: Trajectory) -> bool:
     """Whether there are springs, and no noise or forces in Python."""
-    if scene.custom is not None or trajectory.dw.any() or scene.robot.dof > _JOINTS:
+    in_python = trajectory.dw.any() and scene.noise.diffusion is None
+    if scene.custom is not None or in_python or scene.robot.dof > _JOINTS:
         return False
     kinds = [element.kind for element in scene.elements] + [coupling.kind for coupling in scene.couplings]
     sprung = scene.stiffness.any() or not set(_SPRINGS).isdisjoint(kinds)

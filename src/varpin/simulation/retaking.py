@@ -16,6 +16,7 @@ from varpin.integrators.variational import Variational
 from varpin.integrators.within import Times, changing, in_parts
 from varpin.mechanics.assembly import along_constraints, nearest
 from varpin.mechanics.inputs import in_parts_of_steps, prescribing
+from varpin.mechanics.noise import impulses
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -99,6 +100,26 @@ def shortest_parts(trajectory: Trajectory) -> Integers:
         deepest = np.maximum.reduceat(halvings, np.cumsum(counts) - counts).astype(np.int64)
         parts[split] = 1 << np.minimum(deepest, _UNEVEN + np.ceil(np.log2(counts)).astype(np.int64))
     return parts
+
+
+def impulses_at(scene: Scene, integrator: Integrator, trajectory: Trajectory, steps: Integers) -> tuple[Floats, Floats]:
+    """Impulses of the noise of a motion (..., n) before and after some of its steps (...), of compiled fields.
+
+    Not for an integrator that holds the noise.
+    """
+    diffusion, first = scene.noise.diffusion, trajectory.q[0]
+    assert diffusion is not None
+    # Explicit Euler's kicks come after the step.
+    left = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
+    n = trajectory.q.shape[1]
+
+    def part(share: float, node: Integers) -> Floats:
+        if share == 0.0:
+            return np.zeros((*steps.shape, n))
+        rows = trajectory.q[node.ravel()], trajectory.u[steps.ravel()], trajectory.dw[steps.ravel()]
+        return share * impulses(diffusion, *rows, first).reshape(*steps.shape, n)
+
+    return part(left, steps), part(1.0 - left, steps + 1)
 
 
 class Again:

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core import energy_turnover, glance, windows_agree
-from varpin.integrators import ExplicitEuler, Integrator, Reference
+from varpin.integrators import Integrator, Reference
 from varpin.integrators.base import held_noise, open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.noise import impulses
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import (
     EVEN,
@@ -47,13 +46,13 @@ from varpin.simulation.clearance import clearly_right
 from varpin.simulation.damping import Fast, damping_at_stop, damping_of, fast_damping
 from varpin.simulation.friction import Stop, rate_at_stops, stops
 from varpin.simulation.growth import ADDED as ADDED_WORDS
-from varpin.simulation.growth import NEAR, grown_error, growth_bound
+from varpin.simulation.growth import NEAR, grown_error, growth_bound, whole_error
 from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.growth import WORDS as GROWTH_WORDS
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.simulation.phase import phase_lost
-from varpin.simulation.retaking import Again, Finer, finer, shortest_parts, stopping, taken_again
+from varpin.simulation.retaking import Again, Finer, finer, impulses_at, shortest_parts, stopping, taken_again
 from varpin.trajectory import Trajectory
 
 # Errors are in units of the thresholds WRONG_ENERGY, WRONG_POSITION, WRONG_MOTION and WRONG_VELOCITY.
@@ -341,17 +340,23 @@ def _share(scene: Scene, joint: int, off: float, share: float) -> str:
 
 
 def _out_of_phase(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """A warning if errors in phase and amplitude of oscillations on springs add up over the whole motion."""
+    """A warning if errors in phase and amplitude of oscillations on springs add up over the whole motion.
+
+    The estimate only tells whether to repeat the motion, which gives the error.
+    """
     lost = phase_lost(scene, integrator, trajectory)
     if lost is None:
+        return ()
+    joint, off, share = whole_error(scene, integrator, trajectory) or (lost.joint, lost.off, lost.share)
+    if share < PHASE_WARNED:
         return ()
     sentence = (
         f"oscillations of {lost.rate / (2.0 * np.pi):.3g} Hz lose phase or amplitude: over the motion, steps of "
         f"dt = {trajectory.dt:g} s by {integrator} make an error of about {100 * lost.turned:.2g}% of their amplitude, "
-        f"and joint {trajectory.joint_names[lost.joint]!r} by {_share(scene, lost.joint, lost.off, lost.share)}; "
-        "smaller steps or more stages reduce it"
+        f"and a method of more stages moves joint {trajectory.joint_names[joint]!r} by up to "
+        f"{_share(scene, joint, off, share)}; smaller steps or more stages reduce it"
     )
-    return (Finding("phase", sentence, lost.joint),)
+    return (Finding("phase", sentence, joint),)
 
 
 def _wrong_at_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
@@ -595,7 +600,13 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         of_noise = of_noise.reshape(len(begins), length // times, times, -1).mean(axis=2)
         drift = drift + of_noise if drift.size else of_noise
     elif noisy:
-        kicks = _kicks_of(scene, integrator, trajectory, begins, length, times)
+        before, after = impulses_at(scene, integrator, trajectory, begins[:, None] + np.arange(length))
+        if times == 2:
+            # Half of the kick in the middle of a double step comes before and half after it, which gives the same
+            # position and momentum at its end to first order in the step.
+            half = 0.5 * (after[:, ::2] + before[:, 1::2])
+            before, after = before[:, ::2] + half, half + after[:, 1::2]
+        kicks = np.stack([before, after], axis=2)
     if trajectory.u_stages.shape[1]:
         again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks, of_noise)
     else:
@@ -646,34 +657,6 @@ def _windows(trajectory: Trajectory, *, every: bool) -> tuple[Integers, int]:
             seen[begin : begin + length] = True
         begins = np.union1d(begins, np.array(violent_windows(v, length, seen)[:1], dtype=np.int64))
     return begins, length
-
-
-def _kicks_of(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, begins: Integers, length: int, times: int
-) -> Floats:
-    """Impulses of the noise before and after each repeated step (P, K, 2, n), of ``times`` steps of the motion.
-
-    For a double step half of the kick in its middle comes before and half after it, which gives the same position and
-    momentum at its end to first order in the step.
-    """
-    diffusion, first = scene.noise.diffusion, trajectory.q[0]
-    assert diffusion is not None
-    step = begins[:, None] + np.arange(length)
-    # Explicit Euler's kicks come after the step.
-    left = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
-    n = trajectory.q.shape[1]
-
-    def part(share: float, node: Integers) -> Floats:
-        if share == 0.0:
-            return np.zeros((*step.shape, n))
-        rows = trajectory.q[node.ravel()], trajectory.u[step.ravel()], trajectory.dw[step.ravel()]
-        return share * impulses(diffusion, *rows, first).reshape(*step.shape, n)
-
-    before, after = part(left, step), part(1.0 - left, step + 1)
-    if times == 2:
-        half = 0.5 * (after[:, ::2] + before[:, 1::2])
-        before, after = before[:, ::2] + half, half + after[:, 1::2]
-    return np.stack([before, after], axis=2)
 
 
 def _agree(
