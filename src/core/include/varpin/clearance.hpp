@@ -91,9 +91,9 @@ class Clearance {
         if (!plain) return 0.0;
         double found = growth_of_errors();
         // Controls may have kinks at the nodes.
-        if (found < std::numeric_limits<double>::infinity() && wide_ && within_) {
+        if (found == 0.0 && wide_ && within_) {
             wide_ = nullptr;
-            found = larger(found, growth_of_errors());
+            found = growth_of_errors();
         }
         return found;
     }
