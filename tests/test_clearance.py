@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pinocchio as pin
 import pytest
 import scipy
 
 import varpin as vp
+from varpin.integrators.tableau import gauss_coefficients, radau_coefficients, stability
 from varpin.simulation import clearance
+from varpin.simulation.damping import fast_damping
 from varpin.simulation.soundness import energy_defects, motion_error
 
 N, T = 12, 0.6
@@ -212,6 +216,55 @@ def test_a_wrong_step_is_not_cleared():
             values = getattr(motion, name).copy()
             values[node:, 1] += 0.02 * np.ptp(values[:, 1])
             assert not clearance.clearly_right(CHAIN, vp.Gauss(4), motion.changed(**{name: values}))
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("method", ["gauss", "radau"])
+def test_over_two_steps_no_wrong_mode_of_a_damper_has_a_small_residual(method, stages, monkeypatch):
+    """Modes exp(z t) of x'' + d x' + k x = 0 over steps of unit length, as a method integrates them.
+
+    Springs that turn a mode by more than a radian in a step are left to the check.
+    """
+    if method == "radau" and stages == 1:
+        return
+    a, b, _ = {"gauss": gauss_coefficients, "radau": radau_coefficients}[method](stages)
+    monkeypatch.setattr(clearance.Stretch, "make", lambda **arrays: arrays)
+    _, wide = clearance._stretches.__wrapped__((), 2 * stages <= 4)
+    (values, slopes), (gains, moves) = wide["curves"], wide["sums"]
+    for d, k in product([0.0, *np.geomspace(0.1, 1e4, 60)], [-1.0, -0.3, 0.0, 0.3, 1.0]):
+        z = np.roots([1.0, d, k]).astype(complex)
+        z = z[np.abs(z) > 1e-9]
+        if not len(z):
+            continue
+        factor = stability(a, b, z)
+        # Rows for the nodes.
+        v = factor ** np.arange(3)[:, None]
+        q = v / z
+        data = np.stack([q, v, -k * q - d * v], axis=1).reshape(9, -1)
+        acceleration = -k * values @ data - d * slopes @ data
+        off_v = v[1:] - v[:-1] - gains @ acceleration
+        off_q = q[1:] - q[:-1] - v[:-1] - moves @ acceleration
+        seen = np.maximum(np.abs(off_v), np.abs(off_q)).max(axis=0)
+        error = np.abs(factor - np.exp(z))
+        assert (seen >= 0.5 * np.where(error > 1e-3, error, 0.0)).all()
+
+
+def test_dampers_that_are_faster_than_the_step():
+    """Cleared where velocities follow, and not where they ring after jumps of the torque, or in single steps."""
+    scene = vp.Scene(vp.planar_chain(3), damping=[2.0, 2.0, 2.0], gravity=[0.0, 0.0, 0.0])
+    assert fast_damping(scene, REST[None], REST[None], REST[None], 0.1).rate > 5.0 / 0.1
+    torque = np.array([2.0, 1.3, 0.7])
+    smooth = vp.OpenLoop(lambda t: torque * np.sin(t) ** 2)
+    jumping = np.where((np.arange(30) // 5 % 2)[:, None], torque, -torque)
+    given = {"dt": 0.1, "check": False}
+    for integrator in (vp.Gauss(2), vp.Gauss(3)):
+        motion = vp.simulate(scene, REST, REST, steps=30, controls=smooth, integrator=integrator, **given)
+        assert clearance.clearly_right(scene, integrator, motion)
+        assert motion_error(scene, integrator, motion).worst < 0.1
+        motion = vp.simulate(scene, REST, REST, steps=30, controls=jumping, integrator=integrator, **given)
+        assert not clearance.clearly_right(scene, integrator, motion)
+        motion = vp.simulate(scene, REST, REST, steps=1, controls=smooth, integrator=integrator, **given)
+        assert not clearance.clearly_right(scene, integrator, motion)
 
 
 @pytest.mark.parametrize(

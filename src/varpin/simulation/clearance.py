@@ -1,8 +1,8 @@
 """Motions that are clearly right: most plain motions, which are told without repeating any step.
 
 The equations of motion are evaluated along the polynomials through the nodes. Where they hold far better than any
-warning needs, and no force has a kink or is faster than the step, the check of :mod:`varpin.simulation.soundness` would
-find nothing, and is left out. All other motions go through it: only that check gives warnings.
+warning needs, and no force has a kink, the check of :mod:`varpin.simulation.soundness` would find nothing, and is left
+out. All other motions go through it: only that check gives warnings.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from varpin.simulation.growth import WARNED as GROWTH_WARNED
 from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.trajectory import Trajectory
 
-# Errors of a motion that is clearly right, as a share of what the check would accept; and rates of its dampers, in
-# units of 1 / dt, where 2 is what the check calls fast.
+# Errors of a motion that is clearly right, as a share of what the check would accept; and rates of its dampers along
+# single steps, in units of 1 / dt, where 2 is what the check calls fast.
 _SHARE, _RATE = 0.5, 1.8
 # Parts of the warnings' thresholds that the check accepts in a window: for an error that grows over a period, and for
 # one that adds up over the motion.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from varpin.arrays import Floats
@@ -15,6 +17,7 @@ from varpin.simulation.soundness import Finding
 _ROUNDING = 1e-9
 # Gravity within this share of a thousand times the Earth's looks like mm/s^2.
 _EARTHLY = 0.01
+_PULL = math.hypot(*EARTH)
 # First number of a spring's rest among its values, after both points and the stiffness.
 _SPRINGS = {"FrameSpring": 9, "FrameLengthSpring": 7}
 
@@ -31,15 +34,16 @@ def in_other_units(scene: Scene, q0: Floats) -> tuple[Finding, ...]:
 
 def _gravity_hint(scene: Scene) -> str:
     """A sentence about gravity that looks like mm/s^2."""
-    pull = float(np.linalg.norm(scene.gravity))
-    earth = float(np.linalg.norm(EARTH))
-    if not abs(pull / 1000.0 - earth) < _EARTHLY * earth:
+    pull = math.hypot(*scene.gravity.tolist())
+    if not abs(pull / 1000.0 - _PULL) < _EARTHLY * _PULL:
         return ""
     return f"gravity is {pull:g} m/s^2, a thousand times the Earth's: it may be in mm/s^2, and gravity is in m/s^2"
 
 
 def _springs_hint(scene: Scene) -> str:
     """A sentence about a spring between frames whose ends, or whose length at rest, look like millimetres."""
+    if not scene.couplings:
+        return ""
     springs = [own for own in scene.couplings if own.kind in _SPRINGS]
     lengths = {}
     for number, spring in enumerate(springs, 1):
