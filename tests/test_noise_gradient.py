@@ -10,12 +10,14 @@ from varpin.control.backward import Along, backward
 CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
 
 
-def reach(noise: object, *, steps: int = 6, dt: float = 0.08, rate: float = 0.0, **options: object):
+def reach(
+    noise: object, *, steps: int = 6, dt: float = 0.08, rate: float = 0.0, damping: float = 0.2, **options: object
+):
     cost = vp.ControlCost(0.05) + vp.VelocityCost(0.1)
     cost += vp.Terminal(vp.TrackingCost([0.5, -0.5], 20.0) + vp.VelocityCost(5.0))
     if rate:
         cost += vp.ControlRateCost(rate)
-    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=noise)
+    scene = vp.Scene(vp.planar_chain(2), damping=damping, noise=noise)
     return vp.OptimalControlProblem(scene, cost, [0.2, 0.2], [0.0, 0.0], dt=dt, steps=steps, **options)
 
 
@@ -31,6 +33,7 @@ def reach(noise: object, *, steps: int = 6, dt: float = 0.08, rate: float = 0.0,
         (STATE, {"integrator": vp.Gauss(2, kick="split")}),
         (CONTROL, {"integrator": vp.Gauss(2, kick="held"), "hold": 2}),
         (STATE, {"integrator": vp.Gauss(2, kick="held")}),
+        (CONTROL, {"integrator": vp.Radau(2, kick="held"), "damping": 1.0}),
         (STATE, {"integrator": vp.RungeKutta4()}),
         (vp.AdditiveNoise(0.5), {"integrator": vp.Gauss(2)}),
     ],

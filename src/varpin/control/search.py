@@ -25,7 +25,6 @@ from varpin.control.costs import CostError
 from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
-from varpin.control.moments import left_within_steps
 from varpin.control.multiple_shooting import GapClosing, Path, path_of
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import COMPARISON, SLOW, SUFFICIENT, refine
@@ -1025,9 +1024,7 @@ class _Search:
             feedforward=np.zeros((R, m)) if plan is None else plan.feedforward,
             gradient=np.full((R, m), np.nan) if plan is None else plan.gradient,
             cost=self.cost,
-            noise_cost=(np.nan if problem.scene.processes else 0.0)
-            if plan is None
-            else plan.noise + left_within_steps(problem, self.trajectory),
+            noise_cost=(np.nan if problem.scene.processes else 0.0) if plan is None else plan.noise,
             status=status,
             reason=reason,
             history=tuple(self.history),
