@@ -205,6 +205,8 @@ class _Rounds:
             states=self.states,
             **self.options,
         )
+        if first.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
         cost = abs(first.cost)
         if self.states is not None:
             # Where the auxiliary forces are dropped at once, the motion may fall, and its cost says nothing.

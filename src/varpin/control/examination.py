@@ -11,7 +11,7 @@ from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
-from varpin.control.moments import noise_cost
+from varpin.control.moments import noise_cost, noise_cost_in_halves
 from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
@@ -243,18 +243,24 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
 def _noise_in_halves(solution: Solution) -> list[Finding]:
     """A finding if noise costs other than planned in steps of half the length.
 
-    One impulse a step is right to first order in the step, one held force to second order.
+    One impulse a step is right to first order in the step, one held force to second order. Noise in proportion to
+    controls that are linear over the step has the strength of their mean, and none where they change sign.
     """
     problem, scene = solution.problem, solution.problem.scene
-    if not scene.processes or problem.linear or scene.inputs:
+    if not scene.processes or scene.inputs:
         return []
-    dt, hold, feedback = 0.5 * problem.dt, 2 * problem.hold, Feedback(solution.gains, solution.previous_gains)
+    dt, feedback = 0.5 * problem.dt, Feedback(solution.gains, solution.previous_gains)
+    hold = 1 if problem.linear else 2 * problem.hold
     try:
         finer, failure = rollout(scene, problem.integrator, problem.q0, problem.v0, _in_parts(solution, 2)[1], dt)
         if failure is not None:
             return []
         in_halves = problem.at(dt=dt, hold=hold, integrator=problem.integrator)
-        planned, fine = noise_cost(problem, solution.trajectory, feedback), noise_cost(in_halves, finer, feedback)
+        planned = noise_cost(problem, solution.trajectory, feedback)
+        if problem.linear:
+            fine = noise_cost_in_halves(problem, in_halves, finer, feedback)
+        else:
+            fine = noise_cost(in_halves, finer, feedback)
     except VarpinError:
         # A custom noise or cost, or the linearization, may fail off the plan.
         return []
@@ -262,13 +268,20 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
     expected = abs(solution.cost) + most
     if off <= _NOISE_OFF * expected and (off <= _OF_NOISE * most or most <= _MATTERS * expected):
         return []
+    closer = f"problem.at(dt={dt:g}, hold={hold}) is closer"
+    if problem.linear:
+        closer = f"problem.at(dt={dt:g}) is closer"
+        if problem.steered.any():
+            closer = (
+                "problem.at(controls='held') keeps torques from alternating, by which a line has no noise in its mean"
+            )
     return [
         Finding(
             "noise within steps",
             f"noise costs {fine:.3g} in halves of dt = {problem.dt:g} s, "
             f"and {planned:.3g} in the plan's steps, which are long for it: on the robot noise_cost is another, "
             "although plan.monte_carlo(), in the same steps, "
-            f"agrees with it; problem.at(dt={dt:g}, hold={hold}) is closer",
+            f"agrees with it; {closer}",
         )
     ]
 

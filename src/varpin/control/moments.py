@@ -104,7 +104,45 @@ def noise_gradient(
 def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback) -> float:
     """The noise cost of a motion under feedback, without that of control changes."""
     here = _steps_of(problem, trajectory, np.ones(problem.scene.processes, dtype=bool))
-    C = propagated(here.J, here.g, here.gz, problem, feedback)
+    return _with_covariances(problem, trajectory, here, propagated(here.J, here.g, here.gz, problem, feedback))
+
+
+def noise_cost_in_halves(
+    problem: OptimalControlProblem, halves: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback
+) -> float:
+    """:func:`noise_cost` of linear controls on ``halves``, the problem in half steps, decided once in each whole one.
+
+    A control in the middle of a whole step is the mean of those at its ends, which feedback decides at its beginning.
+    """
+    here = _steps_of(halves, trajectory, np.ones(problem.scene.processes, dtype=bool))
+    x, m, dt = here.J.shape[1], problem.scene.controls, halves.dt
+    C, covariance = np.zeros((halves.steps + 1, x + 2 * m, x + 2 * m)), np.zeros((x + m, x + m))
+    middle = np.hstack([np.zeros((m, x)), 0.5 * np.eye(m), 0.5 * np.eye(m)])
+    last = np.hstack([np.zeros((m, x + m)), np.eye(m)])
+    to_middle = np.vstack([np.eye(x + m, x + 2 * m), middle])
+    for k in range(problem.steps):
+        T = decided(problem, feedback, k, x)
+        whole = covariance if T is None else T @ covariance @ T.T
+        C[2 * k] = to_middle @ whole @ to_middle.T
+        through = np.vstack([here.J[2 * k] @ to_middle, middle, last])
+        C[2 * k + 1] = through @ whole @ through.T
+        C[2 * k + 1, :x, :x] += dt * _kicks(here, 2 * k, C)
+        through = np.vstack([here.J[2 * k + 1], last])
+        covariance = through @ C[2 * k + 1] @ through.T
+        covariance[:x, :x] += dt * _kicks(here, 2 * k + 1, C)
+    C[-1, :x, :x] = covariance[:x, :x]
+    return _with_covariances(halves, trajectory, here, C)
+
+
+def _kicks(steps: _Steps, k: int, C: Floats) -> Floats:
+    """Covariance (2n, 2n) that the noise of step k adds to the state, over dt."""
+    g, gz = steps.g[k], steps.gz[k]
+    added: Floats = g @ g.T + (gz @ C[k]).reshape(len(g), -1) @ gz.reshape(len(g), -1).T
+    return added
+
+
+def _with_covariances(problem: OptimalControlProblem, trajectory: Trajectory, here: _Steps, C: Floats) -> float:
+    """The noise cost with covariances ``C`` (N + 1, Z, Z) of the variables of each step, and of the last state."""
     x = here.J.shape[1]
     over_time = (here.cost * C[:-1]).sum()
     at_end = (_end_hessian(problem, trajectory) * C[-1, :x, :x]).sum()
