@@ -1,4 +1,4 @@
-"""The start of a motion, moved onto the constraints of the scene."""
+"""The start of a motion, moved onto the constraints of the scene, and units that look wrong."""
 
 from __future__ import annotations
 
@@ -30,6 +30,16 @@ def in_other_units(scene: Scene, q0: Floats) -> tuple[Finding, ...]:
         "springs in millimetres": _springs_hint(scene),
     }
     return tuple(Finding(kind, sentence) for kind, sentence in told.items() if sentence)
+
+
+def controls_in_degrees(scene: Scene, controls: Floats) -> tuple[Finding, ...]:
+    """A warning of positions in controls (N, m), of servos and prescribed joints, that look like degrees."""
+    if not (scene.holding.any() and len(controls)):
+        return ()
+    positions = controls @ scene.holding
+    most = positions[np.abs(positions).argmax(axis=0), np.arange(positions.shape[1])]
+    sentence = degrees_hint(scene.robot, "the position in controls", most)
+    return (Finding("controls in degrees", sentence),) if sentence else ()
 
 
 def _gravity_hint(scene: Scene) -> str:
