@@ -178,17 +178,21 @@ def backward(
     *,
     along: Along | None = None,
     demands: bool = False,
+    clipped: bool = False,
 ) -> Plan | None:
     """One backward pass along a motion; None where the model has no minimum in a control.
 
     ``along`` has the expansions of other passes along the motion. With ``demands``, ``regularization`` also applies to
-    what servos demand of their drives, relative to the cost at stake.
+    what servos demand of their drives, relative to the cost at stake. ``clipped`` leaves out the limits of controls.
 
     Raises:
         CostError: An expansion of the cost is not finite.
         LinearizationError: A step has no derivative.
     """
     along = Along(problem, trajectory) if along is None else along
+    if clipped:
+        along = copy(along)
+        along.clipped = True
     damping = regularization * along.stake.moved * along.demands if demands and regularization > 0.0 else None
     if not second_order:
         return _foreseeing(along, regularization, damping)
@@ -378,7 +382,7 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
     earlier ones. So the first pass has no limits, and the next ones take the limits into account that the linearized
     motion reaches, until these do not change. If ever more of them change, the pass is made around the nominal states.
     """
-    if not along.problem.limited:
+    if not along.problem.limited or along.clipped:
         return _pass(along, regularization, curvature=curvature)[0]
     plan = _pass(along, regularization, curvature=curvature)[0]
     held: NDArray[np.bool_] = np.zeros(along.slack[:, 0].shape, dtype=np.bool_)
@@ -455,6 +459,7 @@ class Along:
         if problem.rate is not None:
             self.pull, self.rate = problem.rate.expand(problem.decided(trajectory), problem.period)
         self.slack = np.zeros((0, 2, m))
+        self.clipped = False  # whether passes leave the limits to the motion, which clips controls
         if problem.limited:
             self.slack = problem.control_limits - problem.decided(trajectory)[:, None]
         block = max(1, _BLOCK // problem.hold) * problem.hold
