@@ -188,21 +188,23 @@ def test_growth_is_bounded_by_no_less_than_the_fastest_mode(scene, limits, monke
 
 
 CHAIN = vp.Scene(vp.planar_chain(3))
+RUBBING = vp.Scene(vp.planar_chain(3), forces=[vp.CoulombFriction([3.0, 2.0, 1.0], width=1.0)])
 REST = np.zeros(3)
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3), vp.RungeKutta4()], ids=str)
-def test_no_wrong_motion_is_cleared(integrator):
+@pytest.mark.parametrize("scene", [CHAIN, RUBBING], ids=["free", "friction"])
+def test_no_wrong_motion_is_cleared(integrator, scene):
     """From steps that resolve nothing to fine ones: what is cleared is not off by a tenth of a warning."""
     cleared = []
     for steps in (4, 6, 10, 16, 25, 40, 80, 160):
-        motion = vp.simulate(CHAIN, REST, REST, duration=1.0, steps=steps, integrator=integrator, check=False)
+        motion = vp.simulate(scene, REST, REST, duration=1.0, steps=steps, integrator=integrator, check=False)
         if not integrator.variational:
-            defect = energy_defects(CHAIN, integrator, motion)
+            defect = energy_defects(scene, integrator, motion)
             motion = motion.changed(statistics=motion.statistics.changed(energy_defect=defect))
-        cleared.append(clearance.clearly_right(CHAIN, integrator, motion))
+        cleared.append(clearance.clearly_right(scene, integrator, motion))
         if cleared[-1]:
-            assert motion_error(CHAIN, integrator, motion).worst < 0.1
+            assert motion_error(scene, integrator, motion).worst < 0.1
     assert not cleared[0]
     assert cleared[-1] or integrator.order == 2
 
@@ -270,11 +272,12 @@ def test_dampers_that_are_faster_than_the_step():
 @pytest.mark.parametrize(
     "options",
     [
-        {"forces": [vp.CoulombFriction(0.1, width=0.1)]},
+        {"forces": [vp.CoulombFriction(0.1, width=1e-3)]},
+        {"forces": [vp.CoulombFriction(0.1, width=1.0, breakaway=0.2, stribeck_velocity=1.0)]},
         {"noise": vp.AdditiveNoise(0.0)},
         {"forces": [vp.CustomForce(lambda q, v: -0.1 * v)]},
     ],
-    ids=["friction", "noise", "force in Python"],
+    ids=["narrow friction", "Stribeck's effect", "noise", "force in Python"],
 )
 def test_what_nodes_do_not_tell_is_never_cleared(options):
     scene = vp.Scene(vp.planar_chain(3), **options)
