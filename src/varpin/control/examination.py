@@ -42,6 +42,8 @@ _LINEAR_FRICTION = 0.25
 # Parts of the expected cost and of the noise cost by which noise may cost other than planned in half steps without a
 # warning, and the part of the expected cost that the noise cost has to have for the latter.
 _NOISE_OFF, _OF_NOISE, _MATTERS = 0.05, 0.1, 0.01
+# Violation between nodes, in scales of a constraint (a tenth of its range), from which narrower bounds do not help.
+_NARROWED = 5.0
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
@@ -361,12 +363,16 @@ def _between(solution: Solution) -> list[Finding]:
             c[: PARTS - 1, outside > 0.0] = -np.inf
         sample, row = np.unravel_index(int(np.argmax(c)), c.shape)
         if c[sample, row] > REPORTED * bound.scale:
+            if c[sample, row] < _NARROWED * bound.scale:
+                advice = "make the bound narrower by that much, or dt smaller"
+            else:
+                advice = "the motion goes around the nodes; take a smaller dt"
+                advice += ", or controls='held'" if problem.linear else ""
             found.append(
                 Finding(
                     "constraints between nodes",
                     f"{record.label} holds at the nodes, but between nodes {bound.rows[row]} is violated by "
-                    f"{c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: make the bound narrower by "
-                    "that much, or dt smaller",
+                    f"{c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: {advice}",
                 )
             )
     return found
