@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pinocchio as pin
 import pytest
 import scipy
 
 import varpin as vp
+from varpin.integrators.tableau import gauss_coefficients, radau_coefficients, stability
 from varpin.simulation import clearance
+from varpin.simulation.damping import fast_damping
 from varpin.simulation.soundness import energy_defects, motion_error
 
 N, T = 12, 0.6
@@ -184,21 +188,23 @@ def test_growth_is_bounded_by_no_less_than_the_fastest_mode(scene, limits, monke
 
 
 CHAIN = vp.Scene(vp.planar_chain(3))
+RUBBING = vp.Scene(vp.planar_chain(3), forces=[vp.CoulombFriction([3.0, 2.0, 1.0], width=1.0)])
 REST = np.zeros(3)
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3), vp.RungeKutta4()], ids=str)
-def test_no_wrong_motion_is_cleared(integrator):
+@pytest.mark.parametrize("scene", [CHAIN, RUBBING], ids=["free", "friction"])
+def test_no_wrong_motion_is_cleared(integrator, scene):
     """From steps that resolve nothing to fine ones: what is cleared is not off by a tenth of a warning."""
     cleared = []
     for steps in (4, 6, 10, 16, 25, 40, 80, 160):
-        motion = vp.simulate(CHAIN, REST, REST, duration=1.0, steps=steps, integrator=integrator, check=False)
+        motion = vp.simulate(scene, REST, REST, duration=1.0, steps=steps, integrator=integrator, check=False)
         if not integrator.variational:
-            defect = energy_defects(CHAIN, integrator, motion)
+            defect = energy_defects(scene, integrator, motion)
             motion = motion.changed(statistics=motion.statistics.changed(energy_defect=defect))
-        cleared.append(clearance.clearly_right(CHAIN, integrator, motion))
+        cleared.append(clearance.clearly_right(scene, integrator, motion))
         if cleared[-1]:
-            assert motion_error(CHAIN, integrator, motion).worst < 0.1
+            assert motion_error(scene, integrator, motion).worst < 0.1
     assert not cleared[0]
     assert cleared[-1] or integrator.order == 2
 
@@ -214,14 +220,64 @@ def test_a_wrong_step_is_not_cleared():
             assert not clearance.clearly_right(CHAIN, vp.Gauss(4), motion.changed(**{name: values}))
 
 
+@pytest.mark.parametrize("stages", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("method", ["gauss", "radau"])
+def test_over_two_steps_no_wrong_mode_of_a_damper_has_a_small_residual(method, stages, monkeypatch):
+    """Modes exp(z t) of x'' + d x' + k x = 0 over steps of unit length, as a method integrates them.
+
+    Springs that turn a mode by more than a radian in a step are left to the check.
+    """
+    if method == "radau" and stages == 1:
+        return
+    a, b, _ = {"gauss": gauss_coefficients, "radau": radau_coefficients}[method](stages)
+    monkeypatch.setattr(clearance.Stretch, "make", lambda **arrays: arrays)
+    _, wide = clearance._stretches.__wrapped__((), 2 * stages <= 4)
+    (values, slopes), (gains, moves) = wide["curves"], wide["sums"]
+    for d, k in product([0.0, *np.geomspace(0.1, 1e4, 60)], [-1.0, -0.3, 0.0, 0.3, 1.0]):
+        z = np.roots([1.0, d, k]).astype(complex)
+        z = z[np.abs(z) > 1e-9]
+        if not len(z):
+            continue
+        factor = stability(a, b, z)
+        # Rows for the nodes.
+        v = factor ** np.arange(3)[:, None]
+        q = v / z
+        data = np.stack([q, v, -k * q - d * v], axis=1).reshape(9, -1)
+        acceleration = -k * values @ data - d * slopes @ data
+        off_v = v[1:] - v[:-1] - gains @ acceleration
+        off_q = q[1:] - q[:-1] - v[:-1] - moves @ acceleration
+        seen = np.maximum(np.abs(off_v), np.abs(off_q)).max(axis=0)
+        error = np.abs(factor - np.exp(z))
+        assert (seen >= 0.5 * np.where(error > 1e-3, error, 0.0)).all()
+
+
+def test_dampers_that_are_faster_than_the_step():
+    """Cleared where velocities follow, and not where they ring after jumps of the torque, or in single steps."""
+    scene = vp.Scene(vp.planar_chain(3), damping=[2.0, 2.0, 2.0], gravity=[0.0, 0.0, 0.0])
+    assert fast_damping(scene, REST[None], REST[None], REST[None], 0.1).rate > 5.0 / 0.1
+    torque = np.array([2.0, 1.3, 0.7])
+    smooth = vp.OpenLoop(lambda t: torque * np.sin(t) ** 2)
+    jumping = np.where((np.arange(30) // 5 % 2)[:, None], torque, -torque)
+    given = {"dt": 0.1, "check": False}
+    for integrator in (vp.Gauss(2), vp.Gauss(3)):
+        motion = vp.simulate(scene, REST, REST, steps=30, controls=smooth, integrator=integrator, **given)
+        assert clearance.clearly_right(scene, integrator, motion)
+        assert motion_error(scene, integrator, motion).worst < 0.1
+        motion = vp.simulate(scene, REST, REST, steps=30, controls=jumping, integrator=integrator, **given)
+        assert not clearance.clearly_right(scene, integrator, motion)
+        motion = vp.simulate(scene, REST, REST, steps=1, controls=smooth, integrator=integrator, **given)
+        assert not clearance.clearly_right(scene, integrator, motion)
+
+
 @pytest.mark.parametrize(
     "options",
     [
-        {"forces": [vp.CoulombFriction(0.1, width=0.1)]},
+        {"forces": [vp.CoulombFriction(0.1, width=1e-3)]},
+        {"forces": [vp.CoulombFriction(0.1, width=1.0, breakaway=0.2, stribeck_velocity=1.0)]},
         {"noise": vp.AdditiveNoise(0.0)},
         {"forces": [vp.CustomForce(lambda q, v: -0.1 * v)]},
     ],
-    ids=["friction", "noise", "force in Python"],
+    ids=["narrow friction", "Stribeck's effect", "noise", "force in Python"],
 )
 def test_what_nodes_do_not_tell_is_never_cleared(options):
     scene = vp.Scene(vp.planar_chain(3), **options)

@@ -189,6 +189,30 @@ def around_the_nominal_states(problem, motion, second_order):
     return passes._pass(along, 0.0, curvature=curvature, limits=limits)[0]
 
 
+@pytest.mark.parametrize(("steps", "controls"), [(40, "held"), (25, "linear")])
+def test_limits_that_only_the_first_full_step_meets(steps, controls):
+    """A Panda's reach: a light wrist meets its limit at the first plan, and not on the way. It took 17 iterations."""
+    robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})
+    begin = [0.71, 0.58, -0.4, -1.15, -0.14, 1.96, 0.72]
+    goal = [0.59, 1.23, 0.32, -1.42, -0.62, 1.67, 0.18]
+    speed = vp.VelocityCost(1.0)
+    cost = vp.ControlCost(1.0 / robot.effort_limit**2) + speed
+    cost += vp.Terminal(vp.TrackingCost(goal, 1e4) + 1e3 * speed)
+    given = {"dt": 1.0 / steps, "steps": steps, "controls": controls, "integrator": vp.RungeKutta4()}
+    scene = vp.Scene(robot, damping=0.1)
+    free = vp.OptimalControlProblem(scene, cost, begin, np.zeros(7), **given)
+    limited = vp.OptimalControlProblem(
+        scene, cost, begin, np.zeros(7), **given, control_limits=(-robot.effort_limit, robot.effort_limit)
+    )
+    unlimited, plan = (vp.solve(problem, tolerance=1e-4, check=False) for problem in (free, limited))
+    assert plan.status.converged
+    assert plan.iterations <= unlimited.iterations + 3
+    assert plan.cost == pytest.approx(unlimited.cost, rel=1e-2)
+    begun = vp.solve(limited, tolerance=1e-4, max_iterations=2, check=False)
+    resumed = vp.solve(limited, resume=begun, tolerance=1e-4, check=False)
+    np.testing.assert_array_equal(resumed.controls, plan.controls)
+
+
 @pytest.mark.parametrize("second_order", [False, True])
 def test_each_decision_is_the_minimum_in_its_box(load, second_order):
     """Along any motion: the last decision against SciPy, on the model that the same pass without limits leaves."""

@@ -12,7 +12,9 @@ from varpin.control.square_root import squares_of
 H = 0.1  # the step
 
 
-def random_steps(dof, m, k, *, seed, steps=6, hold=1, samples=2, velocity=True, rated=False, curved=False):
+def random_steps(
+    dof, m, k, *, seed, steps=6, hold=1, samples=2, velocity=True, rated=False, curved=False, within=False
+):
     """Arrays of :class:`varpin.core.ExpandedSteps` with nothing special about them, every Hessian positive definite."""
     rng = np.random.default_rng(seed)
     x, size, decisions = 2 * dof, 2 * dof + m, steps // hold
@@ -37,6 +39,7 @@ def random_steps(dof, m, k, *, seed, steps=6, hold=1, samples=2, velocity=True, 
         "expected": np.zeros((0, size)),
         "rate": definite(decisions, m) if rated else np.zeros((0, m, m)),
         "pull": rng.normal(size=(decisions if rated else 0, m)),
+        "within": definite(steps, x) if within else np.zeros((0, x, x)),
     }
 
 
@@ -73,7 +76,7 @@ def plainly(given, hold, regularization, end_gradient, end_hessian):
         out["costate"][i] = z[:x]
         step = np.block([[A[i], B[i]], [np.zeros((m, x)), np.eye(m)]])
         Q, Qz, Qc = step.T @ V @ step, step.T @ g, step.T @ z
-        S = H * V[:x, :x]
+        S = H * (V[:x, :x] + (given["within"][i] if len(given["within"]) else 0.0))
         if len(given["curvature"]):
             Q = Q + given["curvature"][i]
         for j in range(s):
@@ -141,7 +144,7 @@ def terminal(x):
 
 @pytest.mark.parametrize("regularization", [0.0, 0.3])
 @pytest.mark.parametrize("k", [0, 2])
-@pytest.mark.parametrize("options", [{}, {"rated": True}, {"velocity": False, "samples": 1}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"rated": True}, {"velocity": False, "samples": 1}, {"within": True}], ids=str)
 @pytest.mark.parametrize("hold", [1, 3])
 @pytest.mark.parametrize(("dof", "m"), [(1, 1), (2, 3), (6, 6)])
 def test_both_passes_are_the_equations(dof, m, hold, options, k, regularization):
@@ -157,7 +160,8 @@ def test_both_passes_are_the_equations(dof, m, hold, options, k, regularization)
     roots = core.RootPass(m, squares_of(gradient[None], hessian[None]).core, gradient)
     ours = gains_for(given, hold)
     running, change = squares_of(given["gradient"], given["hessian"]), squares_of(given["pull"], given["rate"])
-    assert roots.run(H, hold, regularization, steps, core.Gains(**ours), running.core, change.core) == -1
+    within = squares_of(np.zeros(given["within"].shape[:2]), given["within"]).core
+    assert roots.run(H, hold, regularization, steps, core.Gains(**ours), running.core, change.core, within) == -1
     close(ours, right, 9)
     np.testing.assert_allclose((roots.slope, roots.curvature, roots.noise), sums, rtol=1e-9)
 

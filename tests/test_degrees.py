@@ -35,6 +35,19 @@ def test_a_start_in_degrees(scene, capsys):
     assert not unnamed(" ".join(capsys.readouterr().err.split()), FACTS)
 
 
+def test_positions_for_servos_in_degrees(scene):
+    servos = vp.Scene(scene.robot, gravity=False, damping=1.0, forces=[vp.PositionServo(100.0, 10.0)])
+    task = {"q0": np.zeros(6), "v0": np.zeros(6), "dt": 1e-3, "steps": 2}
+    by_law = vp.simulate(servos, **task, controls=lambda t, q, v: HOME)
+    for motion in (vp.simulate(servos, **task, controls=HOME), by_law):
+        assert not unnamed(motion.warnings[0], ("controls", *FACTS))
+    forces = vp.simulate(scene, **task, controls=HOME)
+    right = vp.simulate(servos, **task, controls=np.deg2rad(HOME))
+    start = vp.simulate(servos, **{**task, "q0": HOME})
+    assert not any("degrees" in told for told in (*forces.warnings, *right.warnings))
+    assert sum("degrees" in told for told in start.warnings) == 1
+
+
 def test_a_plan_names_units_before_everything_else(scene):
     cost = vp.ControlCost(1e-3) + vp.Terminal(vp.FramePositionCost(scene.robot, "tool0", [400.0, 100.0, 500.0]))
     problem = vp.OptimalControlProblem(scene, cost, np.zeros(6), np.zeros(6), dt=0.05, steps=4)

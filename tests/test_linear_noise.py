@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from findings import about
 
 import varpin as vp
 from varpin.control.backward import Along, backward
-from varpin.control.moments import noise_cost
+from varpin.control.moments import left_within_steps, noise_cost, noise_cost_in_halves
 from varpin.control.spread import Feedback, covariances
 
 CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
@@ -135,7 +136,9 @@ def test_paths_cost_what_the_plan_expects(noise: object, integrator: vp.Integrat
     children = np.random.default_rng(0).spawn(2)
     again = [problem.cost_of(problem.simulate(plan.policy, rng=child)) for child in children]
     first = plan.monte_carlo(2, rng=0)
-    assert first.cost == pytest.approx(np.mean(again), rel=1e-12)
+    within = left_within_steps(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains))
+    assert (within > 0.0) == integrator.holds_noise
+    assert first.cost == pytest.approx(np.mean(again) + within, rel=1e-12)
 
 
 def test_plans_with_the_whole_gradient_end_lower() -> None:
@@ -169,3 +172,39 @@ def test_lines_over_several_steps_with_fields_in_python() -> None:
     ]
     np.testing.assert_allclose(fine[0].u_nodes, fine[1].u_nodes, atol=1e-12)
     np.testing.assert_allclose(fine[0].q, fine[1].q, atol=1e-12)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e-2])
+def test_the_noise_cost_in_halves_is_that_of_each_impulse(rate: float) -> None:
+    """Of a linear system the cost is quadratic in the increments: their second differences are its mean under noise."""
+    noise = vp.AdditiveNoise(0.3)
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=1.0, stiffness=3.0, noise=noise)
+    cost = vp.ControlCost(1e-2) + vp.TrackingCost([0.5], 1.0)
+    cost += vp.Terminal(vp.TrackingCost([0.5], 10.0) + vp.VelocityCost(3.0))
+    task = {"q0": [0.0], "v0": [0.0], "dt": 0.1, "steps": 8, "controls": "linear"}
+    problem = vp.OptimalControlProblem(scene, cost + vp.ControlRateCost(rate) if rate else cost, **task)
+    plan = vp.solve(problem)
+    assert not about(plan.warnings, "noise within steps")
+    halves = vp.OptimalControlProblem(scene, cost, **task).at(dt=0.05)
+
+    def motion(w: np.ndarray) -> vp.Trajectory:
+        policy, own = plan.policy_on("momentum"), problem.integrator
+        return vp.simulate(
+            scene, [0.0], [0.0], dt=0.05, steps=16, controls=policy, increments=w, integrator=own, check=False
+        )
+
+    still = motion(np.zeros((16, 1)))
+    least, expected = halves.cost_of(still), 0.0
+    for w in np.eye(16)[:, :, None]:
+        expected += 0.05 * 0.5 * (halves.cost_of(motion(w)) + halves.cost_of(motion(-w)) - 2.0 * least)
+    found = noise_cost_in_halves(problem, halves, still, Feedback(plan.gains, plan.previous_gains))
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_plan_of_torques_that_alternate_to_see_no_noise_says_so() -> None:
+    """The mean of a line that changes sign is close to zero, and so is the noise that the plan sees."""
+    problem = reach(vp.ControlNoise(1.0), steps=10)
+    plan = vp.solve(problem)
+    (sentence,) = about(plan.warnings, "noise within steps")
+    assert "controls='held'" in sentence
+    assert float(sentence.split()[2]) > 100.0 * plan.noise_cost

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from findings import about
 from scipy.optimize import minimize
 
 import varpin as vp
@@ -147,3 +148,17 @@ def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
     ends = np.array([plan.controls[:2] for plan in run.plans])
     np.testing.assert_allclose(ends[0, 0], hold, atol=1e-12)
     np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1], atol=1e-9)
+
+
+def test_motions_that_go_around_velocity_limits_have_advice():
+    """At 50 ms a node linear torques move a link fast between nodes, and hardly at these."""
+    robot = vp.planar_chain(1)
+    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-3) + vp.Terminal(vp.TrackingCost([0.9], 1e2))
+    options = {"dt": 0.05, "steps": N, "constraints": [vp.WithinVelocityLimits(robot, (-0.3, 0.3))]}
+    scene = vp.Scene(robot, gravity=False, damping=0.1)
+    sentences = {}
+    for controls in ("linear", "held"):
+        problem = vp.OptimalControlProblem(scene, cost, [0.1], [0.0], controls=controls, **options)
+        sentences[controls] = about(vp.solve(problem).warnings, "between nodes")
+    assert "controls='held'" in sentences["linear"][0]
+    assert not sentences["held"]

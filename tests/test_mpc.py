@@ -174,6 +174,39 @@ def test_interruption_keeps_the_motion():
     assert caught.value.trajectory.steps == 70
 
 
+@pytest.mark.parametrize("within", [False, True])
+def test_ctrl_c_ends_a_run_while_it_plans(within):
+    """A search ends with its best plan, and the run ends with it: without a motion in the first plan."""
+    robot, calls, last = vp.planar_chain(1), [], [np.inf]
+
+    def interrupted(t, q, v, u):
+        calls.append(len(t))
+        if len(calls) > last[0]:
+            last[0] = np.inf
+            raise KeyboardInterrupt
+        return (q[:, 0] - 1.0) ** 2
+
+    limits = [vp.WithinVelocityLimits(robot, (-0.5, 0.5))] if within else []
+    cost = vp.CustomCost(interrupted, name="goal") + vp.ControlCost(1e-2)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, gravity=False), cost, [0.0], [0.0], dt=0.05, steps=6, constraints=limits
+    )
+    controller = vp.Mpc(problem, iterations=2)
+    last[0] = 4
+    with pytest.raises(KeyboardInterrupt) as first:
+        controller.run(duration=0.5)
+    assert not isinstance(first.value, vp.Interrupted)
+    calls.clear()
+
+    def soon(done, _):
+        if done == 3:
+            last[0] = len(calls) + 2
+
+    with pytest.raises(vp.Interrupted) as caught:
+        controller.run(duration=0.5, progress=soon)
+    assert caught.value.trajectory.t[-1] == pytest.approx(3 * 0.05)
+
+
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_a_tick_takes_a_backward_pass_for_each_iteration(iterations, monkeypatch):
     """And no more: its gains are those that its last step followed, and near those made anew for its motion."""

@@ -9,6 +9,7 @@ from scipy.linalg import expm
 import varpin as vp
 from varpin.control.moments import noise_cost
 from varpin.control.spread import Feedback
+from varpin.control.within_steps import mean_of_decay
 
 LEVEL, DAMPING = 0.3, 1.5
 WEIGHTS = {"q": 5.0, "v": 1.0, "u": 0.05}
@@ -122,3 +123,38 @@ def test_what_velocities_cost_within_steps(damping):
     variance = (level / inertia) ** 2 / (2.0 * rate)
     mean = dt - (1.0 - np.exp(-2.0 * rate * dt)) / (2.0 * rate)
     assert found == pytest.approx(variance * mean, rel=1e-5)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 3.0, 1e4])
+def test_the_mean_of_what_decays_within_a_step(size):
+    """Against the matrix exponential, with a matrix that has no basis of modes."""
+    Z = size * np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.3], [0.0, 0.0, 2.0]])
+    root = np.random.default_rng(0).normal(size=(3, 3))
+    H = root.T @ root
+    found = mean_of_decay(Z[None], H[None])[0]
+    # d/ds of exp(-Z s)' H exp(-Z s) is linear in it; the integral is the last block of the exponential of a chain.
+    rates = np.zeros((27, 27))
+    rates[:9, :9] = -(np.kron(Z.T, np.eye(3)) + np.kron(np.eye(3), Z.T))
+    rates[9:18, :9] = rates[18:, 9:18] = np.eye(9)
+    right = (expm(rates) @ np.concatenate([H.ravel(), np.zeros(18)]))[18:].reshape(3, 3)
+    np.testing.assert_allclose(found, right, rtol=0, atol=1e-12 * np.abs(right).max())
+
+
+@pytest.mark.parametrize(("strength", "told"), [(5e-4, True), (5e-5, False)])
+def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, told):
+    """The rest of the noise, beside its mean over a step, costs a fifth of it; a small part of the expected cost."""
+    scene = vp.Scene(vp.load_robot("finger"), noise=vp.ControlNoise(strength))
+
+    def reference(t):
+        return [1 + 0.25 * np.sin(4 * np.pi * t), 0.3 + 0.1 * np.sin(2 * np.pi * t), 0.2]
+
+    cost = vp.TrackingCost(reference, 10.0) + vp.ControlCost(0.1)
+    start = {"q0": reference(0.0), "v0": [np.pi, 0.2 * np.pi, 0.0]}
+    found = vp.solve(vp.OptimalControlProblem(scene, cost, **start, dt=4e-3, steps=50))
+    in_halves = found.problem.at(dt=2e-3, hold=2, integrator=found.problem.integrator)
+    finer = in_halves.simulate(found.policy_on("momentum", 2))
+    halves = noise_cost(in_halves, finer, Feedback(found.gains, found.previous_gains))
+    assert abs(halves - found.noise_cost) > 0.1 * halves
+    assert abs(halves - found.noise_cost) < 0.05 * (found.cost + halves)
+    assert (halves > 0.01 * (found.cost + halves)) == told
+    assert bool(about(found.warnings, "noise within steps")) == told

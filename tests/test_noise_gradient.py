@@ -6,16 +6,20 @@ from refusals import refused
 
 import varpin as vp
 from varpin.control.backward import Along, backward
+from varpin.control.moments import noise_cost
+from varpin.control.spread import Feedback
 
 CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
 
 
-def reach(noise: object, *, steps: int = 6, dt: float = 0.08, rate: float = 0.0, **options: object):
+def reach(
+    noise: object, *, steps: int = 6, dt: float = 0.08, rate: float = 0.0, damping: float = 0.2, **options: object
+):
     cost = vp.ControlCost(0.05) + vp.VelocityCost(0.1)
     cost += vp.Terminal(vp.TrackingCost([0.5, -0.5], 20.0) + vp.VelocityCost(5.0))
     if rate:
         cost += vp.ControlRateCost(rate)
-    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=noise)
+    scene = vp.Scene(vp.planar_chain(2), damping=damping, noise=noise)
     return vp.OptimalControlProblem(scene, cost, [0.2, 0.2], [0.0, 0.0], dt=dt, steps=steps, **options)
 
 
@@ -31,6 +35,7 @@ def reach(noise: object, *, steps: int = 6, dt: float = 0.08, rate: float = 0.0,
         (STATE, {"integrator": vp.Gauss(2, kick="split")}),
         (CONTROL, {"integrator": vp.Gauss(2, kick="held"), "hold": 2}),
         (STATE, {"integrator": vp.Gauss(2, kick="held")}),
+        (CONTROL, {"integrator": vp.Radau(2, kick="held"), "damping": 1.0}),
         (STATE, {"integrator": vp.RungeKutta4()}),
         (vp.AdditiveNoise(0.5), {"integrator": vp.Gauss(2)}),
     ],
@@ -108,3 +113,25 @@ def test_a_search_does_not_go_on_under_other_noise():
     plan = vp.solve(problem(0.1), max_iterations=1, check=False)
     with refused(vp.InputError, "noise"):
         vp.solve(problem(0.2), resume=plan)
+
+
+@pytest.mark.parametrize("integrator", [None, vp.Radau(2, kick="held")])
+def test_the_cost_that_a_plan_reports_has_no_slope_at_the_plan(integrator: vp.Integrator | None) -> None:
+    """What velocities cost within steps included, by differences of the whole."""
+    problem = reach(CONTROL, damping=2.0, integrator=integrator)
+
+    def total(u: np.ndarray) -> float:
+        motion = problem.simulate(u)
+        plan = backward(problem, motion, 0.0)
+        return problem.cost_of(motion) + noise_cost(problem, motion, Feedback(plan.feedback, plan.previous))
+
+    def slope(u: np.ndarray, way: np.ndarray) -> float:
+        near, far = (total(u + k * way) - total(u - k * way) for k in (1, 2))
+        return (8.0 * near - far) / 12.0
+
+    plan = vp.solve(problem, noise="whole", tolerance=1e-10, check=False)
+    assert plan.status is vp.Status.CONVERGED
+    assert plan.expected_cost == pytest.approx(total(plan.controls), rel=1e-12)
+    ways = 1e-3 * np.random.default_rng(0).normal(size=(6, *plan.controls.shape))
+    slopes, others = ([abs(slope(u, way)) for way in ways] for u in (plan.controls, 0.99 * plan.controls))
+    assert max(slopes) < 1e-3 * max(others)

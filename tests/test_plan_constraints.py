@@ -17,7 +17,6 @@ from varpin.control.augmented import within_constraints
 from varpin.control.backward import backward
 from varpin.control.hints import hints
 from varpin.control.hints import reach as hints_reach
-from varpin.control.moments import left_within_steps
 from varpin.control.penalties import penalized
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
@@ -694,10 +693,25 @@ def test_noise_that_depends_on_the_motion_does_not_move_a_plan_within_constraint
     assert plan.status is vp.Status.CONVERGED, plan.reason
     np.testing.assert_allclose(plan.controls, still.controls, rtol=0, atol=1e-6 * np.abs(still.controls).max())
     free = two_links(steps=steps, scene=scene)
-    along = backward(free, plan.trajectory, 0.0).noise + left_within_steps(free, plan.trajectory)
+    along = backward(free, plan.trajectory, 0.0).noise
     assert plan.noise_cost == pytest.approx(along, rel=1e-9)
     assert plan.noise_cost > 0.0
     assert about(plan.warnings, "noise left out")
+
+
+@pytest.mark.parametrize("family", ["velocities", "positions"])
+@pytest.mark.parametrize(("damping", "fast"), [(200.0, True), (0.5, False)])
+def test_a_margin_of_velocities_under_fast_damping_is_told_of(family, damping, fast):
+    """The variances of velocities are too small there; those of positions are not."""
+    scene = vp.Scene(ROBOT, damping=damping, noise=vp.AdditiveNoise(0.1))
+    bound = {
+        "velocities": vp.WithinVelocityLimits(ROBOT, (-20.0, 20.0), margin=2.0),
+        "positions": vp.WithinJointLimits(ROBOT, (-20.0, 20.0), margin=2.0),
+    }[family]
+    plan = vp.solve(two_links([bound], steps=8, scene=scene, integrator=vp.Radau(2, kick="held")))
+    assert bool(naming(plan.warnings, "WithinVelocityLimits", "margin", "damping is fast")) == (
+        fast and family == "velocities"
+    )
 
 
 def test_a_margin_without_noise_is_told_of():

@@ -104,7 +104,8 @@ def test_noise_acts_as_in_the_textbook(noise, fields):
     scene, system = pair(vp.planar_chain(3), noise=noise, fields=fields)
     q0, h, N = np.array([0.4, 0.1, -0.2]), 5e-3, 20
     u, dw = rng.normal(size=(N, 3)), np.sqrt(h) * rng.normal(size=(N, 3))
-    ours = vp.simulate(scene, q0, np.zeros(3), dt=h, steps=N, controls=u, increments=dw, check=False)
+    given = {"dt": h, "steps": N, "controls": u, "increments": dw, "integrator": vp.Midpoint()}
+    ours = vp.simulate(scene, q0, np.zeros(3), check=False, **given)
     theirs = textbook.rollout(system, q0, np.zeros(3), u, h, dw=dw)
     assert np.abs(ours.q - theirs.q).max() <= 1e-11
     # What noise adds to a step, (1.7), against differences of the step itself.

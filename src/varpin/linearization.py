@@ -27,9 +27,9 @@ from varpin.trajectory import Trajectory
 # Number of steps that are repeated to check the scene of a motion without scene values, and tolerances as shares of
 # the largest change of velocity in the step and of the largest velocity.
 _RETAKEN, _OF_CHANGE, _OF_SPEED = 8, 1e-5, 1e-8
-# Rates of damping, times the step, from which the stationary variance of a damped velocity is wrong by a fifth: where
+# Rates of damping, times the step, from which the stationary variance of a damped velocity is wrong by a tenth: where
 # the whole impulse precedes the step, and where it is held over the step or split.
-_BEFORE, _WITHIN = 0.2, 2.0
+_BEFORE, _WITHIN = 0.1, 1.1
 
 logger = logging.getLogger(__name__)
 
@@ -133,11 +133,11 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
     if not integrator.variational:
         found = replace(found, K=_kick_columns(scene, trajectory, found.J))
-    return replace(found, warnings=_of_velocities(scene, trajectory, integrator))
+    return replace(found, warnings=wrong_variances(scene, trajectory, integrator))
 
 
-def _of_velocities(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> tuple[str, ...]:
-    """A warning where damping is so fast for the step that variances of velocities are wrong by a fifth and more."""
+def wrong_variances(scene: Scene, trajectory: Trajectory, integrator: Integrator) -> tuple[str, ...]:
+    """A warning where damping is so fast for the step that variances of velocities are wrong by a tenth and more."""
     if not scene.processes:
         return ()
     midpoint = isinstance(integrator, Midpoint) and integrator.alpha == 0.5
@@ -150,7 +150,7 @@ def _of_velocities(scene: Scene, trajectory: Trajectory, integrator: Integrator)
         return ()
     return (
         f"damping is fast for the step (dt * {rate:.3g}/s = {dt * rate:.2g} > {rates:g}): with {integrator} predicted "
-        "variances of velocities are wrong there, by a fifth and more; those of varpin.Midpoint(kick='held') are right "
+        "variances of velocities are wrong there, by a tenth and more; those of varpin.Midpoint(kick='held') are right "
         "in equilibrium at every step, and smaller steps are right throughout",
     )
 

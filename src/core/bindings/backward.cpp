@@ -33,7 +33,8 @@ std::vector<Sample> rule_of(In<2> rule) {
 // Steps with references to their arrays; optional arrays may be empty.
 struct HeldSteps {
     HeldSteps(In<3> A_, In<3> B_, In<3> G_, In<4> Gx_, In<4> Gu_, In<2> rule, In<2> gradient_, In<3> hessian_,
-              In<3> velocity_, In<3> curvature_, In<3> slack_, In<2> expected_, In<3> rate_, In<2> pull_)
+              In<3> velocity_, In<3> curvature_, In<3> slack_, In<2> expected_, In<3> rate_, In<2> pull_,
+              std::optional<In<3>> within_)
         : A(A_),
           B(B_),
           G(G_),
@@ -46,7 +47,8 @@ struct HeldSteps {
           slack(slack_),
           expected(expected_),
           rate(rate_),
-          pull(pull_) {
+          pull(pull_),
+          within(within_) {
         const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), k = G.shape(2), size = x + m;
         const std::size_t points = N * rule.shape(0), R = slack.shape(0), rated = rate.shape(0);
         if (x % 2 != 0) throw std::invalid_argument("A has an odd number of states");
@@ -73,6 +75,7 @@ struct HeldSteps {
                  .one_hessian = one_hessian,
                  .velocity = given(velocity, "velocity", {N + 1, x / 2, x}) ? velocity.data() : nullptr,
                  .curvature = given(curvature, "curvature", {N, size, size}) ? curvature.data() : nullptr,
+                 .within = within && given(*within, "within", {N, x, x}) ? within->data() : nullptr,
                  .slack = R > 0 && given(slack, "slack", {R, 2, m}) ? slack.data() : nullptr,
                  .expected = given(expected, "expected", {R, size}) ? expected.data() : nullptr,
                  .rate = rated > 0 && given(rate, "rate", {rated, m, m}) ? rate.data() : nullptr,
@@ -87,6 +90,7 @@ struct HeldSteps {
     In<2> expected;
     In<3> rate;
     In<2> pull;
+    std::optional<In<3>> within;
     ExpandedSteps steps;
 };
 
@@ -175,7 +179,8 @@ std::ptrdiff_t run(BackwardPass& pass, double h, int hold, double regularization
 }
 
 std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regularization, const HeldSteps& given,
-                            const HeldGains& held, const HeldSquares& running, const HeldSquares* change) {
+                            const HeldGains& held, const HeldSquares& running, const HeldSquares* change,
+                            const HeldSquares* within) {
     require_same(pass, given);
     const Gains gains = held.fitting(given, hold);
     const ExpandedSteps& steps = given.steps;
@@ -183,8 +188,11 @@ std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regulariz
     const Squares samples = running.fitting("running", given.gradient.shape(0), given.gradient.shape(1));
     const Squares changes =
         steps.rate ? change->fitting("change", given.rate.shape(0), given.rate.shape(1)) : Squares{};
+    if (steps.within && !within) throw std::invalid_argument("where jumps have further costs, within is needed");
+    const auto N = static_cast<std::size_t>(steps.steps), x = static_cast<std::size_t>(steps.states());
+    const Squares jumps = steps.within ? within->fitting("within", N, x) : Squares{};
     nb::gil_scoped_release release;
-    return pass.run(h, hold, regularization, steps, samples, changes, gains);
+    return pass.run(h, hold, regularization, steps, samples, changes, jumps, gains);
 }
 
 // The linearized motion under gains from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
@@ -230,10 +238,10 @@ std::optional<std::tuple<Out, Out, nb::ndarray<nb::numpy, bool>>> box_minimum(In
 
 void register_backward(nb::module_& m) {
     nb::class_<HeldSteps>(m, "ExpandedSteps")
-        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<2>, In<3>, In<3>, In<3>, In<3>, In<2>, In<3>,
-                      In<2>>(),
+        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<2>, In<3>, In<3>, In<3>, In<3>, In<2>, In<3>, In<2>,
+                      std::optional<In<3>>>(),
              nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a, "Gu"_a, "rule"_a, "gradient"_a, "hessian"_a, "velocity"_a,
-             "curvature"_a, "slack"_a, "expected"_a, "rate"_a, "pull"_a);
+             "curvature"_a, "slack"_a, "expected"_a, "rate"_a, "pull"_a, "within"_a.none() = nb::none());
     nb::class_<HeldGains>(m, "Gains")
         .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>>(), nb::kw_only(),
              "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "previous"_a.noconvert(),
@@ -246,7 +254,7 @@ void register_backward(nb::module_& m) {
     auto root_pass = nb::class_<RootPass>(m, "RootPass");
     root_pass.def("__init__", &make_root_pass, "controls"_a, "terminal"_a, "gradient"_a)
         .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a,
-             "change"_a.none() = nb::none());
+             "change"_a.none() = nb::none(), "within"_a.none() = nb::none());
     define_results(root_pass);
     m.def("foresee", &foresee, "hold"_a, "steps"_a, "gains"_a, "state"_a.noconvert(), "expected"_a.noconvert(),
           "moves"_a.noconvert());

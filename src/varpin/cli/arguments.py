@@ -112,8 +112,8 @@ def add_integrator(parser: argparse.ArgumentParser) -> None:
         "--integrator",
         metavar="NAME",
         help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Gauss(stages=2), "
-        "with 4 where springs are fast for the step, Radau(stages=4) where dampers are faster, Midpoint(kick=held) under "
-        "noise",
+        "with 4 where springs are fast for the step, Radau(stages=4) where dampers are faster, "
+        "Midpoint(kick=held) under noise",
     )
     group.add_argument(
         "--stages",

@@ -23,7 +23,6 @@ from varpin.control.backward import backward
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
-from varpin.control.moments import left_within_steps
 from varpin.control.multipliers import FEASIBLE, ConstraintReport, Multipliers, reports, split
 from varpin.control.penalties import PenalizedProblem, flat, penalized
 from varpin.control.polish import deviations, polished
@@ -206,6 +205,8 @@ class _Rounds:
             states=self.states,
             **self.options,
         )
+        if first.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
         cost = abs(first.cost)
         if self.states is not None:
             # Where the auxiliary forces are dropped at once, the motion may fall, and its cost says nothing.
@@ -405,8 +406,7 @@ class _Rounds:
             found = None
         if found is None:
             return replace(kept, noise_cost=np.nan)
-        noise = found.noise + left_within_steps(self.problem, kept.trajectory)
-        return replace(kept, gains=found.feedback, previous_gains=found.previous, noise_cost=noise)
+        return replace(kept, gains=found.feedback, previous_gains=found.previous, noise_cost=found.noise)
 
     def _backoff(self, kept: Solution) -> list[Floats]:
         """The margins of all constraints around a plan, in their units."""

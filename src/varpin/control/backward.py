@@ -36,6 +36,7 @@ from varpin.control.penalties import PenalizedProblem, PenalizedRate, flat, rate
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.spread import Feedback
 from varpin.control.square_root import Squares, squares_of
+from varpin.control.within_steps import beyond_samples
 from varpin.errors import LinearizationError
 from varpin.linearization import (
     Linearization,
@@ -177,17 +178,21 @@ def backward(
     *,
     along: Along | None = None,
     demands: bool = False,
+    clipped: bool = False,
 ) -> Plan | None:
     """One backward pass along a motion; None where the model has no minimum in a control.
 
     ``along`` has the expansions of other passes along the motion. With ``demands``, ``regularization`` also applies to
-    what servos demand of their drives, relative to the cost at stake.
+    what servos demand of their drives, relative to the cost at stake. ``clipped`` leaves out the limits of controls.
 
     Raises:
         CostError: An expansion of the cost is not finite.
         LinearizationError: A step has no derivative.
     """
     along = Along(problem, trajectory) if along is None else along
+    if clipped:
+        along = copy(along)
+        along.clipped = True
     damping = regularization * along.stake.moved * along.demands if demands and regularization > 0.0 else None
     if not second_order:
         return _foreseeing(along, regularization, damping)
@@ -377,7 +382,7 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
     earlier ones. So the first pass has no limits, and the next ones take the limits into account that the linearized
     motion reaches, until these do not change. If ever more of them change, the pass is made around the nominal states.
     """
-    if not along.problem.limited:
+    if not along.problem.limited or along.clipped:
         return _pass(along, regularization, curvature=curvature)[0]
     plan = _pass(along, regularization, curvature=curvature)[0]
     held: NDArray[np.bool_] = np.zeros(along.slack[:, 0].shape, dtype=np.bool_)
@@ -454,6 +459,7 @@ class Along:
         if problem.rate is not None:
             self.pull, self.rate = problem.rate.expand(problem.decided(trajectory), problem.period)
         self.slack = np.zeros((0, 2, m))
+        self.clipped = False  # whether passes leave the limits to the motion, which clips controls
         if problem.limited:
             self.slack = problem.control_limits - problem.decided(trajectory)[:, None]
         block = max(1, _BLOCK // problem.hold) * problem.hold
@@ -503,6 +509,22 @@ class Along:
         return self.running.gradient if self.added is None else self.running.gradient + self.added
 
     @cached_property
+    def within(self) -> Floats | None:
+        """The Hessian (N, 2n, 2n), in the noise's jumps, of what their velocities cost beyond the samples."""
+        problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.model_rule)
+        if not (problem.processes and problem.integrator.holds_noise):
+            return None
+        found: list[Floats] = []
+        for begin, end in [(0, problem.steps)] if problem.linear else self.blocks:
+            part, points = self.trajectory.part(begin, end), slice(begin * samples, end * samples)
+            own = hessian[points] if len(hessian) > 1 else hessian
+            more = beyond_samples(problem, part, self.linearized(begin, end)[0], own, samples)
+            if more is None:
+                return None
+            found.append(more)
+        return np.concatenate(found)
+
+    @cached_property
     def stake(self) -> Stake:
         """The cost at stake along the motion."""
         return at_stake(self.problem, self.trajectory, self.model)
@@ -535,6 +557,8 @@ class Along:
         if problem.processes:
             x = lines.A.shape[1]
             kicked = after_impulse(problem.model_rule, found.hessian, lines.velocity, problem.steps, x, problem.dt)
+            if self.within is not None:
+                kicked = kicked + self.within
             steps = noisy(steps, lines, kicked)
         return steps if self.pulled is None else with_pull(steps, self.pulled, problem.dt)
 
@@ -614,6 +638,7 @@ class Along:
             expected=limits.expected[rows],
             rate=self.rate[rows],
             pull=self.pull[rows],
+            within=None if self.within is None else self.within[begin:end],
         )
 
     def _on_lines(self, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
@@ -662,11 +687,12 @@ class _Terminal(NamedTuple):
 
 
 class _ByRoots(NamedTuple):
-    """A pass on square roots, with the costs of samples and of control changes as squares."""
+    """A pass on square roots, with the costs of samples, of control changes and within steps as squares."""
 
     run: core.RootPass
     running: Squares
     change: Squares
+    within: Squares | None
 
 
 def _one_pass(
@@ -699,9 +725,10 @@ def _one_pass(
             squares_of(along.slopes, running.hessian),
         )
         change = squares_of(along.pull, along.rate)
-        if final is None or squares is None or change is None:
+        within = None if along.within is None else squares_of(np.zeros((N, 2 * n)), along.within)
+        if final is None or squares is None or change is None or (within is None and along.within is not None):
             return None, costate
-        by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change)
+        by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change, within)
     if limits is None:
         limits = _Limits(np.zeros((0, 2, m)), np.zeros((0, 2 * n + m)))
     samples = len(problem.model_rule)
@@ -724,7 +751,8 @@ def _one_pass(
             failed = plain.run(*how, given, gains)
         else:
             running_squares, change_squares = by_roots.running[points].core, by_roots.change[rows].core
-            failed = by_roots.run.run(*how, given, gains, running_squares, change_squares)
+            within_squares = None if by_roots.within is None else by_roots.within[steps].core
+            failed = by_roots.run.run(*how, given, gains, running_squares, change_squares, within_squares)
         if failed >= 0:
             return None, costate
     found = plain if by_roots is None else by_roots.run

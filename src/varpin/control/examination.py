@@ -11,7 +11,7 @@ from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
-from varpin.control.moments import noise_cost
+from varpin.control.moments import noise_cost, noise_cost_in_halves
 from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
@@ -21,6 +21,7 @@ from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, VarpinError
 from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
+from varpin.linearization import wrong_variances
 from varpin.mechanics.forces import of_kind
 from varpin.simulation.chatter import alternation, restlessness
 from varpin.simulation.record import rollout
@@ -38,8 +39,11 @@ _OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
 _LITTLE = 1e-3
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
 _LINEAR_FRICTION = 0.25
-# Part of the expected cost by which noise may cost other than planned in half steps without a warning.
-_NOISE_OFF = 0.05
+# Parts of the expected cost and of the noise cost by which noise may cost other than planned in half steps without a
+# warning, and the part of the expected cost that the noise cost has to have for the latter.
+_NOISE_OFF, _OF_NOISE, _MATTERS = 0.05, 0.1, 0.01
+# Violation between nodes, in scales of a constraint (a tenth of its range), from which narrower bounds do not help.
+_NARROWED = 5.0
 _ALTERNATION, _RESTLESS = "alternating velocities", "restless velocities"
 
 
@@ -88,6 +92,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     warnings += (
         _unfinished(solution)
         + _noise_left_out(solution)
+        + _margins_of_velocities(solution)
         + _friction_under_noise(solution)
         + _noise_in_halves(solution)
         + (_alternating(solution) or _restless(solution))
@@ -240,30 +245,45 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
 def _noise_in_halves(solution: Solution) -> list[Finding]:
     """A finding if noise costs other than planned in steps of half the length.
 
-    One impulse a step is right to first order in the step, one held force to second order.
+    One impulse a step is right to first order in the step, one held force to second order. Noise in proportion to
+    controls that are linear over the step has the strength of their mean, and none where they change sign.
     """
     problem, scene = solution.problem, solution.problem.scene
-    if not scene.processes or problem.linear or scene.inputs:
+    if not scene.processes or scene.inputs:
         return []
-    dt, hold, feedback = 0.5 * problem.dt, 2 * problem.hold, Feedback(solution.gains, solution.previous_gains)
+    dt, feedback = 0.5 * problem.dt, Feedback(solution.gains, solution.previous_gains)
+    hold = 1 if problem.linear else 2 * problem.hold
     try:
         finer, failure = rollout(scene, problem.integrator, problem.q0, problem.v0, _in_parts(solution, 2)[1], dt)
         if failure is not None:
             return []
         in_halves = problem.at(dt=dt, hold=hold, integrator=problem.integrator)
-        planned, fine = noise_cost(problem, solution.trajectory, feedback), noise_cost(in_halves, finer, feedback)
+        planned = noise_cost(problem, solution.trajectory, feedback)
+        if problem.linear:
+            fine = noise_cost_in_halves(problem, in_halves, finer, feedback)
+        else:
+            fine = noise_cost(in_halves, finer, feedback)
     except VarpinError:
         # A custom noise or cost, or the linearization, may fail off the plan.
         return []
-    if abs(fine - planned) <= _NOISE_OFF * (abs(solution.cost) + max(planned, fine)):
+    off, most = abs(fine - planned), max(planned, fine)
+    expected = abs(solution.cost) + most
+    if off <= _NOISE_OFF * expected and (off <= _OF_NOISE * most or most <= _MATTERS * expected):
         return []
+    closer = f"problem.at(dt={dt:g}, hold={hold}) is closer"
+    if problem.linear:
+        closer = f"problem.at(dt={dt:g}) is closer"
+        if problem.steered.any():
+            closer = (
+                "problem.at(controls='held') keeps torques from alternating, by which a line has no noise in its mean"
+            )
     return [
         Finding(
             "noise within steps",
             f"noise costs {fine:.3g} in halves of dt = {problem.dt:g} s, "
             f"and {planned:.3g} in the plan's steps, which are long for it: on the robot noise_cost is another, "
             "although plan.monte_carlo(), in the same steps, "
-            f"agrees with it; problem.at(dt={dt:g}, hold={hold}) is closer",
+            f"agrees with it; {closer}",
         )
     ]
 
@@ -293,6 +313,22 @@ def _noise_left_out(solution: Solution) -> list[Finding]:
             "constraints=, solve lowers it, too",
         )
     ]
+
+
+def _margins_of_velocities(solution: Solution) -> list[Finding]:
+    """A finding where margins of velocities are wrong, as damping is fast for the step."""
+    problem, motion = solution.problem, solution.trajectory
+    n = problem.scene.robot.dof
+    labels = {
+        bound.source.label
+        for bound in problem.bound_constraints
+        if bound.source.margin > 0.0 and bound.jacobian(motion.q, motion.v)[:, :, n:].any()
+    }
+    if not labels:
+        return []
+    wrong = wrong_variances(problem.scene, motion, problem.integrator)
+    where = ", ".join(sorted(labels))
+    return [Finding("margins of velocities", f"{where}: a margin= of velocities is as wrong: {why}") for why in wrong]
 
 
 def _between(solution: Solution) -> list[Finding]:
@@ -327,12 +363,16 @@ def _between(solution: Solution) -> list[Finding]:
             c[: PARTS - 1, outside > 0.0] = -np.inf
         sample, row = np.unravel_index(int(np.argmax(c)), c.shape)
         if c[sample, row] > REPORTED * bound.scale:
+            if c[sample, row] < _NARROWED * bound.scale:
+                advice = "make the bound narrower by that much, or dt smaller"
+            else:
+                advice = "the motion goes around the nodes; take a smaller dt"
+                advice += ", or controls='held'" if problem.linear else ""
             found.append(
                 Finding(
                     "constraints between nodes",
                     f"{record.label} holds at the nodes, but between nodes {bound.rows[row]} is violated by "
-                    f"{c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: make the bound narrower by "
-                    "that much, or dt smaller",
+                    f"{c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: {advice}",
                 )
             )
     return found

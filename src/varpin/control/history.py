@@ -106,6 +106,7 @@ class SearchState:
         cut: Whether it has stopped one.
         whole: Whether the search uses the whole gradient of the noise cost.
         saturated: Whether it takes into account that drives of servos are at their limits.
+        clips: Whether plans may leave control limits to the clipping of motions where steps are short.
         history: The iterations before.
     """
 
@@ -124,6 +125,7 @@ class SearchState:
     history: tuple[Iteration, ...]
     whole: bool = False
     saturated: bool = False
+    clips: bool = True
 
     def __repr__(self) -> str:
         return f"SearchState(cost {self.cost:.6g}, after {len(self.history)} iterations)"

@@ -18,6 +18,7 @@ from varpin.arrays import Floats
 from varpin.control.linear_controls import after_impulse, at_samples, in_step, of_samples, on_lines, shifted_lines
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.spread import Feedback, decided, propagated
+from varpin.control.within_steps import beyond_samples
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
 
@@ -33,7 +34,8 @@ class _Steps:
     g: Floats  # (N, 2n, k) derivative in the noise
     gz: Floats  # (N, 2n, k, Z) its derivative in the variables
     cost: Floats  # (N, Z, Z) Hessian of the running cost
-    kicked: Floats  # (N, 2n, 2n) Hessian of the part sampled after the noise impulse, in the state there
+    kicked: Floats  # (N, 2n, 2n) Hessian of the part after the noise impulse, in the state there
+    beyond: Floats | None  # (N, 2n, 2n) what no sample of it sees
 
 
 def noise_gradient(
@@ -100,48 +102,66 @@ def noise_gradient(
 
 
 def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback) -> float:
-    """The noise cost of a motion under feedback, without that of control changes, with :func:`left_within_steps`."""
+    """The noise cost of a motion under feedback, without that of control changes."""
     here = _steps_of(problem, trajectory, np.ones(problem.scene.processes, dtype=bool))
-    C = propagated(here.J, here.g, here.gz, problem, feedback)
+    return _with_covariances(problem, trajectory, here, propagated(here.J, here.g, here.gz, problem, feedback))
+
+
+def noise_cost_in_halves(
+    problem: OptimalControlProblem, halves: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback
+) -> float:
+    """:func:`noise_cost` of linear controls on ``halves``, the problem in half steps, decided once in each whole one.
+
+    A control in the middle of a whole step is the mean of those at its ends, which feedback decides at its beginning.
+    """
+    here = _steps_of(halves, trajectory, np.ones(problem.scene.processes, dtype=bool))
+    x, m, dt = here.J.shape[1], problem.scene.controls, halves.dt
+    C, covariance = np.zeros((halves.steps + 1, x + 2 * m, x + 2 * m)), np.zeros((x + m, x + m))
+    middle = np.hstack([np.zeros((m, x)), 0.5 * np.eye(m), 0.5 * np.eye(m)])
+    last = np.hstack([np.zeros((m, x + m)), np.eye(m)])
+    to_middle = np.vstack([np.eye(x + m, x + 2 * m), middle])
+    for k in range(problem.steps):
+        T = decided(problem, feedback, k, x)
+        whole = covariance if T is None else T @ covariance @ T.T
+        C[2 * k] = to_middle @ whole @ to_middle.T
+        through = np.vstack([here.J[2 * k] @ to_middle, middle, last])
+        C[2 * k + 1] = through @ whole @ through.T
+        C[2 * k + 1, :x, :x] += dt * _kicks(here, 2 * k, C)
+        through = np.vstack([here.J[2 * k + 1], last])
+        covariance = through @ C[2 * k + 1] @ through.T
+        covariance[:x, :x] += dt * _kicks(here, 2 * k + 1, C)
+    C[-1, :x, :x] = covariance[:x, :x]
+    return _with_covariances(halves, trajectory, here, C)
+
+
+def _kicks(steps: _Steps, k: int, C: Floats) -> Floats:
+    """Covariance (2n, 2n) that the noise of step k adds to the state, over dt."""
+    g, gz = steps.g[k], steps.gz[k]
+    added: Floats = g @ g.T + (gz @ C[k]).reshape(len(g), -1) @ gz.reshape(len(g), -1).T
+    return added
+
+
+def _with_covariances(problem: OptimalControlProblem, trajectory: Trajectory, here: _Steps, C: Floats) -> float:
+    """The noise cost with covariances ``C`` (N + 1, Z, Z) of the variables of each step, and of the last state."""
     x = here.J.shape[1]
     over_time = (here.cost * C[:-1]).sum()
     at_end = (_end_hessian(problem, trajectory) * C[-1, :x, :x]).sum()
-    kicks = problem.dt * np.einsum("Nak,Nab,Nbk->", here.g, here.kicked, here.g, optimize=True)
-    kicks += problem.dt * np.einsum("Nakz,Nab,Nbky,Nzy->", here.gz, here.kicked, here.gz, C[:-1], optimize=True)
-    return 0.5 * float(over_time + at_end + kicks) + left_within_steps(problem, trajectory)
+    return 0.5 * float(over_time + at_end) + _of_impulses(problem, here, here.kicked, C)
 
 
-def left_within_steps(problem: OptimalControlProblem, trajectory: Trajectory) -> float:
-    """What velocities cost by the noise of their own step, beyond what its samples see of a force held over the step.
-
-    Without the step's springs a momentum decays as exp(-Z s) over a unit step, with 1 - A = Z J for the derivatives of
-    the step's end in the momentum, A, and in the held impulse, J. The mean of its covariance over the step is
-    dt sum_ij x_i x_j' phi(z_i + z_j), with phi(s) = (1 - (1 - exp(-s)) / s) / s, in modes z of Z. Zero under
-    constraints of the scene, and for impulses.
-    """
-    scene, n, h, rule = problem.scene, problem.scene.robot.dof, problem.dt, problem.rule
-    if not (problem.processes and problem.integrator.holds_noise) or scene.constraints:
+def left_within_steps(problem: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback) -> float:
+    """The part of :func:`noise_cost` that no path shows, see :func:`varpin.control.within_steps.beyond_samples`."""
+    here = _steps_of(problem, trajectory, np.ones(problem.scene.processes, dtype=bool))
+    if here.beyond is None:
         return 0.0
-    lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0)
-    velocity = velocity_at_nodes(scene, trajectory.q, trajectory.v)
-    hessian = problem.expand_running(trajectory).hessian
-    of_sample = hessian.reshape(-1, len(rule), *hessian.shape[1:]) if len(hessian) > 1 else hessian[:, None]
-    nothing = rule.copy()
-    nothing[:, [1, 2, 5, 6]] = 0.0
-    after = np.broadcast_to(np.eye(2 * n), (len(lin.A), 2 * n, 2 * n))
-    z, X = np.linalg.eig((np.eye(n) - lin.A[:, n:, n:]) @ np.linalg.pinv(lin.K[:, n:]))
-    modes = np.linalg.pinv(X) @ lin.F
-    s = z[:, :, None] + z[:, None, :].conj()
-    s = np.where(np.abs(s) < 1e-3, 1e-3, s)
-    spread = h * (modes @ np.swapaxes(modes, 1, 2).conj()) * ((1.0 + np.expm1(-s) / s) / s)
-    own = (X @ spread @ np.swapaxes(X, 1, 2).conj()).real
-    slope = velocity[:-1, :, n:]
-    whole, total = slope @ own @ np.swapaxes(slope, 1, 2), 0.0
-    for k, P in enumerate(at_samples(nothing, after, velocity)):
-        H = of_sample[:, k if of_sample.shape[1] > 1 else 0, n : 2 * n, n : 2 * n]
-        seen = P[:, n:] @ lin.G
-        total += 0.5 * h * rule[k, 0] * float((H * (whole - h * seen @ np.swapaxes(seen, 1, 2))).sum())
-    return total
+    return _of_impulses(problem, here, here.beyond, propagated(here.J, here.g, here.gz, problem, feedback))
+
+
+def _of_impulses(problem: OptimalControlProblem, steps: _Steps, hessian: Floats, C: Floats) -> float:
+    """The cost of the noise's jumps by its Hessian (N, 2n, 2n) in them, for the covariances C before the steps."""
+    twice = np.einsum("Nak,Nab,Nbk->", steps.g, hessian, steps.g, optimize=True)
+    twice += np.einsum("Nakz,Nab,Nbky,Nzy->", steps.gz, hessian, steps.gz, C[:-1], optimize=True)
+    return 0.5 * problem.dt * float(twice)
 
 
 def _end_hessian(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
@@ -190,7 +210,10 @@ def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory, processes:
     for s, whole in enumerate(wholes):
         cost += h * rule[s, 0] * np.swapaxes(whole, 1, 2) @ of_samples(hessian, samples, s) @ whole
     kicked = after_impulse(rule, hessian, velocity, N, x, h)
-    return _Steps(J, lin.G[:, :, processes], gz[:, :, processes], cost, kicked)
+    beyond = beyond_samples(problem, trajectory, lin, hessian, samples)
+    if beyond is not None:
+        kicked = kicked + beyond
+    return _Steps(J, lin.G[:, :, processes], gz[:, :, processes], cost, kicked, beyond)
 
 
 def _hessian(problem: OptimalControlProblem, steps: _Steps, W: Floats, k: int | slice) -> Floats:

@@ -303,7 +303,7 @@ class Mpc:
             StepFailure: The plant's motion, or the first motion of a search, cannot be integrated. It holds the plant's
                 motion so far; after a search, its cause is the search's error.
             CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
-            Interrupted: Ctrl-C; holds the plant's motion so far.
+            Interrupted: Ctrl-C; holds the plant's motion so far. In the first plan, a plain KeyboardInterrupt.
         """
         problem = self.problem
         report: Any = progress
@@ -335,6 +335,8 @@ class Mpc:
         q, v = problem.q0, problem.v0
         before = applied = problem.before
         (active, of_plan), age = self._first_plan(problem), 0
+        if active.status is Status.INTERRUPTED or any(finding.kind == "interrupted" for finding in of_plan):
+            raise KeyboardInterrupt
         noisy = generator is not None and plant.scene.processes > 0
         method = _method(plant, active.trajectory, dt, noisy=noisy)
         # The integrator was chosen for the first plan: the plant may leave it.
@@ -352,6 +354,9 @@ class Mpc:
                         raise _unplanned(failure, _so_far(plant, method, parts)) from failure
                     except CostError as error:
                         raise CostError(error.cost, error.problem, _so_far(plant, method, parts)) from error
+                    if fresh.status is Status.INTERRUPTED:
+                        # A search keeps its best plan and returns; the run is what Ctrl-C is to end.
+                        raise KeyboardInterrupt
                     seconds[tick] = time.perf_counter() - begin
                     iterations[tick] = fresh.iterations
                     late[tick] = seconds[tick] > self.budget

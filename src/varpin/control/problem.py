@@ -594,7 +594,10 @@ class OptimalControlProblem(Frozen):
         """
         require_motion(self.scene, trajectory)
         if self.linear and not trajectory.u_nodes.shape[1]:
-            raise InputError("the motion has no controls at nodes, and the problem's are linear between them")
+            raise InputError(
+                "the motion has no controls at nodes, and the problem's are linear between them: take the motion of a "
+                "plan, or of its policy, plan.policy.without_feedback()"
+            )
         if trajectory.steps != self.steps or abs(trajectory.dt - self.dt) > 1e-12 * self.dt:
             raise InputError(
                 f"the motion has {trajectory.steps} steps of {trajectory.dt:g} s; "

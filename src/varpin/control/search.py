@@ -25,7 +25,6 @@ from varpin.control.costs import CostError
 from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
-from varpin.control.moments import left_within_steps
 from varpin.control.multiple_shooting import GapClosing, Path, path_of
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import COMPARISON, SLOW, SUFFICIENT, refine
@@ -71,6 +70,9 @@ _EARLY, _EXTENSION = 0.85, 4.0
 # long steps and increases after a very short one, or after two short ones in a row.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
 _LONG, _SHORT, _VERY_SHORT = 0.5, 0.1, 0.01
+# A step with clipped controls is preferred to a short one where its decrease is so many times as great, and where it
+# brings no more than this share of the controls to limits.
+_MUCH_MORE, _FEW = 3.0, 0.02
 # Errors that reject a trial.
 _TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
 # Greatest regularization with which a search may converge. Controls without effect or cost need some.
@@ -468,6 +470,8 @@ class _Search:
         # Whether drives of servos have come to their limits while steps were short: from then on changes of their
         # demands are regularized, and second derivatives are used.
         self.saturated = False
+        # Whether plans leave out the limits now, and whether they may do so: no step of theirs has been rejected.
+        self.clipping, self.clips = False, problem.limited
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
@@ -543,6 +547,7 @@ class _Search:
         self.regularization, self.growth = state.regularization, state.growth
         self.bounded, self.cut = state.bounded, state.cut
         self.whole = state.whole and self.wants_whole
+        self.clips = state.clips and self.clips
         if state.saturated:
             self._take_saturation()
 
@@ -563,6 +568,7 @@ class _Search:
             history=tuple(self.history),
             whole=self.whole,
             saturated=self.saturated,
+            clips=self.clips,
         )
 
     def run(
@@ -608,11 +614,15 @@ class _Search:
                 self._note(report, started, passes)
                 self.reason = why + self._numbers(tolerance, afresh=True)
                 return ended
+            meets = self._meets_limits(self.plan)
             step = self._line_search()
             if step.length == 0.0 and self.exact:
                 passes += self._plan(exact=False)
                 more = self._line_search()
                 step = more._replace(trials=step.trials + more.trials, hidden=max(step.hidden, more.hidden))
+            if step.length <= _SHORT and meets:
+                more, added = self._clipped_instead(step)
+                step, passes = more, passes + added
             self._note(report, started, passes, step)
             if step.length == 0.0 and self._decrease_at_most(step.hidden):
                 self.reason = f"{self._expected()}, and rounding hides {step.hidden:.1e} of the cost"
@@ -826,6 +836,7 @@ class _Search:
                 self.exact,
                 along=self.along,
                 demands=self.saturated,
+                clipped=self.clipping,
             )
             if self.plan is not None:
                 self.planned = self.trajectory, self.regularization, self.exact
@@ -861,7 +872,7 @@ class _Search:
                     return plan, float(regularization)
         return None, np.inf
 
-    def _line_search(self) -> _Step:
+    def _line_search(self, shortest: float = 0.0) -> _Step:
         """Move to the first trial along the plan with sufficient decrease of the expected cost, (O13)."""
         if self.plan is None:
             return _Step(0.0, 0, 0.0, 0.0)
@@ -873,7 +884,7 @@ class _Search:
             added,
             self.cost + (float(added.sum()) if added.size else 0.0),
         )
-        left: Sequence[float] = _lengths(self.backtracking)
+        left: Sequence[float] = [length for length in _lengths(self.backtracking) if length > shortest]
         for bounds in self._bounds():
             cut = []
             for step in left:
@@ -912,6 +923,35 @@ class _Search:
         elif tried is not None:
             hidden = rounding(self.problem, self.trajectory, self.shares, tried, self.plan.model)
         return _Step(length, trials, -taken.expected if length > 0.0 else 0.0, hidden)
+
+    def _meets_limits(self, plan: Plan) -> bool:
+        """Whether a plan holds controls at their limits, and no control is there on the motion it is around."""
+        return self.anew and self.clips and not plan.feedback.any(axis=2).all() and self._at_limits() == 0.0
+
+    def _at_limits(self) -> float:
+        """Share of the motion's controls that are at a limit."""
+        lower, upper = self.problem.control_limits
+        u = self.problem.decided(self.trajectory)
+        return float(((u <= lower) | (u >= upper)).mean())
+
+    def _clipped_instead(self, step: _Step) -> tuple[_Step, int]:
+        """The better of a short step and one along the plan without limits, whose trials clip the controls.
+
+        A control that a plan holds at a limit has no feedback, also on trials so short that it is far from there.
+        """
+        after = self.plan, self.planned, self.trajectory, self.shares, self.cost, self.above, self.before, self.jumps
+        if step.length > 0.0 and self.before is not None:
+            self.trajectory, self.shares, self.cost, self.above = self.before
+        self.clipping = True
+        passes = self._plan()
+        self.clipping, self.planned = False, None
+        other = self._line_search(_SHORT)
+        trials = step.trials + other.trials
+        if other.decrease > _MUCH_MORE * step.decrease and self._at_limits() <= _FEW:
+            return other._replace(trials=trials), passes
+        self.clips = False
+        self.plan, self.planned, self.trajectory, self.shares, self.cost, self.above, self.before, self.jumps = after
+        return step._replace(trials=trials), passes
 
     def _divides_others(self, trial: _Trial) -> bool:
         """Whether a trial divides other steps into parts than the motion."""
@@ -1025,9 +1065,7 @@ class _Search:
             feedforward=np.zeros((R, m)) if plan is None else plan.feedforward,
             gradient=np.full((R, m), np.nan) if plan is None else plan.gradient,
             cost=self.cost,
-            noise_cost=(np.nan if problem.scene.processes else 0.0)
-            if plan is None
-            else plan.noise + left_within_steps(problem, self.trajectory),
+            noise_cost=(np.nan if problem.scene.processes else 0.0) if plan is None else plan.noise,
             status=status,
             reason=reason,
             history=tuple(self.history),

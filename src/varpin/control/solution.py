@@ -21,6 +21,7 @@ from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refined import Refinement
 from varpin.control.solution_file import read, write
+from varpin.control.spread import Feedback
 from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
 from varpin.linearization import velocity_at_nodes
@@ -358,14 +359,16 @@ class Solution(Frozen):
             VarpinError: Fewer than two paths succeeded, or workers were lost repeatedly.
             MonteCarloInterrupted: Ctrl-C; holds the result of the paths done. It is a KeyboardInterrupt.
         """
-        policy = self.policy if feedback else self.policy.without_feedback()
+        policy, gains = self.policy, Feedback(self.gains, self.previous_gains)
+        if not feedback:
+            policy, gains = policy.without_feedback(), Feedback(np.zeros(self.gains.shape), None)
         return monte_carlo(
             self.problem,
             policy,
             self.expected_cost,
             paths,
             rng,
-            within=left_within_steps(self.problem, self.trajectory) if np.isfinite(self.noise_cost) else 0.0,
+            within=left_within_steps(self.problem, self.trajectory, gains) if np.isfinite(self.noise_cost) else 0.0,
             workers=workers,
             executor=executor,
             progress=progress,

@@ -338,6 +338,7 @@ class ExpandedSteps:
         expected: Floats,
         rate: Floats,
         pull: Floats,
+        within: Floats | None = None,
     ) -> None:
         """Raises ValueError for arrays that do not fit each other."""
 
@@ -402,8 +403,12 @@ class RootPass(_Found):
         gains: Gains,
         running: Squares,
         change: Squares | None = None,
+        within: Squares | None = None,
     ) -> int:
-        """See :class:`BackwardPass`; ``running`` has the costs of the samples, ``change`` those of R changes."""
+        """See :class:`BackwardPass`; ``running`` has the costs of the samples, ``change`` those of R changes.
+
+        ``within`` has those of the noise's jumps where the steps have them.
+        """
 
 def foresee(hold: int, steps: ExpandedSteps, gains: Gains, state: Floats, expected: Floats, moves: Floats) -> None:
     """The linearized motion under gains, each control clipped to its limits.

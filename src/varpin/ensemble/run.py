@@ -71,8 +71,8 @@ def simulate_ensemble(
             :class:`LinearPolicy`, evaluated at the state of each path.
 
     Other Args:
-        integrator: If left out, ``Midpoint(kick="held")``. In a scene without noise, the integrator that :func:`varpin.simulate`
-            takes for a few of the paths. ``Ensemble.integrator`` says which.
+        integrator: If left out, ``Midpoint(kick="held")``. In a scene without noise, the integrator that
+            :func:`varpin.simulate` takes for a few of the paths. ``Ensemble.integrator`` says which.
         store: Keep every path. Otherwise only the statistics are kept, and memory does not grow with P N.
         quantiles: Levels in [0, 1]; with an empty list, workers return moments alone. Quantiles are exact if paths are
             stored, or if P (N + 1) 2n is at most 33 million. Otherwise they are read from histograms of up to 1000 bins

@@ -517,7 +517,6 @@ def _along(scene: Scene, q: Floats) -> Floats:
 
 
 @functools.lru_cache(maxsize=256)
-@functools.lru_cache(maxsize=64)
 def _core_guards(given: Guard | None, balance: float = 1.0, budget: float = 1.0) -> Guards:
     guard = given or Guard(max_halvings=0)
     return Guards.make(

@@ -220,7 +220,9 @@ class JointStop(Force):
     """A spring and a damper beyond the ends of a joint's range; they store potential energy and dissipate.
 
     Stiffness and damping rise smoothly from 0 to their full values over the first ``width`` beyond an end, so that
-    forces have continuous derivatives.
+    forces have continuous derivatives: at a depth x beyond it they have the share s = 3 y^2 - 2 y^3, y = min(x / width,
+    1). The spring's force is stiffness times the integral of s over the depth, so stiffness (x - width / 2) beyond the
+    width, and the damper's damping s v.
 
     Attributes:
         stiffness: >= 0 [N m/rad or N/m].

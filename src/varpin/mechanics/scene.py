@@ -299,12 +299,16 @@ class Scene(Frozen):
         return damped or self.custom is not None
 
     @cached_property
-    def linear(self) -> bool:
-        """Whether all forces beside the robot's own are linear in a joint's q and v: no constraints, noise or kinks."""
+    def smooth(self) -> bool:
+        """Whether all forces beside the robot's own are smooth in a joint's q and v: no constraints, noise or kinks.
+
+        Dry friction without Stribeck's effect is smooth over its width.
+        """
         if self.constraints or self.couplings or self.processes or self.custom is not None:
             return False
         return all(
             element.kind in ("JointSpring", "JointDamper")
+            or (element.kind == "CoulombFriction" and element.values[0] == element.values[2])
             or (element.kind == "PositionServo" and bool(np.isinf(element.values[2])))
             for element in self.elements
         )

@@ -1,8 +1,8 @@
 """Motions that are clearly right: most plain motions, which are told without repeating any step.
 
 The equations of motion are evaluated along the polynomials through the nodes. Where they hold far better than any
-warning needs, and no force has a kink or is faster than the step, the check of :mod:`varpin.simulation.soundness` would
-find nothing, and is left out. All other motions go through it: only that check gives warnings.
+warning needs, and no force has a kink, the check of :mod:`varpin.simulation.soundness` would find nothing, and is left
+out. All other motions go through it: only that check gives warnings.
 """
 
 from __future__ import annotations
@@ -18,16 +18,20 @@ from varpin.core import Stretch, clear_growth
 from varpin.integrators import Integrator, Reference
 from varpin.integrators.tableau import interpolation
 from varpin.integrators.within import Times
+from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import EVEN, LIGHT, LITTLE, WINDOW, WRONG_ENERGY, WRONG_MOTION, WRONG_VELOCITY
 from varpin.simulation.growth import ALIGNED, FEWEST, JOINTS, NEAR, growth_bound
 from varpin.simulation.growth import WARNED as GROWTH_WARNED
+from varpin.simulation.kinks import turns_over
 from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.trajectory import Trajectory
 
-# Errors of a motion that is clearly right, as a share of what the check would accept; and rates of its dampers, in
-# units of 1 / dt, where 2 is what the check calls fast.
+# Errors of a motion that is clearly right, as a share of what the check would accept; and rates of its dampers along
+# single steps, in units of 1 / dt, where 2 is what the check calls fast.
 _SHARE, _RATE = 0.5, 1.8
+# Largest change of dry friction in a step, as a share of its level.
+_TURNS = 0.25
 # Parts of the warnings' thresholds that the check accepts in a window: for an error that grows over a period, and for
 # one that adds up over the motion.
 _PERIOD, _ADDS = 0.125, 0.25
@@ -53,10 +57,11 @@ def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory, 
     """
     if isinstance(integrator, Reference) or not trajectory.steps:
         return False
-    if not scene.linear or scene.robot.dof > JOINTS or scene.group.any():
+    if not scene.smooth or scene.robot.dof > JOINTS or scene.group.any() or turns_over(scene, trajectory, _TURNS):
         return False
     times = integrator.stage_times if trajectory.u_stages.shape[1] else ()
     narrow, wide = _stretches(times, integrator.order <= _SHORT_STEPS)
+    # Between the nodes at which dampers are looked at, dry friction may be any damper.
     allowed = clear_growth(
         scene.core,
         trajectory.q,
@@ -71,7 +76,7 @@ def clearly_right(scene: Scene, integrator: Integrator, trajectory: Trajectory, 
         wide=wide,
         still=_STILL,
         energy=_SHARE * WRONG_ENERGY,
-        damping=_RATE,
+        damping=0.0 if of_kind(scene.elements, "CoulombFriction") else _RATE,
         damped_at=_DAMPERS,
         travel=_SHARE * _PERIOD * WRONG_MOTION,
         velocity=_SHARE * _PERIOD * WRONG_VELOCITY,

@@ -86,10 +86,20 @@ def _stopping(scene: Scene, trajectory: Trajectory) -> NDArray[np.bool_]:
     return found
 
 
+def turns_over(scene: Scene, trajectory: Trajectory, most: float) -> bool:
+    """Whether the dry friction of a joint changes by more than a share of its level in a step."""
+    return any(np.abs(change).max() > most for change in _turns(scene, trajectory))
+
+
 def _turning(scene: Scene, trajectory: Trajectory) -> NDArray[np.bool_]:
     """Steps (N,) in which dry friction changes by much."""
     found = np.zeros(trajectory.steps, dtype=np.bool_)
-    for friction in of_kind(scene.elements, "CoulombFriction"):
-        side = np.tanh(trajectory.v[:, friction.coordinate] / friction.values[1])
-        found |= np.abs(np.diff(side)) > _TURNS
+    for change in _turns(scene, trajectory):
+        found |= np.abs(change) > _TURNS
     return found
+
+
+def _turns(scene: Scene, trajectory: Trajectory) -> Iterator[Floats]:
+    """For each joint with dry friction, its changes over the steps (N,), in units of its level."""
+    for friction in of_kind(scene.elements, "CoulombFriction"):
+        yield np.diff(np.tanh(trajectory.v[:, friction.coordinate] / friction.values[1]))

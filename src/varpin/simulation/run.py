@@ -28,7 +28,7 @@ from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstabl
 from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import MotionRecord, function_error
 from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
-from varpin.simulation.start import in_other_units, on_constraints
+from varpin.simulation.start import controls_in_degrees, in_other_units, on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
 from varpin.simulation.tolerance import Steps
 from varpin.support.checks import JointValues, count, joint_array
@@ -219,6 +219,9 @@ def simulated(
             found = (*found, *undersampled(controls, scene, integrator, trajectory, right=right))
         if check and isinstance(controls, OpenLoop | FirstOrderHold):
             found = (*found, *begins_elsewhere(controls, scene, q0, v0))
+        if not any(finding.kind == "start in degrees" for finding in early):
+            # Without controls servos hold the start.
+            early = (*early, *controls_in_degrees(scene, trajectory.u))
         found = (*noise_forgotten(scene, rng, increments), *early, *found)
         trajectory = with_warnings(trajectory, found)
         if accuracy is not None:

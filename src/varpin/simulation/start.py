@@ -1,6 +1,8 @@
-"""The start of a motion, moved onto the constraints of the scene."""
+"""The start of a motion, moved onto the constraints of the scene, and units that look wrong."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from varpin.simulation.soundness import Finding
 _ROUNDING = 1e-9
 # Gravity within this share of a thousand times the Earth's looks like mm/s^2.
 _EARTHLY = 0.01
+_PULL = math.hypot(*EARTH)
 # First number of a spring's rest among its values, after both points and the stiffness.
 _SPRINGS = {"FrameSpring": 9, "FrameLengthSpring": 7}
 
@@ -29,17 +32,28 @@ def in_other_units(scene: Scene, q0: Floats) -> tuple[Finding, ...]:
     return tuple(Finding(kind, sentence) for kind, sentence in told.items() if sentence)
 
 
+def controls_in_degrees(scene: Scene, controls: Floats) -> tuple[Finding, ...]:
+    """A warning of positions in controls (N, m), of servos and prescribed joints, that look like degrees."""
+    if not (scene.holding.any() and len(controls)):
+        return ()
+    positions = controls @ scene.holding
+    most = positions[np.abs(positions).argmax(axis=0), np.arange(positions.shape[1])]
+    sentence = degrees_hint(scene.robot, "the position in controls", most)
+    return (Finding("controls in degrees", sentence),) if sentence else ()
+
+
 def _gravity_hint(scene: Scene) -> str:
     """A sentence about gravity that looks like mm/s^2."""
-    pull = float(np.linalg.norm(scene.gravity))
-    earth = float(np.linalg.norm(EARTH))
-    if not abs(pull / 1000.0 - earth) < _EARTHLY * earth:
+    pull = math.hypot(*scene.gravity.tolist())
+    if not abs(pull / 1000.0 - _PULL) < _EARTHLY * _PULL:
         return ""
     return f"gravity is {pull:g} m/s^2, a thousand times the Earth's: it may be in mm/s^2, and gravity is in m/s^2"
 
 
 def _springs_hint(scene: Scene) -> str:
     """A sentence about a spring between frames whose ends, or whose length at rest, look like millimetres."""
+    if not scene.couplings:
+        return ""
     springs = [own for own in scene.couplings if own.kind in _SPRINGS]
     lengths = {}
     for number, spring in enumerate(springs, 1):

@@ -229,7 +229,8 @@ def require_finite(name: str, array: Floats) -> Floats:
     Raises:
         InputError: An entry is not finite; the message names the first one.
     """
-    if not np.isfinite(array).all():
+    # A sum of squares is the faster look, and may overflow.
+    if not math.isfinite(np.vdot(array, array)) and not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         entry = f"{name}[{', '.join(map(str, where))}]" if where else name
         raise InputError(f"{entry} is {array[where]}; it must be finite")

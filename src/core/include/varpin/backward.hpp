@@ -3,7 +3,8 @@
 //
 // The value after a step is v0 + Wx . x' + Wu . u + (1/2) (x', u) W (x', u), in deviations from the nominal trajectory;
 // it depends on u only while a control is held over several steps. With x' = A x + B u + sum_i (g_i + Gx_i x + Gu_i u)
-// dw_i, the cost of the step expanded at its samples z = D (x, u), and S = h (Wxx + h dz/dx'' l_zz dz/dx'),
+// dw_i, the cost of the step expanded at its samples z = D (x, u), and S = h (Wxx + h dz/dx'' l_zz dz/dx' + w_xx)
+// with w a further cost of the noise's jump, if any,
 //
 //     Q_x  = h D'l_z + A'Wx + sum_i Gx_i' S g_i,        Q_xx = h D'l_zz D + A'Wxx A + sum_i Gx_i' S Gx_i,
 //     k    = -Q_uu^-1 Q_u,    K = -Q_uu^-1 Q_ux,        V_xx = Q_xx + K'(Q_uu K + Q_ux) + Q_ux'K,
@@ -194,6 +195,12 @@ class BackwardPass {
         const auto samples = static_cast<std::ptrdiff_t>(steps.rule.size());
         for (int i = 0; i < x; ++i) {
             for (int j = 0; j < x; ++j) S[i][j] = h * W[i][j];
+        }
+        if (steps.within) {
+            const double* more = steps.within + s * x * x;
+            for (int i = 0; i < x; ++i) {
+                for (int j = 0; j < x; ++j) S[i][j] += h * more[i * x + j];
+            }
         }
         for (std::ptrdiff_t k = 0; k < samples; ++k) {
             if (!step.expand_after(steps.rule[k])) continue;

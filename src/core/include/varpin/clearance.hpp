@@ -14,7 +14,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <span>
+#include <optional>
 #include <vector>
 
 #include "varpin/dense.hpp"
@@ -44,7 +44,7 @@ struct Stretch {
 struct Clear {
     double still = 0.0;          // velocity up to which nothing moves
     double energy = 0.0;         // of the balance, as a share of the energy that is turned over
-    double damping = 0.0;        // rates of dampers, in units of 1 / h
+    double damping = 0.0;        // rates of dampers along single steps, in units of 1 / h
     double whole = 0.0;          // sum over the motion, as a share of the travel
     double grown = 0.0;          // this sum, grown as the fastest mode does
     double aligned = 0.0;        // share of a mode's exponent by which errors grow
@@ -86,13 +86,14 @@ class Clearance {
     // each step.
     double growth(const double* defect, const std::int64_t* substeps) {
         const Glance seen = glance(mechanism_, record_, substeps);
-        const bool plain = seen.fastest > clear_.still && !seen.split && !seen.pulled && balanced(defect) && !damped();
+        const bool plain = seen.fastest > clear_.still && !seen.split && !seen.pulled && balanced(defect) &&
+                           !(clear_.known >= 0.0 && damped());
         if (!plain) return 0.0;
         double found = growth_of_errors();
         // Controls may have kinks at the nodes.
-        if (found < std::numeric_limits<double>::infinity() && wide_ && within_) {
+        if (found == 0.0 && wide_ && within_) {
             wide_ = nullptr;
-            found = larger(found, growth_of_errors());
+            found = growth_of_errors();
         }
         return found;
     }
@@ -112,6 +113,7 @@ class Clearance {
     std::vector<double> step_q_, step_v_;  // errors of the steps of a stretch (steps, n)
     std::int64_t from_ = 0, until_ = 0;    // its nodes
     std::vector<double> q_, v_, off_q_, off_v_;
+    std::optional<bool> damped_;
 
     bool balanced(const double* defect) const {
         double off = 0.0;
@@ -124,12 +126,19 @@ class Clearance {
 
     // Whether a damper may be faster than the step.
     bool damped() {
+        if (!damped_) damped_ = outpaced();
+        return *damped_;
+    }
+
+    bool outpaced() {
         if (!mechanism_.forces.any()) return false;
+        std::vector<double> force(n_);
         const std::int64_t last = clear_.damped_at - 1;
         for (std::int64_t i = 0; i <= last; ++i) {
             const std::int64_t node = i * record_.steps / last;
-            force_at(std::min(node, record_.steps - 1), force_.data());
-            inertias_.at(record_.q + node * n_, record_.v + node * n_, force_.data());
+            force_at(std::min(node, record_.steps - 1), force.data());
+            inertias_.masses_at(record_.q + node * n_);
+            inertias_.forces_at(record_.q + node * n_, record_.v + node * n_, force.data());
             if (!inertias_.outpaces_dampers(clear_.damping / record_.h)) return true;
         }
         return false;
@@ -170,12 +179,13 @@ class Clearance {
         return steps < clear_.few || grows_less(factor) ? std::numeric_limits<double>::infinity() : factor;
     }
 
-    // The errors of the steps of a stretch with step k; false where a mass matrix is not positive definite.
+    // The errors of the steps of a stretch with step k; false where they are not known.
     bool examine(std::int64_t k) {
         const bool pair = wide_ && record_.steps > 1;
         if (pair && k + 1 < record_.steps && alike(k)) return examine(*wide_, k);
         if (pair && k > 0 && alike(k - 1)) return examine(*wide_, k - 1);
-        return examine(narrow_, k);
+        // Along one step, methods of few stages fulfil the equations however wrong a fast damper's velocity is.
+        return !damped() && examine(narrow_, k);
     }
 
     // Whether the controls of steps k and k + 1 do not jump between them.
@@ -281,7 +291,7 @@ class Clearance {
             dynamics.acceleration(force_.data(), a_.data());
             dynamics.differentiate(v, a_.data());
             dynamics.derivatives(aq.data(), av.data(), af.data());
-            inertias_.at(q);
+            inertias_.masses_at(q);
             const auto times_mass = [&](const std::vector<double>& x, std::vector<double>& out) {
                 for (int i = 0; i < n; ++i) {
                     for (int j = 0; j < n; ++j) {

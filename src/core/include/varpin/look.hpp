@@ -48,9 +48,14 @@ class Inertias {
 
     int dof() const { return jet_.dof; }
     void at(const double* q) { lagrangian_jet(mechanism_, q, still_.data(), jet_); }
+    // Only M.
+    void masses_at(const double* q) { mass_matrix(mechanism_, q, jet_); }
     // With the forces at velocities v under the controls' forces f (n).
     void at(const double* q, const double* v, const double* f) {
         at(q);
+        forces_at(q, v, f);
+    }
+    void forces_at(const double* q, const double* v, const double* f) {
         sum_forces(mechanism_, q, v, f, forces_.data(), jet_.couplings, by_q_.data(), by_v_.data());
     }
     double diagonal(int c) const { return mass(c, c); }
@@ -224,7 +229,7 @@ inline Turnover turnover(const Mechanism& mechanism, const Record& record, doubl
         const auto node = last ? record.steps : static_cast<std::int64_t>(i * even_share);
         if (node == before) continue;
         before = node;
-        inertias.at(record.q + node * n);
+        inertias.masses_at(record.q + node * n);
         for (int c = 0; c < n; ++c) found.kinetic_of[c] = larger(found.kinetic_of[c], inertias.diagonal(c));
     }
     for (int c = 0; c < n; ++c) {
@@ -300,7 +305,7 @@ class Yardstick {
                 speed_[c].add(v[k * n + c]);
             }
         }
-        inertias_.at(q);
+        inertias_.masses_at(q);
         energy_ = 0.0;
         double far = 0.0;
         for (std::size_t c = 0; c < n; ++c) {

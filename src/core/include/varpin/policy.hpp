@@ -121,8 +121,8 @@ inline void noise_impulse(const Mechanism& mechanism, double part, const double*
     }
 }
 
-// (N2) with the noise held: the constant force over a step of length h whose impulse is that of the noise, plus a drift
-// (n), which may be null.
+// The constant force over a step of length h whose impulse is that of the noise, (N2), plus a drift (n), which may be
+// null.
 inline void held_noise(const Mechanism& mechanism, double h, const double* drift, const double* q, const double* center,
                        const double* u, const double* increments, double* force) {
     noise_impulse(mechanism, 1.0 / h, q, center, u, increments, force);

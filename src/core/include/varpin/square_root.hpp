@@ -109,9 +109,9 @@ class RootPass {
     }
 
     // A pass over a block of steps, as BackwardPass::run. `running` has the costs of the samples, `change` the costs of
-    // changes of the control, if any.
+    // changes of the control, `within` the further costs of the noise's jumps, if any.
     std::ptrdiff_t run(double h, int hold, double regularization, const ExpandedSteps& steps, const Squares& running,
-                       const Squares& change, const Gains& gains) {
+                       const Squares& change, const Squares& within, const Gains& gains) {
         for (std::ptrdiff_t s = steps.steps - 1; s >= 0; --s) {
             if (gains.costate) std::copy_n(costate.data(), x, gains.costate + s * x);
             const bool decides = s % hold == 0;
@@ -119,6 +119,7 @@ class RootPass {
             carry(steps, s, steps.rate || (s + 1) % hold != 0);
             noise_root.reset(x);
             if (steps.processes > 0) add_value_to_noise_root(std::sqrt(h));
+            if (steps.processes > 0 && steps.within) add_to_noise_root(std::sqrt(h), within.root_of(s, x));
             add_running_cost(h, steps, s, running);
             if (steps.processes > 0) add_noise(steps, s, gains.spread + s * x * x);
             linear.swap(before);
@@ -185,6 +186,13 @@ class RootPass {
         for (int i = 0; i < root.rows(); ++i) {
             double* row = noise_root.push();
             for (int c = 0; c < x; ++c) row[c] = factor * root[i][c];
+        }
+    }
+
+    void add_to_noise_root(double factor, const double* more) {
+        for (int i = 0; i < x; ++i) {
+            double* row = noise_root.push();
+            for (int c = 0; c < x; ++c) row[c] = factor * more[i * x + c];
         }
     }
 

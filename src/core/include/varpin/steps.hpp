@@ -35,6 +35,7 @@ struct ExpandedSteps {
     bool one_hessian = false;
     const double* velocity = nullptr;   // (N + 1, n, 2n) dv/dx at the nodes, or null for x = (q, v)
     const double* curvature = nullptr;  // (N, 2n + m, 2n + m) added to the Hessian in (x, u), or null
+    const double* within = nullptr;     // (N, 2n, 2n) Hessian of further costs of the noise's jumps, or null
     // For each of R decisions:
     const double* slack = nullptr;  // (R, 2, m) lower and upper limit of the change of each control, or null
     // (R, 2n + m) expected state and previous control, at which controls are kept within their limits; null for the

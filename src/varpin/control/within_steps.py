@@ -1,0 +1,73 @@
+"""What noise costs within the steps of a plan, beyond what the samples of a step see of a force held over it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from varpin.arrays import Floats
+from varpin.control.linear_controls import after_impulse, of_samples
+from varpin.control.problem import OptimalControlProblem
+from varpin.linearization import Linearization, velocity_at_nodes
+from varpin.trajectory import Trajectory
+
+# Terms of the series for a short part of a step, and the decay over it up to which its error is a rounding error.
+_TERMS, _SHORT = 11, 0.125
+
+
+def beyond_samples(
+    problem: OptimalControlProblem, motion: Trajectory, lin: Linearization, hessian: Floats, samples: int
+) -> Floats | None:
+    """The Hessian (N, 2n, 2n), in the noise's jump of the state after a step, of what velocities cost within the step.
+
+    It is added to that of the samples, :func:`after_impulse`, for the exact mean over the step of the cost of the
+    velocity by white noise that begins with the step. Without the step's springs a momentum decays as exp(-Z s) over a
+    unit step, with 1 - A = Z J for the derivatives of the step's end in the momentum, A, and in the held impulse, J.
+    So an impulse f adds f' B f / 2, with B the integral of (1 - s) exp(-Z s)' l_pp exp(-Z s). None where there is
+    nothing to add: without noise or costs of velocities, for impulses, for sums over nodes (``sampling="start"``), and
+    under constraints of the scene.
+
+    Args:
+        problem: The problem.
+        motion: Nodes and controls of the steps.
+        lin: The linearized steps.
+        hessian: Hessians of the running cost at the samples of each step, first those of the problem's rule.
+        samples: Number of samples of a step.
+    """
+    n, h, rule, N = problem.scene.robot.dof, problem.dt, problem.rule, lin.steps
+    speeds, held = slice(n, 2 * n), problem.integrator.holds_noise and problem.sampling != "start"
+    if not (held and problem.scene.processes and hessian[:, speeds, speeds].any()) or problem.scene.constraints:
+        return None
+    of_speeds = np.zeros((N, len(rule), 2 * n, 2 * n))
+    for s in range(len(rule)):
+        of_speeds[:, s, speeds, speeds] = of_samples(hessian, samples, s)[:, speeds, speeds]
+    velocity = velocity_at_nodes(problem.scene, motion.q, motion.v)
+    found = -after_impulse(rule, of_speeds.reshape(-1, 2 * n, 2 * n), velocity, N, 2 * n, h)
+    slope, to_impulse = velocity[:-1, :, n:], np.linalg.pinv(lin.J[:, n:])
+    whole = np.einsum("s,Nsab->Nab", h * rule[:, 0], of_speeds[:, :, speeds, speeds])
+    decay = (np.eye(n) - lin.A[:, n:, n:]) @ to_impulse
+    mean = mean_of_decay(decay, np.swapaxes(slope, 1, 2) @ whole @ slope)
+    found[:, n:, n:] += np.swapaxes(to_impulse, 1, 2) @ mean @ to_impulse
+    return found
+
+
+def mean_of_decay(Z: Floats, H: Floats) -> Floats:
+    """The integral of (1 - s) exp(-Z s)' H exp(-Z s) over s from 0 to 1, for matrices (N, n, n)."""
+    size = float(np.linalg.norm(Z, axis=(1, 2)).max())
+    doublings = max(0, math.ceil(math.log2(size / _SHORT))) if size > 0.0 else 0
+    part = 0.5**doublings
+    flow = np.broadcast_to(np.eye(Z.shape[1]), Z.shape)
+    term, power, scale = H, flow, part
+    total, first = np.zeros(H.shape), np.zeros(H.shape)
+    for k in range(_TERMS):
+        # H, and its derivatives in time under the decay.
+        total, first = total + scale * term, first + scale * part * (k + 1) / (k + 2) * term
+        power = power @ Z * (-part / (k + 1))
+        flow, turned = flow + power, term @ Z
+        term, scale = -(turned + np.swapaxes(turned, 1, 2)), scale * part / (k + 2)
+    for _ in range(doublings):
+        later = np.swapaxes(flow, 1, 2)
+        total, first = total + later @ total @ flow, first + later @ (first + part * total) @ flow
+        flow, part = flow @ flow, 2.0 * part
+    return total - first
