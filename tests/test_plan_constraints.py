@@ -700,7 +700,7 @@ def test_noise_that_depends_on_the_motion_does_not_move_a_plan_within_constraint
 
 
 @pytest.mark.parametrize("family", ["velocities", "positions"])
-@pytest.mark.parametrize(("damping", "fast"), [(200.0, True), (0.5, False)])
+@pytest.mark.parametrize(("damping", "fast"), [(200.0, True), (0.2, False)])
 def test_a_margin_of_velocities_under_fast_damping_is_told_of(family, damping, fast):
     """The variances of velocities are too small there; those of positions are not."""
     scene = vp.Scene(ROBOT, damping=damping, noise=vp.AdditiveNoise(0.1))
