@@ -240,6 +240,7 @@ class VariationalStepper final : public Stepper {
         const std::int64_t steps = nodes.steps;
         const int m = mechanism.controls, k = mechanism.diffusion.processes, stages = step_equation.stages;
         const bool noisy = increments != nullptr && k > 0;
+        const bool kicks = noisy && !held, spreads = noisy && held;
         for (std::int64_t path = 0; path < nodes.paths; ++path) {
             PathState& state = states[path];
             double* u = nodes.u + path * steps * m;
@@ -252,11 +253,11 @@ class VariationalStepper final : public Stepper {
                 const double* dw = noisy ? increments + row * k : nullptr;
                 apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
                 const double* felt = noisy ? mean_control(commands, path, s, u, mean) : nullptr;
-                if (noisy && !held) noise_kick(left, felt, dw, state);
+                if (kicks) noise_kick(left, felt, dw, state);
                 if (impulses) kick(impulses + 2 * row * n, state);
                 const double* within = stage_controls(commands, path, s, stages, u, line);
                 const double* extra = drift ? drift + row * n : nullptr;
-                if (noisy && held) {
+                if (spreads) {
                     held_noise(mechanism, h, extra, state.q.data(), state.center.data(), felt, dw, bend.data());
                     extra = bend.data();
                 }
@@ -271,7 +272,7 @@ class VariationalStepper final : public Stepper {
                 nodes.ended[path] = static_cast<std::int64_t>(outcome);
                 if (outcome != Outcome::solved) break;
                 state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
-                if (noisy && !held && left < 1.0) noise_kick(1.0 - left, felt, dw, state);
+                if (kicks && left < 1.0) noise_kick(1.0 - left, felt, dw, state);
                 if (impulses) kick(impulses + (2 * row + 1) * n, state);
                 record_node(state, n, nodes, row);
                 nodes.done[path] = s + 1;
