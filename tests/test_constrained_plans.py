@@ -253,30 +253,8 @@ def test_an_ensemble_under_a_plan_is_what_its_model_says():
     assert (np.abs(found.mean[-1] - center) < 5.0 * deviation / np.sqrt(500)).all()
     by_moments = plan.monte_carlo(300, rng=1)
     assert abs(by_moments.cost - by_moments.predicted) < 4.0 * by_moments.standard_error
-    again = vp.simulate_ensemble(
-        scene,
-        problem.q0,
-        problem.v0,
-        dt=dt,
-        steps=steps,
-        paths=40,
-        rng=0,
-        controls=plan.policy,
-        integrator=problem.integrator,
-        workers=1,
-    )
-    other = vp.simulate_ensemble(
-        scene,
-        problem.q0,
-        problem.v0,
-        dt=dt,
-        steps=steps,
-        paths=40,
-        rng=0,
-        controls=plan.policy,
-        integrator=problem.integrator,
-        workers=2,
-    )
+    given = {"dt": dt, "steps": steps, "paths": 40, "rng": 0, "controls": plan.policy, "integrator": problem.integrator}
+    again, other = (vp.simulate_ensemble(scene, problem.q0, problem.v0, **given, workers=w) for w in (1, 2))
     np.testing.assert_array_equal(again.q, other.q)
     g = scene.core.constraints(again.q.reshape(-1, 4))[0]
     assert np.abs(g).max() < 1e-12

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from expected_cost import expected_cost_slopes
 from findings import about
 
 import varpin as vp
-from varpin.control.backward import Along, backward
+from varpin.control.backward import backward
 from varpin.control.moments import left_within_steps, noise_cost, noise_cost_in_halves
 from varpin.control.spread import Feedback, covariances
 
@@ -51,22 +52,9 @@ def test_the_gradient_is_that_of_the_expected_cost(noise: object, options: dict)
     m = problem.scene.controls
     u = 2.0 * np.random.default_rng(0).normal(size=(problem.decisions, m))
 
-    def made(controls: np.ndarray):
-        motion = problem.simulate(line(problem, controls))
-        plan = backward(problem, motion, 0.0)
-        return problem.cost_of(motion) + plan.noise, motion, plan
-
-    _, motion, plan = made(u)
-    along = Along(problem, motion)
-    along.differentiate_noise(plan, np.ones(problem.scene.processes, dtype=bool))
-    whole, step, found = backward(problem, motion, 0.0, along=along).gradient, 1e-4, np.empty_like(u)
-    for index in np.ndindex(u.shape):
-        away = np.zeros_like(u)
-        away[index] = step
-        near, far = (made(u + k * away)[0] - made(u - k * away)[0] for k in (1, 2))
-        found[index] = (8.0 * near - far) / (12.0 * step)
+    whole, found, held = expected_cost_slopes(problem, lambda controls: problem.simulate(line(problem, controls)), u)
     np.testing.assert_allclose(whole, found, atol=5e-8 * np.abs(found).max())
-    assert np.abs(plan.gradient - found).max() > 1e-5 * np.abs(found).max()
+    assert np.abs(held - found).max() > 1e-5 * np.abs(found).max()
 
 
 @pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), CONTROL + STATE, SLIDING])

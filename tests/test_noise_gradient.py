@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from expected_cost import expected_cost_slopes
 from refusals import refused
 
 import varpin as vp
-from varpin.control.backward import Along, backward
+from varpin.control.backward import backward
 from varpin.control.moments import noise_cost
 from varpin.control.spread import Feedback
 
@@ -45,22 +46,12 @@ def test_it_is_that_of_the_expected_cost(noise: object, options: dict) -> None:
     problem = reach(noise, **options)
     u = 2.0 * np.random.default_rng(0).normal(size=(problem.decisions, 2))
 
-    def made(controls: np.ndarray):
-        motion = problem.simulate(np.repeat(controls, problem.hold, axis=0))
-        plan = backward(problem, motion, 0.0)
-        return problem.cost_of(motion) + plan.noise, motion, plan
+    def made(controls: np.ndarray) -> vp.Trajectory:
+        return problem.simulate(np.repeat(controls, problem.hold, axis=0))
 
-    _, motion, plan = made(u)
-    along = Along(problem, motion)
-    along.differentiate_noise(plan, np.ones(problem.scene.processes, dtype=bool))
-    whole, step, found = backward(problem, motion, 0.0, along=along).gradient, 1e-4, np.empty_like(u)
-    for index in np.ndindex(u.shape):
-        away = np.zeros_like(u)
-        away[index] = step
-        near, far = (made(u + k * away)[0] - made(u - k * away)[0] for k in (1, 2))
-        found[index] = (8.0 * near - far) / (12.0 * step)
+    whole, found, held = expected_cost_slopes(problem, made, u)
     np.testing.assert_allclose(whole, found, atol=2e-8 * np.abs(found).max())
-    assert np.abs(plan.gradient - found).max() > 1e-3 * np.abs(found).max()
+    assert np.abs(held - found).max() > 1e-3 * np.abs(found).max()
 
 
 @pytest.mark.parametrize("noise", [CONTROL, STATE])

@@ -34,7 +34,7 @@ from varpin.control.linear_controls import (
 from varpin.control.moments import noise_gradient
 from varpin.control.penalties import PenalizedProblem, PenalizedRate, flat, rate_columns
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.spread import Feedback
+from varpin.control.spread import Feedback, state_slopes
 from varpin.control.square_root import Squares, squares_of
 from varpin.control.within_steps import beyond_samples
 from varpin.errors import LinearizationError
@@ -576,9 +576,7 @@ class Along:
         """
         problem, motion, scene = self.problem, self.trajectory, self.problem.scene
         n, m, N = problem.scene.robot.dof, problem.scene.controls, problem.steps
-        speed = np.tile(np.eye(n, 2 * n, n), (N, 1, 1))
-        if problem.integrator.variational:
-            speed = velocity_at_nodes(scene, motion.q[:-1], motion.v[:-1])
+        speed = state_slopes(problem, motion)[:-1, n:]
         ends = 2 if problem.linear else 1
         found = np.zeros((N, 2 * n + ends * m, 2 * n + ends * m))
         for servo in limited_servos(scene.elements):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.control.linear_controls import after_impulse, at_samples, in_step, of_samples, on_lines, shifted_lines
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.spread import Feedback, decided, propagated
+from varpin.control.spread import Feedback, added_covariance, decided, propagated
 from varpin.control.within_steps import beyond_samples
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
@@ -126,19 +126,12 @@ def noise_cost_in_halves(
         C[2 * k] = to_middle @ whole @ to_middle.T
         through = np.vstack([here.J[2 * k] @ to_middle, middle, last])
         C[2 * k + 1] = through @ whole @ through.T
-        C[2 * k + 1, :x, :x] += dt * _kicks(here, 2 * k, C)
+        C[2 * k + 1, :x, :x] += dt * added_covariance(here.g[2 * k], here.gz[2 * k], C[2 * k])
         through = np.vstack([here.J[2 * k + 1], last])
         covariance = through @ C[2 * k + 1] @ through.T
-        covariance[:x, :x] += dt * _kicks(here, 2 * k + 1, C)
+        covariance[:x, :x] += dt * added_covariance(here.g[2 * k + 1], here.gz[2 * k + 1], C[2 * k + 1])
     C[-1, :x, :x] = covariance[:x, :x]
     return _with_covariances(halves, trajectory, here, C)
-
-
-def _kicks(steps: _Steps, k: int, C: Floats) -> Floats:
-    """Covariance (2n, 2n) that the noise of step k adds to the state, over dt."""
-    g, gz = steps.g[k], steps.gz[k]
-    added: Floats = g @ g.T + (gz @ C[k]).reshape(len(g), -1) @ gz.reshape(len(g), -1).T
-    return added
 
 
 def _with_covariances(problem: OptimalControlProblem, trajectory: Trajectory, here: _Steps, C: Floats) -> float:

@@ -49,6 +49,16 @@ def decided(problem: OptimalControlProblem, feedback: Feedback, k: int, x: int) 
     return T
 
 
+def added_covariance(g: Floats, gz: Floats, C: Floats) -> Floats:
+    """What the noise of a step adds to the covariance (2n, 2n) of the state, over dt.
+
+    ``g`` (2n, k) and ``gz`` (2n, k, Z) are those of the step, ``C`` (Z, Z) the covariance of its variables.
+    """
+    x = len(g)
+    found: Floats = g @ g.T + (gz @ C).reshape(x, -1) @ gz.reshape(x, -1).T
+    return found
+
+
 def propagated(J: Floats, g: Floats, gz: Floats, problem: OptimalControlProblem, feedback: Feedback) -> Floats:
     """Covariances (N + 1, Z, Z) of the variables of each step, and that of the state at the end.
 
@@ -72,7 +82,7 @@ def propagated(J: Floats, g: Floats, gz: Floats, problem: OptimalControlProblem,
         C[k] = covariance if T is None else T @ covariance @ T.T
         through[:x] = J[k]
         covariance = through @ C[k] @ through.T
-        covariance[:x, :x] += problem.dt * (g[k] @ g[k].T + (gz[k] @ C[k]).reshape(x, -1) @ gz[k].reshape(x, -1).T)
+        covariance[:x, :x] += problem.dt * added_covariance(g[k], gz[k], C[k])
     C[N, :x, :x] = covariance[:x, :x]
     return C
 
