@@ -20,7 +20,7 @@ def expected_cost_slopes(problem: vp.OptimalControlProblem, made, u: np.ndarray)
     motion = made(u)
     plan = backward(problem, motion, 0.0)
     along = Along(problem, motion)
-    along.differentiate_noise(plan, np.ones(problem.scene.processes, dtype=bool))
+    along.differentiate_noise(plan, np.ones_like(problem.steered))
     whole, step, found = backward(problem, motion, 0.0, along=along).gradient, 1e-4, np.empty_like(u)
     for index in np.ndindex(u.shape):
         away = np.zeros_like(u)

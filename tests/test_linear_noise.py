@@ -78,7 +78,7 @@ def test_the_noise_cost_is_that_of_the_covariance(noise: object, kick: str) -> N
         Z, C = T @ C @ T.T, np.zeros((6, 6))
         C[:x, :x], C[:x, x:], C[x:, x:] = J @ Z @ J.T, J @ Z[:, 6:], Z[6:, 6:]
         C[x:, :x] = C[:x, x:].T
-        for i in range(problem.scene.processes):
+        for i in range(lin.G.shape[2]):
             D = np.hstack([lin.Gx[k, :, i], lin.Gu[k, :, i] - lin.Gramp[k, :, i], lin.Gramp[k, :, i]])
             C[:x, :x] += problem.dt * (np.outer(lin.G[k, :, i], lin.G[k, :, i]) + D @ Z @ D.T)
     assert plan.noise == pytest.approx(noise_cost(problem, motion, feedback) + changes, rel=1e-10)
@@ -97,8 +97,16 @@ def test_the_effect_of_noise_along_a_line(noise: object, kick: str) -> None:
 
     def effect(ends: np.ndarray) -> np.ndarray:
         moved = problem.simulate(line(problem, ends.reshape(2, 2)))
-        mean = 0.5 * (ends[:2] + ends[2:])[None]
-        before, after = (scene.noise.fields(moved.q[k, None], moved.v[k, None], mean, problem.q0).F[0] for k in (0, 1))
+
+        def fields(k: int, u: np.ndarray) -> np.ndarray:
+            return scene.noise.fields(moved.q[k, None], moved.v[k, None], u[None], problem.q0).F[0]
+
+        def columns(k: int) -> np.ndarray:
+            slope = (fields(k, ends[2:]) - fields(k, ends[:2])) / np.sqrt(12.0)
+            # Noise of the state's alone sees no slope.
+            return np.hstack([fields(k, 0.5 * (ends[:2] + ends[2:])), slope[:, np.abs(slope).any(axis=0)]])
+
+        before, after = columns(0), columns(1)
         found = left * lin.J[0] @ before
         found[n:] += (1.0 - left) * after
         return found
@@ -189,10 +197,88 @@ def test_the_noise_cost_in_halves_is_that_of_each_impulse(rate: float) -> None:
     assert found == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_plan_of_torques_that_alternate_to_see_no_noise_says_so() -> None:
-    """The mean of a line that changes sign is close to zero, and so is the noise that the plan sees."""
-    problem = reach(vp.ControlNoise(1.0), steps=10)
+@pytest.mark.parametrize("strength", [0.1, 1.0])
+def test_strong_noise_costs_what_the_plan_expects_in_fine_steps(strength: float) -> None:
+    """The noise of a line is that of its controls within the step, so alternating ones do not escape it."""
+    problem = reach(vp.ControlNoise(strength), steps=10, dt=0.08 if strength == 1.0 else 0.05)
     plan = vp.solve(problem)
-    (sentence,) = about(plan.warnings, "noise within steps")
-    assert "controls='held'" in sentence
-    assert float(sentence.split()[2]) > 100.0 * plan.noise_cost
+    assert plan.status is vp.Status.CONVERGED
+    assert not about(plan.warnings, "noise within steps")
+    fine = problem.at(dt=problem.dt / 4)
+    given = {"dt": fine.dt, "steps": fine.steps, "controls": plan.policy, "integrator": problem.integrator}
+    paths = [
+        vp.simulate(problem.scene, problem.q0, problem.v0, rng=child, check=False, **given)
+        for child in np.random.default_rng(3).spawn(200)
+    ]
+    costs = np.array([fine.cost_of(path) for path in paths])
+    assert abs(costs.mean() - plan.expected_cost) < 3.0 * costs.std(ddof=1) / np.sqrt(len(costs))
+
+
+FREE = vp.Scene(vp.planar_chain(1), gravity=False, noise=vp.ControlNoise(0.4))
+LINE = vp.FirstOrderHold(np.array([[1.0], [-1.0], [2.0], [0.5], [0.5], [-3.0]]))
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    [vp.Midpoint(), vp.Midpoint(kick="held"), vp.Gauss(2, kick="split"), vp.Gauss(2, kick="held"), vp.RungeKutta4()],
+    ids=str,
+)
+def test_the_covariance_along_a_line_is_that_of_continuous_noise(integrator: vp.Integrator) -> None:
+    """That of a free joint, by quadrature: the momentum exactly, the position as far as one force a step goes."""
+    h, t = 0.1, np.linspace(0.0, 0.5, 50_001)
+    given = {"dt": h, "steps": 5, "controls": LINE, "integrator": integrator}
+    quiet = vp.simulate(FREE, [0.0], [0.0], increments=0.0, **given)
+    inertia = quiet.p[-1, 0] / quiet.v[-1, 0]
+    to_v = np.diag([1.0, 1.0 / inertia if integrator.variational else 1.0])
+    found = to_v @ vp.propagate_moments(vp.linearize(FREE, quiet)).covariance[-1] @ to_v
+    power = (0.4 * np.interp(t, h * np.arange(6), LINE.u[:, 0]) / inertia) ** 2
+    left = 0.5 - t
+    exact = [np.trapezoid(power * left**i, t) for i in (2, 1, 0)]
+    assert found[1, 1] == pytest.approx(exact[2], rel=1e-8)
+    if integrator.holds_noise:
+        assert found[0, 0] == pytest.approx(exact[0], rel=0.02)
+        assert found[0, 1] == pytest.approx(exact[1], rel=0.08)
+    paths = vp.simulate_ensemble(FREE, [0.0], [0.0], paths=2000, rng=1, store=True, **given)
+    drawn = np.cov(paths.q[:, -1, 0], paths.v[:, -1, 0])
+    # The standard error of a variance is sqrt(2 / paths) of it.
+    np.testing.assert_allclose(drawn, found, rtol=3.0 * np.sqrt(2.0 / 2000))
+
+
+def test_halves_of_lines_have_the_impulses_of_whole_ones() -> None:
+    """Of one Brownian path, linear in each half: its increments in halves are those of the mean and of the slope."""
+    halves = np.random.default_rng(2).normal(size=(10, 1)) * np.sqrt(0.05)
+    first, second = halves[::2], halves[1::2]
+    ends, h = LINE.u, 0.1
+    given = {"integrator": vp.Gauss(2, kick="held"), "check": False}
+    fine = vp.simulate(FREE, [0.0], [0.0], dt=h / 2, steps=10, controls=LINE.refined(2), increments=halves, **given)
+    quiet = vp.simulate(FREE, [0.0], [0.0], dt=h / 2, steps=10, controls=LINE.refined(2), increments=0.0, **given)
+    mean, change = 0.5 * (ends[:-1] + ends[1:]), ends[1:] - ends[:-1]
+    impulse = 0.4 * (mean * (first + second) + 0.25 * change * (second - first))
+    np.testing.assert_allclose((fine.p - quiet.p)[::2, 0], np.cumsum([0.0, *impulse[:, 0]]), atol=1e-12)
+    # As increments of the whole steps; sqrt(12) / 4 of the difference are those of the slope.
+    dw = np.hstack([first + second, 0.25 * np.sqrt(12.0) * (second - first)])
+    whole = vp.simulate(FREE, [0.0], [0.0], dt=h, steps=5, controls=LINE, increments=dw, **given)
+    np.testing.assert_allclose(whole.p, fine.p[::2], atol=1e-12)
+    assert whole.dw.shape == (5, 2)
+
+
+@pytest.mark.parametrize(
+    ("kick", "constrained"), [("left", False), ("split", False), ("held", False), ("left", True), ("held", True)]
+)
+def test_paths_on_lines_are_repeated_and_examined_with_their_noise(kick: str, constrained: bool) -> None:
+    noise = vp.ControlNoise(0.05) + vp.AdditiveNoise(0.01)
+    limits = [vp.JointTie("joint2", "joint1")] if constrained else []
+    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=noise, constraints=limits)
+    integrator = vp.Gauss(2, kick=kick)
+    controls = vp.FirstOrderHold(20.0 * np.sin(np.linspace(0.0, 60.0, 201))[:, None] * [1.0, -0.5])
+    given = {"dt": 2e-3, "steps": 200, "controls": controls, "integrator": integrator}
+    motion = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], rng=1, **given)
+    assert motion.dw.shape == (200, 6)
+    assert motion.warnings == ()
+    again = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=motion.dw, **given)
+    np.testing.assert_array_equal(again.q, motion.q)
+    # Without those of slopes these are zero.
+    means = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=motion.dw[:, :4], **given)
+    zeros = np.hstack([motion.dw[:, :4], np.zeros((200, 2))])
+    np.testing.assert_array_equal(means.q, vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=zeros, **given).q)
+    assert np.abs(means.q - motion.q).max() > 1e-6

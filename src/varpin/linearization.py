@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint, integrator_of
-from varpin.integrators.base import diffusion_and_drift, open_loop
+from varpin.integrators.base import diffusion_and_drift, noise_fields, open_line, open_loop
 from varpin.integrators.same_scene import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
@@ -58,7 +58,9 @@ class Linearization:
             ``kick="held"`` it is the derivative in the impulse of a force that is constant over the step.
         J: The same for a jump of x's second half (N, 2n, n): of p, which is K, or of v.
         F: Diffusion fields (N, n, k).
-        G: dx1/dw (N, 2n, k); K F if the whole kick precedes the step or is held over it.
+        G: dx1/dw (N, 2n, k); K F if the whole kick precedes the step or is held over it. Of motions with controls that
+            are linear between nodes it is (N, 2n, K), with the increments for their slopes, see
+            :attr:`Trajectory.dw`; so are the next two.
         Gx: Derivative of G in x0 through the fields (N, 2n, k, 2n).
         Gu: Derivative of G in u (N, 2n, k, m).
         dt: Time step [s].
@@ -129,7 +131,7 @@ def linearize(scene: Scene, trajectory: Trajectory, *, integrator: Integrator | 
         LinearizationError: A step has no solution at dw = 0.
     """
     integrator = _matching(require_scene(scene), trajectory, integrator)
-    within = trajectory.u_stages.shape[1] > 0
+    within = trajectory.u_stages.shape[1] > 0 or trajectory.u_nodes.shape[1] > 0
     found = linearize_steps(scene, trajectory, integrator, trajectory.q[0], ramps=within)
     if not integrator.variational:
         found = replace(found, K=_kick_columns(scene, trajectory, found.J))
@@ -186,7 +188,7 @@ def linearize_steps(
             ramp=ramp,
             Gramp=None if ramp is None else np.zeros((steps, 2 * n, 0, m)),
         )
-    start = scene.noise.fields(q[:-1], v[:-1], trajectory.u, first)
+    start = noise_fields(scene, trajectory, q[:-1], v[:-1], first)
     A, B = Jx, Jf @ scene.transmission
     if start.Fv is not None:
         drift_x, drift_u = _drift_derivatives(scene, trajectory, first, variational=integrator.variational)
@@ -195,33 +197,37 @@ def linearize_steps(
             ramp = ramp + 0.5 * integrator.drift_share * Jf @ drift_u
     left = integrator.left
     if integrator.variational:
-        jump, jump_x, jump_u = start.F, _in_momentum(scene, q[:-1], v[:-1], start), start.Fu
+        to_state = None
+        jump, jump_x = start.F, _in_momentum(scene, q[:-1], v[:-1], start)
     else:
         M, _ = node_jets(scene, q[:-1], v[:-1])
-        jump, jump_x, jump_u = _in_velocity(scene, q[:-1], start, M)
+        to_state = np.asarray(np.linalg.inv(M), dtype=np.float64)
+        jump, jump_x = _in_velocity(scene, q[:-1], start, to_state)
     G = left * (Jk @ jump)
     Gx = left * _chain(Jk, jump_x)
-    Gu = left * _chain(Jk, jump_u)
-    # Noise and drift are of a step's mean control.
-    Gramp = None if ramp is None else 0.5 * Gu
+    through = left * (Jk if to_state is None else Jk @ to_state)
+    Gu = _chain(through, start.Fu)
+    # Where the noise does not see the slope of the control, it is that of the step's mean control, as the drift.
+    Gramp = None if ramp is None else 0.5 * Gu if start.Fr is None else _chain(through, start.Fr)
     if left < 1.0:
         # The part of a kick after the step is evaluated at the step's end.
         end_q, end_v = trajectory.q[1:], trajectory.v[1:]
         if trajectory.noisy:
             end_q, end_v = integrator.quiet_ends(scene, trajectory)
-        end = scene.noise.fields(end_q, end_v, trajectory.u, first)
+        end = noise_fields(scene, trajectory, end_q, end_v, first)
         end_x = _in_momentum(scene, end_q, end_v, end)
         G[:, n:] += (1.0 - left) * end.F
         Gx[:, n:] += (1.0 - left) * np.einsum("Naib,Nbc->Naic", end_x, A)
         Gu[:, n:] += (1.0 - left) * (end.Fu + np.einsum("Naib,Nbc->Naic", end_x, B))
         if ramp is not None and Gramp is not None:
-            Gramp[:, n:] += (1.0 - left) * (0.5 * end.Fu + np.einsum("Naib,Nbc->Naic", end_x, ramp))
+            end_ramp = 0.5 * end.Fu if end.Fr is None else end.Fr
+            Gramp[:, n:] += (1.0 - left) * (end_ramp + np.einsum("Naib,Nbc->Naic", end_x, ramp))
     return Linearization(
         A=A,
         B=B,
         K=Jk if integrator.variational else np.zeros((steps, 2 * n, 0)),
         J=Jk,
-        F=np.broadcast_to(start.F, (steps, n, scene.processes)),
+        F=np.broadcast_to(start.F[:, :, : scene.processes], (steps, n, scene.processes)),
         G=G,
         Gx=Gx,
         Gu=Gu,
@@ -345,20 +351,19 @@ def _in_momentum(scene: Scene, q: Floats, v: Floats, fields: Fields) -> Floats:
     return Fx
 
 
-def _in_velocity(scene: Scene, q: Floats, fields: Fields, M: Floats) -> tuple[Floats, Floats, Floats]:
-    """Y = M^-1 F (N, n, k) and its derivatives in (q, v) (N, n, k, 2n) and u (N, n, k, m).
+def _in_velocity(scene: Scene, q: Floats, fields: Fields, inverse: Floats) -> tuple[Floats, Floats]:
+    """Y = M^-1 F (N, n, k) and its derivative in (q, v) (N, n, k, 2n), for the ``inverse`` of M (N, n, n).
 
     d(M y)/dq at fixed y is L_vq(q, y), so dy = M^-1 (dF - L_vq(q, y) dq).
     """
     N, n, k = fields.F.shape
-    inverse: Floats = np.asarray(np.linalg.inv(M), dtype=np.float64)
     y = inverse @ fields.F
     _, bend = node_jets(scene, np.repeat(q, k, axis=0), np.ascontiguousarray(np.swapaxes(y, 1, 2)).reshape(N * k, n))
     Fx = np.zeros((N, n, k, 2 * n))
     Fx[..., :n] = fields.Fq - np.swapaxes(bend.reshape(N, k, n, n), 1, 2)
     if fields.Fv is not None:
         Fx[..., n:] = fields.Fv
-    return y, _chain(inverse, Fx), _chain(inverse, fields.Fu)
+    return y, _chain(inverse, Fx)
 
 
 def _drift_derivatives(
@@ -422,7 +427,9 @@ def _require_steps_of(scene: Scene, trajectory: Trajectory, integrator: Integrat
         state, _ = integrator.start(scene, trajectory.q[k : k + 1].copy(), trajectory.v[k : k + 1].copy())
         drawn = trajectory.dw[None, k : k + 1] if trajectory.dw.any() else np.zeros((0, 0, scene.processes))
         commands = open_loop(trajectory.u[k : k + 1])
-        if trajectory.u_stages.shape[1]:
+        if trajectory.u_nodes.shape[1]:
+            commands = open_line(trajectory.u_nodes[k : k + 2], integrator.stage_times)
+        elif trajectory.u_stages.shape[1]:
             commands = commands._replace(within=trajectory.u_stages[k : k + 1])
         (again,) = integrator.rollout(scene, state, commands, drawn, trajectory.dt)
         if again.failure is not None or again.statistics.substeps[0] > 1:
@@ -438,7 +445,8 @@ def _require_steps_of(scene: Scene, trajectory: Trajectory, integrator: Integrat
 
 def _integrator_of(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
     """The integrator of the trajectory."""
-    if trajectory.dw.shape[1] != scene.processes:
+    linear = trajectory.u_nodes.shape[1] > 0
+    if trajectory.dw.shape[1] not in (scene.processes, scene.increments(linear=linear)):
         raise InputError(f"the trajectory has {trajectory.dw.shape[1]} processes, the scene {scene.processes}")
     made: Integrator | None = None
     problem = ""

@@ -189,7 +189,9 @@ class Trajectory(Frozen):
         v: Velocities (N + 1, n) [rad/s or m/s]; M(q)^-1 p for variational integrators.
         p: Momenta (N + 1, n) [N m s or N s].
         u: Controls (N, m): constant over each step, or their mean if they change within it.
-        dw: Wiener increments (N, k) [s^0.5]; zeros where no noise was drawn.
+        dw: Wiener increments (N, k) [s^0.5]; zeros where no noise was drawn. Where controls are linear between nodes
+            and the strength of s of the processes depends on them, it is (N, k + s) with s increments dw' of the
+            slopes: sqrt(12) / dt times the integral of (t - t_middle) dw over the step, independent of dw, N(0, dt).
         energy: Sum of kinetic and potential energy (N + 1,) [J]; springs included.
         masses: Masses of the robot's bodies (b,) [kg], to distinguish robots with the same joint names.
         dt: Time step [s].

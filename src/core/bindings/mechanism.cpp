@@ -311,8 +311,15 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
                 out.actuation.push_back({static_cast<int>(r), static_cast<int>(c), actuation(r, c)});
         }
     }
-    out.diffusion = {static_cast<int>(processes), copied(constant), copied(control), copied(quadratic),
-                     copied(centers)};
+    out.diffusion = {static_cast<int>(processes), copied(constant), copied(control),
+                     copied(quadratic),           copied(centers),  {}};
+    for (std::size_t w = 0; w < processes; ++w) {
+        bool depends = false;
+        for (std::size_t r = 0; r < n; ++r) {
+            for (std::size_t c = 0; c < m; ++c) depends = depends || control(r, w, c) != 0.0;
+        }
+        if (depends) out.diffusion.sloped.push_back(static_cast<int>(w));
+    }
     return out;
 }
 

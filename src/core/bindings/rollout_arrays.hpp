@@ -145,10 +145,13 @@ class CommandArrays {
     bool linear = false;    // whether controls are linear over the steps of each decision
 };
 
-// Increments of Wiener processes (P, N, k), or null where there are none: (0, 0, k), or k = 0.
-inline const double* increments_of(const Mechanism& mechanism, const In<3>& increments, const NodeArrays& nodes) {
-    const auto k = static_cast<std::size_t>(mechanism.diffusion.processes);
-    return given(increments, "increments", {nodes.paths(), nodes.steps(), k}) && k > 0 ? increments.data() : nullptr;
+// Increments of Wiener processes (P, N, K), or null where there are none: (0, 0, k), or K = 0. There are as many for a
+// step as the commands see.
+inline const double* increments_of(const Mechanism& mechanism, const In<3>& increments, const NodeArrays& nodes,
+                                   const Commands& commands) {
+    const auto width = static_cast<std::size_t>(increments_of_step(mechanism, commands));
+    return given(increments, "increments", {nodes.paths(), nodes.steps(), width}) && width > 0 ? increments.data()
+                                                                                               : nullptr;
 }
 
 // A force in addition to the controls (P, N, n), or null for (0, 0, n).
@@ -173,10 +176,12 @@ void roll_paths(const Mechanism& mechanism, std::size_t paths, int stages, nb::h
     const NodeArrays to(mechanism, nodes);
     to.require_paths(paths);
     const CommandArrays by(mechanism, commands, paths, to.steps(), stages);
-    const double* dw = increments_of(mechanism, increments, to);
+    Commands view = by.view();
+    view.sloped = view.stage_times && increments.shape(2) > static_cast<std::size_t>(mechanism.diffusion.processes);
+    const double* dw = increments_of(mechanism, increments, to, view);
     const double* more = drift_of(mechanism, drift, to);
     nb::gil_scoped_release release;
-    move(by.view(), dw, more, to.view());
+    move(view, dw, more, to.view());
 }
 
 // The arrays from which N steps are repeated.

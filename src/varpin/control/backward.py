@@ -38,6 +38,7 @@ from varpin.control.spread import Feedback, state_slopes
 from varpin.control.square_root import Squares, squares_of
 from varpin.control.within_steps import beyond_samples
 from varpin.errors import LinearizationError
+from varpin.integrators.base import noise_fields
 from varpin.linearization import (
     Linearization,
     linearize_steps,
@@ -108,7 +109,7 @@ def noise_shares(
 ) -> Floats:
     """Noise cost of each step of a motion (N,), with the noise's effect and value function of the plan's own motion.
 
-    ``processes`` (k,) selects the processes, by default all. Empty where there is no noise.
+    ``processes`` (K,) selects increments, by default all. Empty where there is no noise.
     """
     if problem.processes == 0:
         return np.zeros(0)
@@ -120,15 +121,15 @@ def noise_shares(
 
 
 def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floats) -> Floats:
-    """Effect of each Wiener process on the state after each step of a motion (N, 2n, k), for given ``jumps``."""
+    """Effect of each increment on the state after each step of a motion (N, 2n, K), for given ``jumps``."""
     scene, n, left = problem.scene, problem.scene.robot.dof, problem.integrator.left
-    q, v, u = trajectory.q, trajectory.v, trajectory.u
-    jump = scene.noise.fields(q[:-1], v[:-1], u, problem.q0).F
+    q, v = trajectory.q, trajectory.v
+    jump = noise_fields(scene, trajectory, q[:-1], v[:-1], problem.q0).F
     if not problem.integrator.variational:
         jump = velocity_at_nodes(scene, q[:-1], v[:-1])[:, :, n:] @ jump
     g: Floats = left * (jumps @ jump)
     if left < 1.0:
-        g[:, n:] += (1.0 - left) * scene.noise.fields(q[1:], v[1:], u, problem.q0).F
+        g[:, n:] += (1.0 - left) * noise_fields(scene, trajectory, q[1:], v[1:], problem.q0).F
     return g
 
 
@@ -166,7 +167,7 @@ def _curvature(along: Along, plan: Plan, costate: Floats) -> Floats:
     if problem.processes and problem.integrator.variational:
         pull = plan.spread @ impulses(problem, trajectory, plan.jumps)
         weight = problem.integrator.left * np.swapaxes(plan.jumps, 1, 2) @ pull
-        total[:, :n, :n] += scene.noise.curvature(weight)
+        total[:, :n, :n] += scene.noise.curvature(weight[:, :, : scene.processes])
     return widened(total, scene.controls) if problem.linear else total
 
 
@@ -485,7 +486,7 @@ class Along:
         return found
 
     def differentiate_noise(self, plan: Plan, processes: NDArray[np.bool_]) -> None:
-        """Add the whole gradient of the noise cost of ``processes`` (k,) under the plan's gains to later passes."""
+        """Add the whole gradient of the noise cost of ``processes`` (K,) under the plan's gains to later passes."""
         problem, N = self.problem, self.problem.steps
         feedback = Feedback(plan.feedback, plan.previous)
         pull = noise_gradient(problem, self.trajectory, feedback, self.rate, processes)

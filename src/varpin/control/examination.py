@@ -245,8 +245,7 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
 def _noise_in_halves(solution: Solution) -> list[Finding]:
     """A finding if noise costs other than planned in steps of half the length.
 
-    One impulse a step is right to first order in the step, one held force to second order. Noise in proportion to
-    controls that are linear over the step has the strength of their mean, and none where they change sign.
+    One impulse a step is right to first order in the step, one held force to second order.
     """
     problem, scene = solution.problem, solution.problem.scene
     if not scene.processes or scene.inputs:
@@ -273,10 +272,6 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
     closer = f"problem.at(dt={dt:g}, hold={hold}) is closer"
     if problem.linear:
         closer = f"problem.at(dt={dt:g}) is closer"
-        if problem.steered.any():
-            closer = (
-                "problem.at(controls='held') keeps torques from alternating, by which a line has no noise in its mean"
-            )
     return [
         Finding(
             "noise within steps",

@@ -54,7 +54,7 @@ def noise_gradient(
         trajectory: The motion.
         feedback: The gains of a backward pass along it.
         rate: Hessian (R, m, m) of the cost of control changes, or (0, m, m).
-        processes: Mask of the processes that count (k,).
+        processes: Mask of the increments that count (K,).
     """
     n, N = problem.scene.robot.dof, problem.steps
     here = _steps_of(problem, trajectory, processes)
@@ -103,7 +103,7 @@ def noise_gradient(
 
 def noise_cost(problem: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback) -> float:
     """The noise cost of a motion under feedback, without that of control changes."""
-    here = _steps_of(problem, trajectory, np.ones(problem.scene.processes, dtype=bool))
+    here = _steps_of(problem, trajectory, slice(None))
     return _with_covariances(problem, trajectory, here, propagated(here.J, here.g, here.gz, problem, feedback))
 
 
@@ -114,7 +114,7 @@ def noise_cost_in_halves(
 
     A control in the middle of a whole step is the mean of those at its ends, which feedback decides at its beginning.
     """
-    here = _steps_of(halves, trajectory, np.ones(problem.scene.processes, dtype=bool))
+    here = _steps_of(halves, trajectory, slice(None))
     x, m, dt = here.J.shape[1], problem.scene.controls, halves.dt
     C, covariance = np.zeros((halves.steps + 1, x + 2 * m, x + 2 * m)), np.zeros((x + m, x + m))
     middle = np.hstack([np.zeros((m, x)), 0.5 * np.eye(m), 0.5 * np.eye(m)])
@@ -144,7 +144,7 @@ def _with_covariances(problem: OptimalControlProblem, trajectory: Trajectory, he
 
 def left_within_steps(problem: OptimalControlProblem, trajectory: Trajectory, feedback: Feedback) -> float:
     """The part of :func:`noise_cost` that no path shows, see :func:`varpin.control.within_steps.beyond_samples`."""
-    here = _steps_of(problem, trajectory, np.ones(problem.scene.processes, dtype=bool))
+    here = _steps_of(problem, trajectory, slice(None))
     if here.beyond is None:
         return 0.0
     return _of_impulses(problem, here, here.beyond, propagated(here.J, here.g, here.gz, problem, feedback))
@@ -184,7 +184,7 @@ def _perturbed(
     return replace(moved, q=q, p=trajectory.p + dx[:, n:], v=v)
 
 
-def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory, processes: NDArray[np.bool_]) -> _Steps:
+def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory, processes: NDArray[np.bool_] | slice) -> _Steps:
     scene, n, m, N = problem.scene, problem.scene.robot.dof, problem.scene.controls, problem.steps
     x, h, rule, samples = 2 * n, problem.dt, problem.rule, len(problem.rule)
     lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0, ramps=problem.linear)

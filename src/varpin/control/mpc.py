@@ -22,6 +22,7 @@ from varpin.integrators.base import Failure
 from varpin.mechanics.inputs import in_parts_of_steps, with_ends
 from varpin.mechanics.policy import FirstOrderHold
 from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.wiener import wiener_increments
 from varpin.simulation.chatter import alternation
 from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
@@ -562,7 +563,9 @@ def _simulated(
         moved = in_parts_of_steps(plant.scene, u[None], q[None], v[None], dt * plant.substeps, plant.substeps)
         controls = FirstOrderHold(np.vstack([line[:1], with_ends(plant.scene, line[1:], moved)]))
     options: dict[str, Any] = {"dt": dt, "steps": plant.substeps, "controls": controls, "integrator": method}
-    options |= {"increments": 0.0} if rng is None or not plant.scene.processes else {"rng": rng}
+    # Plants of many steps a tick hardly see the slopes of controls within a step: their noise is of the mean control.
+    drawn = wiener_increments(plant.scene.processes, dt, plant.substeps, rng)
+    options |= {"increments": drawn if len(drawn) else 0.0}
     try:
         # The whole run is examined, and its findings logged, at the end.
         return simulated(plant.scene, q, v, **options, check=False)[0]

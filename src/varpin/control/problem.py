@@ -473,11 +473,12 @@ class OptimalControlProblem(Frozen):
 
     @property
     def steered(self) -> NDArray[np.bool_]:
-        """Which processes (k,) can change plans; one of constant strength adds the same cost to all motions."""
+        """Which increments (K,) can change plans; noise of constant strength adds the same cost to all motions."""
+        found = np.ones(self.scene.increments(linear=self.linear), dtype=np.bool_)
         fields = self.scene.noise.diffusion
-        if fields is None or not self.integrator.variational:
-            return np.ones(self.scene.processes, dtype=np.bool_)
-        return np.array(fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0), dtype=np.bool_)
+        if fields is not None and self.integrator.variational:
+            found[: self.scene.processes] = fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0)
+        return found
 
     @property
     def model_places(self) -> Floats:

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
 
-import numpy as np
-
 from varpin.arrays import Floats
 from varpin.ensemble.paths import Extremes, Shared, Task
 from varpin.simulation.loop_stability import examined_in_loop
@@ -64,7 +62,7 @@ def _examine(task: Task) -> tuple[Finding, ...]:
     """Findings about one path."""
     shared = task.shared
     (generator,) = shared.seeds.generators(task.first, task.first + 1)
-    drawn = generator.standard_normal((shared.steps, shared.scene.processes)) * np.sqrt(shared.dt)
+    drawn = shared.drawn(generator)
     motions = Motions(shared.scene, shared.integrator, task.q0[0], task.v0[0], shared.dt)
     motion, _ = motions.under(shared.commands, increments=drawn)
     # The loop's check is for held controls.

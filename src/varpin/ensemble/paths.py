@@ -77,6 +77,16 @@ class Shared(Frozen):
     steps: int
     seeds: Children
 
+    @property
+    def increments(self) -> int:
+        """K, the number of increments of a step."""
+        return self.scene.increments(linear=len(self.commands.stage_times) > 0)
+
+    def drawn(self, generator: np.random.Generator) -> Floats:
+        """The increments (N, K) of the path of a generator."""
+        found: Floats = generator.standard_normal((self.steps, self.increments)) * np.sqrt(self.dt)
+        return found
+
 
 @dataclass(frozen=True, eq=False)
 class Task(Frozen):
@@ -248,7 +258,7 @@ class _Chunk:
         shared, group = self.shared, self.groups[number]
         hold = shared.commands.hold
         decisions = rows(shared.commands, begin // hold, end // hold, self.before[number])
-        increments = np.empty((group.stop - group.start, end - begin, shared.scene.processes))
+        increments = np.empty((group.stop - group.start, end - begin, shared.increments))
         for drawn, child in zip(increments, self.generators[group], strict=True):
             child.standard_normal(out=drawn)
         increments *= np.sqrt(shared.dt)
@@ -274,7 +284,7 @@ class _Chunk:
         shared, task = self.shared, self.task
         for i in range(group.start, group.stop):
             (generator,) = shared.seeds.generators(task.first + i, task.first + i + 1)
-            drawn = generator.standard_normal((shared.steps, shared.scene.processes)) * np.sqrt(shared.dt)
+            drawn = shared.drawn(generator)
             given = shared.scene, shared.integrator, (task.q0[i], task.v0[i]), shared.commands, shared.dt
             found = located(*given, drawn, error, f"path {task.first + i}: ")
             if found is not error:

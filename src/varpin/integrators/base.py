@@ -19,6 +19,7 @@ from varpin.core import Watch
 from varpin.core.arrays import Commands, RolloutArrays
 from varpin.errors import InputError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.noise import Fields, over_steps
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Bytes, StepStatistics, Trajectory, joined
 
@@ -158,7 +159,8 @@ class Integrator(ABC):
     def rollout(self, scene: Scene, state: Any, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
         """Advance ``state`` by the N steps of ``commands``, each of length ``dt`` [s].
 
-        ``increments`` are the Wiener increments (P, N, k) [s^0.5], or (0, 0, k) for none. Returns a segment for each
+        ``increments`` are the Wiener increments (P, N, k) [s^0.5], or (0, 0, k) for none; (P, N, K), those of slopes
+        included (:meth:`Scene.increments`), for controls that are linear between nodes. Returns a segment for each
         path; with diffusion fields that only Python can evaluate there is one path.
         """
         if scene.noise.diffusion is not None:
@@ -222,9 +224,19 @@ class Integrator(ABC):
 
     @abstractmethod
     def rollout_compiled(
-        self, scene: Scene, state: Any, commands: Commands, increments: Floats, drift: Floats, dt: float
+        self,
+        scene: Scene,
+        state: Any,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        dt: float,
+        impulses: Floats | None = None,
     ) -> list[Segment]:
-        """:meth:`rollout` with fields that the core evaluates; ``drift`` is a force (P, N, n), or (0, 0, n)."""
+        """:meth:`rollout` with fields that the core evaluates; ``drift`` is a force (P, N, n), or (0, 0, n).
+
+        ``impulses`` (P, N, 2, n) are added to the momenta before and after each step, but not under constraints.
+        """
 
     def motions(
         self,
@@ -343,6 +355,29 @@ def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Fl
     return F, 0.5 * np.einsum("ikj,jk->i", diffusion.Fv[0], np.linalg.solve(M, F))
 
 
+def noise_of_step(
+    scene: Scene, F: Floats, q: Floats, v: Floats, ends: tuple[Floats, Floats], start: Floats, dw: Floats
+) -> Floats:
+    """The impulse (n,) of increments dw (K,) at a state (q, v), by fields in Python.
+
+    ``F`` (n, k) are those of the mean control, ``ends`` (1, m) the controls at both ends of the step, ``start`` (n,)
+    the configuration at the start of the motion.
+    """
+    k = scene.processes
+    impulse: Floats = F @ dw[:k]
+    if dw.size > k:
+        impulse = impulse + over_steps(scene.noise, q[None], v[None], ends[0], ends, start).F[0, :, k:] @ dw[k:]
+    return impulse
+
+
+def ends_of(command: Commands, decided: Floats) -> tuple[Floats, Floats]:
+    """The controls (1, m) at both ends of the first step under a decision's control (m,)."""
+    if not len(command.stage_times):
+        return decided[None], decided[None]
+    nodes = lines(command, decided[None], ()).nodes
+    return nodes[:1], nodes[1:]
+
+
 def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
     """The drift of :func:`diffusion_and_drift` at the start of every step (N, n)."""
     if not scene.noise.velocity_dependent:
@@ -357,8 +392,29 @@ def held_noise(scene: Scene, trajectory: Trajectory, steps: slice | Integers = s
     Zero for joints of kinematic inputs, whose drives absorb the noise.
     """
     q, v = trajectory.q[:-1][steps], trajectory.v[:-1][steps]
-    F = scene.noise.fields(q, v, trajectory.u[steps], trajectory.q[0]).F
-    return without_inputs(scene, np.einsum("Nik,Nk->Ni", F, trajectory.dw[steps]) / trajectory.dt)
+    return without_inputs(scene, noise_impulses(scene, trajectory, q, v, steps) / trajectory.dt)
+
+
+def noise_fields(
+    scene: Scene, trajectory: Trajectory, q: Floats, v: Floats, first: Floats, steps: slice | Integers = slice(None)
+) -> Fields:
+    """The diffusion fields at (q, v) of the increments of some steps of a motion that began at ``first`` (n,).
+
+    With controls that are linear between nodes they are those of :func:`varpin.mechanics.noise.over_steps`.
+    """
+    nodes = trajectory.u_nodes
+    ends = (nodes[:-1][steps], nodes[1:][steps]) if nodes.shape[1] else None
+    return over_steps(scene.noise, q, v, trajectory.u[steps], ends, first)
+
+
+def noise_impulses(
+    scene: Scene, trajectory: Trajectory, q: Floats, v: Floats, steps: slice | Integers = slice(None)
+) -> Floats:
+    """The impulses (N, n) of the noise of some steps of a motion, with its fields at (q, v) (N, n)."""
+    dw = trajectory.dw[steps]
+    F = noise_fields(scene, trajectory, q, v, trajectory.q[0], steps).F
+    found: Floats = np.einsum("Nik,Nk->Ni", F[:, :, : dw.shape[1]], dw)
+    return found
 
 
 def without_inputs(scene: Scene, values: Floats) -> Floats:

@@ -21,10 +21,12 @@ from varpin.integrators.base import (
     control_of,
     diffusion_and_drift,
     drifts,
+    ends_of,
     failure_of,
     first_nodes,
     first_of,
     forces,
+    noise_of_step,
     segments_of,
     steps_of,
 )
@@ -88,7 +90,7 @@ class _Explicit(Integrator):
         now = first_of(command, decided, self.stage_times)
         F, drift = diffusion_and_drift(scene, q, v, now.u[0], state.start[0])
         if len(increment):
-            impulse = F @ increment[0, 0]
+            impulse = noise_of_step(scene, F, q, v, ends_of(command, decided), state.start[0], increment[0, 0])
             if self.method is ExplicitMethod.euler:
                 drift = drift + impulse / dt
             else:
@@ -98,11 +100,18 @@ class _Explicit(Integrator):
         return segment
 
     def rollout_compiled(
-        self, scene: Scene, state: ExplicitRun, commands: Commands, increments: Floats, drift: Floats, dt: float
+        self,
+        scene: Scene,
+        state: ExplicitRun,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        dt: float,
+        impulses: Floats | None = None,
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
-        state.paths.roll(dt, commands, increments, drift, nodes)
+        state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
         return segments_of(nodes, REASONS)
 
     def watched(

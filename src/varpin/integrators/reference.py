@@ -130,10 +130,17 @@ class Reference(Integrator):
         raise InputError(f"{self} integrates no noise: leave it out of the scene")
 
     def rollout_compiled(
-        self, scene: Scene, state: ReferenceRun, commands: Commands, increments: Floats, drift: Floats, dt: float
+        self,
+        scene: Scene,
+        state: ReferenceRun,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        dt: float,
+        impulses: Floats | None = None,
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`; the rate of change is compiled, the steps are those of SciPy."""
-        if increments.size:
+        if increments.size or impulses is not None:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
         nodes = new_nodes(len(state.x), steps_of(commands), scene.robot.dof, scene.controls)
         failures = [self._path(scene, state, commands, drift, dt, nodes, i) for i in range(len(state.x))]

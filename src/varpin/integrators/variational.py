@@ -32,10 +32,12 @@ from varpin.integrators.base import (
     control_of,
     diffusion_and_drift,
     drifts,
+    ends_of,
     failure_of,
     first_nodes,
     first_of,
     forces,
+    noise_of_step,
     parts_of,
     segments_of,
     steps_of,
@@ -261,9 +263,11 @@ class Variational(Integrator):
         increments: Floats,
         drift: Floats,
         dt: float,
+        impulses: Floats | None = None,
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`."""
-        found = segments_of(_rolled(scene, state, commands, increments, drift, dt), REASONS, state.paths.halvings)
+        nodes = _rolled(scene, state, commands, increments, drift, dt, impulses)
+        found = segments_of(nodes, REASONS, state.paths.halvings)
         if isinstance(state.paths, ConstrainedRollout):
             return [_constrained(scene, state.paths, i, segment) for i, segment in enumerate(found)]
         return found
@@ -317,11 +321,13 @@ class Variational(Integrator):
         decided = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
         now = first_of(command, decided, self.stage_times)
         F, drift = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
-        drift = self.drift_share * drift
-        if len(increment) and self.holds_noise:
-            drift = drift + without_inputs(scene, F @ increment[0, 0]) / dt
-        elif len(increment):
-            state.paths.kick(self.left * (F @ increment[0, 0])[None])
+        drift, ends = self.drift_share * drift, ends_of(command, decided)
+        if len(increment):
+            impulse = noise_of_step(scene, F, q[0], v[0], ends, state.start[0], increment[0, 0])
+            if self.holds_noise:
+                drift = drift + without_inputs(scene, impulse) / dt
+            else:
+                state.paths.kick(self.left * impulse[None])
         (segment,) = self.rollout_compiled(
             scene,
             state,
@@ -333,7 +339,8 @@ class Variational(Integrator):
         if len(increment) and self.left < 1.0 and segment.failure is None:
             q, p, v, _ = state.paths.nodes()
             F, _ = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
-            state.paths.kick((1.0 - self.left) * (F @ increment[0, 0])[None])
+            impulse = noise_of_step(scene, F, q[0], v[0], ends, state.start[0], increment[0, 0])
+            state.paths.kick((1.0 - self.left) * impulse[None])
             _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
         segment.u[:] = decided
         return segment
@@ -534,9 +541,18 @@ def _require_solved(trajectory: Trajectory, outcome: int, done: int) -> None:
 
 
 def _rolled(
-    scene: Scene, state: VariationalRun, commands: Commands, increments: Floats, drift: Floats, dt: float
+    scene: Scene,
+    state: VariationalRun,
+    commands: Commands,
+    increments: Floats,
+    drift: Floats,
+    dt: float,
+    impulses: Floats | None = None,
 ) -> RolloutArrays:
     """Advance ``state`` by the steps of ``commands``; the nodes after them."""
     nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
-    state.paths.roll(dt, commands, increments, drift, nodes)
+    if impulses is None or isinstance(state.paths, ConstrainedRollout):
+        state.paths.roll(dt, commands, increments, drift, nodes)
+    else:
+        state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
     return nodes

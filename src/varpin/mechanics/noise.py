@@ -9,6 +9,7 @@ velocity, which only :class:`CustomNoise` allows, the strong order is 1/2.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Diffusion
 from varpin.errors import InputError
 from varpin.support.checks import (
@@ -45,12 +46,15 @@ class Fields:
         Fq: dF/dq (N, n, k, n).
         Fv: dF/dv (N, n, k, n), or None if no field depends on the velocity.
         Fu: dF/du (N, n, k, m).
+        Fr: Of steps with linear controls, dF/du for a change of the control that grows linearly from 0 at the start of
+            the step to du at its end (N, n, k, m); else None.
     """
 
     F: Floats
     Fq: Floats
     Fv: Floats | None
     Fu: Floats
+    Fr: Floats | None = None
 
 
 class Noise(ABC):
@@ -95,6 +99,13 @@ class BoundNoise(Frozen, ABC):
     def diffusion(self) -> Diffusion | None:
         """The fields in the form of the core, or None for fields in Python."""
         return None
+
+    @property
+    def sloped(self) -> Integers:
+        """The processes whose strength depends on the control; they see its slope within a step."""
+        if self.diffusion is None:
+            return np.arange(self.processes)
+        return np.flatnonzero(self.diffusion.control.any(axis=(0, 2)))
 
     def curvature(self, weight: Floats) -> Floats:
         """Second derivatives of sum_i weight_i . F_i in q (N, n, n), weights (N, n, k); zero for fields in Python."""
@@ -143,10 +154,39 @@ def _values(arrays: Diffusion, q: Floats, u: Floats, start: Floats) -> tuple[Flo
     return F, offset
 
 
-def impulses(arrays: Diffusion, q: Floats, u: Floats, dw: Floats, start: Floats) -> Floats:
-    """The momentum impulses sum_i F_i(q, u) dw_i (N, n), for dw (N, k); other arguments as in ``fields``."""
-    found: Floats = np.einsum("Nik,Nk->Ni", _values(arrays, q, u, start)[0], dw)
-    return found
+def over_steps(
+    noise: BoundNoise, q: Floats, v: Floats, u: Floats, ends: tuple[Floats, Floats] | None, start: Floats
+) -> Fields:
+    """The fields of a step's increments, (N3): those of its mean control, then those of the slope of its control.
+
+    A control that is linear over a step is mean + (s - 1/2) (after - before) at the share s of it. Noise in proportion
+    to it has the impulse F(mean) dw + (F(after) - F(before)) / sqrt(12) dw', with independent dw and dw' ~ N(0, dt).
+
+    Args:
+        noise: The noise.
+        q: Configurations (N, n) [rad or m].
+        v: Velocities (N, n) [rad/s or m/s].
+        u: Mean controls (N, m).
+        ends: Controls at the begin and at the end of each step, each (N, m), where they are linear over it; else None.
+        start: Configuration (n,) at the start of the motion.
+    """
+    mean, sloped = noise.fields(q, v, u, start), noise.sloped
+    if ends is None or not sloped.size:
+        return mean
+    before, after = (noise.fields(q, v, end, start) for end in ends)
+    share = 1.0 / math.sqrt(12.0)
+
+    def joined(name: str) -> Floats:
+        added = share * (getattr(after, name) - getattr(before, name))[:, :, sloped]
+        return np.concatenate([getattr(mean, name), added], axis=2)
+
+    return Fields(
+        joined("F"),
+        joined("Fq"),
+        None if mean.Fv is None else joined("Fv"),
+        joined("Fu"),
+        np.concatenate([0.5 * mean.Fu, share * after.Fu[:, :, sloped]], axis=2),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +213,12 @@ class CompositeFields(BoundNoise):
             return None
         columns = zip(*(fields for fields in diffusions if fields is not None), strict=True)
         return Diffusion(*(np.concatenate(arrays, axis=1) for arrays in columns))
+
+    @property
+    def sloped(self) -> Integers:
+        """See :attr:`BoundNoise.sloped`."""
+        first = np.cumsum([0, *(part.processes for part in self.parts)])
+        return np.concatenate([start + part.sloped for start, part in zip(first[:-1], self.parts, strict=True)])
 
     def curvature(self, weight: Floats) -> Floats:
         """See :meth:`BoundNoise.curvature`."""
@@ -346,6 +392,11 @@ class CustomFields(BoundNoise):
     def velocity_dependent(self) -> bool:
         """See :attr:`BoundNoise.velocity_dependent`."""
         return self.noise.dv is not None
+
+    @property
+    def sloped(self) -> Integers:
+        """See :attr:`BoundNoise.sloped`."""
+        return np.arange(0 if self.noise.du is None else self.processes)
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
         """See :meth:`BoundNoise.fields`.

@@ -453,6 +453,10 @@ class Scene(Frozen):
         """k, the number of Wiener processes."""
         return self.noise.processes
 
+    def increments(self, *, linear: bool) -> int:
+        """K, the number of increments of a step, (N3): k, and those for slopes of controls ``linear`` over it."""
+        return self.processes + (len(self.noise.sloped) if linear else 0)
+
     @cached_property
     def core(self) -> Core:
         """The scene in the compiled core, without noise fields that only Python can evaluate."""

@@ -10,7 +10,7 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.integrators import Integrator
-from varpin.integrators.base import open_loop, rows
+from varpin.integrators.base import open_line, open_loop, rows
 from varpin.integrators.within import Times, changing
 from varpin.mechanics.inputs import in_parts_of_steps, prescribing
 from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
@@ -56,6 +56,9 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
                 f"FirstOrderHold: u must have shape {(steps + 1, scene.controls)}, a row for each node of the motion, "
                 f"got {controls.u.shape}"
             )
+        if scene.noise.sloped.size:
+            # Their noise sees the lines themselves.
+            return open_line(controls.u, integrator.stage_times)
         return prescribing(scene, _on_lines(controls.u, integrator.stage_times), controls.u[1:])
     if callable(controls):
         raise InputError(

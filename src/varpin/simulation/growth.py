@@ -24,7 +24,7 @@ from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, travel_scales
 from varpin.simulation.kinks import kinks
 from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bounds
-from varpin.simulation.retaking import Finer, finer, impulses_at, shortest_parts, taken_again
+from varpin.simulation.retaking import Finer, finer, impulses_at, noise_left_out, shortest_parts, taken_again
 from varpin.trajectory import Trajectory
 
 # First words of the warning, where errors grow and where they only add up.
@@ -170,7 +170,7 @@ def whole_error(scene: Scene, trajectory: Trajectory, other: Finer, times: Times
     The share is that of the joint's scale, see :func:`travel_scales`. ``times`` are those of the motion's controls at
     stages. None where the motion cannot be repeated, as under noise in Python.
     """
-    if _in_python(scene, trajectory):
+    if noise_left_out(scene, other.method, trajectory):
         return None
     apart = _whole_off(scene, trajectory, other, times, kinks(scene, trajectory).steps)
     if apart is None:

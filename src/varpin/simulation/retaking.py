@@ -10,13 +10,12 @@ import numpy as np
 from varpin.arrays import Floats, Integers
 from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, RungeKutta4
-from varpin.integrators.base import held_noise, open_loop
+from varpin.integrators.base import held_noise, noise_impulses, open_loop
 from varpin.integrators.collocation import MOST_STAGES
 from varpin.integrators.variational import Variational
 from varpin.integrators.within import Times, changing, in_parts
 from varpin.mechanics.assembly import along_constraints, nearest
 from varpin.mechanics.inputs import in_parts_of_steps, prescribing
-from varpin.mechanics.noise import impulses
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
@@ -107,8 +106,6 @@ def impulses_at(scene: Scene, integrator: Integrator, trajectory: Trajectory, st
 
     Not for an integrator that holds the noise.
     """
-    diffusion, first = scene.noise.diffusion, trajectory.q[0]
-    assert diffusion is not None
     # Explicit Euler's kicks come after the step.
     left = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
     n = trajectory.q.shape[1]
@@ -116,10 +113,21 @@ def impulses_at(scene: Scene, integrator: Integrator, trajectory: Trajectory, st
     def part(share: float, node: Integers) -> Floats:
         if share == 0.0:
             return np.zeros((*steps.shape, n))
-        rows = trajectory.q[node.ravel()], trajectory.u[steps.ravel()], trajectory.dw[steps.ravel()]
-        return share * impulses(diffusion, *rows, first).reshape(*steps.shape, n)
+        at = trajectory.q[node.ravel()], trajectory.v[node.ravel()]
+        return share * noise_impulses(scene, trajectory, *at, steps.ravel()).reshape(*steps.shape, n)
 
     return part(left, steps), part(1.0 - left, steps + 1)
+
+
+def noise_left_out(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
+    """Whether a repetition has no noise, though the motion has.
+
+    So it is for fields in Python, and under constraints for kicks that see the slopes of controls.
+    """
+    if not trajectory.dw.any():
+        return False
+    kicked = trajectory.dw.shape[1] > scene.processes and not integrator.holds_noise
+    return scene.noise.diffusion is None or (kicked and bool(scene.constraints))
 
 
 class Again:
@@ -195,10 +203,17 @@ class Again:
             if self.ended:
                 return
         taken = slice(self._step + begin, self._step + end)
-        drawn, drift = scene.silence, scene.no_drift
+        drawn, drift, kicks = scene.silence, scene.no_drift, None
         if trajectory.dw.any() and method.holds_noise:
             drift = np.repeat(held_noise(scene, trajectory, taken), parts, axis=0)[None]
-        elif trajectory.dw.any() and scene.noise.diffusion is not None:
+        elif not trajectory.dw.any() or noise_left_out(scene, method, trajectory):
+            pass
+        elif trajectory.dw.shape[1] > scene.processes:
+            # The core sees the slopes of the parts, not of the whole steps.
+            kicks = np.zeros((1, (end - begin) * parts, 2, scene.robot.dof))
+            steps = np.arange(taken.start, taken.stop)
+            kicks[0, ::parts, 0], kicks[0, parts - 1 :: parts, 1] = impulses_at(scene, method, trajectory, steps)
+        else:
             drawn = np.zeros((1, (end - begin) * parts, trajectory.dw.shape[1]))
             if isinstance(method, ExplicitEuler):
                 # Its kicks come after the step.
@@ -213,7 +228,7 @@ class Again:
             at = method.stage_times
             parted = changing(in_parts(trajectory.u_stages[taken], self._times, parts, at), at)
             commands = prescribing(scene, parted, commands.u)
-        (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, drift, trajectory.dt / parts)
+        (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, drift, trajectory.dt / parts, kicks)
         done = len(segment.q) // parts
         for nodes, values in ((self.q, segment.q), (self.v, segment.v)):
             nodes[begin + 1 : begin + done + 1] = values[parts - 1 :: parts][:done]

@@ -31,7 +31,7 @@ from varpin.simulation.soundness import Finding, announce, findings_from_record,
 from varpin.simulation.start import controls_in_degrees, in_other_units, on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
 from varpin.simulation.tolerance import Steps
-from varpin.support.checks import JointValues, count, joint_array
+from varpin.support.checks import JointValues, as_floats, count, joint_array
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -97,7 +97,8 @@ def simulate(
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, with a
             warning if the scene has noise. An ``rng`` for a scene without noise gives a warning, too.
-        increments: The increments themselves, (N, k) [s^0.5], to replay or refine a path, see
+        increments: The increments themselves, (N, k) [s^0.5], or (N, K) as :attr:`Trajectory.dw` with those for slopes
+            of linear controls, which are zero if left out, to replay or refine a path, see
             :mod:`varpin.mechanics.wiener`. 0 gives the motion without noise and without the warning.
         check: Examine the finished motion for ``Trajectory.warnings`` and the log: does its energy balance close, do
             its steps resolve it, is its control loop stable? The check takes about half as long as the motion where
@@ -186,7 +187,12 @@ def simulated(
         dt, steps = time_steps(dt, steps, duration, choosable=True)
     period = count("period", period, least=1)
     _require_memory(scene, steps)
-    dw = wiener_increments(scene.processes, dt, steps, rng, increments)
+    on_lines = isinstance(controls, FirstOrderHold) or (isinstance(controls, LinearPolicy) and controls.linear)
+    width = scene.increments(linear=on_lines)
+    if increments is not None and as_floats("increments", increments).shape == (steps, scene.processes):
+        # Given without those for slopes of the controls, which are zero then.
+        width = scene.processes
+    dw = wiener_increments(width, dt, steps, rng, increments)
     reporter = Reporter(progress, steps, dt)
     law = controls if callable(controls) else None
     if law is not None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats, Integers
 from varpin.core import energy_turnover, glance, windows_agree
 from varpin.integrators import Integrator, Reference
-from varpin.integrators.base import held_noise, open_loop
+from varpin.integrators.base import held_noise, noise_impulses, open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -52,7 +52,16 @@ from varpin.simulation.growth import WORDS as GROWTH_WORDS
 from varpin.simulation.limits import left as limits_left
 from varpin.simulation.phase import WARNED as PHASE_WARNED
 from varpin.simulation.phase import phase_lost
-from varpin.simulation.retaking import Again, Finer, finer, impulses_at, shortest_parts, stopping, taken_again
+from varpin.simulation.retaking import (
+    Again,
+    Finer,
+    finer,
+    impulses_at,
+    noise_left_out,
+    shortest_parts,
+    stopping,
+    taken_again,
+)
 from varpin.trajectory import Trajectory
 
 # Errors are in units of the thresholds WRONG_ENERGY, WRONG_POSITION, WRONG_MOTION and WRONG_VELOCITY.
@@ -364,8 +373,8 @@ def _wrong_at_rest(scene: Scene, integrator: Integrator, trajectory: Trajectory)
     The friction force is wrong where a velocity near rest is wrong by a part of the width over which the force changes
     sign.
     """
-    kicked = trajectory.dw.any() and scene.noise.diffusion is None
-    if integrator.l_stable or isinstance(integrator, Reference) or kicked:
+    left_out = noise_left_out(scene, integrator, trajectory)
+    if integrator.l_stable or isinstance(integrator, Reference) or left_out:
         return ()
     given = trajectory.q, trajectory.v, trajectory.u
     for stop in stops(scene, trajectory.v):
@@ -531,8 +540,7 @@ def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats
     if not trajectory.dw.any():
         return 0.0, 0.0
     q, v = trajectory.q[:-1], trajectory.v[:-1]
-    fields = scene.noise.fields(q, v, trajectory.u, trajectory.q[0]).F
-    impulse = np.einsum("kij,kj->ki", fields, trajectory.dw)
+    impulse = noise_impulses(scene, trajectory, q, v)
     change = np.einsum("kij,kj->ki", accelerations(scene, q, v, np.zeros_like(q))[3], impulse)
     return change, impulse * (v + 0.5 * change)
 
@@ -826,8 +834,8 @@ def _estimate(
     count = min(judged, max(1, affordable))
     parts = parts[window.step : window.step + count]
     q, v = (values[window.step : window.step + count + 1] for values in (trajectory.q, trajectory.v))
-    if scene.noise.diffusion is None and trajectory.dw.any():
-        # Noise in Python is left out of both motions.
+    if noise_left_out(scene, integrator, trajectory):
+        # Of both motions.
         plain = taken_again(scene, integrator, trajectory, times, window.step, count, parts // other.parts)
         if plain is None:
             return None

@@ -282,8 +282,9 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     void roll(double h, const Commands& commands, const double* increments, const double* drift,
               std::vector<ConstrainedState>& states, const Nodes& nodes) override {
         const std::int64_t steps = nodes.steps;
-        const int controls = mechanism.controls, k = mechanism.diffusion.processes;
-        const bool noisy = increments != nullptr && k > 0;
+        const int controls = mechanism.controls;
+        const std::int64_t width = increments_of_step(mechanism, commands);
+        const bool noisy = increments != nullptr && width > 0;
         for (std::int64_t p = 0; p < nodes.paths; ++p) {
             ConstrainedState& state = states[p];
             PathState& path = state.path;
@@ -299,10 +300,10 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
             }
             for (std::int64_t s = 0; s < steps; ++s) {
                 const std::int64_t row = p * steps + s;
-                const double* dw = noisy ? increments + row * k : nullptr;
+                const double* dw = noisy ? increments + row * width : nullptr;
                 apply_policy(commands, p, s, n, path.q.data(), path.momentum.data(), u);
                 const double* extra = drift ? drift + row * n : nullptr;
-                const double* felt = noisy ? mean_control(commands, p, s, u, mean) : nullptr;
+                const Felt felt = noisy ? felt_controls(commands, p, s, u, seen) : Felt{};
                 if (noisy && held) {
                     held_noise(mechanism, h, extra, path.q.data(), path.center.data(), felt, dw, y.data());
                     // The entry of a driven joint is its goal, and its drive absorbs the noise.
@@ -389,7 +390,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     std::array<std::vector<double>, 2> by_rates;  // (2n, 2n) and (2n, n), derivatives in rates at both ends
     std::vector<double> given;                    // (s, n) force at the stages of the whole step, if it varies
     std::vector<double> line;                     // (s, m) controls at the stages, if they are linear in time
-    std::vector<double> mean;                     // (m) and their mean
+    std::vector<double> seen;                     // (2, m) what the noise sees of them
     std::vector<double> at;                       // (s + 1, s) t_kj
     std::vector<double> weight;                   // (s, s) w_ik
     Trial trial;

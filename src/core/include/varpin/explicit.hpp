@@ -216,7 +216,7 @@ class ExplicitRollout {
         return true;
     }
 
-    // Take all steps, each of length h. Each of these may be null: increments (P, N, k), a drift (P, N, n) added to the
+    // Take all steps, each of length h. Each of these may be null: increments (P, N, K), a drift (P, N, n) added to the
     // controls' force, and impulses (P, N, 2, n) added to the noise's before and after each step. For a single path a
     // watch may end the rollout.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
@@ -228,7 +228,7 @@ class ExplicitRollout {
             bool regular = at_state();
             for (std::int64_t s = 0; s < nodes.steps; ++s) {
                 const std::int64_t row = i * nodes.steps + s;
-                const double* dw = increments ? increments + row * mechanism_->diffusion.processes : nullptr;
+                const double* dw = increments ? increments + row * increments_of_step(*mechanism_, commands) : nullptr;
                 const double* kicks = impulses ? impulses + 2 * row * dof() : nullptr;
                 outcome = step(h, commands, dw, drift ? drift + row * dof() : nullptr, kicks, regular, nodes, i, s);
                 if (outcome != Outcome::solved) break;
@@ -263,7 +263,7 @@ class ExplicitRollout {
         double* u = nodes.u + path * nodes.steps * m;
         apply_policy(commands, path, s, n, at_q.data(), at_v.data(), u);
         const double* within = stage_controls(commands, path, s, stepper_.abscissae(), u, line_);
-        const double* felt = mean_control(commands, path, s, u, mean_);
+        const Felt felt = felt_controls(commands, path, s, u, seen_);
         u += s * m;
         stage_forces(*mechanism_, drift, within ? within : u, within ? stepper_.abscissae() : 1, force_.data());
         if (!regular) return Outcome::singular;
@@ -311,7 +311,7 @@ class ExplicitRollout {
     std::int64_t paths_;
     std::vector<double> center_;  // (P, n, k) of the diffusion fields
     ExplicitStepper stepper_;
-    std::vector<double> force_, jump_, line_, mean_;
+    std::vector<double> force_, jump_, line_, seen_;
 };
 
 }  // namespace varpin

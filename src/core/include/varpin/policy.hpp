@@ -6,6 +6,7 @@
 
 #include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <vector>
 
 #include "varpin/tree.hpp"
@@ -25,7 +26,15 @@ struct Commands {
     const double* before = nullptr;       // (P, m) control of each path before its first, or null for the reference
     const double* within = nullptr;       // (N, s, m) controls at the stages of each step, or null for constant ones
     const double* stage_times = nullptr;  // (s) times of the stages for linear controls, which need `before`; or null
+    bool sloped = false;                  // whether steps have increments for the slopes of linear controls as well
 };
+
+// Number of increments of a step, (N3): one for each process, then one for each whose strength depends on the control
+// where these see the slopes of linear controls.
+inline std::int64_t increments_of_step(const Mechanism& mechanism, const Commands& commands) {
+    const Diffusion& fields = mechanism.diffusion;
+    return fields.processes + (commands.sloped ? static_cast<std::int64_t>(fields.sloped.size()) : 0);
+}
 
 // Controls of step s of a path, clipped to their limits, into row s of u (N, m).
 inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, int n, const double* first,
@@ -76,19 +85,28 @@ inline const double* stage_controls(const Commands& commands, std::ptrdiff_t pat
     return line.data();
 }
 
-// The control (m) of step s of a path that its noise sees, after apply_policy: the mean over the step. That of a linear
-// control is written to `mean`.
-inline const double* mean_control(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, const double* u,
-                                  std::vector<double>& mean) {
+// What the noise of a step sees of its controls, (N3).
+struct Felt {
+    const double* mean = nullptr;    // (m) over the step
+    const double* change = nullptr;  // (m) from its start to its end, or null where the noise does not see it
+};
+
+// The controls of step s of a path that its noise sees, after apply_policy. Those of linear controls are written to
+// `work`.
+inline Felt felt_controls(const Commands& commands, std::ptrdiff_t path, std::ptrdiff_t s, const double* u,
+                          std::vector<double>& work) {
     const int m = commands.controls;
     const double* to = u + s * m;
-    if (!commands.stage_times) return to;
+    if (!commands.stage_times) return {to, nullptr};
     const std::ptrdiff_t first = s - s % commands.hold;
     const double* from = first > 0 ? u + (first - 1) * m : commands.before + path * m;
     const double share = (static_cast<double>(s - first) + 0.5) / commands.hold;
-    mean.resize(m);
-    for (int c = 0; c < m; ++c) mean[c] = (1.0 - share) * from[c] + share * to[c];
-    return mean.data();
+    work.resize(2 * static_cast<std::size_t>(m));
+    for (int c = 0; c < m; ++c) {
+        work[c] = (1.0 - share) * from[c] + share * to[c];
+        work[m + c] = (to[c] - from[c]) / commands.hold;
+    }
+    return {work.data(), commands.sloped ? work.data() + m : nullptr};
 }
 
 // The force drift + B u of a step with constant controls; drift (n) may be null.
@@ -104,9 +122,25 @@ inline void stage_forces(const Mechanism& mechanism, const double* drift, const 
         constant_force(mechanism, drift, u + i * mechanism.controls, force + i * mechanism.dof());
 }
 
-// The impulse part * sum_i F_i(q, u) dw_i.
+// Add to an impulse the part of the increments for the slopes of the controls, (N3).
+inline void add_slope_noise(const Mechanism& mechanism, double part, const double* change, const double* increments,
+                            double* impulse) {
+    const Diffusion& fields = mechanism.diffusion;
+    const int n = mechanism.dof(), m = mechanism.controls, k = fields.processes;
+    const double share = part / std::sqrt(12.0);
+    for (std::size_t a = 0; a < fields.sloped.size(); ++a) {
+        for (int i = 0; i < n; ++i) {
+            const double* row = fields.control.data() + (static_cast<std::size_t>(i) * k + fields.sloped[a]) * m;
+            double field = 0.0;
+            for (int c = 0; c < m; ++c) field += row[c] * change[c];
+            impulse[i] += share * field * increments[k + a];
+        }
+    }
+}
+
+// The impulse part * sum_i F_i(q, u) dw_i, and that of the slopes of linear controls.
 inline void noise_impulse(const Mechanism& mechanism, double part, const double* q, const double* center,
-                          const double* u, const double* increments, double* impulse) {
+                          const Felt& felt, const double* increments, double* impulse) {
     const Diffusion& fields = mechanism.diffusion;
     const int n = mechanism.dof(), m = mechanism.controls, k = fields.processes;
     for (int i = 0; i < n; ++i) {
@@ -114,18 +148,19 @@ inline void noise_impulse(const Mechanism& mechanism, double part, const double*
         for (int w = 0; w < k; ++w) {
             const double offset = q[i] - center[i * k + w];
             double field = fields.constant[i * k + w] + fields.quadratic[i * k + w] * offset * offset;
-            for (int c = 0; c < m; ++c) field += fields.control[(i * k + w) * m + c] * u[c];
+            for (int c = 0; c < m; ++c) field += fields.control[(i * k + w) * m + c] * felt.mean[c];
             total += field * increments[w];
         }
         impulse[i] = part * total;
     }
+    if (felt.change) add_slope_noise(mechanism, part, felt.change, increments, impulse);
 }
 
 // The constant force over a step of length h whose impulse is that of the noise, (N2), plus a drift (n), which may be
 // null.
 inline void held_noise(const Mechanism& mechanism, double h, const double* drift, const double* q, const double* center,
-                       const double* u, const double* increments, double* force) {
-    noise_impulse(mechanism, 1.0 / h, q, center, u, increments, force);
+                       const Felt& felt, const double* increments, double* force) {
+    noise_impulse(mechanism, 1.0 / h, q, center, felt, increments, force);
     for (int i = 0; drift && i < mechanism.dof(); ++i) force[i] += drift[i];
 }
 

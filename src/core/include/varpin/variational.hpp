@@ -233,13 +233,15 @@ class VariationalStepper final : public Stepper {
 
     // Advances every path by N steps. Writes the node after each step, its controls and its statistics into `nodes`. A
     // path that fails stops; nodes.ended and nodes.done hold the reason and the number of steps. These may be null:
-    // `increments` of the Wiener processes (P, N, k), `drift`, a force in addition to the controls (P, N, n), and
-    // `impulses` in addition to the noise, before and after each step (P, N, 2, n). A `watch` may stop a single path.
+    // `increments` of the Wiener processes (P, N, K) with K = increments_of_step, `drift`, a force in addition to the
+    // controls (P, N, n), and `impulses` in addition to the noise, before and after each step (P, N, 2, n). A `watch`
+    // may stop a single path.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
               std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) override {
         const std::int64_t steps = nodes.steps;
-        const int m = mechanism.controls, k = mechanism.diffusion.processes, stages = step_equation.stages;
-        const bool noisy = increments != nullptr && k > 0;
+        const int m = mechanism.controls, stages = step_equation.stages;
+        const std::int64_t width = increments_of_step(mechanism, commands);
+        const bool noisy = increments != nullptr && width > 0;
         const bool kicks = noisy && !held, spreads = noisy && held;
         for (std::int64_t path = 0; path < nodes.paths; ++path) {
             PathState& state = states[path];
@@ -250,9 +252,9 @@ class VariationalStepper final : public Stepper {
             nodes.done[path] = 0;
             for (std::int64_t s = 0; s < steps; ++s) {
                 const std::int64_t row = path * steps + s;
-                const double* dw = noisy ? increments + row * k : nullptr;
+                const double* dw = noisy ? increments + row * width : nullptr;
                 apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
-                const double* felt = noisy ? mean_control(commands, path, s, u, mean) : nullptr;
+                const Felt felt = noisy ? felt_controls(commands, path, s, u, seen) : Felt{};
                 if (kicks) noise_kick(left, felt, dw, state);
                 if (impulses) kick(impulses + 2 * row * n, state);
                 const double* within = stage_controls(commands, path, s, stages, u, line);
@@ -294,7 +296,7 @@ class VariationalStepper final : public Stepper {
     Trial trial;
     std::vector<double> given;  // (s, n) varying force at the stages of the whole step
     std::vector<double> line;   // (s, m) linear controls at these stages
-    std::vector<double> mean;   // (m) and their mean
+    std::vector<double> seen;   // (2, m) what the noise sees of them
     std::vector<double> guess;  // (s, n) extrapolated stage velocities
     std::vector<double> bend;   // (2, n)
     std::vector<double> at;     // (n)
@@ -398,8 +400,8 @@ class VariationalStepper final : public Stepper {
     }
 
     // The impulse of `part` of the increments dw, (N2).
-    void noise_kick(double part, const double* u, const double* dw, PathState& state) {
-        noise_impulse(mechanism, part, state.q.data(), state.center.data(), u, dw, bend.data());
+    void noise_kick(double part, const Felt& felt, const double* dw, PathState& state) {
+        noise_impulse(mechanism, part, state.q.data(), state.center.data(), felt, dw, bend.data());
         kick(bend.data(), state);
     }
 };
