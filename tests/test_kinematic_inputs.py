@@ -417,9 +417,9 @@ def test_what_does_not_know_inputs_refuses_them():
     noisy = vp.Scene(robot, constraints=[loop, hand], noise=vp.ControlNoise(np.full((3, 2, 3), 0.1)))
     with refused(vp.InputError, "ControlNoise", "KinematicInput", "position"):
         vp.simulate(noisy, q, v, dt=0.01, steps=3, rng=0)
-    own = vp.CustomNoise(lambda q, v, u: np.ones((3, 1)), 1)
+    own = vp.CustomNoise(lambda q, v, u: np.ones((3, 1)), 1, dv=lambda q, v, u: np.zeros((3, 1, 3)))
     noisy = vp.Scene(robot, constraints=[loop, hand], noise=own)
-    with refused(vp.InputError, "CustomNoise", "KinematicInput"):
+    with refused(vp.InputError, "noise", "velocity", "constraints"):
         vp.simulate(noisy, q, v, dt=0.01, steps=3, rng=0)
     for actuation in (["joint2"], 2.0 * np.eye(3), np.ones((3, 1))):
         with refused(vp.InputError, "control"):

@@ -90,3 +90,104 @@ def test_a_controller_takes_them(interpolation: str) -> None:
     run = vp.Mpc(problem).run(vp.Plant(problem.scene, substeps=3), duration=1.2)
     np.testing.assert_allclose(run.motion.q[1:, 0], run.motion.u[:, 0], atol=1e-12)
     np.testing.assert_allclose(run.motion.q[-1], [0.4, -0.6, 0.2], atol=0.1)
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_searches_start_on_states(interpolation: str, controls: str) -> None:
+    """The inputs follow the states, forces of the other joints make up for what the motors lack: the same optimum."""
+    problem = hand_and_motor(interpolation, controls=controls)
+    own = vp.solve(problem, tolerance=1e-12, check=False)
+    share = np.linspace(0.0, 1.0, problem.steps + 1)[:, None]
+    states = problem.q0 + share * (np.array([0.3, -0.4, 0.1]) - problem.q0)
+    found = vp.solve(problem, states=states, tolerance=1e-12, check=False)
+    assert found.status.converged
+    assert found.cost == pytest.approx(own.cost, rel=1e-9)
+    np.testing.assert_allclose(found.trajectory.q, own.trajectory.q, atol=1e-5)
+    # The first motion of no iterations is on the states.
+    first = vp.solve(problem, states=own.trajectory, max_iterations=0, check=False)
+    np.testing.assert_allclose(first.trajectory.q[:, 0], own.trajectory.q[:, 0], atol=1e-12)
+
+
+def noisy_pair(interpolation: str, **options: object) -> list[vp.OptimalControlProblem]:
+    """The same problem under noise that the core evaluates, and that Python does."""
+    m = 4 if interpolation == "cubic" else 3
+    intensity = np.zeros((3, 2, m))
+    intensity[1, 0, 1], intensity[2, 1, 2], intensity[1, 1, 2] = 0.3, 0.2, 0.1
+    python = vp.CustomNoise(lambda q, v, u: intensity @ u, 2, du=lambda q, v, u: intensity)
+    return [hand_and_motor(interpolation, noise=noise, **options) for noise in (vp.ControlNoise(intensity), python)]
+
+
+@pytest.mark.parametrize("kick", ["left", "held"])
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_noise_in_python_is_that_of_the_core(interpolation: str, kick: str) -> None:
+    """Beside inputs that move over a step, over the steps of a decision, and beside lines over one or several steps."""
+    core, python = noisy_pair(interpolation, integrator=vp.Gauss(2, kick=kick))
+    m, rng = core.scene.controls, np.random.default_rng(1)
+    u, gains, nodes = 0.5 * rng.normal(size=(7, m)), 0.05 * rng.normal(size=(6, m, 6)), np.zeros((6, 6))
+    u[0] = start_of(core)[0]
+    laws = [
+        (u[1:], 6, 0.08),
+        (vp.LinearPolicy(u[1:], gains, nodes, 3, "momentum", period=0.08), 18, 0.08 / 3),
+        (vp.LinearPolicy(u[1:], gains, nodes, on="momentum", before=u[0], linear=True, period=0.08), 6, 0.08),
+        (vp.LinearPolicy(u[1:], gains, nodes, on="momentum", before=u[0], linear=True, period=0.08), 12, 0.04),
+    ]
+    for controls, steps, dt in laws:
+        width = core.scene.increments(linear=isinstance(controls, vp.LinearPolicy) and controls.linear)
+        dw = np.sqrt(dt) * rng.normal(size=(steps, width))
+        one, other = (
+            vp.simulate(
+                problem.scene, problem.q0, problem.v0, dt=dt, steps=steps, controls=controls, increments=dw,
+                integrator=problem.integrator, check=False,
+            )
+            for problem in (core, python)
+        )  # fmt: skip
+        np.testing.assert_allclose(other.q, one.q, atol=1e-11)
+        np.testing.assert_allclose(other.v, one.v, atol=1e-10)
+        np.testing.assert_allclose(other.u, one.u, atol=1e-11)
+        assert np.abs(one.q[-1] - one.q[0]).max() > 0.1
+        found, expected = (vp.linearize(problem.scene, motion) for problem, motion in ((python, other), (core, one)))
+        for name in ("A", "G", "Gx", "Gu"):
+            np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-10)
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_plans_under_noise_in_python_are_those_under_the_same_in_the_core(controls: str) -> None:
+    one, other = (vp.solve(problem, check=False) for problem in noisy_pair("cubic", controls=controls))
+    assert other.status.converged
+    assert other.noise_cost == pytest.approx(one.noise_cost, rel=1e-6)
+    assert other.cost == pytest.approx(one.cost, rel=1e-8)
+    told = other.monte_carlo(8, rng=0)
+    assert told.cost == pytest.approx(one.monte_carlo(8, rng=0).cost, rel=1e-5)
+
+
+def test_noise_of_the_position_of_an_input_is_differentiated_at_the_end_of_the_step() -> None:
+    """Its derivatives in the controls at both ends of a line, by differences of the fields there."""
+    own = vp.CustomNoise(
+        lambda q, v, u: np.array([[0.0], [u[0] * u[1]], [u[0] ** 2]]),
+        1,
+        du=lambda q, v, u: np.array([[[0.0] * 3], [[u[1], u[0], 0.0]], [[2.0 * u[0], 0.0, 0.0]]]),
+        check=True,
+    )
+    problem = hand_and_motor(steps=1, noise=own)
+    u, step = start_of(problem).ravel(), 1e-5
+    u[3] += 0.4
+
+    def linearized(ends: np.ndarray) -> vp.Linearization:
+        return vp.linearize(problem.scene, problem.simulate(line(problem, ends.reshape(2, 3))))
+
+    lin = linearized(u)
+    first = lin.F[0, :, 0]
+    np.testing.assert_allclose(first, [0.0, u[3] * 0.5 * (u[1] + u[4]), u[3] ** 2], atol=1e-12)
+    slope = np.array([0.0, u[3] * (u[4] - u[1]), 0.0]) / np.sqrt(12.0)
+    np.testing.assert_allclose(lin.G[0], lin.J[0] @ np.stack([first, slope], axis=1), atol=1e-12)
+    for c in range(6):
+        away = step * np.eye(6)[c]
+        # The Jacobian of the step stays: it is the fields that are differentiated.
+        fields = []
+        for at in (u + away, u - away):
+            mean, last = 0.5 * (at[1] + at[4]), at[3]
+            fields.append(np.array([[0.0, last * mean, last**2], [0.0, last * (at[4] - at[1]) / np.sqrt(12.0), 0.0]]).T)
+        expected = lin.J[0] @ (fields[0] - fields[1]) / (2.0 * step)
+        found = (lin.Gramp if c >= 3 else lin.Gu - lin.Gramp)[0, :, :, c % 3]
+        np.testing.assert_allclose(found, expected, atol=1e-8)

@@ -222,6 +222,9 @@ def linearize_steps(
         if ramp is not None and Gramp is not None:
             end_ramp = 0.5 * end.Fu if end.Fr is None else end.Fr
             Gramp[:, n:] += (1.0 - left) * (end_ramp + np.einsum("Naib,Nbc->Naic", end_x, ramp))
+    if Gramp is not None and scene.inputs:
+        # As of the step itself, only the end counts.
+        Gramp[..., scene.prescribed] = Gu[..., scene.prescribed]
     return Linearization(
         A=A,
         B=B,

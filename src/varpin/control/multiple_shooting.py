@@ -1,11 +1,11 @@
 """Multiple shooting from given states: auxiliary joint forces hold the first motion on them, then are removed.
 
 Equations (O14) and (O15) of docs/mathematics.md. The given states need not be feasible: an auxiliary force on every
-joint makes up for what the controls lack. The effect of a step's auxiliary forces on the state at its end is the gap of
-multiple shooting. Each iteration first tries the step that closes all gaps, as FDDP does (Mastalli et al., "Crocoddyl",
-2020); the backward pass includes the removal of the forces. If the motion does not follow the model that far, the
-forces become controls with a quadratic cost, and its weight grows. Without auxiliary forces the motion is feasible, and
-single shooting continues from it.
+joint makes up for what the controls lack; joints of kinematic inputs follow the states themselves. The effect of a
+step's auxiliary forces on the state at its end is the gap of multiple shooting. Each iteration first tries the step
+that closes all gaps, as FDDP does (Mastalli et al., "Crocoddyl", 2020); the backward pass includes the removal of the
+forces. If the motion does not follow the model that far, the forces become controls with a quadratic cost, and its
+weight grows. Without auxiliary forces the motion is feasible, and single shooting continues from it.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.inputs import as_moved, with_ends
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene, assisted, quiet
@@ -88,10 +89,6 @@ def path_of(problem: OptimalControlProblem, given: object) -> Path:
     Raises:
         InputError: The states do not fit the problem, or do not begin at its q0.
     """
-    if problem.scene.inputs:
-        raise InputError(
-            "states cannot be used with a KinematicInput, whose control is its joint's position: give controls instead"
-        )
     n, nodes, names = problem.scene.robot.dof, problem.steps + 1, problem.scene.robot.joint_names
     q: object = given
     v: object = None
@@ -164,7 +161,8 @@ class GapClosing:
         self._wanted = problem
         if problem.linear:
             problem = _held(problem)
-            controls = None if controls is None else 0.5 * (controls[:-1] + controls[1:])
+            if controls is not None:
+                controls = with_ends(problem.scene, 0.5 * (controls[:-1] + controls[1:]), controls[1:])
         scene, own = assisted(problem.scene), quiet(problem.scene)
         self.scene, self.problem = scene, problem.changed(scene=own)
         if isinstance(problem, PenalizedProblem):
@@ -176,21 +174,27 @@ class GapClosing:
         M = lagrangian_jet(own, problem.q0, np.zeros(n)).Lvv
         omega = _HOLDING_FREQUENCY / problem.period
         hold = -np.hstack([omega**2 * M, 2.0 * omega * (np.eye(n) if problem.integrator.variational else M)])
-        self._weight = np.linalg.inv(M)
+        free, moved = own.unprescribed, own.prescribed
+        self._free = free
+        self._weight = np.linalg.inv(M[np.ix_(free, free)])
         self._motions = Motions(scene, problem.integrator, problem.q0, problem.v0, problem.dt)
-        self._gains = np.tile(np.linalg.pinv(own.actuation) @ hold, (problem.decisions, 1, 1))
+        own_hold = np.linalg.pinv(own.actuation) @ hold
+        own_hold[moved] = 0.0
+        self._gains = np.tile(own_hold, (problem.decisions, 1, 1))
         u, force = _inverse_dynamics(problem, path, controls)
-        gains = np.zeros((problem.decisions, m + n, 2 * n))
-        gains[:, m:] = hold
+        gains = np.zeros((problem.decisions, m + len(free), 2 * n))
+        gains[:, m:] = hold[free]
         at = path.q, path.v
         if problem.integrator.variational:
             at = path.q, np.array([lagrangian_jet(own, q, v).Lv for q, v in zip(*at, strict=True)])
-        self.motion = self._rolled(np.hstack([u, force]), gains, np.hstack(at)[: -1 : problem.hold])
+        self.motion = self._rolled(np.hstack([u, force[:, free]]), gains, np.hstack(at)[: -1 : problem.hold])
         if controls is None:
             # The controls take as much of the holding force as their limits allow.
-            force = self.motion.full.u @ scene.actuation.T
+            full = self.motion.full
+            force = full.u @ scene.actuation.T
             u = np.clip(force @ np.linalg.pinv(own.actuation).T, *problem.control_limits)
-            self.motion = self._of(replace(self.motion.full, u=np.hstack([u, force - u @ own.actuation.T])))
+            u = with_ends(own, u, full.u)
+            self.motion = self._of(replace(full, u=np.hstack([u, (force - u @ own.actuation.T)[:, free]])))
         if not np.isfinite(self.motion.cost):
             culprits = " + ".join(map(repr, problem.not_finite(self.motion.trajectory) or problem.cost.terms))
             raise CostError(culprits, f"the cost of the motion along the states is {self.motion.cost}")
@@ -225,6 +229,8 @@ class GapClosing:
         # Lines through the means of neighbours. A line answers a state half a step later than a held control, so that
         # its feedback may do harm.
         nodes = np.vstack([u[:1], 0.5 * (u[:-1] + u[1:]), u[-1:]])
+        nodes[1:] = with_ends(problem.scene, nodes[1:], u)
+        nodes = self._wanted.begun(nodes)
         line = LinearPolicy(
             nodes[1:],
             held.gains,
@@ -265,7 +271,7 @@ class GapClosing:
     def _rolled(self, u: Floats, gains: Floats, reference: Floats) -> _Motion:
         """Integrate the motion under controls and auxiliary forces (R, m + n) with feedback."""
         problem = self.problem
-        free = np.outer([-np.inf, np.inf], np.ones(problem.scene.robot.dof))
+        free = np.outer([-np.inf, np.inf], np.ones(len(self._free)))
         commands = Commands(
             u=u,
             gains=gains,
@@ -358,10 +364,10 @@ class GapClosing:
         Returns:
             The step length, the expected increase of the cost, the gradient's largest entry and the number of trials.
         """
-        problem, motion, n, m = self.problem, self.motion, self.problem.scene.robot.dof, self.problem.scene.controls
+        problem, motion, m = self.problem, self.motion, self.problem.scene.controls
         assisted = problem.changed(
             scene=self.scene,
-            control_limits=np.hstack([problem.control_limits, np.outer([-np.inf, np.inf], np.ones(n))]),
+            control_limits=np.hstack([problem.control_limits, np.outer([-np.inf, np.inf], np.ones(len(self._free)))]),
         )
         plan = backward(assisted, motion.full, regularization, along=self._weighted(assisted))
         if plan is None:
@@ -523,5 +529,6 @@ def _inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Floa
     still = q @ scene.holding.T @ scene.actuation.T
     needed += still - scene.core.forces(q, v, still)[0]
     if controls is None:
-        controls = np.clip(needed @ np.linalg.pinv(scene.actuation).T, *problem.control_limits)
+        controls = needed @ np.linalg.pinv(scene.actuation).T
+        controls = np.clip(as_moved(scene, path.q[hold::hold], path.v[hold::hold], controls), *problem.control_limits)
     return controls, needed - controls @ scene.actuation.T

@@ -18,6 +18,7 @@ from varpin.arrays import Floats, Integers
 from varpin.core import Watch
 from varpin.core.arrays import Commands, RolloutArrays
 from varpin.errors import InputError, SingularMassMatrix
+from varpin.mechanics.inputs import with_ends
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import Fields, over_steps
 from varpin.mechanics.scene import Scene
@@ -170,7 +171,7 @@ class Integrator(ABC):
         for j in range(steps_of(commands)):
             row = rows(commands, j // commands.hold, j // commands.hold + 1, segments[-1].u[None, -1] if j else None)
             if (taken := j % commands.hold) > 0:
-                row = open_loop(segments[-1].u)
+                row = open_loop(segments[-1].u)._replace(hold=commands.hold - taken)
                 if len(commands.stage_times):
                     first = segments[j - taken - 1].u if j > taken else commands.before[:1]
                     row = _rest_of_line(row, first, taken, commands)
@@ -402,9 +403,11 @@ def noise_fields(
 
     With controls that are linear between nodes they are those of :func:`varpin.mechanics.noise.over_steps`.
     """
-    nodes = trajectory.u_nodes
-    ends = (nodes[:-1][steps], nodes[1:][steps]) if nodes.shape[1] else None
-    return over_steps(scene.noise, q, v, trajectory.u[steps], ends, first)
+    nodes, u, ends = trajectory.u_nodes, trajectory.u[steps], None
+    if nodes.shape[1]:
+        # The noise sees positions of kinematic inputs at the end of a step.
+        ends = with_ends(scene, nodes[:-1][steps], u), with_ends(scene, nodes[1:][steps], u)
+    return over_steps(scene.noise, q, v, u, ends, first)
 
 
 def noise_impulses(

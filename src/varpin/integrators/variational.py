@@ -45,6 +45,7 @@ from varpin.integrators.base import (
     written,
 )
 from varpin.mechanics.forces import limited_servos
+from varpin.mechanics.inputs import in_parts_of_steps, prescribing, with_ends
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.support.checks import count, fraction, is_one_of, positive
 from varpin.trajectory import MOST_HALVINGS, Bytes, Trajectory
@@ -178,8 +179,6 @@ class Variational(Integrator):
         if scene.processes and self.left < 1.0:
             raise InputError("kick='split' does not go with constraints: take kick='left' or kick='held'")
         noise = scene.noise.diffusion
-        if scene.inputs and noise is None:
-            raise InputError("a CustomNoise does not go with a KinematicInput: take ControlNoise or StateNoise")
         if noise is not None and noise.control[:, :, scene.prescribed].any():
             raise InputError(
                 "ControlNoise is proportional to forces, and the control of a KinematicInput is a position: its "
@@ -319,9 +318,15 @@ class Variational(Integrator):
         """One step of one path with diffusion fields that are evaluated in Python."""
         q, p, v, _ = state.paths.nodes()
         decided = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
-        now = first_of(command, decided, self.stage_times)
+        now, ends = first_of(command, decided, self.stage_times), ends_of(command, decided)
+        if scene.inputs:
+            after = in_parts_of_steps(scene, decided[None], q, v, dt * command.hold, command.hold)[:1]
+            now, ends = (
+                prescribing(scene, now, after),
+                (with_ends(scene, ends[0], after), with_ends(scene, ends[1], after)),
+            )
         F, drift = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
-        drift, ends = self.drift_share * drift, ends_of(command, decided)
+        drift = self.drift_share * drift
         if len(increment):
             impulse = noise_of_step(scene, F, q[0], v[0], ends, state.start[0], increment[0, 0])
             if self.holds_noise:

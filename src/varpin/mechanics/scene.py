@@ -395,6 +395,11 @@ class Scene(Frozen):
         positions = [int(np.argmax(self.actuation[c])) for c in self.inputs.values()]
         return np.array([*positions, *(rate for rate in self.rates if rate >= 0)], dtype=np.int64)
 
+    @property
+    def unprescribed(self) -> Integers:
+        """The coordinates without kinematic inputs."""
+        return np.setdiff1d(np.arange(self.robot.dof), list(self.inputs.values()))
+
     @cached_property
     def transmission(self) -> Floats:
         """Matrix from controls (m,) to the inputs of linearized steps: forces (n,), then velocities of cubic inputs."""
@@ -640,8 +645,8 @@ def quiet(scene: Scene) -> Scene:
 
 
 def assisted(scene: Scene) -> Scene:
-    """The scene without noise, with n additional controls, a force on each joint."""
-    return _driven(scene, np.hstack([scene.actuation, np.eye(scene.robot.dof)]))
+    """The scene without noise, with additional controls, a force on each joint without a kinematic input."""
+    return _driven(scene, np.hstack([scene.actuation, np.eye(scene.robot.dof)[:, scene.unprescribed]]))
 
 
 def _driven(scene: Scene, actuation: Floats) -> Scene:
