@@ -282,3 +282,15 @@ def test_paths_on_lines_are_repeated_and_examined_with_their_noise(kick: str, co
     zeros = np.hstack([motion.dw[:, :4], np.zeros((200, 2))])
     np.testing.assert_array_equal(means.q, vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=zeros, **given).q)
     assert np.abs(means.q - motion.q).max() > 1e-6
+
+
+@pytest.mark.parametrize("slopes", [False, True])
+@pytest.mark.parametrize("kick", ["left", "split"])
+def test_kicks_of_strong_noise_on_lines_are_no_error_of_the_motion(kick: str, slopes: bool) -> None:
+    """A kick is of the control over the whole step, also where the check repeats the step in parts."""
+    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=vp.ControlNoise(0.3))
+    controls = vp.FirstOrderHold(10.0 * np.sin(np.linspace(0.0, 30.0, 41))[:, None] * [1.0, -0.5])
+    dw = 0.2 * np.random.default_rng(1).normal(size=(40, 4))
+    given = {"dt": 0.04, "steps": 40, "controls": controls, "integrator": vp.Gauss(2, kick=kick)}
+    motion = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=dw if slopes else dw[:, :2], **given)
+    assert motion.warnings == ()

@@ -122,12 +122,18 @@ def impulses_at(scene: Scene, integrator: Integrator, trajectory: Trajectory, st
 def noise_left_out(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
     """Whether a repetition has no noise, though the motion has.
 
-    So it is for fields in Python, and under constraints for kicks that see the slopes of controls.
+    So it is for fields in Python, and under constraints for kicks that depend on controls that change within steps.
     """
     if not trajectory.dw.any():
         return False
-    kicked = trajectory.dw.shape[1] > scene.processes and not integrator.holds_noise
+    kicked = _of_whole_steps(scene, trajectory) and not integrator.holds_noise
     return scene.noise.diffusion is None or (kicked and bool(scene.constraints))
+
+
+def _of_whole_steps(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether kicks depend on controls that change within steps: the core sees those of parts, not of whole steps."""
+    within = trajectory.u_stages.shape[1] > 0 or trajectory.u_nodes.shape[1] > 0
+    return within and scene.noise.sloped.size > 0
 
 
 class Again:
@@ -208,8 +214,7 @@ class Again:
             drift = np.repeat(held_noise(scene, trajectory, taken), parts, axis=0)[None]
         elif not trajectory.dw.any() or noise_left_out(scene, method, trajectory):
             pass
-        elif trajectory.dw.shape[1] > scene.processes:
-            # The core sees the slopes of the parts, not of the whole steps.
+        elif _of_whole_steps(scene, trajectory):
             kicks = np.zeros((1, (end - begin) * parts, 2, scene.robot.dof))
             steps = np.arange(taken.start, taken.stop)
             kicks[0, ::parts, 0], kicks[0, parts - 1 :: parts, 1] = impulses_at(scene, method, trajectory, steps)
