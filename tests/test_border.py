@@ -159,6 +159,7 @@ def calls():
     guess = np.zeros((N, 2, n))
     yield "derivatives", core.variational_derivatives, {**steps(own), "guess": guess}
     yield "curvatures", core.variational_curvatures, {**steps(own), "guess": guess, "z": draw(N, 2 * n)}
+    yield "bends", core.variational_bends, {**steps(own), "guess": guess, "weights": draw(N, 2 * n, 3 * n)}
     yield "ends", core.variational_ends, steps(own)
     yield "accelerations", core.accelerations, {"mechanism": own.core, **many}
     for method in core.ExplicitMethod:
@@ -195,7 +196,7 @@ FREE = {("place a frame", "q", 0), ("changes", "u", 0), ("changes", "u", 1), ("e
 FREE |= {("constraints", "q", 0)}
 FREE |= {("changes", "before", 0), ("expanded changes", "before", 0)}
 # Of two stages: a force for each.
-FREE |= {(name, "force", 1) for name in ("derivatives", "curvatures", "ends", "derivatives under constraints")}
+FREE |= {(name, "force", 1) for name in ("derivatives", "curvatures", "bends", "ends", "derivatives under constraints")}
 
 
 @pytest.fixture(scope="module")

@@ -9,18 +9,31 @@ import varpin as vp
 from varpin.control.backward import backward
 from varpin.control.moments import noise_cost
 from varpin.control.spread import Feedback
+from varpin.control.within_steps import mean_of_decay, mean_of_decay_slopes
 
 CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
 
 
 def reach(
-    noise: object, *, steps: int = 6, dt: float = 0.08, rate: float = 0.0, damping: float = 0.2, **options: object
+    noise: object,
+    *,
+    steps: int = 6,
+    dt: float = 0.08,
+    rate: float = 0.0,
+    damping: float = 0.2,
+    place: bool = False,
+    **options: object,
 ):
     cost = vp.ControlCost(0.05) + vp.VelocityCost(0.1)
     cost += vp.Terminal(vp.TrackingCost([0.5, -0.5], 20.0) + vp.VelocityCost(5.0))
     if rate:
         cost += vp.ControlRateCost(rate)
-    scene = vp.Scene(vp.planar_chain(2), damping=damping, noise=noise)
+    robot = vp.planar_chain(2)
+    if place:
+        # Hessians that depend on the configuration.
+        cost += vp.FramePositionCost(robot, "tip", [0.5, 0.0, -1.0], 3.0)
+        cost += vp.Terminal(vp.FramePositionCost(robot, "tip", [0.5, 0.0, -1.0], 10.0))
+    scene = vp.Scene(robot, damping=damping, noise=noise)
     return vp.OptimalControlProblem(scene, cost, [0.2, 0.2], [0.0, 0.0], dt=dt, steps=steps, **options)
 
 
@@ -39,6 +52,8 @@ def reach(
         (CONTROL, {"integrator": vp.Radau(2, kick="held"), "damping": 1.0}),
         (STATE, {"integrator": vp.RungeKutta4()}),
         (vp.AdditiveNoise(0.5), {"integrator": vp.Gauss(2)}),
+        (CONTROL, {"integrator": vp.Gauss(2, kick="held"), "place": True}),
+        (CONTROL, {"integrator": vp.Gauss(2), "place": True, "sampling": "start"}),
     ],
 )
 def test_it_is_that_of_the_expected_cost(noise: object, options: dict) -> None:
@@ -54,10 +69,31 @@ def test_it_is_that_of_the_expected_cost(noise: object, options: dict) -> None:
     assert np.abs(held - found).max() > 1e-3 * np.abs(found).max()
 
 
+@pytest.mark.parametrize("size", [1e-3, 0.5, 20.0])
+def test_derivatives_of_the_mean_over_a_decay(size: float) -> None:
+    rng = np.random.default_rng(0)
+    Z, (H, pull) = size * (np.eye(3) + 0.3 * rng.normal(size=(2, 3, 3))), rng.normal(size=(2, 2, 3, 3))
+    H, pull = (0.5 * (a + np.swapaxes(a, 1, 2)) for a in (H, pull))
+    to_Z, to_H = mean_of_decay_slopes(Z, H, pull)
+    step = 1e-3 * max(size, 1.0)
+    for index in np.ndindex(3, 3):
+        away = np.zeros((3, 3))
+        away[index] = step
+        near, far = (
+            ((mean_of_decay(Z + k * away, H) - mean_of_decay(Z - k * away, H)) * pull).sum(axis=(1, 2)) for k in (1, 2)
+        )
+        np.testing.assert_allclose(
+            to_Z[(..., *index)], (8.0 * near - far) / (12.0 * step), atol=1e-9 * np.abs(to_Z).max()
+        )
+        shift = 0.5 * (away + away.T)
+        change = ((mean_of_decay(Z, H + shift) - mean_of_decay(Z, H)) * pull).sum(axis=(1, 2)) / step
+        np.testing.assert_allclose(to_H[(..., *index)], change, atol=1e-11 * np.abs(to_H).max())
+
+
 @pytest.mark.parametrize("noise", [CONTROL, STATE])
 def test_plans_end_at_the_minimum_of_the_expected_cost(noise: object) -> None:
     problem = reach(noise, steps=12, dt=0.05, integrator=vp.Gauss(2))
-    held, whole = (vp.solve(problem, noise=mode, tolerance=1e-11, check=False) for mode in ("held", "whole"))
+    held, whole = (vp.solve(problem, noise=mode, tolerance=1e-11, check=False) for mode in ("held", None))
     assert held.status.converged
     assert whole.status.converged
     assert whole.expected_cost < (1.0 - 1e-5) * held.expected_cost

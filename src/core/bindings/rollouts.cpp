@@ -103,6 +103,27 @@ std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanis
     return {curvatures, static_cast<std::int64_t>(outcome), done};
 }
 
+// Derivatives in (q0, p0, f) of the sum of weights times d(q1, p1)/d(q0, p0, f) of each step (N, 3n), for weights
+// (N, 2n, 3n).
+std::tuple<Out, std::int64_t, std::size_t> variational_bends(const Mechanism& mechanism, const Tableau& tableau,
+                                                             double tolerance, const Guards& guards, double h, In<2> q,
+                                                             In<2> p, In<3> force, Integers<1> substeps, Bytes halvings,
+                                                             In<3> guess, In<3> weights, Solver solver) {
+    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
+    const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
+    require(guess, "guess", {N, stages, n});
+    require(weights, "weights", {N, 2 * n, 3 * n});
+    double* slopes = nullptr;
+    const Out found = array_for(slopes, {N, 3 * n});
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    work.varies = at.varies;
+    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
+        return work.bend(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
+                         weights.data() + s * 6 * n * n, slopes + s * 3 * n, at.past(s));
+    });
+    return {found, static_cast<std::int64_t>(outcome), done};
+}
+
 // Configurations and velocities (N, n) at the end of each step.
 std::tuple<Out, Out, std::int64_t, std::size_t> variational_ends(const Mechanism& mechanism, const Tableau& tableau,
                                                                  double tolerance, const Guards& guards, double h,
@@ -145,6 +166,9 @@ void register_rollouts(nb::module_& m) {
           "solver"_a = Solver::automatic);
     m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
           "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "z"_a,
+          "solver"_a = Solver::automatic);
+    m.def("variational_bends", &variational_bends, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a,
+          "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "weights"_a,
           "solver"_a = Solver::automatic);
     m.def("variational_ends", &variational_ends, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a,
           "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "solver"_a = Solver::automatic);

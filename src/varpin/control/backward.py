@@ -489,7 +489,8 @@ class Along:
         """Add the whole gradient of the noise cost of ``processes`` (K,) under the plan's gains to later passes."""
         problem, N = self.problem, self.problem.steps
         feedback = Feedback(plan.feedback, plan.previous)
-        pull = noise_gradient(problem, self.trajectory, feedback, self.rate, processes)
+        lin = self.linearized(0, N)[0] if len(self.blocks) == 1 else None
+        pull = noise_gradient(problem, self.trajectory, feedback, self.rate, processes, lin, plan.spread)
         if problem.linear:
             self.pulled, self.noise_differentiated = pull, True
             vars(self).pop("line", None)

@@ -9,33 +9,22 @@ docs/mathematics.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control.linear_controls import after_impulse, at_samples, in_step, of_samples, on_lines, shifted_lines
+from varpin.control.noise_adjoint import LinearizedSteps, exact_gradient, is_exact
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.spread import Feedback, added_covariance, decided, propagated
 from varpin.control.within_steps import beyond_samples
-from varpin.linearization import linearize_steps, velocity_at_nodes
+from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
 
 # Step of the central differences, relative to the largest value of each variable along the motion.
 _SHIFT = 1e-5
-
-
-@dataclass(frozen=True, eq=False)
-class _Steps:
-    """N linearized steps in their Z variables, (x, u) or (x, w, u), with their costs to second order."""
-
-    J: Floats  # (N, 2n, Z)
-    g: Floats  # (N, 2n, k) derivative in the noise
-    gz: Floats  # (N, 2n, k, Z) its derivative in the variables
-    cost: Floats  # (N, Z, Z) Hessian of the running cost
-    kicked: Floats  # (N, 2n, 2n) Hessian of the part after the noise impulse, in the state there
-    beyond: Floats | None  # (N, 2n, 2n) what no sample of it sees
 
 
 def noise_gradient(
@@ -44,6 +33,8 @@ def noise_gradient(
     feedback: Feedback,
     rate: Floats,
     processes: NDArray[np.bool_],
+    lin: Linearization | None = None,
+    spread: Floats | None = None,
 ) -> Floats:
     """The gradient (N, Z) of the noise cost in the Z variables of each step, (O12).
 
@@ -55,12 +46,33 @@ def noise_gradient(
         feedback: The gains of a backward pass along it.
         rate: Hessian (R, m, m) of the cost of control changes, or (0, m, m).
         processes: Mask of the increments that count (K,).
+        lin: The linearized steps, if they are known.
+        spread: S of (O2) from the backward pass (N, 2n, 2n).
     """
-    n, N = problem.scene.robot.dof, problem.steps
-    here = _steps_of(problem, trajectory, processes)
-    Z = here.J.shape[2]
-    W = _values(problem, here, feedback, _end_hessian(problem, trajectory), rate)
+    here = _steps_of(problem, trajectory, processes, lin)
+    if spread is not None and problem.hold == 1 and not len(rate) and not problem.linear:
+        # The value has no rows for the control before a decision.
+        x = here.J.shape[1]
+        W = np.zeros((len(spread) + 1, here.J.shape[2], here.J.shape[2]))
+        W[1:, :x, :x] = spread / problem.dt - here.kicked
+    else:
+        W = _values(problem, here, feedback, _end_hessian(problem, trajectory), rate)
     C = propagated(here.J, here.g, here.gz, problem, feedback)
+    if is_exact(problem):
+        return exact_gradient(problem, trajectory, here, W, C, processes)
+    return _by_differences(problem, trajectory, here, W, C, processes)
+
+
+def _by_differences(
+    problem: OptimalControlProblem,
+    trajectory: Trajectory,
+    here: LinearizedSteps,
+    W: Floats,
+    C: Floats,
+    processes: NDArray[np.bool_],
+) -> Floats:
+    """:func:`noise_gradient` by central differences of the shares, for any step, cost and noise."""
+    (N, _, Z), n = here.J.shape, problem.scene.robot.dof
     variational = problem.integrator.variational
     x = np.concatenate([trajectory.q, trajectory.p if variational else trajectory.v], axis=1)
     nodes = trajectory.u_nodes
@@ -134,7 +146,9 @@ def noise_cost_in_halves(
     return _with_covariances(halves, trajectory, here, C)
 
 
-def _with_covariances(problem: OptimalControlProblem, trajectory: Trajectory, here: _Steps, C: Floats) -> float:
+def _with_covariances(
+    problem: OptimalControlProblem, trajectory: Trajectory, here: LinearizedSteps, C: Floats
+) -> float:
     """The noise cost with covariances ``C`` (N + 1, Z, Z) of the variables of each step, and of the last state."""
     x = here.J.shape[1]
     over_time = (here.cost * C[:-1]).sum()
@@ -150,7 +164,7 @@ def left_within_steps(problem: OptimalControlProblem, trajectory: Trajectory, fe
     return _of_impulses(problem, here, here.beyond, propagated(here.J, here.g, here.gz, problem, feedback))
 
 
-def _of_impulses(problem: OptimalControlProblem, steps: _Steps, hessian: Floats, C: Floats) -> float:
+def _of_impulses(problem: OptimalControlProblem, steps: LinearizedSteps, hessian: Floats, C: Floats) -> float:
     """The cost of the noise's jumps by its Hessian (N, 2n, 2n) in them, for the covariances C before the steps."""
     twice = np.einsum("Nak,Nab,Nbk->", steps.g, hessian, steps.g, optimize=True)
     twice += np.einsum("Nakz,Nab,Nbky,Nzy->", steps.gz, hessian, steps.gz, C[:-1], optimize=True)
@@ -184,10 +198,16 @@ def _perturbed(
     return replace(moved, q=q, p=trajectory.p + dx[:, n:], v=v)
 
 
-def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory, processes: NDArray[np.bool_] | slice) -> _Steps:
+def _steps_of(
+    problem: OptimalControlProblem,
+    trajectory: Trajectory,
+    processes: NDArray[np.bool_] | slice,
+    lin: Linearization | None = None,
+) -> LinearizedSteps:
     scene, n, m, N = problem.scene, problem.scene.robot.dof, problem.scene.controls, problem.steps
     x, h, rule, samples = 2 * n, problem.dt, problem.rule, len(problem.rule)
-    lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0, ramps=problem.linear)
+    if lin is None:
+        lin = linearize_steps(scene, trajectory, problem.integrator, problem.q0, ramps=problem.linear)
     velocity = np.zeros((0, n, x))
     if problem.integrator.variational and rule[:, [2, 4, 6, 8]].any():
         velocity = velocity_at_nodes(scene, trajectory.q, trajectory.v)
@@ -206,10 +226,10 @@ def _steps_of(problem: OptimalControlProblem, trajectory: Trajectory, processes:
     beyond = beyond_samples(problem, trajectory, lin, hessian, samples)
     if beyond is not None:
         kicked = kicked + beyond
-    return _Steps(J, lin.G[:, :, processes], gz[:, :, processes], cost, kicked, beyond)
+    return LinearizedSteps(J, lin.G[:, :, processes], gz[:, :, processes], cost, kicked, beyond, lin, velocity, hessian)
 
 
-def _hessian(problem: OptimalControlProblem, steps: _Steps, W: Floats, k: int | slice) -> Floats:
+def _hessian(problem: OptimalControlProblem, steps: LinearizedSteps, W: Floats, k: int | slice) -> Floats:
     """Hessian in the step's variables of the cost from step k on, with the value function W after the step."""
     J, gz, x = steps.J[k], steps.gz[k], steps.J.shape[1]
     after = slice(-problem.scene.controls, None)
@@ -220,11 +240,12 @@ def _hessian(problem: OptimalControlProblem, steps: _Steps, W: Floats, k: int | 
     Y[..., :, after] += mixed
     Y[..., after, :] += np.swapaxes(mixed, -1, -2)
     Y[..., after, after] += W[..., x:, x:]
-    added: Floats = np.einsum("...akz,...ab,...bky->...zy", gz, spread, gz, optimize=True)
+    by_process = np.moveaxis(gz, -2, -3)
+    added: Floats = (np.swapaxes(by_process, -1, -2) @ (spread[..., None, :, :] @ by_process)).sum(axis=-3)
     return Y + added
 
 
-def _shares(problem: OptimalControlProblem, steps: _Steps, W: Floats, C: Floats) -> Floats:
+def _shares(problem: OptimalControlProblem, steps: LinearizedSteps, W: Floats, C: Floats) -> Floats:
     """Noise cost of each step (N,), from the values W after the steps and the covariances C before them."""
     x = steps.J.shape[1]
     spread = problem.dt * (W[1:, :x, :x] + steps.kicked)
@@ -234,7 +255,7 @@ def _shares(problem: OptimalControlProblem, steps: _Steps, W: Floats, C: Floats)
 
 
 def _values(
-    problem: OptimalControlProblem, steps: _Steps, feedback: Feedback, terminal: Floats, rate: Floats
+    problem: OptimalControlProblem, steps: LinearizedSteps, feedback: Feedback, terminal: Floats, rate: Floats
 ) -> Floats:
     """Hessians of the value function at the nodes (N + 1, 2n + m, 2n + m) in (x, previous control)."""
     N, x, m = problem.steps, steps.J.shape[1], problem.scene.controls

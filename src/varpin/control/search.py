@@ -26,6 +26,7 @@ from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.control.multiple_shooting import GapClosing, Path, path_of
+from varpin.control.noise_adjoint import is_exact
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import COMPARISON, SLOW, SUFFICIENT, refine
 from varpin.control.solution import Solution
@@ -81,6 +82,10 @@ _LITTLE = 1e-4
 _LOSSY = 1e-8
 # Iterations without significant decrease before the search stalls. The cost is discontinuous where guards cut steps.
 PATIENCE = 15
+# A search goes on with the whole gradient of the noise cost from this share of the cost at stake as expected decrease,
+# or after so many iterations without a decrease.
+_NEAR = 1e-4
+_CYCLE = 4
 # Iterations by whose decrease a search that may end early is judged.
 _SLOW = 8
 # Share of the first motion's cost at stake that is added to the current one: an optimum of cost zero has none.
@@ -115,7 +120,7 @@ def solve(
     progress: Progress | None = None,
     check: bool = True,
     true_cost: float | None = None,
-    noise: Literal["held", "whole"] = "held",
+    noise: Literal["held", "whole"] | None = None,
     states: ArrayLike | tuple[ArrayLike, ArrayLike] | Trajectory | None = None,
 ) -> Solution:
     """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
@@ -182,12 +187,15 @@ def solve(
             slow leaves the rest to half the step, where that lowers the cost by more than ``true_cost``. Ctrl-C keeps
             the best plan so far. Where dampers are far faster than the step, ``controls="linear"`` in the problem
             reaches the accuracy at much larger steps.
-        noise: Gradient of the noise cost, where the noise's strength depends on the state or the control. ``"held"``:
-            as in the paper, with the Hessian of the value function held; it neglects the derivatives of that Hessian,
-            and ends next to the minimum of the expected cost. ``"whole"``: the search continues from there to that
-            minimum, a local one of the model, for 10 to 50 times the time. With ``second_order`` and within control
-            limits it is held. Problems with constraints are solved for the least cost without noise, which then
-            affects only their feedback and margins.
+        noise: Gradient of the noise cost, where the noise's strength depends on the state or the control. ``"whole"``:
+            once the search is close to its end, it takes the whole gradient of the expected cost, and ends at a minimum
+            of it, a local one of the model. ``"held"``: as in the paper, with the Hessian of the value function held;
+            it neglects the derivatives of that Hessian, and ends next to the minimum. By default it is the whole one
+            where steps have second derivatives: with a variational integrator, constant controls and a kick that is
+            left or held, without custom forces, custom noise, kinematic inputs and constraints of the scene. It then
+            takes two to four times as long as the search with it held; elsewhere, by differences, ``"whole"`` takes 10
+            to 50 times as long. With ``second_order`` and within control limits it is held. Problems with constraints
+            are solved for the least cost without noise, which then affects only their feedback and margins.
         states: Initial states, which need not be feasible: configurations at the nodes (N + 1, n), the first one q0; a
             pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of another planner
             will do: auxiliary joint forces hold the first motion on it, and the first iterations remove them (multiple
@@ -215,8 +223,9 @@ def solve(
         raise InputError(f"backtracking must be in (0, 1), got {backtracking}")
     if not real("regularization", regularization) >= 0.0:
         raise InputError(f"regularization must be >= 0, got {regularization}")
-    if not is_one_of(noise, ("held", "whole")):
-        raise InputError(f"noise must be 'held' or 'whole', got {noise!r}")
+    if noise is not None and not is_one_of(noise, ("held", "whole")):
+        raise InputError(f"noise must be 'held', 'whole' or None, got {noise!r}")
+    whole_noise = noise == "whole" or (noise is None and is_exact(problem))
     report_all = require_reports(callback, progress)
     positive("tolerance", tolerance, "1")
     deadline = time.perf_counter() + checked_time(time_limit)
@@ -237,9 +246,7 @@ def solve(
         slow: float | None = None,
     ) -> Solution:
         """One search, of at most ``most`` iterations after those of ``resume``."""
-        search = _Search(
-            problem, second_order, forward, armijo, backtracking, regularization, whole_noise=noise == "whole"
-        )
+        search = _Search(problem, second_order, forward, armijo, backtracking, regularization, whole_noise=whole_noise)
         if resume is not None:
             search.resume(_search_of(problem, controls, resume))
         elif path is None:
@@ -414,6 +421,13 @@ class _Here(NamedTuple):
     total: float  # the expected cost
 
 
+class _Rated(NamedTuple):
+    """A motion's expansions and their plan with the Hessian of the value function held."""
+
+    along: Along
+    plan: Plan
+
+
 class _Trial(NamedTuple):
     """A trial of the line search.
 
@@ -423,6 +437,7 @@ class _Trial(NamedTuple):
         cost: Change of the cost without noise.
         expected: Change of the expected cost.
         cut: Whether it was stopped for its number of substeps.
+        rated: The expansions along it and their plan, where the expected cost needed them.
     """
 
     motion: Attempt | None = None
@@ -430,6 +445,7 @@ class _Trial(NamedTuple):
     cost: float = np.inf
     expected: float = np.inf
     cut: bool = False
+    rated: _Rated | None = None
 
 
 class _Step(NamedTuple):
@@ -505,6 +521,7 @@ class _Search:
         # limits the noise cost is discontinuous where a control meets one and loses its gains, so it has no gradient.
         self.wants_whole = whole_noise and not (second_order or problem.limited) and self.any_steered
         self.whole = False
+        self.rated: _Rated | None = None  # of the current motion
         # Prefix of each log line: it tells several problems, and a controller's ticks, apart.
         robot, begin = problem.scene.robot.name, problem.t0
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {begin:g} s"
@@ -651,9 +668,11 @@ class _Search:
 
     def _turns_whole(self, *, there: bool) -> bool:
         """Whether the search with held noise has ended and the one with the whole gradient begins."""
-        if not self.wants_whole or self.whole:
+        # The noise cost of exact passes is another.
+        if not self.wants_whole or self.whole or self.second_order:
             return False
-        return there or (len(self.gains) > 1 and self.gains[-1] <= 0.0)
+        near = there or self._decrease_at_most(self._share(_NEAR))
+        return near or (len(self.gains) > _CYCLE and not any(self.gains[-_CYCLE:]))
 
     def _take_whole(self) -> None:
         """Use the whole gradient of the noise cost from now on, starting at the best motion so far."""
@@ -668,6 +687,10 @@ class _Search:
     def _differentiate_noise(self, regularization: float) -> int:
         """Add the whole gradient of the noise cost to passes along the motion; returns the passes that took."""
         if not self.whole or self.along.noise_differentiated:
+            return 0
+        rated, self.rated = self.rated, None
+        if rated is not None and rated.along is self.along:
+            self.along.differentiate_noise(rated.plan, self.steered)
             return 0
         plan = backward(self.problem, self.trajectory, regularization, along=self.along)
         if plan is not None:
@@ -918,6 +941,9 @@ class _Search:
         if taken.motion is not None and taken.shares is not None:
             self.before = self.trajectory, self.shares, self.cost, self.above
             self.trajectory, self.shares = taken.motion.trajectory(), taken.shares
+            if taken.rated is not None:
+                self.trajectory = taken.rated.along.trajectory
+                self._around, self.rated = taken.rated.along, taken.rated
             self.cost = float(taken.shares.sum())
             self.above += taken.cost
         elif tried is not None:
@@ -1010,26 +1036,27 @@ class _Search:
                 few = attempt.failure is not None and bounds.integrator != problem.integrator
                 return _Trial(cut=few or attempt.verdict is Watch.Verdict.cut)
             there = attempt.shares()
-            noise = more = 0.0
+            noise, more, rated = 0.0, 0.0, None
             if problem.processes:
                 noise = float((noise_shares(problem, attempt.trajectory(), plan) - here.added).sum())
             if self.whole:
-                more = self._noise_beyond(attempt.trajectory(), plan)
+                more, rated = self._noise_beyond(attempt.trajectory(), plan)
         except _TRIAL_ERRORS as error:
             logger.info("%s: trial of length %g: %s", self.label, step, error)
             return _Trial()
         cost = float((there - self.shares).sum())
         if not math.isfinite(cost):
             return _Trial()
-        return _Trial(attempt, there, cost, cost + noise + more)
+        return _Trial(attempt, there, cost, cost + noise + more, rated=rated)
 
-    def _noise_beyond(self, trial: Trajectory, plan: Plan) -> float:
+    def _noise_beyond(self, trial: Trajectory, plan: Plan) -> tuple[float, _Rated | None]:
         """Noise cost along a trial with the value function there, minus that with the current plan's."""
-        found = backward(self.problem, trial, self.regularization)
+        along = Along(self.problem, trial)
+        found = backward(self.problem, trial, self.regularization, along=along)
         if found is None:
-            return np.inf
+            return np.inf, None
         shares, held = (noise_shares(self.problem, trial, each, self.steered).sum() for each in (found, plan))
-        return float(shares - held)
+        return float(shares - held), _Rated(along, found)
 
     def _last_plan(self) -> Plan | None:
         if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):

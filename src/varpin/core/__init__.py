@@ -39,6 +39,7 @@ from varpin.core._core import longest_alternation as longest_alternation
 from varpin.core._core import pulls_fast as pulls_fast
 from varpin.core._core import sample_steps as sample_steps
 from varpin.core._core import stake_of as stake_of
+from varpin.core._core import variational_bends as variational_bends
 from varpin.core._core import variational_curvatures as variational_curvatures
 from varpin.core._core import variational_derivatives as variational_derivatives
 from varpin.core._core import variational_ends as variational_ends

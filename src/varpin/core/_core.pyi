@@ -281,6 +281,27 @@ def variational_derivatives(
     parts that active ``guards`` refuse are halved.
     """
 
+def variational_bends(
+    mechanism: Mechanism,
+    tableau: Tableau,
+    tolerance: float,
+    guards: Guards,
+    dt: float,
+    q: Floats,
+    p: Floats,
+    force: Floats,
+    substeps: Integers,
+    halvings: Bytes,
+    *,
+    guess: Floats,
+    weights: Floats,
+    solver: Solver = Solver.automatic,
+) -> tuple[Floats, int, int]:
+    """Derivatives (N, 3n) of sums of ``weights`` (N, 2n, 3n) times d(q1, p1)/d(q0, p0, f) in (q0, p0, f).
+
+    Also the outcome, and the number of steps done.
+    """
+
 def variational_curvatures(
     mechanism: Mechanism,
     tableau: Tableau,

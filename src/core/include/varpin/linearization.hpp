@@ -13,6 +13,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <numeric>
 #include <span>
 #include <vector>
 
@@ -57,10 +58,13 @@ class VariationalLinearization final : public StepDerivatives {
           at_q(n),
           at_v(n),
           inner(entries(2 * n, 3 * n)),
+          df(entries(n, 3 * n)),
           at_f(n),
           along_q(n),
           along_v(n),
-          along_f(n) {}
+          along_f(n) {
+        for (int c = 0; c < n; ++c) df[c * 3 * n + 2 * n + c] = 1.0;
+    }
 
     // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f. An undivided step
     // is solved again from a guess (s, n) close to its root; the arrays q, p and force have `past` earlier steps before
@@ -106,24 +110,45 @@ class VariationalLinearization final : public StepDerivatives {
             return Outcome::solved;
         }
         std::vector<Substep> trail;
-        std::vector<double> Jx(4 * n * n), Jf(2 * n * n), back(z, z + 2 * n), before(2 * n);
-        chained.begin(Jx.data(), Jf.data());
-        const Outcome outcome = parts(h, q, p, force, halvings, [&](double begin, double length) {
-            trail.push_back({from, from_p, stepper.step_equation.V, begin, length, joined(Jx, Jf)});
-            part_derivatives(length);
-            chained.follow(Jx.data(), Jf.data());
-        });
+        std::vector<double> row(z, z + 2 * n), before(2 * n);
+        const Outcome outcome = follow(h, q, p, force, halvings, trail);
         if (outcome != Outcome::solved) return outcome;
         for (std::size_t k = trail.size(); k-- > 0;) {
             const Outcome again = root_of(h, trail[k]);
             if (again != Outcome::solved) return again;
             part_derivatives(trail[k].length);
-            add_curvature(trail[k].length, back.data(), trail[k].start.data(), H);
-            for (int c = 0; c < 2 * n; ++c) {
-                before[c] = 0.0;
-                for (int r = 0; r < 2 * n; ++r) before[c] += chained.part[r * 2 * n + c] * back[r];
-            }
-            std::swap(before, back);
+            add_curvature(trail[k].length, row.data(), trail[k].start.data(), H);
+            back(row.data(), before.data());
+            std::swap(before, row);
+        }
+        return Outcome::solved;
+    }
+
+    // Derivatives (3n) in (q0, p0, f) of the sum of `weights` (2n, 3n) times d(q1, p1)/d(q0, p0, f) of one step, into
+    // `found`. As `second`, with row a of the weights times the second derivatives of entry a of (q1, p1).
+    Outcome bend(double h, const double* q, const double* p, const double* guess, const double* force,
+                 std::span<const std::uint8_t> halvings, const double* weights, double* found, int past = 0) {
+        std::fill(found, found + 3 * n, 0.0);
+        std::vector<double> rows(entries(2 * n, 2 * n), 0.0);
+        for (int a = 0; a < 2 * n; ++a) rows[a * 2 * n + a] = 1.0;
+        if (halvings.empty() && !stepper.guards.active) {
+            const Outcome outcome = root(h, q, p, guess, force, past);
+            if (outcome != Outcome::solved) return outcome;
+            part_derivatives(h);
+            add_bends(h, rows, nullptr, weights, found);
+            return Outcome::solved;
+        }
+        std::vector<Substep> trail;
+        const Outcome outcome = follow(h, q, p, force, halvings, trail);
+        if (outcome != Outcome::solved) return outcome;
+        std::vector<double> before(rows.size());
+        for (std::size_t k = trail.size(); k-- > 0;) {
+            const Outcome again = root_of(h, trail[k]);
+            if (again != Outcome::solved) return again;
+            part_derivatives(trail[k].length);
+            add_bends(trail[k].length, rows, trail[k].start.data(), weights, found);
+            for (int a = 0; a < 2 * n; ++a) back(&rows[a * 2 * n], &before[a * 2 * n]);
+            std::swap(before, rows);
         }
         return Outcome::solved;
     }
@@ -154,7 +179,10 @@ class VariationalLinearization final : public StepDerivatives {
     std::vector<double> multiplier, slope;  // (s, n)
     Jet<Dual> direction;
     std::vector<Dual> at_q, at_v;
-    std::vector<double> inner;  // (2n, 3n)
+    std::vector<double> inner;         // (2n, 3n)
+    std::vector<double> df;            // (n, 3n) of the force
+    std::vector<double> multipliers;   // (2n, s n)
+    std::vector<double> moves, pulls;  // (2n)
     std::vector<Dual> at_f;
     std::vector<Dual> coupled_q, coupled_v;                   // (n, n) of couplings, along a direction
     std::vector<JointForce<Dual>> along_q, along_v, along_f;  // (n) of the elements, with derivatives in q, in v, in f
@@ -214,6 +242,26 @@ class VariationalLinearization final : public StepDerivatives {
         });
     }
 
+    // The parts of a step, repeated.
+    Outcome follow(double h, const double* q, const double* p, const double* force,
+                   std::span<const std::uint8_t> halvings, std::vector<Substep>& trail) {
+        std::vector<double> Jx(4 * n * n), Jf(2 * n * n);
+        chained.begin(Jx.data(), Jf.data());
+        return parts(h, q, p, force, halvings, [&](double begin, double length) {
+            trail.push_back({from, from_p, stepper.step_equation.V, begin, length, joined(Jx, Jf)});
+            part_derivatives(length);
+            chained.follow(Jx.data(), Jf.data());
+        });
+    }
+
+    // A row (2n) on the end of a part, brought to its beginning by the part's derivatives.
+    void back(const double* row, double* before) const {
+        for (int c = 0; c < 2 * n; ++c) {
+            before[c] = 0.0;
+            for (int r = 0; r < 2 * n; ++r) before[c] += chained.part[r * 2 * n + c] * row[r];
+        }
+    }
+
     // Derivatives of the part whose root is in the stepper.
     void part_derivatives(double length) {
         stepper.step_equation.derivatives(length, dV, chained.part.data(), chained.part_f.data());
@@ -228,6 +276,16 @@ class VariationalLinearization final : public StepDerivatives {
         return both;
     }
 
+    // Changes of Q and V at a stage and of f along w directions, each (n, w).
+    struct Moved {
+        const double *q, *v, *f;
+        int width;
+    };
+    // The sum's derivatives in them along the same directions, each (n, w).
+    struct Pulled {
+        double *q, *v, *f;
+    };
+
     // Add start' (z . d2(q1, p1)) start, (L4), at the stepper's root, after part_derivatives; `start` (2n, 3n) may be
     // null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
@@ -238,11 +296,17 @@ class VariationalLinearization final : public StepDerivatives {
         stepper.step_equation.solve_transposed(h, slope.data(), multiplier.data());
         if (start != nullptr) bring_to_start(start);
         for (int i = 0; i < stages; ++i) {
-            differentiate_along(h, i, z);
+            differentiate_along(h, i, z, multiplier.data());
             move_stage(h, i, start);
-            bend_stage(i);
-            if (mechanism.forces.any()) add_elements(h, i, z, H);
-            if (equation.coupled()) add_couplings(h, i, z);
+            std::fill(inner.begin(), inner.end(), 0.0);
+            const Moved moved{dQ.data(), &dV[i * n * w], df.data(), w};
+            const Pulled pulled{inner.data(), &inner[n * w], H + 2 * n * w};
+            bend_stage(moved, pulled);
+            if (mechanism.forces.any()) {
+                differentiate_elements(i);
+                add_elements(h, i, z, multiplier.data(), moved, pulled);
+            }
+            if (equation.coupled()) add_couplings(h, i, z, multiplier.data(), moved, pulled);
             for (int c = 0; c < n; ++c) {
                 const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
                 const double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
@@ -254,6 +318,44 @@ class VariationalLinearization final : public StepDerivatives {
         }
         for (int r = 0; r < w; ++r) {
             for (int k = 0; k < r; ++k) H[r * w + k] = H[k * w + r] = 0.5 * (H[r * w + k] + H[k * w + r]);
+        }
+    }
+
+    // Add the derivatives of `bend` through one part at the stepper's root, after part_derivatives; the rows (2n, 2n)
+    // are those of the end of the step at the part's end.
+    void add_bends(double h, const std::vector<double>& rows, const double* start, const double* weights,
+                   double* found) {
+        const Collocation<Size, Stages>& equation = stepper.step_equation;
+        const int w = 3 * n;
+        multipliers.resize(entries(2 * n, stages * n));
+        moves.resize(2 * n);
+        pulls.resize(2 * n);
+        for (int a = 0; a < 2 * n; ++a) {
+            write_slopes(h, &rows[a * 2 * n]);
+            stepper.step_equation.solve_transposed(h, slope.data(), &multipliers[a * stages * n]);
+        }
+        if (start != nullptr) bring_to_start(start);
+        for (int i = 0; i < stages; ++i) {
+            move_stage(h, i, start);
+            if (stepper.mechanism.forces.any()) differentiate_elements(i);
+            std::fill(pulls.begin(), pulls.end(), 0.0);
+            const Pulled pulled{pulls.data(), &pulls[n], found + 2 * n};
+            for (int a = 0; a < 2 * n; ++a) {
+                const double *z = &rows[a * 2 * n], *along = weights + a * w, *by = &multipliers[a * stages * n];
+                for (int c = 0; c < n; ++c) {
+                    moves[c] = std::inner_product(along, along + w, &dQ[c * w], 0.0);
+                    moves[n + c] = std::inner_product(along, along + w, &dV[(i * n + c) * w], 0.0);
+                }
+                const Moved moved{moves.data(), &moves[n], along + 2 * n, 1};
+                differentiate_along(h, i, z, by);
+                bend_stage(moved, pulled);
+                if (stepper.mechanism.forces.any()) add_elements(h, i, z, by, moved, pulled);
+                if (equation.coupled()) add_couplings(h, i, z, by, moved, pulled);
+            }
+            for (int c = 0; c < n; ++c) {
+                const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
+                for (int k = 0; k < w; ++k) found[k] += dq[k] * pulls[c] + dv[k] * pulls[n + c];
+            }
         }
     }
 
@@ -280,7 +382,7 @@ class VariationalLinearization final : public StepDerivatives {
     }
 
     // The jet at stage i and its derivative along (alpha, -multiplier), of which psi is the Lagrangian's share.
-    void differentiate_along(double h, int i, const double* z) {
+    void differentiate_along(double h, int i, const double* z, const double* multiplier) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
         const Tableau& tableau = equation.tableau;
         for (int c = 0; c < n; ++c) {
@@ -305,16 +407,15 @@ class VariationalLinearization final : public StepDerivatives {
         }
     }
 
-    // (psi_qq dQ + psi_qv dV; psi_vq dQ + psi_vv dV) at stage i into `inner`.
-    void bend_stage(int i) {
-        const int w = 3 * n;
-        std::fill(inner.begin(), inner.end(), 0.0);
+    // Add (psi_qq dQ + psi_qv dV; psi_vq dQ + psi_vv dV) at the stage of `direction`.
+    void bend_stage(const Moved& moved, const Pulled& pulled) const {
+        const int w = moved.width;
         for (int r = 0; r < n; ++r) {
-            double *in_q = &inner[r * w], *in_v = &inner[(n + r) * w];
+            double *in_q = pulled.q + r * w, *in_v = pulled.v + r * w;
             for (int j = 0; j < n; ++j) {
                 const double qq = direction.Lqq[r * n + j].slope, vq = direction.A[r * n + j].slope;
                 const double qv = direction.A[j * n + r].slope, vv = direction.M[r * n + j].slope;
-                const double *dq = &dQ[j * w], *dv = &dV[(i * n + j) * w];
+                const double *dq = moved.q + j * w, *dv = moved.v + j * w;
                 for (int k = 0; k < w; ++k) {
                     in_q[k] += qq * dq[k] + qv * dv[k];
                     in_v[k] += vq * dq[k] + vv * dv[k];
@@ -323,10 +424,9 @@ class VariationalLinearization final : public StepDerivatives {
         }
     }
 
-    // Add the diagonal second derivatives of gamma . F of elements at stage i to `inner`, and those in f to H.
-    void add_elements(double h, int i, const double* z, double* H) {
+    // The elements' forces at stage i, with derivatives in q, in v and in f.
+    void differentiate_elements(int i) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
-        const int w = 3 * n;
         for (auto* along : {&along_q, &along_v, &along_f}) {
             for (int c = 0; c < n; ++c) {
                 at_q[c] = {equation.Q[i * n + c], along == &along_q ? 1.0 : 0.0};
@@ -335,37 +435,40 @@ class VariationalLinearization final : public StepDerivatives {
             }
             stepper.mechanism.forces.sum(n, at_q.data(), at_v.data(), at_f.data(), along->data());
         }
+    }
+
+    // Add the diagonal second derivatives of gamma . F of the elements that were differentiated at stage i.
+    void add_elements(double h, int i, const double* z, const double* multiplier, const Moved& moved,
+                      const Pulled& pulled) const {
+        const int w = moved.width;
         for (int c = 0; c < n; ++c) {
-            const double gamma = weight(h, i, c, z);
+            const double gamma = weight(h, i, c, z, multiplier);
             const double qq = gamma * along_q[c].by_q.slope, qv = gamma * along_q[c].by_v.slope;
-            const double vv = gamma * along_v[c].by_v.slope;
+            const double vv = gamma * along_v[c].by_v.slope, ff = gamma * along_f[c].by_f.slope;
             const double qf = gamma * along_f[c].by_q.slope, vf = gamma * along_f[c].by_v.slope;
-            const int f = 2 * n + c;
-            const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
-            double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w], *in_f = H + f * w;
+            const double *dq = moved.q + c * w, *dv = moved.v + c * w, *of_f = moved.f + c * w;
+            double *in_q = pulled.q + c * w, *in_v = pulled.v + c * w, *in_f = pulled.f + c * w;
             for (int k = 0; k < w; ++k) {
-                in_q[k] += qq * dq[k] + qv * dv[k];
-                in_v[k] += qv * dq[k] + vv * dv[k];
-                in_f[k] += qf * dq[k] + vf * dv[k];
+                in_q[k] += qq * dq[k] + qv * dv[k] + qf * of_f[k];
+                in_v[k] += qv * dq[k] + vv * dv[k] + vf * of_f[k];
+                in_f[k] += qf * dq[k] + vf * dv[k] + ff * of_f[k];
             }
-            in_q[f] += qf;
-            in_v[f] += vf;
-            in_f[f] += gamma * along_f[c].by_f.slope;
         }
     }
 
     // The weight gamma of the force of stage i on coordinate c.
-    double weight(double h, int i, int c, const double* z) const {
+    double weight(double h, int i, int c, const double* z, const double* multiplier) const {
         const Tableau& tableau = stepper.step_equation.tableau;
         double gamma = tableau.b[i] * z[n + c];
         for (int j = 0; j < stages; ++j) gamma += tableau.force[j * stages + i] * multiplier[j * n + c];
         return h * gamma;
     }
 
-    // Add the second derivatives of gamma . F of couplings at stage i to `inner`, by columns of the Hessian.
-    void add_couplings(double h, int i, const double* z) {
+    // Add the second derivatives of gamma . F of couplings at stage i, by columns of the Hessian.
+    void add_couplings(double h, int i, const double* z, const double* multiplier, const Moved& moved,
+                       const Pulled& pulled) {
         const Collocation<Size, Stages>& equation = stepper.step_equation;
-        const int w = 3 * n;
+        const int w = moved.width;
         for (auto* matrix : {&coupled_q, &coupled_v}) matrix->resize(n * n);
         for (int along = 0; along < 2 * n; ++along) {
             for (int c = 0; c < n; ++c) {
@@ -375,18 +478,18 @@ class VariationalLinearization final : public StepDerivatives {
             std::fill(along_q.begin(), along_q.end(), JointForce<Dual>{});
             stepper.mechanism.couplings.add_forces(n, at_q.data(), at_v.data(), direction.couplings, along_q.data(),
                                                    coupled_q.data(), coupled_v.data());
-            const double* moved = along < n ? &dQ[along * w] : &dV[(i * n + along - n) * w];
+            const double* change = along < n ? moved.q + along * w : moved.v + (along - n) * w;
             for (int c = 0; c < n; ++c) {
                 double by_q = 0.0, by_v = 0.0;
                 for (int r = 0; r < n; ++r) {
-                    const double gamma = weight(h, i, r, z);
+                    const double gamma = weight(h, i, r, z, multiplier);
                     by_q += gamma * coupled_q[r * n + c].slope;
                     by_v += gamma * coupled_v[r * n + c].slope;
                 }
-                double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
+                double *in_q = pulled.q + c * w, *in_v = pulled.v + c * w;
                 for (int k = 0; k < w; ++k) {
-                    in_q[k] += by_q * moved[k];
-                    in_v[k] += by_v * moved[k];
+                    in_q[k] += by_q * change[k];
+                    in_v[k] += by_v * change[k];
                 }
             }
         }
