@@ -475,6 +475,18 @@ class Along:
         self.pulled: Floats | None = None
         self.noise_differentiated = False
 
+    def beside(self, trajectory: Trajectory) -> Along:
+        """Expansions of the cost along a motion close by, with the linearization of this one, which is one block."""
+        made, problem = copy(self), self.problem
+        made.trajectory, made.kept = trajectory, self.linearized(0, problem.steps)
+        for name in ("running", "within", "stake", "model", "terminal", "line", "demands"):
+            vars(made).pop(name, None)
+        if problem.rate is not None:
+            made.pull, made.rate = problem.rate.expand(problem.decided(trajectory), problem.period)
+        if problem.limited:
+            made.slack = problem.control_limits - problem.decided(trajectory)[:, None]
+        return made
+
     @cached_property
     def running(self) -> Expansion:
         """The running cost at its samples."""
