@@ -59,6 +59,7 @@ Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
 
+_EPS = float(np.finfo(np.float64).eps)
 # Least share of the expected decrease that a step must reach (Armijo), and the factor between trials.
 ARMIJO, BACKTRACKING = 1e-5, 0.5
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
@@ -372,11 +373,17 @@ def _search_of(problem: OptimalControlProblem, controls: object, resume: Solutio
     return resume.search
 
 
-def _onto_limits(u: Floats, limits: Floats) -> Floats:
-    """Controls (R, m), moved exactly onto a limit where they differ from it by rounding."""
-    rounding = 8.0 * np.finfo(float).eps * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+def _at_rounding(limits: Floats) -> Floats:
+    """Rounding errors of controls at their limits (2, m); (m,)."""
+    return 8.0 * _EPS * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+
+
+def _onto_limits(u: Floats, limits: Floats, rounding: Floats) -> Floats:
+    """Controls (R, m), moved exactly onto a limit where they differ from it by no more than ``rounding`` (m,)."""
     for limit in limits:
-        u = np.where(np.abs(u - limit) <= rounding, limit, u)
+        close = np.abs(u - limit) <= rounding
+        if close.any():
+            u = np.where(close, limit, u)
     return u
 
 
@@ -484,6 +491,7 @@ class _Search:
         self.saturated = False
         # Whether plans leave out the limits now, and whether they may do so: no step of theirs has been rejected.
         self.clipping, self.clips = False, problem.limited
+        self.rounding = _at_rounding(problem.control_limits)
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
@@ -714,10 +722,13 @@ class _Search:
         """Tolerance on the expected decrease, in units of the cost."""
         return tolerance * (self.along.stake.moved + NOTHING * self.first)
 
+    def _bound(self, tolerance: float) -> float:
+        """A bound on :meth:`_share` that takes no time: the value of a sum of squares bounds its cost at stake."""
+        return tolerance * (self.cost + NOTHING * self.first) if self.problem.cost.nonnegative else np.inf
+
     def _is_there(self, plan: Plan, tolerance: float) -> bool:
         least = tolerance * NOTHING * self.first
-        if self.problem.cost.nonnegative and plan.expected_decrease > tolerance * self.cost + least:
-            # The value of a sum of squares bounds its cost at stake.
+        if plan.expected_decrease > self._bound(tolerance):
             return False
         if not self.any_steered and self.along.stake.free <= least:
             # The cost is at its lower bound. Without costs on the controls the model may have no minimum even there.
@@ -735,7 +746,7 @@ class _Search:
             return self._out_of(last, deadline), ""
         if len(self.gains) > PATIENCE:
             recent = sum(self.gains[-PATIENCE:])
-            if recent <= self._share(tolerance):
+            if recent <= self._bound(tolerance) and recent <= self._share(tolerance):
                 lowered = f"{PATIENCE} iterations have lowered the expected cost by {recent:.1e}; "
                 return Status.STALLED, lowered + self._jump()
         return self._out_of(last, deadline), ""
@@ -1063,7 +1074,7 @@ class _Search:
             # Explicit methods have no substeps.
             parts = bounds.parts * max(1, int(self.trajectory.statistics.substeps[: self.trials.third].sum()))
         if problem.limited:
-            u = _onto_limits(u, problem.control_limits)
+            u = _onto_limits(u, problem.control_limits, self.rounding)
         commands = Commands(u, *here.feedback[1:])
         if problem.linear:
             # The first control has no feedback: its state is given.
