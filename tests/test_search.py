@@ -477,3 +477,52 @@ def test_a_step_is_extended_while_the_cost_falls_on():
     assert all(row.decrease > 2.0 * row.expected_decrease for row in extended)
     costs = [row.cost for row in plan.history]
     assert costs == sorted(costs, reverse=True)
+
+
+def steep_reach():
+    """Three links reach with little on the controls and much on the end: long steps along the model miss it."""
+    end = vp.Terminal(vp.TrackingCost([1.0, -1.5, 1.0], 1e4) + vp.VelocityCost(1e3))
+    options = {"dt": 1.0 / 30, "steps": 30, "integrator": vp.RungeKutta4()}
+    scene = vp.Scene(vp.planar_chain(3), damping=0.1)
+    return vp.OptimalControlProblem(scene, vp.ControlCost(1e-3) + end, np.zeros(3), np.zeros(3), **options)
+
+
+def test_corrections_of_poor_trials_save_iterations_and_lead_to_the_same_plan(monkeypatch):
+    corrected = vp.solve(steep_reach(), check=False)
+    monkeypatch.setattr(search, "_CORRECTIONS", 0)
+    plain = vp.solve(steep_reach(), check=False)
+    assert corrected.status.converged
+    assert plain.status.converged
+    assert corrected.cost == pytest.approx(plain.cost, rel=1e-6)
+    assert corrected.iterations <= 0.8 * plain.iterations
+    assert sum(row.rollouts for row in corrected.history) < sum(row.rollouts for row in plain.history)
+    costs = [row.cost for row in corrected.history]
+    assert costs == sorted(costs, reverse=True)
+
+
+@pytest.mark.parametrize("before", [2, 4, 6])
+def test_searches_that_correct_trials_go_on_as_if_not_interrupted(before):
+    problem = steep_reach()
+    whole = vp.solve(problem, check=False)
+    part = vp.solve(problem, max_iterations=before, check=False)
+    assert_same_search(whole, vp.solve(problem, resume=part, check=False))
+
+
+@pytest.mark.parametrize("iterations", [2, 3, 5])
+def test_a_correction_brings_a_poor_trial_close_to_the_cost_that_the_model_promises(iterations, monkeypatch):
+    problem = steep_reach()
+    part = vp.solve(problem, max_iterations=iterations, check=False)
+    monkeypatch.setattr(search._Search, "_corrects", True)
+    monkeypatch.setattr(search, "_CORRECTIONS", 1)
+    at = search._Search(problem, second_order=False)
+    at.resume(part.search)
+    at._plan()
+    feedback = search.with_feedback(problem, at.trajectory, at.plan, closed=True)
+    here = search._Here(problem.decided(at.trajectory), feedback, np.zeros(0), at.cost)
+    bounds = search._Bounds(problem.integrator, np.inf, watched=False)
+    trial = at._try(1.0, at.plan, here, bounds)
+    assert trial.cost > 0.3 * at.plan.slope
+    corrected, trials, _ = at._corrected(1.0, trial, at.plan, here, bounds)
+    assert trials == 1
+    promised = -at.plan.expected_decrease
+    assert abs(corrected.cost - promised) < 0.5 * abs(trial.cost - promised)

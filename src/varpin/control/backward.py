@@ -386,13 +386,14 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
     if not along.problem.limited or along.clipped:
         return _pass(along, regularization, curvature=curvature)[0]
     plan = _pass(along, regularization, curvature=curvature)[0]
-    held: NDArray[np.bool_] = np.zeros(along.slack[:, 0].shape, dtype=np.bool_)
-    others = held.size + 1
+    lower, upper = along.slack[:, 0], along.slack[:, 1]
+    held: NDArray[np.bool_] = np.zeros(lower.shape, dtype=np.bool_)
+    others, moves = held.size + 1, None
     while plan is not None and others > 0:
         expected, moves = _foreseen(along, plan)
-        if not held.any() and not ((moves <= along.slack[:, 0]) | (moves >= along.slack[:, 1])).any():
+        if not held.any() and not ((moves <= lower) | (moves >= upper)).any():
             break
-        plan = _pass(along, regularization, curvature=curvature, limits=_Limits(along.slack, expected))[0]
+        plan, moves = _pass(along, regularization, curvature=curvature, limits=_Limits(along.slack, expected))[0], None
         if plan is None:
             break
         now = np.logical_not(plan.feedback.any(axis=2))
@@ -403,7 +404,8 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
         held, others = now, changed
     if plan is not None and plan.expected_decrease > 0.0:
         # The feed-forward parts belong together with the feedback, so the slope is that of both.
-        slope = float((plan.gradient * _foreseen(along, plan)[1]).sum())
+        moves = _foreseen(along, plan)[1] if moves is None else moves
+        slope = float((plan.gradient * moves).sum())
         if slope < 0.0:
             return replace(plan, slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
     nominal = _Limits(along.slack, np.zeros((0, along.states + along.problem.scene.controls)))
@@ -475,6 +477,18 @@ class Along:
         # With linear controls in (x, w, u) of each step (N, 2n + 2m).
         self.pulled: Floats | None = None
         self.noise_differentiated = False
+
+    def beside(self, trajectory: Trajectory) -> Along:
+        """Expansions of the cost along a motion close by, with the linearization of this one, which is one block."""
+        made, problem = copy(self), self.problem
+        made.trajectory, made.kept = trajectory, self.linearized(0, problem.steps)
+        for name in ("running", "within", "stake", "model", "terminal", "line", "demands"):
+            vars(made).pop(name, None)
+        if problem.rate is not None:
+            made.pull, made.rate = problem.rate.expand(problem.decided(trajectory), problem.period)
+        if problem.limited:
+            made.slack = problem.control_limits - problem.decided(trajectory)[:, None]
+        return made
 
     @cached_property
     def running(self) -> Expansion:

@@ -58,8 +58,8 @@ class Iteration:
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
         backward_passes: Number of backward passes with different regularizations. Those that determine the controls at
-            their limits, on the same derivatives, do not count.
-        rollouts: Number of trials of the line search.
+            their limits, on the same derivatives, do not count, nor do those that correct trials.
+        rollouts: Number of trials of the line search, corrections included.
         seconds: Time of the iteration [s].
         second_order: Whether second derivatives of the dynamics were used.
     """

@@ -60,10 +60,16 @@ Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
 
+_EPS = float(np.finfo(np.float64).eps)
 # Least share of the expected decrease that a step must reach (Armijo), and the factor between trials.
 ARMIJO, BACKTRACKING = 1e-5, 0.5
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
+# Where a step of late was of a length between these, poor trials no shorter are corrected, so many times at most, while
+# the change of the cost falls below this share of itself. Not where it exceeds _FAR times what the slope gives, nor
+# where a correction of the controls, in units of the trial's step, is outside the last bounds.
+_TINY, _BENT, _CORRECTIONS, _CONTRACTION, _FAR = 0.03, 0.25, 3, 0.3, 3.0
+_SMALLEST, _LARGEST = 0.03, 1.0
 # A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
 # half. The step is extended by a factor while that lowers the cost.
 _EARLY, _EXTENSION = 0.85, 4.0
@@ -374,12 +380,25 @@ def _search_of(problem: OptimalControlProblem, controls: object, resume: Solutio
     return resume.search
 
 
-def _onto_limits(u: Floats, limits: Floats) -> Floats:
-    """Controls (R, m), moved exactly onto a limit where they differ from it by rounding."""
-    rounding = 8.0 * np.finfo(float).eps * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+def _at_rounding(limits: Floats) -> Floats:
+    """Rounding errors of controls at their limits (2, m); (m,)."""
+    return 8.0 * _EPS * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+
+
+def _onto_limits(u: Floats, limits: Floats, rounding: Floats) -> Floats:
+    """Controls (R, m), moved exactly onto a limit where they differ from it by no more than ``rounding`` (m,)."""
     for limit in limits:
-        u = np.where(np.abs(u - limit) <= rounding, limit, u)
+        close = np.abs(u - limit) <= rounding
+        if close.any():
+            u = np.where(close, limit, u)
     return u
+
+
+def _relative(change: Floats, step: Floats) -> float:
+    """Root mean square over the controls of the size of a change (R, m) relative to that of a step (R, m)."""
+    squares, moved = (change**2).sum(axis=0), (step**2).sum(axis=0)
+    moves = moved > 0.0
+    return math.sqrt(float((squares[moves] / moved[moves]).mean())) if moves.any() else math.inf
 
 
 @functools.lru_cache(maxsize=16)
@@ -488,6 +507,7 @@ class _Search:
         self.saturated = False
         # Whether plans leave out the limits now, and whether they may do so: no step of theirs has been rejected.
         self.clipping, self.clips = False, problem.limited
+        self.rounding = _at_rounding(problem.control_limits)
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
@@ -725,10 +745,13 @@ class _Search:
         """Tolerance on the expected decrease, in units of the cost."""
         return tolerance * (self.along.stake.moved + NOTHING * self.first)
 
+    def _bound(self, tolerance: float) -> float:
+        """A bound on :meth:`_share` that takes no time: the value of a sum of squares bounds its cost at stake."""
+        return tolerance * (self.cost + NOTHING * self.first) if self.problem.cost.nonnegative else np.inf
+
     def _is_there(self, plan: Plan, tolerance: float) -> bool:
         least = tolerance * NOTHING * self.first
-        if self.problem.cost.nonnegative and plan.expected_decrease > tolerance * self.cost + least:
-            # The value of a sum of squares bounds its cost at stake.
+        if plan.expected_decrease > self._bound(tolerance):
             return False
         if not self.any_steered and self.along.stake.free <= least:
             # The cost is at its lower bound. Without costs on the controls the model may have no minimum even there.
@@ -746,7 +769,7 @@ class _Search:
             return self._out_of(last, deadline), ""
         if len(self.gains) > PATIENCE:
             recent = sum(self.gains[-PATIENCE:])
-            if recent <= self._share(tolerance):
+            if recent <= self._bound(tolerance) and recent <= self._share(tolerance):
                 lowered = f"{PATIENCE} iterations have lowered the expected cost by {recent:.1e}; "
                 return Status.STALLED, lowered + self._jump()
         return self._out_of(last, deadline), ""
@@ -901,6 +924,7 @@ class _Search:
             return _Step(0.0, 0, 0.0, 0.0)
         added = noise_shares(self.problem, self.trajectory, self.plan)
         taken, length, tried, trials, jumps = _Trial(), 0.0, None, 0, False
+        longest = np.inf  # of the steps that are corrected
         here = _Here(
             self.problem.decided(self.trajectory),
             with_feedback(self.problem, self.trajectory, self.plan, closed=self.forward == "closed"),
@@ -913,6 +937,9 @@ class _Search:
             for step in left:
                 trials += 1
                 trial = self._try(step, self.plan, here, bounds)
+                if trial.expected > _POOR * step * self.plan.slope and _TINY < step <= longest:
+                    trial, more, longest = self._corrected(step, trial, self.plan, here, bounds)
+                    trials += more
                 if trial.expected <= self.armijo * step * self.plan.slope and trial.expected < taken.expected:
                     taken, length = trial, step
                     if trial.expected <= _POOR * step * self.plan.slope:
@@ -969,9 +996,8 @@ class _Search:
         if step.length > 0.0 and self.before is not None:
             self.trajectory, self.shares, self.cost, self.above = self.before
         self.clipping = True
-        passes = self._plan()
-        self.clipping, self.planned = False, None
-        other = self._line_search(_SHORT)
+        passes, self.planned = self._plan(), None
+        other, self.clipping = self._line_search(_SHORT), False
         trials = step.trials + other.trials
         if other.decrease > _MUCH_MORE * step.decrease and self._at_limits() <= _FEW:
             return other._replace(trials=trials), passes
@@ -1011,7 +1037,60 @@ class _Search:
         yield _Bounds(integrator, np.inf, watched=True)
 
     def _try(self, step: float, plan: Plan, here: _Here, bounds: _Bounds) -> _Trial:
-        """A trial of length ``step`` along the plan, stopped early where its substeps or its cost exceed bounds."""
+        """A trial of length ``step`` along the plan."""
+        return self._run(step, here.controls + step * plan.feedforward, plan, here, bounds)
+
+    def _corrected(
+        self, step: float, trial: _Trial, plan: Plan, here: _Here, bounds: _Bounds
+    ) -> tuple[_Trial, int, float]:
+        """A poor trial moved towards the motion that the plan's model has there.
+
+        A correction is a Newton step with the derivatives of the dynamics along the current motion, and those of the
+        cost along the trial. It removes what the curvature of motions adds to steep costs, such as those of the end.
+
+        Returns:
+            The trial, the number of further trials, and the longest step of the line search to correct from now on.
+        """
+        trials, longest, most = 0, np.inf, -_FAR * step * plan.slope
+        while trials < _CORRECTIONS and trial.motion is not None and trial.expected <= most and self._corrects:
+            motion = trial.motion.trajectory()
+            beside = self.along.beside(motion)
+            try:
+                there = backward(self.problem, motion, self.regularization, along=beside, clipped=self.clipping)
+            except _TRIAL_ERRORS:
+                break
+            if there is None:
+                break
+            # The plan there also has what this plan has left.
+            change = there.feedforward - (1.0 - step) * plan.feedforward
+            size = _relative(change, step * plan.feedforward)
+            if not _SMALLEST <= size <= _LARGEST:
+                # The size is about proportional to the step.
+                longest = step * _LARGEST / size if size > _LARGEST else 0.0
+                break
+            around = here._replace(feedback=with_feedback(self.problem, motion, there, closed=True))
+            more = self._run(step, self.problem.decided(motion) + change, plan, around, bounds)
+            trials += 1
+            if not more.expected < trial.expected:
+                break
+            before, trial = trial, more
+            if trial.expected <= _POOR * step * plan.slope or trial.expected > _CONTRACTION * before.expected:
+                break
+        return trial, trials, longest
+
+    @property
+    def _corrects(self) -> bool:
+        """Whether poor trials are corrected: after short steps, along motions of one block, with first derivatives."""
+        special = self.exact or self.whole or self.saturated or self.forward != "closed"
+        if special or not self.anew or len(self.along.blocks) > 1:
+            return False
+        return any(_TINY < item.step <= _BENT for item in self.history[-2:])
+
+    def _run(self, step: float, u: Floats, plan: Plan, here: _Here, bounds: _Bounds) -> _Trial:
+        """A trial under controls u (R, m), stopped early where its substeps or its cost exceed bounds.
+
+        What is acceptable is that of a trial of length ``step`` along the plan.
+        """
         problem = self.problem
         # Where the rest of the cost and the noise cost cannot be negative, a partial sum bounds the total from below.
         bounded = problem.cost.nonnegative and not (self.exact and problem.processes)
@@ -1020,9 +1099,8 @@ class _Search:
         if bounds.parts < np.inf and (bounds.watched or step < 1.0):
             # Explicit methods have no substeps.
             parts = bounds.parts * max(1, int(self.trajectory.statistics.substeps[: self.trials.third].sum()))
-        u = here.controls + step * plan.feedforward
         if problem.limited:
-            u = _onto_limits(u, problem.control_limits)
+            u = _onto_limits(u, problem.control_limits, self.rounding)
         commands = Commands(u, *here.feedback[1:])
         if problem.linear:
             # The first control has no feedback: its state is given.
