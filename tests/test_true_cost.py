@@ -1,6 +1,7 @@
 """Plans to a wished true cost."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,24 @@ def test_searches_that_end_early_are_finished_with_the_last_step(wish: float, ha
     assert steps == 3 * 2**halvings
     assert set(finished) <= {steps}
     assert plan.cost == pytest.approx(vp.solve(reach(steps), check=False).cost, rel=1e-4)
+
+
+def test_a_search_that_half_the_step_does_not_help_is_finished() -> None:
+    """Models of limited controls promise decreases that searches of few iterations do not reach on any grid."""
+
+    def creep(problem: vp.OptimalControlProblem, start: object) -> vp.Solution:
+        plan = vp.solve(problem, start, max_iterations=2 if start is None else 0, check=False)
+        last = plan.history[-1]
+        if last.expected_decrease > 0.01 * plan.cost:
+            last = replace(last, expected_decrease=plan.cost * problem.steps / 100)
+        return replace(plan, status=vp.Status.MAX_ITERATIONS, history=(*plan.history[:-1], last))
+
+    def finish(problem: vp.OptimalControlProblem, start: vp.Solution) -> vp.Solution:
+        return vp.solve(problem, start, tolerance=1e-5, check=False)
+
+    found = refine(reach(12), creep, 0.05, lambda: np.inf, creep, finish).refinement
+    assert found.met
+    assert [row.status.converged for row in found.tried] == [False, True]
 
 
 def test_slow_progress_ends_the_searches_of_coarse_steps() -> None:

@@ -170,9 +170,13 @@ class _Refining:
         return excess(last.true_cost, last.cost - gained * _FALLS[0] / (1.0 - _FALLS[0]))
 
     def _promises(self, solution: Solution, finer: Solution | None) -> bool:
-        """Whether a plan whose search ended early would be within the wish once it is finished."""
+        """Whether a plan whose search ended early is to be finished, as it may then be within the wish."""
         if finer is None or finer.status is Status.INTERRUPTED:
             return finer is None
+        costs = [*(row.cost for row in self.tried[-2:]), finer.cost]
+        if len(costs) > 2 and max(costs[0] - costs[1], costs[1] - costs[2]) <= self.wish * abs(costs[1]):
+            # Twice, half the step has hardly lowered the cost, whatever the model expects of it.
+            return True
         rest = max(solution.history[-1].expected_decrease, 0.0) if solution.history else 0.0
         return _excess(self.tried, finer, rest) <= self.wish
 
