@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin.control.backward import Along
+from varpin.control import search
+from varpin.control.backward import Along, backward
+from varpin.errors import LinearizationError
+from varpin.simulation.friction import rate_at_rest
 
 GOAL = np.array([1.0, -0.7])
 STIFFNESS, DAMPING = np.array([400.0, 200.0]), np.array([40.0, 15.0])
@@ -94,3 +97,44 @@ def test_linear_controls_at_the_limits_of_drives():
     problem, motion, j = found.problem, found.trajectory, 7
     expected = demands_differentiated(problem, motion, motion.u_nodes[j : j + 2], j)
     np.testing.assert_allclose(Along(problem, motion).demands[j + 1], expected, rtol=1e-6, atol=1e-6)
+
+
+def test_dampers_of_servos_count_where_the_arm_begins():
+    """A drive that is told to go to 0 from there is at its limit, and damps nothing."""
+    begin = np.array([0.8, -0.5])
+    servos = vp.PositionServo(STIFFNESS, [500.0, 300.0], [20.0, 10.0])
+    scene = vp.Scene(vp.planar_chain(2), forces=[servos], gravity=False)
+    M = vp.lagrangian_jet(scene, begin, np.zeros(2)).Lvv
+    rate = np.linalg.eigvals(np.linalg.solve(M, np.diag([500.0, 300.0]))).real.max()
+    assert rate_at_rest(scene, begin) == pytest.approx(rate, rel=1e-12)
+    cost = vp.ControlCost(1e-3, reference=GOAL) + vp.Terminal(vp.TrackingCost(GOAL, 1e3))
+    found = vp.OptimalControlProblem(scene, cost, begin, np.zeros(2), dt=0.02, steps=40)
+    assert 0.02 * rate > 10.0
+    assert found.integrator == vp.Radau(4)
+
+
+def test_a_search_does_not_return_to_where_it_cannot_linearize(monkeypatch, tmp_path):
+    """Full steps lead to motions without derivatives; under more and more regularization they end before those."""
+    scene = vp.Scene(vp.planar_chain(2), gravity=False)
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(GOAL, 1e3) + vp.VelocityCost(10.0))
+    problem = vp.OptimalControlProblem(scene, cost, np.zeros(2), np.zeros(2), dt=0.02, steps=40)
+    most = 0.5 * np.abs(vp.solve(problem, check=False, max_iterations=1).controls).max()
+
+    def refusing(problem, motion, *others, **options):
+        if np.abs(motion.u).max() > most:
+            raise LinearizationError(0, 0.0, "a step has no derivative")
+        return backward(problem, motion, *others, **options)
+
+    monkeypatch.setattr(search, "backward", refusing)
+    found = vp.solve(problem, check=False, max_iterations=12)
+    assert np.abs(found.controls).max() <= most
+    assert found.cost < 0.5 * problem.cost_of(problem.simulate(np.zeros(2)))
+    # A search that has just gone back goes on from a file as it would have.
+    begun = vp.solve(problem, check=False, max_iterations=2)
+    assert begun.search.returned
+    read = vp.Solution.load(begun.save(tmp_path / "plan.npz"), problem)
+    assert read.search.returned
+    resumed = vp.solve(problem, resume=read, check=False, max_iterations=10)
+    assert [(row.cost, row.regularization) for row in resumed.history] == [
+        (row.cost, row.regularization) for row in found.history
+    ]

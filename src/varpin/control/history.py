@@ -107,6 +107,7 @@ class SearchState:
         whole: Whether the search uses the whole gradient of the noise cost.
         saturated: Whether it takes into account that drives of servos are at their limits.
         clips: Whether plans may leave control limits to the clipping of motions where steps are short.
+        returned: Whether it has just gone back from a motion that cannot be linearized.
         history: The iterations before.
     """
 
@@ -126,6 +127,7 @@ class SearchState:
     whole: bool = False
     saturated: bool = False
     clips: bool = True
+    returned: bool = False
 
     def __repr__(self) -> str:
         return f"SearchState(cost {self.cost:.6g}, after {len(self.history)} iterations)"

@@ -529,6 +529,8 @@ class _Search:
         self.cut = False  # whether one did
         # The motion before the last step, its shares, cost, and cost above the best one.
         self.before: tuple[Trajectory, Floats, float, float] | None = None
+        # Whether the search has just gone back from a motion that cannot be linearized.
+        self.returned = False
         # Whether short trials of the last line searches were rejected where they divide other steps than the motion.
         self.jumps = False
         self.gains: list[float] = []  # decrease of the least expected cost in each iteration
@@ -585,6 +587,7 @@ class _Search:
         self.bounded, self.cut = state.bounded, state.cut
         self.whole = state.whole and self.wants_whole
         self.clips = state.clips and self.clips
+        self.returned = state.returned
         if state.saturated:
             self._take_saturation()
 
@@ -606,6 +609,7 @@ class _Search:
             whole=self.whole,
             saturated=self.saturated,
             clips=self.clips,
+            returned=self.returned,
         )
 
     def run(
@@ -671,7 +675,10 @@ class _Search:
                 self.followed = step.length
                 self.reason = f"{self._expected()} before the last step"
                 return ended
-            if step.length >= _LONG:
+            if self.returned:
+                # With less regularization the step might lead there again.
+                self.returned = False
+            elif step.length >= _LONG:
                 self._relax()
             elif self._steps_short() and not self._stiffen() and not self._lift():
                 self.reason = f"no step lowers the cost, whatever the regularization; {self._jump()}"
@@ -836,6 +843,7 @@ class _Search:
             return False
         logger.info("%s: back to the motion before, as the last one cannot be linearized", self.label)
         (self.trajectory, self.shares, self.cost, self.above), self.before = self.before, None
+        self.returned = True
         return True
 
     def _steps_short(self) -> bool:

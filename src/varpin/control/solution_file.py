@@ -30,6 +30,7 @@ _FORMAT = "varpin.solution/2"
 _PROBLEM = ("q0", "v0", "t0", "steps", "hold", "controls", "sampling", "control_limits")
 _STATUSES = tuple(Status)
 _NUMBERS = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
+_FLAGS = ("bounded", "cut", "whole", "saturated", "clips", "returned")
 _REFINED = tuple(item.name for item in fields(Refined) if item.name != "status")
 # The columns of a history; the truth values of `second_order` are an entry of their own, which older files do not have.
 _COLUMNS = tuple(item.name for item in fields(Iteration) if item.type != "bool")
@@ -53,6 +54,8 @@ class _Search:
     history: int
     whole: int = 0
     saturated: int = 0
+    clips: int = 1
+    returned: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +113,7 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     search, best = None, None
     if state is not None:
         numbers: dict[str, Any] = {name: getattr(state, name) for name in _NUMBERS}
-        numbers |= {"bounded": int(state.bounded), "cut": int(state.cut), "history": len(state.history)}
-        numbers |= {"whole": int(state.whole), "saturated": int(state.saturated)}
+        numbers |= {name: int(getattr(state, name)) for name in _FLAGS} | {"history": len(state.history)}
         search = _Search(prefixes[id(state.trajectory)], gains=np.array(state.gains), **numbers)
         best = None if state.best is None else _Best(prefixes[id(state.best)])
     apart = ("search", "best", "refined", "refinement", "second_order")
@@ -206,10 +208,7 @@ def _search(
         best=None if best is None else motions[best],
         gains=tuple(state.gains.tolist()),
         history=history[: state.history],
-        bounded=bool(state.bounded),
-        cut=bool(state.cut),
-        whole=bool(state.whole),
-        saturated=bool(state.saturated),
+        **{name: bool(getattr(state, name)) for name in _FLAGS},
         **{name: getattr(state, name) for name in _NUMBERS},
     )
 

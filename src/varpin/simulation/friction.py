@@ -13,7 +13,7 @@ import scipy.linalg
 
 from varpin.arrays import Floats, Integers
 from varpin.core import fastest_damping
-from varpin.mechanics.forces import dissipates, of_kind
+from varpin.mechanics.forces import dissipates, limited_servos, of_kind
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import masses
 
@@ -77,11 +77,16 @@ def states_at_stops(scene: Scene, q: Floats, v: Floats, u: Floats, at: list[Stop
 
 
 def rate_at_rest(scene: Scene, q: Floats) -> float:
-    """The fastest rate of damping [1/s] at a configuration (n,) with all joints at rest, where friction is steepest."""
+    """The fastest rate of damping [1/s] at a configuration (n,) with all joints at rest, where friction is steepest.
+
+    Servos are told to stay there: a drive at its limit would damp nothing.
+    """
     if not any(map(dissipates, scene.elements)) and not any(map(dissipates, scene.couplings)):
         return 0.0
-    still = np.zeros((1, q.size))
-    return float(fastest_damping(scene.core, np.ascontiguousarray(q[None]), still, still, _SLOWEST))
+    still, force = np.zeros((1, q.size)), np.zeros((1, q.size))
+    for servo in limited_servos(scene.elements):
+        force[0, servo.coordinate] = servo.values[0] * q[servo.coordinate]
+    return float(fastest_damping(scene.core, np.ascontiguousarray(q[None]), still, force, _SLOWEST))
 
 
 class JointRates(NamedTuple):
