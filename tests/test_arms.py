@@ -99,7 +99,7 @@ def test_who_integrates_where_nobody_is_named(load):
 
     assert taken() == "Radau(stages=4)"
     assert taken(5e-5) == "Gauss(stages=2)"
-    assert taken(noise=vp.AdditiveNoise(0.1)) == "Midpoint(alpha=0.5, kick=held)"
+    assert taken(noise=vp.AdditiveNoise(0.1)) == 'Midpoint(alpha=0.5, kick="held")'
     assert (
         vp.simulate(vp.Scene(load("ur5")), np.zeros(6), np.zeros(6), dt=1e-2, steps=1).integrator == "Gauss(stages=2)"
     )

@@ -172,8 +172,8 @@ def test_paths_without_noise_are_those_of_simulate():
             None,
             "Radau(stages=4)",
         ),
-        ({"damping": 0.3, "noise": vp.AdditiveNoise(0.1)}, None, "Gauss(stages=2, kick=held)"),
-        ({"damping": 0.3, "noise": vp.AdditiveNoise(0.1)}, 0, "Midpoint(alpha=0.5, kick=held)"),
+        ({"damping": 0.3, "noise": vp.AdditiveNoise(0.1)}, None, 'Gauss(stages=2, kick="held")'),
+        ({"damping": 0.3, "noise": vp.AdditiveNoise(0.1)}, 0, 'Midpoint(alpha=0.5, kick="held")'),
     ],
     ids=["light", "damped", "stops", "lever", "no noise", "noise"],
 )

@@ -12,7 +12,7 @@ from refusals import refused, unnamed
 import varpin as vp
 from varpin.cli import main
 from varpin.control.hints import hints
-from varpin.model import degrees_hint
+from varpin.model import degrees_hint, degrees_per_second_hint
 
 HOME = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0])
 FACTS = ("'shoulder_lift_joint'", "-90 rad", "14 turns", "looks like degrees", "np.deg2rad")
@@ -33,6 +33,45 @@ def test_a_start_in_degrees(scene, capsys):
     assert not unnamed(ensemble.warnings[0], FACTS)
     assert main(["simulate", "ur5", "--steps", "2", "--q0", *map(str, HOME)]) == 0
     assert not unnamed(" ".join(capsys.readouterr().err.split()), FACTS)
+
+
+SPIN = np.array([0.0, 45.0, -90.0, 0.0, 30.0, 0.0])
+SPIN_FACTS = ("'elbow_joint'", "-90 rad/s", "28.6 times its limit of 3.15", "degrees per second", "np.deg2rad")
+
+
+def test_a_velocity_in_degrees_per_second(scene, capsys):
+    task = {"dt": 1e-3, "steps": 2}
+    motion = vp.simulate(scene, np.zeros(6), SPIN, **task)
+    assert not unnamed(motion.warnings[0], SPIN_FACTS)
+    ensemble = vp.simulate_ensemble(scene, np.zeros(6), SPIN, **task, paths=2, rng=0, workers=1)
+    assert not unnamed(ensemble.warnings[0], SPIN_FACTS)
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), np.zeros(6), SPIN, dt=0.05, steps=4)
+    assert not unnamed(vp.solve(problem, max_iterations=1).warnings[0], SPIN_FACTS)
+    assert main(["simulate", "ur5", "--steps", "2", "--dt", "1e-3", "--v0", *map(str, SPIN)]) == 0
+    assert not unnamed(" ".join(capsys.readouterr().err.split()), SPIN_FACTS)
+
+
+@pytest.mark.parametrize(
+    "v",
+    [
+        np.deg2rad(SPIN),
+        # Fast, as a fall or an impact leaves it: not typed, or too little beyond the limits.
+        SPIN + 1.0 / 7.0,
+        [0.0, 10.0, 0.0, 0.0, 0.0, 0.0],
+        # Beyond the limits in either unit.
+        [0.0, 45.0, 0.0, 0.0, 400.0, 0.0],
+        np.zeros(6),
+    ],
+    ids=["radians", "computed", "three times", "faster than degrees explain", "rest"],
+)
+def test_fast_motions_are_no_mistake(scene, v):
+    assert not degrees_per_second_hint(scene.robot, "v0", np.array(v))
+
+
+def test_velocities_without_limits_are_no_mistake():
+    assert not degrees_per_second_hint(vp.planar_chain(2), "v0", np.array([90.0, 45.0]))
+    slider = vp.load_robot(pin_slider())
+    assert not degrees_per_second_hint(slider, "v0", np.full(slider.dof, 90.0))
 
 
 def test_positions_for_servos_in_degrees(scene):
@@ -86,6 +125,21 @@ def pin_slider():
     place = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "cart")
     model.appendBodyToJoint(place, pin.Inertia(1.0, np.zeros(3), 0.1 * np.eye(3)), pin.SE3.Identity())
     return model
+
+
+@pytest.mark.parametrize(("distance", "told"), [(20.0, True), (5.0, True), (0.5, False)])
+def test_clearances_in_millimetres(distance, told):
+    """More than twice as far as the robot gets from its root, and so from anything that is in its way."""
+    robot = vp.load_robot("ur5")
+    straight = np.linalg.norm(robot.frame_positions(np.zeros(6)))
+    assert (distance > 2.0 * straight) == told
+    clear = vp.KeepClear(robot, [vp.Obstacle.sphere([0.6, 0.5, 0.4], 0.1)], distance, links=["forearm_link"])
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot), vp.ControlCost(1e-3), np.zeros(6), np.zeros(6), dt=0.05, steps=4, constraints=[clear]
+    )
+    found = [finding.sentence for finding in hints(problem) if finding.kind == "places in millimetres"]
+    assert len(found) == told
+    assert not told or not unnamed(found[0], ("KeepClear: distance", f"{distance:g} m", "may be in millimetres"))
 
 
 def test_other_positions_in_degrees(scene, caplog):

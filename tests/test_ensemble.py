@@ -44,7 +44,8 @@ def test_same_bytes_for_any_number_of_workers_and_blocks(kick, monkeypatch):
     integrator, calls = vp.Midpoint(kick=kick), []
     one, two = (run(paths=200, workers=w, integrator=integrator) for w in (1, 2))
     seven = run(paths=200, workers=7, integrator=integrator, progress=lambda *done: calls.append(done))
-    assert calls == [(96, 200), (192, 200), (200, 200)]
+    # 4000 steps, twice as many, and then 96 paths.
+    assert calls == [(80, 200), (176, 200), (200, 200)]
     blocks_of(monkeypatch, 9 * numbers_a_step(make_scene(), 96))
     in_blocks = run(paths=200, workers=2, integrator=integrator)
     for other in (two, seven, in_blocks):
@@ -303,22 +304,37 @@ def test_all_paths_failing_is_an_error(monkeypatch, block):
 
 def test_interruption_keeps_what_is_done():
     def interrupt(done, total):
-        if done == 192:
+        if done == 176:
             raise KeyboardInterrupt
 
-    with refused(vp.EnsembleInterrupted, "192") as caught:
-        run(paths=300, progress=interrupt)
+    with refused(vp.EnsembleInterrupted) as caught:
+        run(paths=3000, progress=interrupt, workers=1)
     assert isinstance(caught.value, KeyboardInterrupt)
-    part, whole = caught.value.ensemble, run(paths=300)
+    part, whole = caught.value.ensemble, run(paths=3000)
+    kept = len(part.q)
+    assert 176 <= kept < 3000
+    assert f"{kept} paths" in str(caught.value)
     assert part.t.tobytes() == whole.t.tobytes()
     for name in ARRAYS:
-        assert getattr(part, name).tobytes() == getattr(whole, name)[:192].tobytes()
+        assert getattr(part, name).tobytes() == getattr(whole, name)[:kept].tobytes()
     check_statistics(part)
-    assert part.statistics.count.tolist() == [192] * 51
+    assert part.statistics.count.tolist() == [kept] * 51
+
+
+def test_interruption_keeps_statistics_of_paths_that_are_not_stored():
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
     with pytest.raises(vp.EnsembleInterrupted) as caught:
-        run(paths=300, progress=interrupt, store=False)
-    assert caught.value.ensemble.q is None
-    same_statistics(caught.value.ensemble, part)
+        run(paths=3000, progress=interrupt, store=False)
+    part = caught.value.ensemble
+    kept = int(part.statistics.count[0])
+    assert part.q is None
+    assert 80 <= kept < 3000
+    whole = run(paths=kept)
+    np.testing.assert_allclose(part.statistics.mean, whole.statistics.mean, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(part.statistics.covariance, whole.statistics.covariance, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(part.statistics.quantiles, whole.statistics.quantiles)
 
 
 def test_interruption_before_anything_is_done(monkeypatch):
@@ -414,10 +430,10 @@ def test_the_failures_of_an_interrupted_ensemble_are_told():
         raise KeyboardInterrupt
 
     with pytest.raises(vp.EnsembleInterrupted) as caught:
-        run(fragile_scene(), **FRAGILE | {"paths": 100, "q0": starts(100), "v0": np.zeros(3)}, progress=interrupt)
+        run(fragile_scene(), **FRAGILE | {"paths": 2000, "q0": starts(2000), "v0": np.zeros(3)}, progress=interrupt)
     part = caught.value.ensemble
     done, lost = int(part.statistics.count[0]), len(part.failures)
-    assert 0 < lost < done < 100
+    assert 0 < lost < done < 2000
     assert part.warnings[0].startswith(f"{lost} of {done} paths failed, the first at step ")
 
 

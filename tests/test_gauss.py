@@ -471,6 +471,6 @@ def test_a_trajectory_knows_its_integrator():
     scene = vp.Scene(vp.planar_chain(2))
     motion = vp.simulate(scene, np.zeros(2), np.zeros(2), dt=1e-2, steps=2, integrator=vp.Gauss(stages=3))
     assert motion.integrator == "Gauss(stages=3)"
-    assert str(vp.Gauss(2, kick="split")) == "Gauss(stages=2, kick=split)"
+    assert str(vp.Gauss(2, kick="split")) == 'Gauss(stages=2, kick="split")'
     with refused(vp.InputError, "Gauss(stages=3)", "Gauss(stages=2)"):
         vp.linearize(scene, motion, integrator=vp.Gauss(2))

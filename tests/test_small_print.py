@@ -106,3 +106,50 @@ def test_motions_of_several_kinds_of_controls_are_chained():
     np.testing.assert_array_equal(both.u_stages[5:], two.u_stages)
     with refused(vp.InputError, "2", "3"):
         chained([two, three])
+
+
+def plan_problem(**horizon):
+    cost = vp.ControlCost(1.0) + vp.Terminal(vp.TrackingCost([0.5, 0.2], 10.0))
+    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2)), cost, [0.0, 0.0], [0.0, 0.0], **horizon)
+
+
+@pytest.mark.parametrize("horizon", [{"dt": 0.02, "duration": 0.6}, {"steps": 30, "duration": 0.6}])
+def test_a_problem_has_the_time_that_it_is_given(horizon):
+    one, other = plan_problem(dt=0.02, steps=30), plan_problem(**horizon)
+    assert (other.dt, other.steps) == (one.dt, one.steps)
+    assert vp.solve(other).trajectory.u.tobytes() == vp.solve(one).trajectory.u.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "dt", "steps"),
+    [
+        ({"dt": 0.01}, 0.01, 60),
+        ({"duration": 1.2}, 0.02, 60),
+        ({"duration": 1.2, "steps": 30}, 0.04, 30),
+        ({"duration": 1.2, "dt": 0.04}, 0.04, 30),
+        ({"dt": 0.1, "steps": 3}, 0.1, 3),
+    ],
+)
+def test_a_problem_at_another_time(change, dt, steps):
+    other = plan_problem(dt=0.02, steps=30).at(**change)
+    assert (other.dt, other.steps) == (dt, steps)
+    assert other.duration == pytest.approx(dt * steps, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("horizon", "named"),
+    [
+        ({}, "two of dt"),
+        ({"dt": 0.02}, "two of dt"),
+        ({"dt": 0.02, "steps": 30, "duration": 0.6}, "two of dt"),
+        ({"dt": 0.02, "duration": 0.615}, "0.615"),
+        ({"steps": 0, "duration": 0.6}, "steps"),
+        ({"dt": 0.02, "steps": 0}, "steps"),
+        ({"dt": 0.02, "duration": -1.0}, "duration"),
+        ({"dt": 0.02, "duration": float("nan")}, "duration"),
+        ({"dt": 0.02, "duration": "1 s"}, "duration"),
+    ],
+)
+def test_times_that_do_not_fit_are_refused(horizon, named):
+    with refused(vp.InputError, named):
+        plan_problem(**horizon)

@@ -747,3 +747,31 @@ def test_parts_of_unequal_length_are_repeated_as_short_as_the_shortest():
     off = np.abs(motion.q[at : at + 4] - right).max()
     assert np.abs(fine - right).max() < 0.1 * off
     assert np.abs(coarse - right).max() > off
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("integrator", "forces", "torque", "noise"),
+    [
+        (vp.ExplicitEuler(), [vp.PositionServo(1e5, 100.0)], None, 1.0),
+        (vp.ExplicitEuler(), [], None, 1.0),
+        (vp.SemiImplicitEuler(), [], 1e155, None),
+        (vp.ExplicitEuler(), [vp.CoulombFriction(1.0)], 1e155, None),
+    ],
+    ids=["servo", "noise", "force", "friction"],
+)
+@pytest.mark.parametrize("steps", [1, 2, 3, 150])
+def test_squares_that_overflow_are_no_warnings_of_numpy(integrator, forces, torque, noise, steps):
+    """Velocities near the square root of the largest number: the motion ends or is warned of, in words of varpin's."""
+    scene = vp.Scene(
+        vp.planar_chain(1), gravity=(0.0, 0.0, 0.0), forces=forces, noise=noise and vp.AdditiveNoise(noise)
+    )
+    given = {"controls": None if torque is None else [torque], "rng": None if noise is None else 0}
+    try:
+        motion = vp.simulate(scene, [0.0], [1e154], dt=0.01, steps=steps, integrator=integrator, **given)
+    except vp.StepFailure:
+        return
+    # A free joint keeps its velocity; all else has to be warned of.
+    free = not forces and torque is None
+    assert np.isfinite(motion.v).all()
+    assert motion.warnings or (free and np.abs(motion.v - 1e154).max() < 1e140)

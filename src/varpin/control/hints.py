@@ -22,7 +22,16 @@ from varpin.control.constraints import (
 from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
 from varpin.control.costs.base import Scaled, weight_matrix
 from varpin.control.problem import OptimalControlProblem
-from varpin.model import ADVICE, AFAR, IN_MILLIMETRES, Robot, degrees_hint, looks_like_degrees, millimetres_hint
+from varpin.model import (
+    ADVICE,
+    AFAR,
+    ASIDE,
+    IN_MILLIMETRES,
+    Robot,
+    degrees_hint,
+    looks_like_degrees,
+    millimetres_hint,
+)
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.simulation.soundness import Finding
 from varpin.simulation.start import in_other_units
@@ -48,7 +57,7 @@ _SAME = 1e-6
 
 def hints(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about constraints that no motion satisfies, and about values that look like degrees or millimetres."""
-    found = [*in_other_units(problem.scene, problem.q0)]
+    found = [*in_other_units(problem.scene, problem.q0, problem.v0)]
     found += [*_goals(problem), *_targets(problem), *_limits(problem), *_ends(problem), *_places(problem)]
     for bound in problem.bound_constraints:
         found += _overlaps(problem, bound)
@@ -174,9 +183,13 @@ def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 def _places(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Obstacles and regions whose places or sizes look like millimetres."""
+    robot = problem.scene.robot
     for constraint in problem.constraints:
         lengths = _lengths(constraint)
-        if lengths and (sentence := millimetres_hint(problem.scene.robot, lengths)):
+        sentence = millimetres_hint(robot, lengths) if lengths else ""
+        if isinstance(constraint, KeepClear) and not sentence:
+            sentence = millimetres_hint(robot, {"KeepClear: distance": abs(constraint.distance)}, ASIDE)
+        if sentence:
             yield Finding("places in millimetres", sentence)
 
 
@@ -184,7 +197,7 @@ def _lengths(constraint: PlanConstraint) -> dict[str, float]:
     """Names of a constraint's lengths, and their sizes [m]; places count by their distance from the robot's root."""
     name = type(constraint).__name__
     if isinstance(constraint, KeepClear):
-        found = {f"{name}: distance": abs(constraint.distance)}
+        found = {}
         root = constraint.robot.tree.translation[0]
         for body in constraint.obstacles:
             label = f"{name}: the obstacle {body.name!r}"

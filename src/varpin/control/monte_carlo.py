@@ -25,7 +25,7 @@ from varpin.simulation.failures import NoiseError, StepFailure
 from varpin.simulation.loop_stability import examined_in_loop
 from varpin.simulation.soundness import Finding, announce
 from varpin.support.checks import count
-from varpin.support.executors import executing, in_order
+from varpin.support.executors import executing, in_order, take_all
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
 
@@ -87,7 +87,7 @@ class MonteCarloInterrupted(KeyboardInterrupt):
     """Ctrl-C during :meth:`Solution.monte_carlo`.
 
     Attributes:
-        result: The result of the paths done so far; None if there are fewer than two.
+        result: The result of the paths done, and of those that threads had begun; None if there are fewer than two.
     """
 
     def __init__(self, result: MonteCarlo | None) -> None:
@@ -140,6 +140,13 @@ def monte_carlo(
     found: tuple[Finding, ...] = ()
     extremes: Extremes = {}
     done, sent = 0, _sent(problem)
+
+    def add(part: _Costs) -> None:
+        nonlocal extremes, done
+        costs.append(part.values)
+        extremes = greater(extremes, part.extremes)
+        done += len(part.values)
+
     with executing(executor, workers) as pool:
         seeds = children(rng, paths)
         compiled = problem.scene.noise.diffusion is not None
@@ -158,12 +165,7 @@ def monte_carlo(
                 # Custom functions need not be thread-safe.
                 parts = (_alone(_Alone(sent, policy, seeds, path)) for path in range(paths))
             with closing(parts):
-                for part in parts:
-                    costs.append(part.values)
-                    extremes = greater(extremes, part.extremes)
-                    done += len(part.values)
-                    if progress is not None:
-                        progress(done, paths)
+                take_all(parts, add, lambda: progress(done, paths) if progress is not None else None)
             if shared is not None:
                 found = looked_at(pool, shared, q0, v0, extremes)
             elif np.isfinite(costs[0]).all():

@@ -42,6 +42,7 @@ from varpin.simulation.friction import rate_at_rest
 from varpin.simulation.run import simulate
 from varpin.simulation.soundness import announce
 from varpin.simulation.start import on_constraints
+from varpin.simulation.time_steps import time_steps
 from varpin.support.checks import (
     JointValues,
     control_values,
@@ -103,7 +104,7 @@ class OptimalControlProblem(Frozen):
             small miss is corrected, as :func:`varpin.simulate` does.
         v0: Initial velocity (n,) [rad/s or m/s]; also by joint name, and corrected in the same way.
         dt: Time step [s].
-        steps: N.
+        steps: N. ``duration=``, steps * dt [s], may be given instead of one of the two.
         integrator: Any of varpin's. If left out, ``Gauss(stages=4)``; ``Radau(stages=4)`` where dry friction or dampers
             are more than 10 times as fast as the step at ``q0`` and rest, and the scene has no constraints. Both with
             ``kick="held"`` where the scene has noise.
@@ -152,8 +153,9 @@ class OptimalControlProblem(Frozen):
         q0: JointValues,
         v0: JointValues,
         *,
-        dt: float,
-        steps: int,
+        dt: float | None = None,
+        steps: int | None = None,
+        duration: float | None = None,
         integrator: Integrator | None = None,
         sampling: Sampling = "gauss",
         hold: int = 1,
@@ -169,18 +171,19 @@ class OptimalControlProblem(Frozen):
 
         Raises:
             UnknownJoint: An unknown joint name, or one of a joint that is not driven, for controls.
-            InputError: Wrong shapes, values that are not finite, steps that are no multiple of ``hold``, a
-                reference that does not fit the problem's grid, or a lower limit above the upper one; linear controls
-                with ``hold``; ``hold`` with a :class:`KinematicInput`; another ``sampling`` than
-                "gauss" with a cubic one, or with linear controls; constraints that are no plan constraints or of
-                another robot.
+            InputError: Wrong shapes, values that are not finite, not two of ``dt``, ``steps`` and ``duration``, a
+                duration that is no multiple of ``dt``, steps that are no multiple of ``hold``, a reference that does
+                not fit the problem's grid, or a lower limit above the upper one; linear controls with ``hold``;
+                ``hold`` with a :class:`KinematicInput`; another ``sampling`` than "gauss" with a cubic one, or with
+                linear controls; constraints that are no plan constraints or of another robot.
             CostError: A reference function fails.
             AssemblyError: The scene's constraints cannot be satisfied near q0.
         """
         n, m = require_scene(scene).robot.dof, scene.controls
         if not isinstance(cost, Cost):
             raise InputError(f"cost must be a cost, for example varpin.TrackingCost(...), got {type(cost).__name__}")
-        dt, steps, hold = positive("dt", dt, "s"), count("steps", steps, least=1), count("hold", hold, least=1)
+        dt, steps = time_steps(dt, steps, duration)
+        steps, hold = count("steps", steps, least=1), count("hold", hold, least=1)
         if steps % hold:
             raise InputError(f"steps = {steps} is no multiple of hold = {hold}")
         if not is_one_of(sampling, ("midpoint", "gauss", "start")):
@@ -335,6 +338,7 @@ class OptimalControlProblem(Frozen):
         v0: JointValues | None = None,
         dt: float | None = None,
         steps: int | None = None,
+        duration: float | None = None,
         integrator: Integrator | None = None,
         sampling: Sampling | None = None,
         hold: int | None = None,
@@ -344,8 +348,8 @@ class OptimalControlProblem(Frozen):
     ) -> OptimalControlProblem:
         """The same problem with another discretization or initial state.
 
-        With ``dt`` alone the horizon stays, and the number of steps follows. An integrator that was left out is chosen
-        anew for the step and the state. ``before`` is the control applied before
+        With ``dt`` alone the horizon stays, and with ``duration`` alone the step; the number of steps follows. An
+        integrator that was left out is chosen anew for the step and the state. ``before`` is the control applied before
         the horizon, one number, (m,) or by joint name, for :class:`ControlRateCost` and :class:`WithinControlRate`.
 
         Raises:
@@ -357,10 +361,12 @@ class OptimalControlProblem(Frozen):
                 "before is the control that a ControlRateCost or a WithinControlRate begins with; the problem has "
                 "neither"
             )
-        if dt is not None and steps is None:
+        if dt is not None and steps is None and duration is None:
             steps = round(self.duration / positive("dt", dt, "s"))
             if abs(steps * dt - self.duration) > 1e-9 * self.duration:
                 raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
+        elif duration is not None:
+            dt, steps = time_steps(self.dt if dt is None and steps is None else dt, steps, duration)
         if all(option is None for option in (dt, steps, integrator, sampling, hold, controls)):
             return self._restarted(q0, v0, t0, before)
         return OptimalControlProblem(

@@ -46,15 +46,23 @@ def without_geometry(scene: Scene) -> Scene:
     return bare
 
 
-def chunks(steps: int, paths: int) -> Iterator[tuple[int, int]]:
-    """The first path of each chunk, and one past its last."""
+def chunks(steps: int, paths: int, *, begin_small: bool = True) -> Iterator[tuple[int, int]]:
+    """The first path of each chunk, and one past its last.
+
+    With ``begin_small`` the first is small and each twice as large as the one before, up to the size of all others, so
+    that some paths are finished soon.
+    """
     steps = max(1, steps)
     size = max(math.ceil(paths / _CHUNKS), _LEAST_STEPS // steps)
     size = max(_FEWEST_PATHS, min(size, _MOST_STEPS // steps, _MOST_PATHS))
     if size > _GROUP:
         size = math.ceil(size / _GROUP) * _GROUP
-    for first in range(0, paths, size):
-        yield first, min(first + size, paths)
+    now = min(size, max(1, _LEAST_STEPS // steps)) if begin_small else size
+    first = 0
+    while first < paths:
+        last = min(first + now, paths)
+        yield first, last
+        first, now = last, min(2 * now, size)
 
 
 @dataclass(frozen=True, eq=False)

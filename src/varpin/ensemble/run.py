@@ -27,7 +27,7 @@ from varpin.simulation.soundness import Finding, announce
 from varpin.simulation.start import in_other_units, on_constraints
 from varpin.simulation.time_steps import time_steps
 from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, require_finite
-from varpin.support.executors import executing, in_order
+from varpin.support.executors import executing, in_order, take_all
 
 logger = logging.getLogger(__name__)
 
@@ -91,7 +91,8 @@ def simulate_ensemble(
             to the failure.
         AssemblyError: No configuration near q0 satisfies the scene's constraints.
         VarpinError: Every path failed, or workers are lost repeatedly.
-        EnsembleInterrupted: Ctrl-C; holds the finished paths. It is a KeyboardInterrupt.
+        EnsembleInterrupted: Ctrl-C; holds the finished paths, and those that threads had begun. It is a
+            KeyboardInterrupt.
     """
     require_scene(scene)
     dt, steps = time_steps(dt, steps, duration)
@@ -119,10 +120,8 @@ def simulate_ensemble(
         sums = Sums(shared, paths, levels, store=store)
         try:
             with closing(_parts(pool, sums, start[0], start[1])) as parts:
-                for part in parts:
-                    sums.add(part)
-                    if progress is not None:
-                        progress(sums.done, paths)
+                take_all(parts, sums.add, lambda: progress(sums.done, paths) if progress is not None else None)
+            assert sums.done == paths
             found = looked_at(pool, shared, start[0], start[1], sums.extremes)
         except KeyboardInterrupt:
             if not sums.done:
@@ -131,7 +130,7 @@ def simulate_ensemble(
             raise EnsembleInterrupted(sums.ensemble((*sums.lost(), *seen))) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*in_other_units(scene, start[0][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
+    found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene, dt, found)
     return sums.ensemble(found)
 

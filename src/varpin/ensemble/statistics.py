@@ -45,7 +45,7 @@ class Sums:
 
     def tasks(self, q0: Floats, v0: Floats) -> Iterator[Task]:
         """The chunks. Where quantiles are estimated, the first one has to be added before the second is requested."""
-        for first, last in chunks(self.shared.steps, self.paths):
+        for first, last in chunks(self.shared.steps, self.paths, begin_small=not self.estimated):
             yield Task(
                 self.shared,
                 first,
@@ -59,7 +59,7 @@ class Sums:
     def part_bytes(self) -> int:
         """Size of a chunk's result [bytes], arrays alone."""
         nodes, size = self.shared.steps + 1, 2 * self.shared.scene.robot.dof
-        _, paths = next(chunks(self.shared.steps, self.paths))
+        _, paths = next(chunks(self.shared.steps, self.paths, begin_small=False))
         numbers = nodes * (size**2 + size + 3) + paths
         if self.store:
             numbers += paths * (nodes * (3 * size // 2 + 1) + self.shared.steps * self.shared.scene.controls)
@@ -71,9 +71,10 @@ class Sums:
         return 8 * numbers
 
     def add(self, part: Part) -> None:
-        """Add the next chunk."""
+        """Add the next chunk. One after a gap, which Ctrl-C may leave, is not added."""
         here = slice(part.first, part.first + part.paths)
-        assert part.first == self.done
+        if part.first != self.done:
+            return
         assert part.moments is not None
         self.moments = part.moments if self.moments is None else self.moments.merged(part.moments)
         self.failures += part.failures

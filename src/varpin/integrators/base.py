@@ -323,9 +323,9 @@ def written(made: object, named: Sequence[str] = ()) -> str:
 
 
 def _text(value: object) -> str:
-    """A number with as few digits as restore it exactly; a string without quotes."""
+    """A value as Python reads it; a number with as few digits as restore it exactly."""
     if isinstance(value, str):
-        return value
+        return f'"{value}"'
     if isinstance(value, (float, np.floating)):
         number = float(value)
         short = f"{number:g}"

@@ -32,7 +32,8 @@ def integrator_of(text: str) -> Integrator:
 
         integrator_of("RungeKutta4")
         integrator_of("Gauss(3)")
-        integrator_of("Midpoint(alpha=0.5, kick=split)")
+        integrator_of('Midpoint(alpha=0.5, kick="split")')
+        integrator_of("Midpoint(kick=split)")
 
     Raises:
         InputError: The text has another form, the integrator or an option is unknown, or a value is out of its range.

@@ -5,7 +5,9 @@ from varpin.model.angles import looks_like_degrees as looks_like_degrees
 from varpin.model.chain import planar_chain as planar_chain
 from varpin.model.combination import combine as combine
 from varpin.model.degrees import degrees_hint as degrees_hint
+from varpin.model.degrees import degrees_per_second_hint as degrees_per_second_hint
 from varpin.model.millimetres import AFAR as AFAR
+from varpin.model.millimetres import ASIDE as ASIDE
 from varpin.model.millimetres import IN_MILLIMETRES as IN_MILLIMETRES
 from varpin.model.millimetres import longest_reach as longest_reach
 from varpin.model.millimetres import millimetres_hint as millimetres_hint

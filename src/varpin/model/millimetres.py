@@ -8,6 +8,8 @@ from varpin.model.robot import Robot
 
 # Largest plausible length in a robot's surroundings, in units of its reach: a larger one looks like millimetres.
 AFAR = 50.0
+# Largest plausible clearance, in the same units.
+ASIDE = 2.0
 # Least reach that counts [m]: a wheel has none.
 _LEAST = 0.1
 IN_MILLIMETRES = "it may be in millimetres, and lengths are in metres"
@@ -27,10 +29,13 @@ def longest_reach(robot: Robot) -> float:
     return float((path + np.linalg.norm(tree.center, axis=1)).max())
 
 
-def millimetres_hint(robot: Robot, lengths: dict[str, float]) -> str:
-    """A sentence about the largest of some named lengths [m] that look like millimetres; empty if none does."""
+def millimetres_hint(robot: Robot, lengths: dict[str, float], plausible: float = AFAR) -> str:
+    """A sentence about the largest of some named lengths [m] that look like millimetres; empty if none does.
+
+    Lengths up to ``plausible`` times the robot's reach do not.
+    """
     name, length = max(lengths.items(), key=lambda own: own[1])
     reach = longest_reach(robot)
-    if not length > AFAR * max(reach, _LEAST):
+    if not length > plausible * max(reach, _LEAST):
         return ""
     return f"{name} is {length:.4g} m, and the reach of {robot.name} at most {reach:.3g} m: {IN_MILLIMETRES}"

@@ -156,6 +156,7 @@ class Loop:
         return float(self.span.values(self.A + self.B @ self.K).real.max())
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def examined_in_loop(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, error: float | None = None
 ) -> tuple[Trajectory, tuple[Finding, ...]]:

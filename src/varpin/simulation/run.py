@@ -173,7 +173,7 @@ def simulated(
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
     known: Steps = ()
-    early = in_other_units(scene, q0)
+    early = in_other_units(scene, q0, v0)
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
         early = (*early, *moved)

@@ -117,6 +117,8 @@ class Finding:
     joint: int | None = None
 
 
+# Squares of the numbers of a motion that blows up may be infinite, and their differences undefined.
+@np.errstate(over="ignore", invalid="ignore")
 def examined(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, error: float | None = None
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
@@ -179,6 +181,7 @@ def announce(logger: logging.Logger, scene: Scene, dt: float, found: Iterable[Fi
             logger.warning(finding.sentence)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def findings_from_record(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
     """Possible errors from the record alone: dampers faster than the step, steps taken in parts, limits exceeded.
 

@@ -7,7 +7,7 @@ import logging
 import os
 import pickle
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Generic, TypeVar
 
@@ -89,7 +89,9 @@ def in_order(
 
     A task whose worker is lost is repeated; a broken pool is replaced by a new one. The number of tasks ahead of
     the awaited result is limited, so that results do not accumulate: four for each worker and 2 GiB of results, but at
-    least two. Close the iterator to cancel tasks that have not begun.
+    least two. Close the iterator to cancel tasks that have not begun. After Ctrl-C, or a KeyboardInterrupt thrown
+    into the iterator, results go on up to the first task that is neither done nor begun in a thread of this process;
+    then the KeyboardInterrupt is raised.
 
     Args:
         executor: The executor.
@@ -153,11 +155,16 @@ def in_order(
                 losses = _counted(losses, error)
                 waiting[0] = task, submitted(task)
                 continue
-            waiting.popleft()
             losses = 0
-            if isinstance(result, _Raised):
-                raise result.error
-            yield result
+            try:
+                if isinstance(result, _Raised):
+                    raise result.error
+                yield result
+            finally:
+                waiting.popleft()
+    except KeyboardInterrupt:
+        yield from _begun(executor, [future for _, future in waiting])
+        raise
     finally:
         for _, future in waiting:
             future.cancel()
@@ -165,6 +172,43 @@ def in_order(
             # Without tasks left, waiting is short. Without waiting, Python 3.11 may replace a worker that has done its
             # max_tasks_per_child after the shutdown of its pool, and then hangs at exit.
             current.shutdown(wait=not waiting, cancel_futures=True)
+
+
+def _begun(executor: Executor, futures: Sequence[Future[Result | _Raised]]) -> Iterator[Result]:
+    """Results of the first tasks: of those that are done, and of those that threads of this process are doing."""
+    # From the last to the first, lest a worker takes one with a gap before it.
+    for future in reversed(futures):
+        future.cancel()
+    for future in futures:
+        # Other workers get Ctrl-C themselves, or are too far away to wait for.
+        if future.cancelled() or not (future.done() or in_process(executor)):
+            return
+        try:
+            result = future.result()
+        except Exception:
+            return
+        if isinstance(result, _Raised):
+            return
+        yield result
+
+
+def take_all(results: Generator[Result, None, None], take: Callable[[Result], None], tell: Callable[[], None]) -> None:
+    """``take`` each result of :func:`in_order`, and ``tell`` of it; after Ctrl-C also those of tasks that have begun.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C.
+    """
+    # Ctrl-C interrupts the main thread alone: in another one each result is taken wholly or not at all.
+    with ThreadPoolExecutor(1) as taker:
+        try:
+            for result in results:
+                taker.submit(take, result).result()
+                tell()
+        except KeyboardInterrupt as interrupt:
+            result = results.throw(interrupt)
+            while True:
+                taker.submit(take, result).result()
+                result = next(results)
 
 
 def _counted(losses: int, error: Exception) -> int:
