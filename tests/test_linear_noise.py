@@ -9,6 +9,7 @@ import varpin as vp
 from varpin.control.backward import backward
 from varpin.control.moments import left_within_steps, noise_cost, noise_cost_in_halves
 from varpin.control.spread import Feedback, covariances
+from varpin.integrators.base import diffusion_and_drift
 
 CONTROL, STATE = vp.ControlNoise(0.3), vp.StateNoise(3.0, center=np.zeros(2))
 SLIDING = vp.CustomNoise(
@@ -294,3 +295,35 @@ def test_kicks_of_strong_noise_on_lines_are_no_error_of_the_motion(kick: str, sl
     given = {"dt": 0.04, "steps": 40, "controls": controls, "integrator": vp.Gauss(2, kick=kick)}
     motion = vp.simulate(scene, [0.2, 0.2], [0.0, 0.0], increments=dw if slopes else dw[:, :2], **given)
     assert motion.warnings == ()
+
+
+@pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Gauss(2, kick="held"), vp.RungeKutta4()], ids=str)
+def test_the_drift_along_a_line_is_its_mean_over_the_step(integrator: vp.Integrator) -> None:
+    """By Simpson's rule, exact for noise linear in the control; its derivatives by differences of quiet steps."""
+    sliding = vp.CustomNoise(
+        lambda q, v, u: np.array([[0.2 * v[0] + 0.1 * u[1]], [0.3 + 0.1 * u[0] * v[1]]]),
+        1,
+        dv=lambda q, v, u: np.array([[[0.2, 0.0]], [[0.0, 0.1 * u[0]]]]),
+        du=lambda q, v, u: np.array([[[0.0, 0.1]], [[0.1 * v[1], 0.0]]]),
+        check=True,
+    )
+    problem = reach(sliding, steps=1, integrator=integrator).at(q0=[0.3, -0.2], v0=[0.4, 0.7])
+    scene, u = problem.scene, np.array([1.0, -2.0, -3.0, 4.0])
+
+    def ends(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        at = problem.at(q0=x[:2], v0=x[2:])
+        motion = at.simulate(line(at, u.reshape(2, 2)))
+        return np.concatenate([motion.q[1], motion.p[1] if integrator.variational else motion.v[1]])
+
+    def local(control: np.ndarray) -> np.ndarray:
+        return diffusion_and_drift(scene, problem.q0, problem.v0, control, problem.q0)[1]
+
+    mean = 0.5 * (u[:2] + u[2:])
+    found = diffusion_and_drift(scene, problem.q0, problem.v0, mean, problem.q0, (u[None, :2], u[None, 2:]))[1]
+    np.testing.assert_allclose(found, (local(u[:2]) + 4.0 * local(mean) + local(u[2:])) / 6.0, atol=1e-14)
+    assert np.abs(found - local(mean)).max() > 1e-2
+    lin = vp.linearize(scene, problem.simulate(line(problem, u.reshape(2, 2))))
+    x, step = np.concatenate([problem.q0, problem.v0]), 1e-5
+    by_control = np.concatenate([lin.B - lin.ramp, lin.ramp], axis=2)[0]
+    for c, away in enumerate(step * np.eye(4)):
+        np.testing.assert_allclose(by_control[:, c], (ends(x, u + away) - ends(x, u - away)) / (2 * step), atol=1e-8)

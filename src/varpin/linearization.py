@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint, integrator_of
-from varpin.integrators.base import diffusion_and_drift, noise_fields, open_line, open_loop
+from varpin.integrators.base import diffusion_and_drift, ends_at, noise_fields, open_line, open_loop
 from varpin.integrators.same_scene import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
@@ -191,10 +191,10 @@ def linearize_steps(
     start = noise_fields(scene, trajectory, q[:-1], v[:-1], first)
     A, B = Jx, Jf @ scene.transmission
     if start.Fv is not None:
-        drift_x, drift_u = _drift_derivatives(scene, trajectory, first, variational=integrator.variational)
+        drift_x, drift_u, drift_r = _drift_derivatives(scene, trajectory, first, variational=integrator.variational)
         A, B = A + integrator.drift_share * Jf @ drift_x, B + integrator.drift_share * Jf @ drift_u
         if ramp is not None:
-            ramp = ramp + 0.5 * integrator.drift_share * Jf @ drift_u
+            ramp = ramp + integrator.drift_share * Jf @ drift_r
     left = integrator.left
     if integrator.variational:
         to_state = None
@@ -371,33 +371,45 @@ def _in_velocity(scene: Scene, q: Floats, fields: Fields, inverse: Floats) -> tu
 
 def _drift_derivatives(
     scene: Scene, trajectory: Trajectory, start: Floats, *, variational: bool
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats]:
     """Derivatives of the drift in (q, p), or (q, v), (N, n, 2n) and in u (N, n, m), by differences of eighth order.
 
-    Differences, as the drift alone needs second derivatives of diffusion fields, which noise classes do not provide.
+    The last ones (N, n, m) are those in a change of the control that grows linearly from 0 over the step. Differences,
+    as the drift alone needs second derivatives of diffusion fields, which noise classes do not provide.
     """
     n, m = scene.robot.dof, scene.controls
     weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
     in_state, in_control = np.zeros((trajectory.steps, n, 2 * n)), np.zeros((trajectory.steps, n, m))
+    in_ramp = np.zeros_like(in_control)
     for j in range(trajectory.steps):
         # In v even if the state is (q, p): a difference in p that suits the base moves a light wrist by rad/s, and at
         # rest the momentum gives no scale.
-        point = [trajectory.q[j], trajectory.v[j], trajectory.u[j]]
-        for slot, (target, offset) in enumerate(((in_state, 0), (in_state, n), (in_control, 0))):
+        point, ends = [trajectory.q[j], trajectory.v[j], trajectory.u[j]], ends_at(trajectory, j)
+        slots = [(0, in_state, 0, 0.0), (1, in_state, n, 0.0), (2, in_control, 0, 1.0)]
+        if ends is not None:
+            slots.append((2, in_ramp, 0, 0.0))
+        # `before` is the share of a change of the control at the begin of the step.
+        for slot, target, offset, before in slots:
             size = 2e-3 * max(1.0, np.abs(point[slot]).max(initial=0.0))
             for c in range(point[slot].size):
                 for shift, weight in weights.items():
                     for sign in (1.0, -1.0):
-                        shifted = [x.copy() for x in point]
-                        shifted[slot][c] += sign * shift * size
-                        drift = diffusion_and_drift(scene, shifted[0], shifted[1], shifted[2], start)[1]
+                        shifted, away = [x.copy() for x in point], sign * shift * size
+                        at = ends
+                        if slot == 2 and ends is not None:
+                            du = away * np.eye(m)[c]
+                            shifted[2] += 0.5 * (1.0 + before) * du
+                            at = ends[0] + before * du, ends[1] + du
+                        else:
+                            shifted[slot][c] += away
+                        drift = diffusion_and_drift(scene, shifted[0], shifted[1], shifted[2], start, at)[1]
                         target[j, :, offset + c] += sign * weight / size * drift
     if variational:
         rates = velocity_at_nodes(scene, trajectory.q[:-1], trajectory.v[:-1])
         in_velocity = in_state[:, :, n:].copy()
         in_state[:, :, n:] = 0.0
         in_state += in_velocity @ rates
-    return in_state, in_control
+    return in_state, in_control, in_ramp if trajectory.u_nodes.shape[1] else 0.5 * in_control
 
 
 def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:

@@ -342,18 +342,22 @@ def join(segments: Sequence[Segment]) -> Segment:
     return Segment(**nodes, statistics=statistics, failure=segments[-1].failure, impulses=impulses)
 
 
-def diffusion_and_drift(scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
+def diffusion_and_drift(
+    scene: Scene, q: Floats, v: Floats, u: Floats, start: Floats, ends: tuple[Floats, Floats] | None = None
+) -> tuple[Floats, Floats]:
     """Diffusion fields F (n, k) at one state, and the Ito correction: the drift (n,) from Stratonovich to Ito.
 
     The drift is (1/2) sum_i (dF_i/dv) M^-1 F_i [N m or N], equation (N1) and (1.3) of the paper; it is zero if no field
-    depends on the velocity.
+    depends on the velocity. Of controls that are linear over a step between ``ends`` (1, m) it is the mean drift.
     """
-    diffusion = scene.noise.fields(q[None], v[None], u[None], start)
-    F = diffusion.F[0]
+    diffusion = over_steps(
+        scene.noise, q[None], v[None], u[None], ends if scene.noise.velocity_dependent else None, start
+    )
+    F, k = diffusion.F[0], scene.processes
     if diffusion.Fv is None:
-        return F, np.zeros_like(q)
+        return F[:, :k], np.zeros_like(q)
     M = lagrangian_jet(scene, q, v).Lvv
-    return F, 0.5 * np.einsum("ikj,jk->i", diffusion.Fv[0], np.linalg.solve(M, F))
+    return F[:, :k], 0.5 * np.einsum("ikj,jk->i", diffusion.Fv[0], np.linalg.solve(M, F))
 
 
 def noise_of_step(
@@ -384,7 +388,18 @@ def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
     if not scene.noise.velocity_dependent:
         return np.zeros((trajectory.steps, scene.robot.dof))
     nodes = zip(trajectory.q[:-1], trajectory.v[:-1], trajectory.u, strict=True)
-    return np.array([diffusion_and_drift(scene, q, v, u, trajectory.q[0])[1] for q, v, u in nodes])
+    return np.array(
+        [
+            diffusion_and_drift(scene, q, v, u, trajectory.q[0], ends_at(trajectory, k))[1]
+            for k, (q, v, u) in enumerate(nodes)
+        ]
+    )
+
+
+def ends_at(trajectory: Trajectory, k: int) -> tuple[Floats, Floats] | None:
+    """The controls (1, m) at both ends of step k where they are linear between nodes; else None."""
+    nodes = trajectory.u_nodes
+    return (nodes[k : k + 1], nodes[k + 1 : k + 2]) if nodes.shape[1] else None
 
 
 def held_noise(scene: Scene, trajectory: Trajectory, steps: slice | Integers = slice(None)) -> Floats:

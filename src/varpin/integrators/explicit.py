@@ -88,9 +88,10 @@ class _Explicit(Integrator):
         q, v = state.paths.q[0], state.paths.v[0]
         decided = control_of(command, 0, np.concatenate([q, v]), command.before)
         now = first_of(command, decided, self.stage_times)
-        F, drift = diffusion_and_drift(scene, q, v, now.u[0], state.start[0])
+        ends = ends_of(command, decided)
+        F, drift = diffusion_and_drift(scene, q, v, now.u[0], state.start[0], ends)
         if len(increment):
-            impulse = noise_of_step(scene, F, q, v, ends_of(command, decided), state.start[0], increment[0, 0])
+            impulse = noise_of_step(scene, F, q, v, ends, state.start[0], increment[0, 0])
             if self.method is ExplicitMethod.euler:
                 drift = drift + impulse / dt
             else:

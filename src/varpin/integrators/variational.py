@@ -326,7 +326,7 @@ class Variational(Integrator):
                 prescribing(scene, now, after),
                 (with_ends(scene, ends[0], after), with_ends(scene, ends[1], after)),
             )
-        F, drift = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
+        F, drift = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0], ends)
         drift = self.drift_share * drift
         if len(increment):
             impulse = noise_of_step(scene, F, q[0], v[0], ends, state.start[0], increment[0, 0])

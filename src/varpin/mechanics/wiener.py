@@ -1,4 +1,7 @@
-"""Wiener increments: drawn from a seed, refined to half the step, or summed to a multiple of it."""
+"""Wiener increments: drawn from a seed, refined to half the step, or summed to a multiple of it.
+
+Those that are refined or summed are of the processes themselves: the first k columns of :attr:`Trajectory.dw`.
+"""
 
 from __future__ import annotations
 
