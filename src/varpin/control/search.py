@@ -683,7 +683,7 @@ class _Search:
             self.shares = self.problem.shares(self.best)
         # Noise costs before and after this switch are not comparable.
         self.whole, self.best, self.best_cost, self.best_noise, self.above = True, None, np.inf, np.inf, 0.0
-        self.gains, self._around = [], None
+        self.gains, self._around, self.regularization, self.growth = [], None, 0.0, 1.0
 
     def _differentiate_noise(self, regularization: float) -> int:
         """Add the whole gradient of the noise cost to passes along the motion; returns the passes that took."""
