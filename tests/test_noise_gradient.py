@@ -107,6 +107,14 @@ def test_plans_end_at_the_minimum_of_the_expected_cost(noise: object) -> None:
     assert np.abs(whole.gradient).max() < 1e-4 * start
 
 
+@pytest.mark.parametrize("noise", [vp.ControlNoise(0.1), vp.ControlNoise(1.0), vp.StateNoise(20.0, center=np.zeros(2))])
+def test_strong_noise_ends_converged_and_below_the_search_with_it_held(noise: object) -> None:
+    problem = reach(noise, steps=20, dt=0.04)
+    held, found = (vp.solve(problem, noise=mode, check=False) for mode in ("held", None))
+    assert found.status.converged
+    assert found.expected_cost < (1.0 - 1e-5) * held.expected_cost
+
+
 def test_the_prediction_is_that_of_paths_where_noise_is_small() -> None:
     plan = vp.solve(reach(vp.ControlNoise(0.03), steps=12, dt=0.05, integrator=vp.Gauss(2)), check=False)
     found = plan.monte_carlo(4000, rng=0)

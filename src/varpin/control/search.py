@@ -88,10 +88,8 @@ _LITTLE = 1e-4
 _LOSSY = 1e-8
 # Iterations without significant decrease before the search stalls. The cost is discontinuous where guards cut steps.
 PATIENCE = 15
-# A search goes on with the whole gradient of the noise cost from this share of the cost at stake as expected decrease,
-# or after so many iterations without a decrease.
+# Expected decrease, as a share of the cost at stake, from which a search takes the whole gradient of the noise cost.
 _NEAR = 1e-4
-_CYCLE = 4
 # Iterations by whose decrease a search that may end early is judged.
 _SLOW = 8
 # Share of the first motion's cost at stake that is added to the current one: an optimum of cost zero has none.
@@ -199,9 +197,10 @@ def solve(
             it neglects the derivatives of that Hessian, and ends next to the minimum. By default it is the whole one
             where steps have second derivatives: with a variational integrator, constant controls and a kick that is
             left or held, without custom forces, custom noise, kinematic inputs and constraints of the scene. It then
-            takes two to four times as long as the search with it held; elsewhere, by differences, ``"whole"`` takes 10
-            to 50 times as long. With ``second_order`` and within control limits it is held. Problems with constraints
-            are solved for the least cost without noise, which then affects only their feedback and margins.
+            takes two to four times as long as the search with it held, more where that ends far from the minimum;
+            elsewhere, by differences, ``"whole"`` takes 10 to 50 times as long. With ``second_order`` and within
+            control limits it is held. Problems with constraints are solved for the least cost without noise, which
+            then affects only their feedback and margins.
         states: Initial states, which need not be feasible: configurations at the nodes (N + 1, n), the first one q0; a
             pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of another planner
             will do: auxiliary joint forces hold the first motion on it, and the first iterations remove them (multiple
@@ -637,7 +636,7 @@ class _Search:
             if not self.history or self.first == UNKNOWN:
                 self.first = self._at_first()
             there = self._is_there(self.plan, tolerance)
-            if self._turns_whole(there=there):
+            if self._turns_whole(ends=there):
                 self._take_whole()
                 continue
             if there:
@@ -650,6 +649,9 @@ class _Search:
                 return Status.MAX_ITERATIONS
             ended, why = self._ended(tolerance, last, deadline)
             if ended is Status.STALLED and self._lift():
+                continue
+            if ended is Status.STALLED and self._turns_whole(ends=True):
+                self._take_whole()
                 continue
             if ended is not None:
                 self._note(report, started, passes)
@@ -693,13 +695,12 @@ class _Search:
         stake = self.along.stake
         return stake.free if np.isfinite(stake.free) else stake.moved
 
-    def _turns_whole(self, *, there: bool) -> bool:
-        """Whether the search with held noise has ended and the one with the whole gradient begins."""
+    def _turns_whole(self, *, ends: bool) -> bool:
+        """Whether the search with held noise ends, or is close to it, and the one with the whole gradient begins."""
         # The noise cost of exact passes is another.
         if not self.wants_whole or self.whole or self.second_order:
             return False
-        near = there or self._decrease_at_most(self._share(_NEAR))
-        return near or (len(self.gains) > _CYCLE and not any(self.gains[-_CYCLE:]))
+        return ends or self._decrease_at_most(self._share(_NEAR))
 
     def _take_whole(self) -> None:
         """Use the whole gradient of the noise cost from now on, starting at the best motion so far."""
@@ -709,7 +710,7 @@ class _Search:
             self.shares = self.problem.shares(self.best)
         # Noise costs before and after this switch are not comparable.
         self.whole, self.best, self.best_cost, self.best_noise, self.above = True, None, np.inf, np.inf, 0.0
-        self.gains, self._around = [], None
+        self.gains, self._around, self.regularization, self.growth = [], None, 0.0, 1.0
 
     def _differentiate_noise(self, regularization: float) -> int:
         """Add the whole gradient of the noise cost to passes along the motion; returns the passes that took."""
