@@ -44,6 +44,7 @@ from varpin.simulation.record import located
 from varpin.support.checks import (
     JointValues,
     count,
+    flag,
     fraction,
     is_one_of,
     positive,
@@ -217,6 +218,7 @@ def solve(
         raise InputError(f"regularization must be >= 0, got {regularization}")
     if not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held' or 'whole', got {noise!r}")
+    second_order, check = flag("second_order", second_order), flag("check", check)
     report_all = require_reports(callback, progress)
     positive("tolerance", tolerance, "1")
     deadline = time.perf_counter() + checked_time(time_limit)
@@ -324,7 +326,7 @@ def require_reports(callback: Any, progress: object) -> Report:
 
 def checked_time(limit: object) -> float:
     """A time limit [s] as a float > 0, infinite for none."""
-    return np.inf if limit == np.inf else positive("time_limit", limit, "s")
+    return np.inf if isinstance(limit, float) and limit == np.inf else positive("time_limit", limit, "s")
 
 
 def replan(
