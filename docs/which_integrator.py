@@ -73,6 +73,7 @@ STYLES = {
     "SciPy Radau": ("#9bd3bf", "s", ":"),
     "trep midpoint": ("#999933", "d", "--"),
     "Midpoint, split kick": ("#009e73", "s", "--"),
+    "Midpoint, held": ("#cc79a7", "v", "-"),
     "Euler-Maruyama": ("#d55e00", "^", "-"),
     "Gauss(2), split kick": ("#000000", "P", "--"),
 }
@@ -515,6 +516,7 @@ NOISY: dict[str, vp.Integrator] = {
     "Euler-Maruyama": vp.ExplicitEuler(),
     "Midpoint": vp.Midpoint(),
     "Midpoint, split kick": vp.Midpoint(kick="split"),
+    "Midpoint, held": vp.Midpoint(kick="held"),
     "Gauss(2), split kick": vp.Gauss(2, kick="split"),
 }
 
@@ -582,7 +584,7 @@ def stationary(scale: Scale) -> list[str]:
                      noise=vp.AdditiveNoise(strength))  # fmt: skip
     start = np.random.default_rng(3).normal(size=(2, 500, 1))
     q0, v0 = start[0] * np.sqrt(heat / stiffness), start[1] * np.sqrt(heat / inertia)
-    for name in ("Euler-Maruyama", "Midpoint", "Midpoint, split kick"):
+    for name in ("Euler-Maruyama", "Midpoint", "Midpoint, split kick", "Midpoint, held"):
         for product in (0.03, 0.3, 1.0, 1.8):
             dt = product / 3.0
             steps = round(scale.stationary / dt)

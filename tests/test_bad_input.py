@@ -634,3 +634,72 @@ class TestSimulation:
 def test_planar_chain(arguments, facts):
     with refused(vp.InputError, facts):
         vp.planar_chain(**arguments)
+
+
+ARRAY = np.zeros(17)
+FREE = {"dt": 0.01, "steps": 2}
+REST = ([0.0, 0.0], [0.0, 0.0])
+
+
+def the_problem(scene, **options):
+    return vp.OptimalControlProblem(scene, vp.ControlCost(1.0), *REST, **FREE, **options)
+
+
+def noisy(robot):
+    return vp.Scene(robot, noise=vp.AdditiveNoise(0.1))
+
+
+def clear(robot, **options):
+    body = {"link1": ([0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 0.05)}
+    return vp.KeepClear(robot, **{"obstacles": [vp.Obstacle.sphere([2.0, 0.0, 0.0], 0.1)], "capsules": body} | options)
+
+
+@pytest.mark.parametrize(
+    ("call", "facts"),
+    [
+        (lambda r, s: vp.simulate(s, *REST, **FREE, check="no"), ("check", "'no'")),
+        (lambda r, s: vp.simulate(s, *REST, **FREE, check=ARRAY), "check"),
+        (lambda r, s: vp.simulate_ensemble(s, *REST, **FREE, paths=2, rng=0, store="no"), ("store", "'no'")),
+        (lambda r, s: vp.simulate_ensemble(s, *REST, **FREE, paths=2, rng=0, progress=3), ("progress", "3")),
+        (
+            lambda r, s: vp.simulate_ensemble(s, *REST, **FREE, paths=2, rng=0, progress=lambda done: None),
+            ("progress", "paths done"),
+        ),
+        (lambda r, s: vp.solve(the_problem(s)).monte_carlo(4, 0, progress=3), ("progress", "3")),
+        (lambda r, s: vp.solve(the_problem(s), check="no"), ("check", "'no'")),
+        (lambda r, s: vp.solve(the_problem(s), second_order=ARRAY), "second_order"),
+        (lambda r, s: vp.solve(the_problem(s), time_limit=ARRAY), "time_limit"),
+        (lambda r, s: the_problem(s, t0=float("nan")), ("t0", "nan")),
+        (lambda r, s: the_problem(s).at(t0=float("inf")), ("t0", "inf")),
+        (
+            lambda r, s: the_problem(s, constraints=[vp.WithinControlRate(1.0, before=float("nan"))]),
+            ("before", "nan"),
+        ),
+        (lambda r, s: vp.propagate_moments(ARRAY), ("linearization", "ndarray")),
+        (lambda r, s: vp.load_robot("ur5", lock=ARRAY), "lock"),
+        (lambda r, s: vp.Scene(r, constraints=[vp.KinematicInput(ARRAY)]), "KinematicInput"),
+        (
+            lambda r, s: vp.work_precision(vp.Scene(r), *REST, duration=0.1, integrators=3, dts=[0.01]),
+            ("integrators", "3"),
+        ),
+        (lambda r, s: clear(r, obstacles=3), ("obstacles", "3")),
+        (lambda r, s: clear(r, links=3), ("links", "3")),
+        (lambda r, s: clear(r, links="link1"), ("links", "'link1'")),
+        (lambda r, s: clear(r, capsules=3), ("capsules", "3")),
+        (lambda r, s: clear(r, itself="no"), ("itself", "'no'")),
+        (lambda r, s: vp.LiveView(r, constraints=3, open=False), ("constraints", "3")),
+        (lambda r, s: vp.LiveView(r, open="no"), ("open", "'no'")),
+        (lambda r, s: vp.replay(r, ARRAY, html="x.html", loop="no"), ("loop", "'no'")),
+        (lambda r, s: vp.replay(r, ARRAY, html="x.html", growing=ARRAY), "growing"),
+        (lambda r, s: vp.plots.plot_energy_error(vp.simulate(s, *REST, **FREE), relative="no"), ("relative", "'no'")),
+    ],
+)
+def test_what_is_no_flag_function_list_or_record(robot, call, facts):
+    """Refused by name, before anything is computed or written; neither taken for True nor a failure inside."""
+    with refused(vp.InputError, facts):
+        call(robot, noisy(robot))
+
+
+@pytest.mark.parametrize("value", [True, np.True_, 1])
+def test_what_is_a_flag(scene, value):
+    assert vp.simulate(scene, *REST, **FREE, check=value).steps == 2

@@ -537,3 +537,15 @@ def test_a_held_policy_is_the_same_policy_decided_less_often(integrator):
     assert np.array_equal(ensemble.u[:, ::5], ensemble.u[:, 4::5])
     with refused(vp.InputError, "6", "5", "30", "31"):
         vp.simulate(scene, np.zeros(3), np.zeros(3), dt=1e-3, steps=31, controls=policy)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("store", [True, False])
+def test_paths_that_blow_up_leave_no_warning_of_numpy(store):
+    """Euler's method far beyond its stability: velocities grow to 1e150 and more, and their squares are infinite."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, stiffness=1e5, noise=vp.AdditiveNoise(1.0))
+    task = {"dt": 1e-2, "steps": 100, "paths": 200, "rng": 0, "integrator": vp.SemiImplicitEuler(), "store": store}
+    end = vp.simulate_ensemble(scene, [0.0], [1e8], **task)
+    assert end.statistics.count[-1] == 200
+    assert not np.isfinite(end.statistics.energy_deviation[-1])
+    np.testing.assert_allclose(end.statistics.mean[1, 0], 1e-2 * 1e8, rtol=1e-6)

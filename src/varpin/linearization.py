@@ -532,6 +532,8 @@ def propagate_moments(
     Raises:
         InputError: A shape is wrong, a value is not finite, or ``covariance`` is not symmetric and semidefinite.
     """
+    if not isinstance(linearization, Linearization):
+        raise InputError(f"linearization must be one of varpin.linearize, got {type(linearization).__name__}")
     size = linearization.A.shape[1]
     means, covariances = np.zeros((linearization.steps + 1, size)), np.zeros((linearization.steps + 1, size, size))
     if mean is not None:

@@ -24,7 +24,7 @@ from varpin.simulation.commands import commands_of
 from varpin.simulation.failures import NoiseError, StepFailure
 from varpin.simulation.loop_stability import examined_in_loop
 from varpin.simulation.soundness import Finding, announce
-from varpin.support.checks import count
+from varpin.support.checks import count, counting
 from varpin.support.executors import executing, in_order, take_all
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
@@ -136,6 +136,7 @@ def monte_carlo(
 ) -> MonteCarlo:
     """See :meth:`Solution.monte_carlo`; for any policy. ``within`` is what no path shows of the noise within steps."""
     paths = count("paths", paths, least=2)
+    counting("progress", progress, "paths done, paths in all")
     costs: list[Floats] = []
     found: tuple[Finding, ...] = ()
     extremes: Extremes = {}

@@ -47,11 +47,11 @@ from varpin.support.checks import (
     JointValues,
     control_values,
     count,
+    finite,
     is_one_of,
     joint_array,
     named_limits,
     positive,
-    real,
 )
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
@@ -217,7 +217,7 @@ class OptimalControlProblem(Frozen):
             raise InputError("the scene has no controls, so there is nothing to optimize")
         places, rule = _rule(sampling, dt, cubic=cubic)
         times = _times(places, steps, dt)
-        t0 = real("t0", t0)
+        t0 = finite("t0", t0)
         points = Points(
             t0 + times, dt * steps, steps, n, m, t0, scene.robot.joint_names, scene.control_joints, scene.robot
         )
@@ -410,8 +410,8 @@ class OptimalControlProblem(Frozen):
             changed["constraints"] = self._after(before)
             changed["cost"] = with_control_before(self.cost, before)
             changed["rate"] = control_rate(changed["cost"], scene.controls, scene.control_joints)
-        if t0 is not None and real("t0", t0) != self.t0:
-            changed["t0"] = t0 = real("t0", t0)
+        if t0 is not None and finite("t0", t0) != self.t0:
+            changed["t0"] = t0 = finite("t0", t0)
             times = t0 + _times(self.places, self.steps, self.dt)
             points = replace(self.running.points, t=times, t0=t0)
             changed["running"], changed["terminal"] = bind_cost(self.cost, times, points, (self.running, self.terminal))

@@ -45,6 +45,7 @@ from varpin.simulation.record import located
 from varpin.support.checks import (
     JointValues,
     count,
+    flag,
     fraction,
     is_one_of,
     positive,
@@ -231,6 +232,7 @@ def solve(
     if noise is not None and not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held', 'whole' or None, got {noise!r}")
     whole_noise = noise == "whole" or (noise is None and is_exact(problem))
+    second_order, check = flag("second_order", second_order), flag("check", check)
     report_all = require_reports(callback, progress)
     positive("tolerance", tolerance, "1")
     deadline = time.perf_counter() + checked_time(time_limit)
@@ -336,7 +338,7 @@ def require_reports(callback: Any, progress: object) -> Report:
 
 def checked_time(limit: object) -> float:
     """A time limit [s] as a float > 0, infinite for none."""
-    return np.inf if limit == np.inf else positive("time_limit", limit, "s")
+    return np.inf if isinstance(limit, float) and limit == np.inf else positive("time_limit", limit, "s")
 
 
 def replan(

@@ -137,6 +137,8 @@ class Moments(Frozen):
     squares: Floats
     energy: Floats
 
+    # Paths that blow up may have squares that are infinite.
+    @np.errstate(over="ignore", invalid="ignore")
     def merged(self, other: Moments) -> Moments:
         """Sums over the paths of both (Chan, Golub and LeVeque 1979)."""
         total = self.count + other.count
@@ -336,6 +338,7 @@ class _Chunk:
         moved = as_moved(shared.scene, segment.q[:steps], segment.v[:steps], u) if moving else u
         return moved, moved
 
+    @np.errstate(over="ignore", invalid="ignore")
     def _reduce(self, first: int, done: Integers) -> None:
         """Add the block to the statistics. It begins at node ``first`` and has ``done[i]`` nodes of path i."""
         last, n2 = int(done.max()), self.block.shape[1] - 1

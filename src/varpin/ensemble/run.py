@@ -26,7 +26,16 @@ from varpin.simulation.record import rollout
 from varpin.simulation.soundness import Finding, announce
 from varpin.simulation.start import in_other_units, on_constraints
 from varpin.simulation.time_steps import time_steps
-from varpin.support.checks import JointValues, as_floats, count, finite_array, joint_array, require_finite
+from varpin.support.checks import (
+    JointValues,
+    as_floats,
+    count,
+    counting,
+    finite_array,
+    flag,
+    joint_array,
+    require_finite,
+)
 from varpin.support.executors import executing, in_order, take_all
 
 logger = logging.getLogger(__name__)
@@ -96,7 +105,8 @@ def simulate_ensemble(
     """
     require_scene(scene)
     dt, steps = time_steps(dt, steps, duration)
-    paths = count("paths", paths, least=1)
+    paths, store = count("paths", paths, least=1), flag("store", store)
+    counting("progress", progress, "paths done, paths in all")
     _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
     if scene.noise.diffusion is None:

@@ -293,8 +293,10 @@ class KinematicInput(Constraint):
 
     def bind(self, robot: Robot) -> Bound:
         """See :meth:`Constraint.bind`."""
+        if not isinstance(self.joint, str):
+            raise InputError(f"KinematicInput takes the name of a joint, got {self.joint!r}")
         if self.joint not in robot.joint_names:
-            raise UnknownJoint(str(self.joint), robot.joint_names, "KinematicInput")
+            raise UnknownJoint(self.joint, robot.joint_names, "KinematicInput")
         if not is_one_of(self.interpolation, ("linear", "cubic")):
             raise InputError(f"interpolation must be 'linear' or 'cubic', got {self.interpolation!r}")
         c = robot.coordinate(self.joint)

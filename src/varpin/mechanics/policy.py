@@ -19,6 +19,7 @@ from varpin.support.checks import (
     control_values,
     count,
     finite_array,
+    flag,
     is_one_of,
     named_limits,
     positive,
@@ -58,8 +59,7 @@ class OpenLoop:
     def __post_init__(self) -> None:
         if not callable(self.f):
             raise InputError(f"OpenLoop takes a function of the time t, got {reprlib.repr(self.f)}")
-        if not isinstance(self.vectorized, bool):
-            raise InputError(f"vectorized must be True or False, got {reprlib.repr(self.vectorized)}")
+        flag("vectorized", self.vectorized)
         if not takes(self.f, 1):
             hint = "; a law of (t, q, v) is given as it is, controls=law" if takes(self.f, 3) else ""
             raise InputError(f"OpenLoop takes a function of one argument, the time t{hint}")

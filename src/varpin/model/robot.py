@@ -485,7 +485,7 @@ def _lock(
     model, visuals = description.model, description.visuals
     index = joint_index(model)
     leaders = {tie.follower: tie for tie in description.ties}
-    if not isinstance(lock or {}, Mapping):
+    if not (lock is None or isinstance(lock, Mapping)):
         raise InputError(f"lock must map joint names to positions, as in {{'elbow': 0.5}}, got {lock!r}")
     reference = pin.neutral(model)
     locked: dict[str, float | tuple[float, ...]] = {}

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
+from varpin.support.checks import flag
 from varpin.trajectory import Trajectory, kinematic_input_rows, require_trajectory
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ def plot_energy_error(
     """
     _require_motion(trajectory, None)
     start = trajectory.energy[0]
-    if relative and start == 0.0:
+    if flag("relative", relative) and start == 0.0:
         raise InputError("the initial energy is 0 J, so nothing is relative to it: plot with relative=False")
     figure, axes = _axes(axes)
     change = (trajectory.energy - start) / (abs(start) if relative else 1.0)

@@ -31,7 +31,7 @@ from varpin.simulation.soundness import Finding, announce, findings_from_record,
 from varpin.simulation.start import controls_in_degrees, in_other_units, on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
 from varpin.simulation.tolerance import Steps
-from varpin.support.checks import JointValues, as_floats, count, joint_array
+from varpin.support.checks import JointValues, as_floats, count, flag, joint_array
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -185,7 +185,7 @@ def simulated(
         dt = span / steps
     else:
         dt, steps = time_steps(dt, steps, duration, choosable=True)
-    period = count("period", period, least=1)
+    period, check = count("period", period, least=1), flag("check", check)
     _require_memory(scene, steps)
     on_lines = isinstance(controls, FirstOrderHold) or (isinstance(controls, LinearPolicy) and controls.linear)
     width = scene.increments(linear=on_lines)

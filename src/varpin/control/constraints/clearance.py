@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,7 @@ from varpin.control.constraints.base import (
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.clearance import Clearance, Obstacle, clearance
-from varpin.support.checks import finite, path_like
+from varpin.support.checks import finite, flag, path_like
 
 # Scale: a tenth of an arm's reach [m].
 _LENGTH = 0.1
@@ -86,11 +86,18 @@ class KeepClear(PlanConstraint):
             InputError: There are no pairs, a link has no shapes, or a value is invalid.
         """
         self.robot = require_robot(robot, type(self).__name__)
-        if isinstance(obstacles, Obstacle) or not all(isinstance(item, Obstacle) for item in obstacles):
+        if not isinstance(obstacles, Iterable) or not all(isinstance(item, Obstacle) for item in obstacles):
             raise InputError(f"KeepClear obstacles must be a list of varpin.Obstacle, got {obstacles!r}")
         self.obstacles = tuple(obstacles)
         self.distance = finite("KeepClear distance", distance)
         self.margin = checked_margin(self, margin)
+        itself = flag("KeepClear itself", itself)
+        if links is not None and (
+            isinstance(links, str) or not isinstance(links, Iterable) or not all(isinstance(x, str) for x in links)
+        ):
+            raise InputError(f"KeepClear links must be a list of names of links, got {links!r}")
+        if not (capsules is None or isinstance(capsules, Mapping)):
+            raise InputError(f"KeepClear capsules must map names of links to (begin, end, radius), got {capsules!r}")
         file = None if srdf is None else path_like("KeepClear srdf", srdf)
         self._of = clearance(robot, self.obstacles, links=links, itself=itself, srdf=file, capsules=capsules)
         self.pairs = self._of.names

@@ -35,7 +35,7 @@ from varpin.show.replay.script import Actor, Script
 from varpin.show.replay.surroundings import goals, parts_of, regions, ties
 from varpin.show.replay.view import set_view
 from varpin.show.replay.viewer import open_browser
-from varpin.support.checks import positive
+from varpin.support.checks import flag, positive
 from varpin.trajectory import Nodes, Trajectory
 
 if TYPE_CHECKING:
@@ -127,6 +127,7 @@ class LiveView:
                 f"a LiveView takes a Robot, a Scene or an OptimalControlProblem, got {type(source).__name__}"
             )
         self.robot = robot
+        constraints, open = flag("constraints", constraints), flag("open", open)
         self._speed = None if speed is None else positive("speed", speed, "1")
         self._interval = 1.0 / positive("fps", fps, "1/s")
         self._hold = max(positive("hold", hold, "s"), self._interval)

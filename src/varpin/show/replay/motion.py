@@ -29,7 +29,7 @@ from varpin.show.replay.annotations import (
 from varpin.show.replay.script import Actor, Script
 from varpin.show.replay.surroundings import goals, parts_of, regions, ties
 from varpin.show.replay.video import Film, frame_size
-from varpin.support.checks import JointValues, as_floats, count, finite_array, positive, require_finite, writable
+from varpin.support.checks import JointValues, as_floats, count, finite_array, flag, positive, require_finite, writable
 from varpin.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -141,7 +141,10 @@ def replay(
     """
     shown = _pairs(robot, motion)
     several = len(shown) > 1
-    if (html is not None or video is not None) + bool(open) + bool(inline) != 1:
+    open, inline, growing, loop = (
+        flag(name, value) for name, value in (("open", open), ("inline", inline), ("growing", growing), ("loop", loop))
+    )
+    if (html is not None or video is not None) + open + inline != 1:
         raise InputError(
             "give either html=path, for a file, or open=True, for a window; or video=path, for a film; or inline=True, "
             "for a notebook"

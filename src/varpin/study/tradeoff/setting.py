@@ -6,7 +6,7 @@ import hashlib
 import logging
 import reprlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -237,6 +237,8 @@ def integrators_of(scene: Scene, integrators: Sequence[Integrator] | None) -> tu
     """
     if integrators is None:
         return candidates(scene)
+    if not isinstance(integrators, Iterable):
+        raise InputError(f"integrators must be a list of varpin's, got {integrators!r}")
     members = tuple(integrators)
     for member in members:
         if not isinstance(member, Integrator):
