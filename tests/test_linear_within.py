@@ -197,7 +197,7 @@ def test_motions_do_not_go_around_velocity_limits():
     assert costs["linear"] < costs["held"]
 
 
-@pytest.mark.parametrize("name", ["ur5", "two links"])
+@pytest.mark.parametrize("name", [pytest.param("ur5", marks=pytest.mark.slow), "two links"])
 def test_speeds_hold_between_nodes(name):
     robot = vp.load_robot(name) if name == "ur5" else vp.planar_chain(2)
     problem = reach(robot, 0.8) if name == "ur5" else reach(robot, 0.6, dt=0.1, steps=10)
@@ -234,3 +234,43 @@ def test_rounds_with_rows_between_nodes_go_on_where_they_stopped(tmp_path):
         rest = vp.solve(problem, resume=vp.Solution.load(part.save(tmp_path / "plan.npz"), problem), check=False)
         assert rest.controls.tobytes() == whole.controls.tobytes()
         assert rest.multipliers.values.tobytes() == whole.multipliers.values.tobytes()
+
+
+@pytest.mark.parametrize("kind", ["region", pytest.param("clearance", marks=pytest.mark.slow)])
+def test_regions_and_clearance_hold_between_nodes(kind):
+    """To a thousandth of the range, 1e-3 m, in 32 parts of each step of 0.15 s."""
+    robot = vp.planar_chain(2)
+    if kind == "region":
+        within = vp.KeepOutOfSphere(robot, "tip", center=[1.3, 0.0, -1.5], radius=0.2)
+    else:
+        arm = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
+        ball = vp.Obstacle.sphere([1.4, 0.0, -1.35], 0.15, name="ball")
+        within = vp.KeepClear(robot, [ball], 0.02, capsules=arm)
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
+    given = {"dt": 0.15, "steps": N, "controls": "linear", "constraints": [within]}
+    problem = vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, [0.0, 0.0], [0.0, 0.0], **given)
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged, plan.reason
+    assert len(plan.constraints[0].t) > N
+    fine = problem.constraints_on(0.15 / 32, 32 * N, 1)[0]
+    lines = vp.FirstOrderHold(plan.controls).refined(32)
+    options = {"dt": 0.15 / 32, "steps": 32 * N, "controls": lines, "integrator": vp.RungeKutta4()}
+    motion = vp.simulate(problem.scene, problem.q0, problem.v0, **options, check=False)
+    assert fine.value(motion.q, motion.v, motion.u).max() <= 1e-3
+
+
+def test_files_with_other_rows_between_nodes_are_refused(tmp_path):
+    problem = reach(vp.planar_chain(2), 0.6, dt=0.125, steps=N)
+    path = vp.solve(problem, check=False).save(tmp_path / "plan.npz")
+    with np.load(path) as file:
+        members = dict(file)
+    wrong = {
+        "instants": members["multipliers.instants"] + [0, N, 0],
+        "offsets": members["multipliers.offsets"][1:],
+        "weights": members["multipliers.weights"][:1],
+    }
+    for name, array in wrong.items():
+        np.savez(path, **members | {f"multipliers.{name}": array})
+        with pytest.raises(vp.FileError, match="multipliers"):
+            vp.Solution.load(path, problem)
