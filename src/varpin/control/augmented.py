@@ -20,10 +20,12 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.backward import backward
+from varpin.control.between_nodes import NOWHERE, Instants, carried, enforced, seen, updated
+from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
-from varpin.control.multipliers import FEASIBLE, ConstraintReport, Multipliers, reports, split
+from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, reports_of, split
 from varpin.control.penalties import PenalizedProblem, flat, penalized
 from varpin.control.polish import deviations, polished
 from varpin.control.problem import OptimalControlProblem
@@ -60,6 +62,12 @@ _MOVING, _SETTLED = 12, 1e-3
 _STUCK, _LOWERED = 3, 0.9
 # Expected decrease, relative to the cost with penalties, with which a stalled search has not shown infeasibility.
 _MUCH = 1e-2
+# Greatest number of last steps, each with the rows between nodes of the motion before.
+_LOOKS = 4
+# Number of rounds from which on none is added for the sake of what is between nodes.
+_BETWEEN = 25
+# Violation between nodes that is left to the last steps.
+_CLOSE = 1e-5
 # Violation at which penalties stop growing; the last step removes the rest.
 _AIM = 1e-8
 
@@ -118,6 +126,7 @@ class _State:
     tolerance: float
     round: int = 0
     stuck: int = 0
+    between: Instants = NOWHERE
 
 
 class _Rounds:
@@ -126,7 +135,9 @@ class _Rounds:
     def __init__(
         self, problem: OptimalControlProblem, search: Callable[..., Solution], options: dict[str, Any]
     ) -> None:
-        self.problem, self.search, self.bound = problem, search, problem.bound_constraints
+        self.problem, self.search = problem, search
+        # The problem of a round, with its rows between nodes.
+        self.whole = problem
         self.options = dict(options)
         self.check = bool(self.options.pop("check", True))
         self.progress = self.options.pop("progress", None)
@@ -139,8 +150,13 @@ class _Rounds:
         self.report_all = require_reports(self.options.pop("callback", None), self.progress)
         self.label = f"{problem.scene.robot.name}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
         self.history: list[Iteration] = []
-        self.noisy = bool(problem.scene.processes) and any(item.source.margin > 0.0 for item in self.bound)
+        self.noisy = bool(problem.scene.processes) and any(item.margin > 0.0 for item in problem.constraints)
         self.state: _State
+
+    @property
+    def bound(self) -> tuple[BoundConstraint, ...]:
+        """The bound constraints of a round."""
+        return self.whole.bound_constraints
 
     def run(self) -> Solution:
         began = time.perf_counter()
@@ -153,10 +169,11 @@ class _Rounds:
         found, resume = first, self._resumed_search()
         while True:
             begun = self.state
+            self.whole = enforced(self.problem, begun.between)
             known = len(self.history)
             done = 0 if resume is None or resume.search is None else len(resume.search.history)
             left = min(last - known, _OF_ROUND - done)
-            problem = penalized(self.problem, begun.multipliers, begun.weights, begun.backoff)
+            problem = penalized(self.whole, begun.multipliers, begun.weights, begun.backoff)
             options: dict[str, Any] = dict(self.options)
             if resume is None:
                 options["controls"] = self.controls if begun.round == 0 else found
@@ -178,15 +195,16 @@ class _Rounds:
             resume = None
             self.history += [replace(item, index=item.index + known) for item in found.history]
             kept = self._steady(self._kept(found, problem, begun, known))
-            status, reason = self._ended_or_next(kept, begun, found, last)
-            if status is not None:
-                break
-        if kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
             try:
-                kept, closing = self._polished(replace(kept, status=status))
-                status, reason = kept.status, f"{reason}; {closing}"
+                status, reason = self._ended_or_next(kept, begun, found, last)
+                if self._goes_between(kept, begun, status) or status is None:
+                    continue
+                if kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
+                    kept, closing = self._polished(replace(kept, status=status))
+                    status, reason = kept.status, f"{reason}; {closing}"
             except KeyboardInterrupt:
-                status = Status.INTERRUPTED
+                status, reason = Status.INTERRUPTED, found.reason
+            break
         plan = replace(kept, status=status, reason=reason)
         return looked_at(plan)[0] if self.check else plan
 
@@ -230,6 +248,7 @@ class _Rounds:
         known = resumed.multipliers
         if resumed.search is None or known is None:
             raise InputError("resume: the solution does not hold the state of its search; give it as controls")
+        self.whole = enforced(self.problem, known.between)
         self.state = _State(
             split(self.bound, known.begun),
             known.weights,
@@ -239,6 +258,7 @@ class _Rounds:
             known.tolerance,
             known.round,
             known.stuck,
+            known.between,
         )
         self.history = list(resumed.search.history)
         return resumed
@@ -276,6 +296,7 @@ class _Rounds:
             round=begun.round,
             iterations=known,
             stuck=begun.stuck,
+            **_of_instants(begun.between),
         )
         search = found.search
         if search is not None:
@@ -297,7 +318,8 @@ class _Rounds:
         """Status and reason if the rounds end; else update multipliers and weights for the next round, (P3)."""
         known = kept.multipliers
         assert known is not None
-        constraints = reports(self.problem, kept.trajectory, known)
+        values = split(self.bound, known.values)
+        constraints = reports_of(self.whole, kept.trajectory, values, begun.backoff)
         violation = np.array([item.violation for item in constraints])
         worst = max(constraints, key=lambda item: item.violation)
         state = f"round {begun.round}: {worst.label} is violated by {worst.violation:.1e} {worst.unit}"
@@ -335,7 +357,7 @@ class _Rounds:
         more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
         weights = np.where(more, _GROWTH * begun.weights, begun.weights)
         self.state = _State(
-            multipliers=split(self.bound, known.values),
+            multipliers=values,
             weights=weights,
             first_weights=begun.first_weights,
             backoff=backoff,
@@ -344,33 +366,136 @@ class _Rounds:
             tolerance=begun.tolerance if exact or stays else max(_FINAL * self.tolerance, _TIGHTER * begun.tolerance),
             round=begun.round + 1,
             stuck=stuck,
+            between=begun.between,
         )
         return None, ""
 
+    def _looked_between(self, motion: Trajectory, between: Instants, backoff: list[Floats], least: float) -> Instants:
+        """Rows between nodes with the offsets of a motion, and those that it violates by more than ``least``."""
+        values = seen(self.problem, motion)
+        if values is None:
+            return between
+        margins = backoff[: len(self.problem.bound_constraints)]
+        return updated(self.problem, between, motion, values, margins, least)
+
+    def _goes_between(self, kept: Solution, begun: _State, ended: Status | None) -> bool:
+        """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
+
+        Only linear controls lead around the nodes. There are no such rows until the rounds have ended with a motion
+        that violates a constraint by more than a thousandth of its range. From then on each round has the offsets of
+        the motion before, and the rows that it violates. The weights of penalties are the first ones again when there
+        are rows for the first time.
+        """
+        before, base, known = begun.between, self.state, kept.multipliers
+        assert known is not None
+        values = split(self.bound, known.values)
+        if not self.problem.linear or (ended is None and not len(before.rows)):
+            # Under held controls motions between nodes are close to them, or too fast for a cubic.
+            return False
+        if ended is not None:
+            if begun.round + 1 >= _BETWEEN or ended not in (Status.CONVERGED, Status.STALLED):
+                return False
+            if kept.violation > FEASIBLE:
+                return False
+            base = replace(begun, multipliers=values, round=begun.round + 1, stuck=0)
+        between = self._looked_between(kept.trajectory, before, begun.backoff, FEASIBLE)
+        if not len(between.rows):
+            return False
+        parts = (carried(self.problem, before, between, array) for array in (base.multipliers, base.backoff))
+        multipliers, backoff = next(parts), self._margins(next(parts), between)
+        arrays = (base.weights, base.first_weights, base.worst)
+        weights, first_weights, worst = (_of_all(array, before, between) for array in arrays)
+        whole = enforced(self.problem, between)
+        told = reports_of(whole, kept.trajectory, multipliers, backoff)
+        if ended is not None:
+            bounds = [_CLOSE if len(before.rows) else REPORTED * item.scale for item in whole.bound_constraints]
+            if all(item.violation <= most for item, most in zip(told, bounds, strict=True)):
+                return False
+        most = max(told, key=lambda item: item.violation)
+        logger.info(
+            "%s: between nodes %s is violated by %.1e %s: rows at %d instants from now on",
+            self.label, most.label, most.violation, most.unit, len(between.rows),
+        )  # fmt: skip
+        self.state = replace(
+            base,
+            multipliers=multipliers,
+            weights=weights,
+            first_weights=first_weights,
+            backoff=backoff,
+            worst=worst,
+            between=between,
+        )
+        if not len(before.rows):
+            self.state = replace(self.state, weights=first_weights, worst=np.full(len(worst), np.inf), tolerance=_LOOSE)
+        return True
+
+    def _left(self, motion: Trajectory, between: Instants, backoff: list[Floats]) -> float:
+        """The largest violation of a motion, with rows between nodes."""
+        whole = enforced(self.problem, between)
+        return max(told.violation for told in reports_of(whole, motion, backoff, backoff))
+
+    def _margins(self, backoff: list[Floats], between: Instants) -> list[Floats]:
+        """The margins of all rows, those between nodes as at the end of their step."""
+        count = len(self.problem.bound_constraints)
+        of_instants = [backoff[i][between.of(i)[:, 0]] for i in between.constraints]
+        return [*backoff[:count], *of_instants]
+
     def _polished(self, kept: Solution) -> tuple[Solution, str]:
-        """The plan moved onto its constraints and to its optimum, with matching gains, and its residuals in words."""
+        """The plan moved onto its constraints and to its optimum, with matching gains, and its residuals in words.
+
+        The motion then has other offsets of its rows between nodes, so that the last step is made again. With such
+        rows, the plan stays where it is if that does not lead closer.
+        """
         known = kept.multipliers
         assert known is not None
         values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
+        motion, between, found, dense = kept.trajectory, known.between, None, len(known.between.rows) > 0
+        least, bound = np.inf, np.inf
+        if dense:
+            between = self._looked_between(motion, between, backoff, np.inf)
+            least = self._left(motion, between, backoff)
+            kept = replace(kept, multipliers=replace(known, **_of_instants(between)))
         try:
-            found = polished(self.problem, kept.trajectory, values, known.weights, backoff)
+            for _ in range(_LOOKS):
+                self.whole = enforced(self.problem, between)
+                after = polished(self.whole, motion, values, known.weights, backoff)
+                bound = self.tolerance * (after.stake + NOTHING * (0.0 if kept.search is None else kept.search.first))
+                told = between
+                if dense:
+                    told = self._looked_between(after.motion, between, backoff, np.inf)
+                    left = self._left(after.motion, told, backoff)
+                    if left > max(least, FEASIBLE) or after.decrease > bound:
+                        break
+                    least = left
+                found, between = after, told
+                motion, values = found.motion, found.multipliers
+                if not dense or least <= FEASIBLE:
+                    break
         except (CostError, NoiseFieldError, LinearizationError):
-            return kept, f"constraints hold to {kept.violation:.1e}"
-        plan = self._along(kept, found.motion, replace(known, values=flat(found.multipliers)))
+            pass
+        self.whole = enforced(self.problem, between)
+        if found is None:
+            closing = f"constraints hold to {kept.violation:.1e}"
+            return replace(kept, status=Status.STALLED) if self._clearly_beyond(kept) else kept, closing
+        plan = self._along(kept, found.motion, replace(known, values=flat(values), **_of_instants(between)))
         closing = (
             f"constraints hold to {plan.violation:.1e}, and within them the cost would fall by {found.decrease:.1e}"
         )
-        bound = self.tolerance * (found.stake + NOTHING * (0.0 if kept.search is None else kept.search.first))
-        if kept.status is Status.CONVERGED and not found.decrease <= bound:
+        if kept.status is Status.CONVERGED and (self._clearly_beyond(plan) or not found.decrease <= bound):
             plan = replace(plan, status=Status.STALLED)
         return plan, closing
+
+    def _clearly_beyond(self, plan: Solution) -> bool:
+        """Whether the motion violates a constraint between nodes by more than a thousandth of its range."""
+        bound = self.problem.bound_constraints
+        return any(told.violation > REPORTED * item.scale for told, item in zip(plan.constraints, bound, strict=True))
 
     def _along(self, kept: Solution, motion: Trajectory, multipliers: Multipliers) -> Solution:
         """The plan with a neighbouring motion, its multipliers and the results of a backward pass along it."""
         moved = replace(kept, trajectory=motion, cost=self.problem.cost_of(motion), multipliers=multipliers)
         values, backoff = split(self.bound, multipliers.values), split(self.bound, multipliers.backoff)
         try:
-            found = backward(penalized(self.problem, values, multipliers.weights, backoff), motion, 0.0)
+            found = backward(penalized(self.whole, values, multipliers.weights, backoff), motion, 0.0)
         except (CostError, NoiseFieldError, LinearizationError):
             return moved
         if found is None:
@@ -399,7 +524,7 @@ class _Rounds:
             first if item.source.equality else 0.0 for item, first in zip(self.bound, known.first_weights, strict=True)
         ]
         zeros = [np.zeros(item.shape) for item in self.bound]
-        calm = penalized(self.problem, zeros, np.array(goals), zeros, quiet=False)
+        calm = penalized(self.whole, zeros, np.array(goals), zeros, quiet=False)
         try:
             found = backward(calm, kept.trajectory, 0.0)
         except (CostError, NoiseFieldError, LinearizationError):
@@ -416,6 +541,21 @@ class _Rounds:
             else np.zeros(item.shape)
             for item in self.bound
         ]
+
+
+def _of_instants(between: Instants) -> dict[str, Any]:
+    """The rows between nodes as fields of :class:`Multipliers`."""
+    return {"instants": between.rows, "offsets": between.offsets} if len(between.rows) else {}
+
+
+def _of_all(values: Floats, old: Instants, new: Instants) -> Floats:
+    """Numbers (C,) of all constraints and those with rows at instants ``old``, for ``new`` ones, that have others.
+
+    A constraint that had no such rows has the number of its rows at the nodes.
+    """
+    count = len(values) - len(old.constraints)
+    known = dict(zip(old.constraints, values[count:], strict=True))
+    return np.array([*values[:count], *(known.get(i, values[i]) for i in new.constraints)])
 
 
 def _blocked(found: Solution) -> bool:

@@ -266,7 +266,9 @@ class _Rows:
         slopes = np.tile(np.eye(2 * n), (len(q), 1, 1))
         if problem.integrator.variational:
             slopes[:, n:] = velocity
-        self.by_state = [J @ slopes[item.bound.places] for item, J in zip(self.of_nodes, self.jacobians, strict=True)]
+        self.by_state = [
+            [(nodes, J @ slopes[nodes]) for nodes, J in item.bound.of_nodes(q, v)] for item in self.of_nodes
+        ]
 
     def along(self, held: list[Mask]) -> Along:
         """Expansions for a pass with the active rows ``held``."""
@@ -299,8 +301,8 @@ class _Rows:
         states = states[len(A) - problem.steps :, :x]
         self.ahead_of = states, moves
         found = [
-            s + np.einsum("krx,kx->kr", J, states[item.bound.places])
-            for item, s, J in zip(self.of_nodes, self.signed[: len(self.of_nodes)], self.by_state, strict=True)
+            s + sum(np.einsum("krx,kx->kr", J, states[nodes]) for nodes, J in parts)
+            for s, parts in zip(self.signed[: len(self.of_nodes)], self.by_state, strict=True)
         ]
         for item, s in zip(self.of_rate, self.signed[len(self.of_nodes) :], strict=True):
             bound = item.bound

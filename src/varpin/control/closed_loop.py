@@ -193,7 +193,10 @@ class ClosedLoop:
         R, m, x = self.gains.shape
         total, hold = sum(int(rows.sum()) for rows in active), problem.hold
         G = np.zeros((total, R, m))
-        carried, node = np.zeros((total, x)), np.full(total, -1)
+        # For each row and each of its nodes, which may be two, the row's derivatives in the state there.
+        carried: list[Floats] = [np.zeros((0, x))]
+        node: list[NDArray[np.int64]] = []
+        of_row: list[NDArray[np.int64]] = []
         begin = 0
         for item, rows in zip(problem.bound_constraints, active, strict=True):
             k, r = np.nonzero(rows)
@@ -202,14 +205,16 @@ class ClosedLoop:
             if isinstance(item, BoundRate):
                 G[part] = _of_rate(item, k, r, R, m)
             elif len(k):
-                places = item.places[k]
-                J = item.jacobian(motion.q, motion.v)[k, r]
-                carried[part, : J.shape[1]] = np.einsum("ax,axy->ay", J, self._slopes[places])
-                node[part] = places + self._before
-        back = np.zeros_like(carried)
+                for places, J in item.of_nodes(motion.q, motion.v):
+                    by_state = np.einsum("ax,axy->ay", J[k, r], self._slopes[places[k]])
+                    carried.append(np.pad(by_state, ((0, 0), (0, x - by_state.shape[1]))))
+                    node.append(places[k] + self._before)
+                    of_row.append(np.arange(begin - len(k), begin))
+        slopes, nodes, owners = np.concatenate(carried), _joined(node), _joined(of_row)
+        back = np.zeros((total, x))
         for j in reversed(range(len(self._A))):
-            own, here = j // hold, node == j + 1
-            back[here] += carried[here]
+            own, here = j // hold, nodes == j + 1
+            np.add.at(back, owners[here], slopes[here])
             G[:, own] += back @ self._B[j]
             back = back @ self._A[j]
             if j % hold == 0:
@@ -244,10 +249,16 @@ class ClosedLoop:
                 rate = rate[item.places][:, item.limited]
                 found.append(c + np.concatenate([rate, -rate], axis=1))
             else:
-                J = item.jacobian(motion.q, motion.v)
-                by_state = np.einsum("kxy,ky->kx", self._slopes[item.places], response[item.places])
-                found.append(c + np.einsum("krx,kx->kr", J, by_state))
+                change_of = np.zeros_like(c)
+                for nodes, J in item.of_nodes(motion.q, motion.v):
+                    by_state = np.einsum("kxy,ky->kx", self._slopes[nodes], response[nodes])
+                    change_of += np.einsum("krx,kx->kr", J, by_state)
+                found.append(c + change_of)
         return found
+
+
+def _joined(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
 
 def _inverse(matrix: Floats) -> Floats:

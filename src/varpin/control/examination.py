@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.control.between_nodes import enforced
 from varpin.control.constraints import BoundConstraint
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.moments import noise_cost, noise_cost_in_halves
-from varpin.control.multipliers import FEASIBLE, REPORTED
+from varpin.control.multipliers import FEASIBLE, REPORTED, split
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes
@@ -328,8 +329,8 @@ def _margins_of_velocities(solution: Solution) -> list[Finding]:
 
 def _between(solution: Solution) -> list[Finding]:
     """Findings about constraints that hold at the nodes and are violated between them."""
-    problem = solution.problem
-    if not problem.constraints or solution.violation > FEASIBLE:
+    problem, known = solution.problem, solution.multipliers
+    if known is None or solution.violation > FEASIBLE:
         return []
     dt = problem.dt / PARTS
     # In parts of steps the controls alone may leave an unstable motion, and so may a feedback that is too fast.
@@ -345,13 +346,14 @@ def _between(solution: Solution) -> list[Finding]:
     motion = kept
     found = []
     fine = problem.constraints_on(dt, problem.steps * PARTS, problem.hold * PARTS)
-    plan = solution.trajectory
-    for bound, whole, record in zip(fine, problem.bound_constraints, solution.constraints, strict=True):
+    # Those at the nodes come first.
+    margins = split(enforced(problem, known.between).bound_constraints, known.backoff)[: len(fine)]
+    for bound, whole, margin in zip(fine, problem.bound_constraints, margins, strict=True):
         if bound.of_controls or bound.source.equality:
             continue
         c = bound.value(motion.q, motion.v, problem.control_rows(motion))
         # The margin is that of the plan's node at the end of the step.
-        c = c + (record.values - whole.value(plan.q, plan.v, problem.control_rows(plan))).repeat(PARTS, axis=0)
+        c = c + margin.repeat(PARTS, axis=0)
         outside = _at_start(problem, whole)
         if outside is not None:
             # A row that is violated at the start cannot hold before the first node, so it is not reported there.
@@ -366,7 +368,7 @@ def _between(solution: Solution) -> list[Finding]:
             found.append(
                 Finding(
                     "constraints between nodes",
-                    f"{record.label} holds at the nodes, but between nodes {bound.rows[row]} is violated by "
+                    f"{bound.source.label} holds at the nodes, but between nodes {bound.rows[row]} is violated by "
                     f"{c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: {advice}",
                 )
             )

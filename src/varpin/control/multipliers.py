@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
+from varpin.control.between_nodes import NOWHERE, Instants, enforced
 from varpin.control.constraints import BoundConstraint
 from varpin.control.problem import OptimalControlProblem
 from varpin.io.archive import Axes
@@ -25,7 +26,8 @@ REPORTED = 1e-2
 class Multipliers(Frozen):
     """Multipliers of a plan's constraints, and the state of the rounds of the augmented Lagrangian.
 
-    Arrays (M,) have one number for each place and row of all constraints, one constraint after another.
+    Arrays (M,) have one number for each place and row of all constraints, one constraint after another. C constraints
+    are the problem's, and then, once more, those that also have rows between nodes.
 
     Attributes:
         values: Multipliers of the plan's motion (M,) [cost / unit of the constraint].
@@ -38,6 +40,9 @@ class Multipliers(Frozen):
         round: Number of the last round, from 0.
         iterations: Iterations of all rounds before.
         stuck: Number of successive rounds that have hardly lowered the worst violation.
+        instants: Constraint, step and instant (I, 3) of each instant between nodes at which a constraint has rows; None
+            where all hold there without.
+        offsets: What is added to the values of these rows (O,), which are those of cubics through the nodes.
     """
 
     values: Annotated[Floats, Axes("rows", finite=True)]
@@ -50,10 +55,19 @@ class Multipliers(Frozen):
     round: int
     iterations: int
     stuck: int
+    instants: Annotated[Integers, Axes("instants", 3)] | None = None
+    offsets: Annotated[Floats, Axes("offsets", finite=True)] | None = None
 
     def __post_init__(self) -> None:
-        for array in (self.values, self.backoff, self.begun, self.weights, self.first_weights, self.worst):
-            array.setflags(write=False)
+        arrays = (self.values, self.backoff, self.begun, self.weights, self.first_weights, self.worst)
+        for array in (*arrays, self.instants, self.offsets):
+            if array is not None:
+                array.setflags(write=False)
+
+    @property
+    def between(self) -> Instants:
+        """The rows between nodes."""
+        return NOWHERE if self.instants is None or self.offsets is None else Instants(self.instants, self.offsets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +78,7 @@ class ConstraintReport(Frozen):
         label: The constraint.
         rows: Description of each row.
         unit: Unit of the values.
-        t: Times of its places (K,) [s].
+        t: Times of its places (K,) [s]: nodes, and instants between them at which it would not hold otherwise.
         values: c at each place (K, rows), margin included. The constraint holds where c <= 0, an equality where c = 0.
         multipliers: (K, rows) [cost / unit]: decrease of the least cost per unit by which the bound is relaxed.
         equality: Whether the constraint is c = 0 rather than c <= 0.
@@ -116,17 +130,33 @@ def split(bound: tuple[BoundConstraint, ...], flat: Floats) -> list[Floats]:
     return [part.reshape(item.shape) for item, part in zip(bound, np.split(flat, ends[:-1]), strict=True)]
 
 
+def reports_of(
+    problem: OptimalControlProblem, motion: Trajectory, values: list[Floats], backoff: list[Floats]
+) -> tuple[ConstraintReport, ...]:
+    """Reports about each bound constraint of a problem, with multipliers ``values`` and margins (K, rows)."""
+    found = []
+    for item, margin, multipliers in zip(problem.bound_constraints, backoff, values, strict=True):
+        c = item.value(motion.q, motion.v, problem.control_rows(motion)) + margin
+        given = item.source.label, item.rows, item.unit, item.times, c, multipliers
+        found.append(ConstraintReport(*given, item.source.equality))
+    return tuple(found)
+
+
 def reports(
     problem: OptimalControlProblem, motion: Trajectory, multipliers: Multipliers
 ) -> tuple[ConstraintReport, ...]:
-    """Reports about each constraint of a problem for a motion on its grid."""
-    bound = problem.bound_constraints
-    found = []
-    for item, backoff, values in zip(
-        bound, split(bound, multipliers.backoff), split(bound, multipliers.values), strict=True
-    ):
-        c = item.value(motion.q, motion.v, problem.control_rows(motion)) + backoff
-        found.append(
-            ConstraintReport(item.source.label, item.rows, item.unit, item.times, c, values, item.source.equality)
+    """Reports about each constraint of a problem for a motion on its grid, with their rows between nodes."""
+    between = multipliers.between
+    whole = enforced(problem, between)
+    parts = (split(whole.bound_constraints, array) for array in (multipliers.values, multipliers.backoff))
+    found = list(reports_of(whole, motion, *parts))
+    count = len(problem.bound_constraints)
+    for i, more in zip(between.constraints, found[count:], strict=True):
+        of_nodes = found[i]
+        order = np.argsort(np.concatenate([of_nodes.t, more.t]), kind="stable")
+        t, c, lam = (
+            np.concatenate([getattr(of_nodes, name), getattr(more, name)])[order]
+            for name in ("t", "values", "multipliers")
         )
-    return tuple(found)
+        found[i] = replace(of_nodes, t=t, values=c, multipliers=lam)
+    return tuple(found[:count])

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
-from varpin.control.constraints import BoundConstraint, BoundRate
+from varpin.control.constraints import BoundBetween, BoundConstraint, BoundRate
 from varpin.control.costs import ControlRate, Expansion
-from varpin.control.problem import OptimalControlProblem
+from varpin.control.problem import OptimalControlProblem, cubics
+from varpin.core import sample_steps
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
@@ -143,10 +144,12 @@ def _rate_of(penalty: Penalty) -> BoundRate:
 class PenalizedProblem(OptimalControlProblem):
     """A problem with the penalties of its constraints in the cost. Made by :func:`penalized`.
 
-    Penalties of states are evaluated at the end of each step, in addition to the samples of the cost.
+    Penalties of states are evaluated at the end of each step, and at instants within steps where there are such rows,
+    in addition to the samples of the cost.
 
     Attributes:
         penalties: Penalties of constraints on states.
+        instants: Where these instants are in a step of unit length (i,), empty without rows within steps.
         all_penalties: Penalties of all constraints, in the problem's order.
         quiet: Whether plans leave the scene's noise out: otherwise stiff penalties would add to the noise cost.
         passes: Greatest number of passes that determine the active rows; 0 keeps those of the nominal motion.
@@ -155,6 +158,7 @@ class PenalizedProblem(OptimalControlProblem):
     """
 
     penalties: tuple[Penalty, ...]
+    instants: Floats
     all_penalties: tuple[Penalty, ...]
     quiet: bool
     passes: int
@@ -181,7 +185,15 @@ class PenalizedProblem(OptimalControlProblem):
         """See :attr:`OptimalControlProblem.model_rule`."""
         # Weight, and coefficients that select q and v at the end of the step.
         node = [self.rule[0, 0], 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-        return np.vstack([self.rule, node])
+        return np.vstack([self.rule, node, self._within])
+
+    @property
+    def _within(self) -> Floats:
+        """Sample points of the instants within steps, as :attr:`rule`."""
+        if not len(self.instants):
+            return np.zeros((0, 9))
+        weights = np.full(len(self.instants), self.rule[0, 0])
+        return np.column_stack([weights, cubics(self.instants, self.dt)])
 
     @property
     def at_velocities(self) -> bool:
@@ -191,7 +203,7 @@ class PenalizedProblem(OptimalControlProblem):
     @property
     def model_places(self) -> Floats:
         """See :attr:`OptimalControlProblem.model_places`."""
-        return np.append(self.places, 1.0)
+        return np.concatenate([self.places, [1.0], self.instants])
 
     def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """See :meth:`OptimalControlProblem.model_samples`."""
@@ -202,6 +214,15 @@ class PenalizedProblem(OptimalControlProblem):
             np.concatenate([x.reshape(steps, -1, x.shape[-1]), y[:, None]], axis=1)
             for x, y in zip(samples, nodes, strict=True)
         ]
+        if len(self.instants):
+            share, begin = self.instants[:, None], u[:-1, None] if self.linear else u[:, None]
+            end = u[1:, None] if self.linear else begin
+            at_q, at_v = sample_steps(self._within, q[None], v[None])
+            within = at_q[0], at_v[0], (1.0 - share) * begin + share * end
+            joined = [
+                np.concatenate([x, y.reshape(steps, -1, y.shape[-1])], axis=1)
+                for x, y in zip(joined, within, strict=True)
+            ]
         q, v, u = (x.reshape(-1, x.shape[-1]) for x in joined)
         return q, v, u
 
@@ -234,18 +255,21 @@ class PenalizedProblem(OptimalControlProblem):
         derivatives.
         """
         N, size, x = self.steps, expansion.gradient.shape[1], 2 * self.scene.robot.dof
-        gradient, hessian = np.zeros((N, size)), np.zeros((N, size, size))
+        # At the end of each step, then at the instants within it.
+        places = 1 + len(self.instants)
+        gradient, hessian = np.zeros((N, places, size)), np.zeros((N, places, size, size))
         for penalty, s, J, rows in zip(self.penalties, shifted, jacobians, held, strict=True):
             if not rows.any():
                 continue
-            steps, counted = penalty.bound.places - 1, rows.astype(float)
-            gradient[steps, :x] += penalty.weight * np.einsum("kr,krx->kx", s * counted, J)
-            hessian[steps, :x, :x] += penalty.weight * (np.swapaxes(J, 1, 2) @ (counted[:, :, None] * J))
+            bound, counted = penalty.bound, rows.astype(float)
+            at = (bound.places - 1, 1 + bound.samples if isinstance(bound, BoundBetween) else 0)
+            gradient[*at, :x] += penalty.weight * np.einsum("kr,krx->kx", s * counted, J)
+            hessian[*at, :x, :x] += penalty.weight * (np.swapaxes(J, 1, 2) @ (counted[:, :, None] * J))
         # All samples of the model have the same weight.
         weight = self.dt * float(self.rule[0, 0])
-        gradients = np.concatenate([expansion.gradient.reshape(N, -1, size), gradient[:, None] / weight], axis=1)
+        gradients = np.concatenate([expansion.gradient.reshape(N, -1, size), gradient / weight], axis=1)
         there = np.broadcast_to(expansion.hessian, (len(expansion.gradient), size, size)).reshape(N, -1, size, size)
-        hessians = np.concatenate([there, hessian[:, None] / weight], axis=1)
+        hessians = np.concatenate([there, hessian / weight], axis=1)
         return Expansion(gradients.reshape(-1, size), hessians.reshape(-1, size, size))
 
 
@@ -280,6 +304,7 @@ def penalized(
     changes: dict[str, object] = {
         "penalties": tuple(part for part in parts if not part.bound.of_controls),
         "all_penalties": tuple(parts),
+        "instants": next((part.bound.shares for part in parts if isinstance(part.bound, BoundBetween)), np.zeros(0)),
     }
     changes |= {"constraints": (), "bound_constraints": (), "quiet": quiet, "passes": passes, "until": until}
     if on_rate:

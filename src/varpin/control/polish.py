@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.control.backward import states
 from varpin.control.closed_loop import ClosedLoop
-from varpin.control.constraints import BoundConstraint
+from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes
@@ -213,9 +213,14 @@ class _Step:
                 rows | (c > _DONE)
                 for rows, c in zip(self.rows, loop.values_after(self.c, response, change), strict=True)
             ]
-            if all(np.array_equal(a, b) for a, b in zip(met, self.rows, strict=True)):
+            if all(np.array_equal(a, b) for a, b in zip(met, self.rows, strict=True)) or self._crowded(met):
                 break
             self.rows = met
+
+    def _crowded(self, met: list[Mask]) -> bool:
+        """Whether there are more rows than controls that could meet them, with rows between nodes among them."""
+        between = any(isinstance(item, BoundBetween) for item in self.bound)
+        return between and sum(int(rows.sum()) for rows in met) > self.free.size
 
     def commands(self, length: float) -> Commands:
         """The commands of the motion after the step, ``length`` of its part along the constraints, with feedback."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control import search
+from varpin.control.between_nodes import enforced
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Iteration, Status
 from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers, split
@@ -65,7 +66,7 @@ def replan(
             deadline=deadline,
         )
     old, new = previous.problem.bound_constraints, problem.bound_constraints
-    hold = problem.hold
+    hold, known = problem.hold, _at_nodes(previous.problem, known)
     multipliers = [
         _shifted_to(*parts, decisions, hold) for parts in zip(old, new, split(old, known.values), strict=True)
     ]
@@ -116,6 +117,26 @@ def replan(
         if done or found.status is Status.INTERRUPTED or time.perf_counter() > deadline - longest:
             break
     return _judged(kept, known)
+
+
+def _at_nodes(problem: OptimalControlProblem, known: Multipliers) -> Multipliers:
+    """Multipliers of the rows at nodes only: a tick has no time for those between them."""
+    bound, count = enforced(problem, known.between).bound_constraints, len(problem.bound_constraints)
+
+    def first(values: Floats) -> Floats:
+        return flat(split(bound, values)[:count])
+
+    return replace(
+        known,
+        values=first(known.values),
+        backoff=first(known.backoff),
+        begun=first(known.begun),
+        weights=known.weights[:count],
+        first_weights=known.first_weights[:count],
+        worst=known.worst[:count],
+        instants=None,
+        offsets=None,
+    )
 
 
 def _shifted_to(old: BoundConstraint, new: BoundConstraint, values: Floats, decisions: int, hold: int) -> Floats:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
+from varpin.control.between_nodes import SHARES, enforced, watched
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.multipliers import Multipliers
 from varpin.control.problem import OptimalControlProblem
@@ -143,7 +144,6 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     members = read_npz(source, _FORMAT)
     scene = problem.scene
     sizes = {"decisions": problem.decisions, "controls": scene.controls, "states": 2 * scene.robot.dof}
-    sizes |= {"rows": sum(item.size for item in problem.bound_constraints), "constraints": len(problem.constraints)}
 
     _require_problem(source, members, problem)
     motions = {"": _motion(source, members, "", problem)}
@@ -158,6 +158,8 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     history = _iterations(source, plan.history, plan.second_order)
     if bool(problem.constraints) != (plan.multipliers is not None):
         raise FileError(f"{source}: multipliers of the problem's constraints do not belong to it, or are missing")
+    if plan.multipliers is not None:
+        _require_rows(source, plan.multipliers, problem)
     if (problem.rate is not None or problem.linear) and plan.previous_gains is None:
         raise FileError(f"{source}: previous_gains is missing")
     apart = ("best", "refined", "second_order")
@@ -166,6 +168,26 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     given |= {"status": Status[plan.status], "history": history}
     given |= {"search": _search(source, members, plan, motions, history, problem)}
     return given | {"problem": problem, "trajectory": motions[""]}
+
+
+def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalControlProblem) -> None:
+    """Refuse multipliers of another number of rows, or of instants that the problem does not have."""
+    between = multipliers.between
+    most = len(problem.constraints), problem.steps, len(SHARES)
+    inside = ((between.rows >= 0) & (between.rows < most)).all()
+    known = inside and np.array_equal(between.rows, np.unique(between.rows, axis=0))
+    if not known or any(not watched(problem)[i] for i in between.constraints):
+        raise FileError(f"{source}: multipliers.instants are not in the problem's steps")
+    own = [problem.bound_constraints[i] for i in between.rows[:, 0]]
+    if sum(len(item.rows) for item in own) != between.offsets.size:
+        raise FileError(f"{source}: multipliers.offsets do not belong to multipliers.instants")
+    sizes = [item.size for item in enforced(problem, between).bound_constraints]
+    for name, found, expected in (
+        ("values", multipliers.values, sum(sizes)),
+        ("weights", multipliers.weights, len(sizes)),
+    ):
+        if found.size != expected:
+            raise FileError(f"{source}: multipliers.{name} has shape ({found.size},), where ({expected},) belongs")
 
 
 def _refinement(source: Path, plan: _Plan) -> Refinement | None:

@@ -93,6 +93,10 @@ class BoundConstraint(Frozen, ABC):
         """
         raise NotImplementedError
 
+    def of_nodes(self, q: Floats, v: Floats) -> list[tuple[Integers, Floats]]:
+        """Nodes (K,) of one motion and dc/d(q, v) at them (K, rows, 2n), one entry for each node of a place."""
+        return [(self.places, self.jacobian(q, v))]
+
 
 class PlanConstraint(Frozen, ABC):
     """A hard constraint of a plan. A subclass implements ``bind``.

@@ -1,0 +1,224 @@
+"""Constraints of a plan between its nodes: where the motion violates them, and rows that forbid it there.
+
+A row is at one of a few instants of a step. Its value is that of the cubic through the nodes, as a function of these,
+plus an offset, the difference to the motion itself. So its derivatives are those of the cubic, and its value, once
+the offset is that of the plan, is exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin.arrays import Floats, Integers
+from varpin.control.constraints import BoundBetween, BoundConstraint, Horizon, PlanConstraint
+from varpin.control.problem import OptimalControlProblem, cubics
+from varpin.integrators.base import open_line, open_loop
+from varpin.mechanics.forces import limited_servos
+from varpin.simulation.record import rollout
+from varpin.support.frozen import Frozen
+from varpin.trajectory import Trajectory
+
+# Parts of a step, whose ends within the step are the instants, and where these are in a step of unit length.
+_PARTS = 8
+SHARES: Floats = np.arange(1, _PARTS) / _PARTS
+SHARES.setflags(write=False)
+# Violation of the start from which on a row cannot hold in the first step.
+_OUTSIDE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Instants(Frozen):
+    """Instants between nodes at which constraints have rows.
+
+    Attributes:
+        rows: Constraint, step and instant (I, 3), each from 0, in ascending order.
+        offsets: Offsets of all rows of each of them (O,), one instant after another.
+    """
+
+    rows: Integers
+    offsets: Floats
+
+    def __post_init__(self) -> None:
+        for array in (self.rows, self.offsets):
+            array.setflags(write=False)
+
+    @property
+    def constraints(self) -> list[int]:
+        """Indices of the constraints with such rows."""
+        return [int(i) for i in np.unique(self.rows[:, 0])]
+
+    def of(self, constraint: int) -> Integers:
+        """Step and instant (K, 2) of the rows of one constraint."""
+        return self.rows[self.rows[:, 0] == constraint, 1:]
+
+
+NOWHERE = Instants(np.zeros((0, 3), dtype=np.int64), np.zeros(0))
+
+
+def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalControlProblem:
+    """The problem with further bound constraints, one for each constraint with rows at ``instants``."""
+    if not len(instants.rows):
+        return problem
+    made, begin = object.__new__(type(problem)), 0
+    found: list[BoundConstraint] = list(problem.bound_constraints)
+    for i in instants.constraints:
+        own = _bound(problem, i, instants.of(i))
+        offset = instants.offsets[begin : begin + own.size].reshape(own.shape)
+        begin += own.size
+        found.append(replace(own, offset=offset))
+    # The dataclass is frozen: attributes are set in its dictionary.
+    vars(made).update(vars(problem) | {"bound_constraints": tuple(found)})
+    return made
+
+
+def _bound(problem: OptimalControlProblem, constraint: int, rows: Integers) -> BoundBetween:
+    """A constraint at the step and instant of ``rows`` (K, 2), without offsets."""
+    of_nodes, (steps, samples) = problem.bound_constraints[constraint], rows.T
+    times = problem.t0 + problem.dt * (steps + SHARES[samples])
+    inner = _at_times(problem, of_nodes.source, times)
+    zeros = np.zeros((len(times), len(of_nodes.rows)))
+    rule = cubics(SHARES, problem.dt)[samples]
+    given = of_nodes.source, steps + 1, times, of_nodes.rows, of_nodes.unit, of_nodes.scale
+    return BoundBetween(*given, inner, SHARES, samples, rule, zeros)
+
+
+def _at_times(problem: OptimalControlProblem, constraint: PlanConstraint, times: Floats) -> BoundConstraint:
+    """A constraint on a grid whose nodes after the first are at ``times`` (K,) [s]."""
+    scene, grid = problem.scene, np.concatenate([times[:1], times])
+    return constraint.bind(Horizon(grid, scene.robot, scene.controls, 1, scene.control_joints, None, problem.linear))
+
+
+def watched(problem: OptimalControlProblem) -> list[bool]:
+    """Which constraints may have rows between nodes: inequalities of states that hold at all nodes after the first."""
+    after = np.arange(1, problem.steps + 1)
+    return [
+        np.array_equal(item.places, after) and not (item.of_controls or item.source.equality)
+        for item in problem.bound_constraints
+    ]
+
+
+def seen(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats | None] | None:
+    """The values of each constraint within the steps of a motion (N, instants + 2, rows), with those at the nodes.
+
+    None for constraints on controls, and for those that hold at some nodes only. Rows that the start violates are -inf
+    in the first step. None, too, where there is no other constraint, or a step cannot be integrated in parts.
+    """
+    N, n = motion.steps, problem.scene.robot.dof
+    looks = watched(problem)
+    parted = _parted(problem, motion) if any(looks) else None
+    if parted is None:
+        return None
+    q, v = (
+        np.concatenate([np.concatenate([x[:-1, None], y], axis=1).reshape(-1, n), x[-1:]])
+        for x, y in zip((motion.q, motion.v), parted, strict=True)
+    )
+    q, v = np.concatenate([q[:1], q]), np.concatenate([v[:1], v])
+    times: Floats = problem.t0 + problem.dt / _PARTS * np.arange(N * _PARTS + 1, dtype=np.float64)
+    points = _PARTS * np.arange(N)[:, None] + np.arange(_PARTS + 1)
+    u = np.zeros((len(times), problem.scene.controls))
+    found: list[Floats | None] = [None] * len(looks)
+    for i, item in enumerate(problem.bound_constraints):
+        if looks[i]:
+            c = _at_times(problem, item.source, times).value(q, v, u)
+            of_steps = c[points]
+            of_steps[0][:, c[0] > _OUTSIDE] = -np.inf
+            found[i] = of_steps
+    return found
+
+
+def _parted(problem: OptimalControlProblem, motion: Trajectory) -> tuple[Floats, Floats] | None:
+    """The q and v (N, parts - 1, n) between the nodes of a motion, each step on its own; None where one fails."""
+    scene, integrator, dt, N = problem.scene, problem.integrator, problem.dt / _PARTS, motion.steps
+    lines = problem.linear
+    if not (lines or scene.inputs or scene.custom or limited_servos(scene.elements)):
+        commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=_PARTS)
+        forces = np.repeat((motion.u @ scene.actuation.T)[:, None], _PARTS, axis=1)
+        found = integrator.motions(scene, motion.q[:-1].copy(), motion.v[:-1].copy(), commands, forces, dt)
+        return None if found is None else (found[0][:, :-1], found[1][:, :-1])
+    q, v = (np.empty((N, _PARTS - 1, scene.robot.dof)) for _ in range(2))
+    for k in range(N):
+        own = open_line(motion.u_nodes[k : k + 2], integrator.stage_times) if lines else open_loop(motion.u[k : k + 1])
+        part, failure = rollout(scene, integrator, motion.q[k], motion.v[k], own._replace(hold=_PARTS), dt)
+        if failure is not None:
+            return None
+        q[k], v[k] = part.q[1:-1], part.v[1:-1]
+    return q, v
+
+
+def updated(
+    problem: OptimalControlProblem,
+    instants: Instants,
+    motion: Trajectory,
+    values: list[Floats | None],
+    backoff: list[Floats],
+    least: float,
+) -> Instants:
+    """The instants, with the offsets of a motion, and further ones where it violates a constraint by > ``least``.
+
+    These are where a row is greatest between its neighbours in the step.
+
+    Args:
+        problem: The problem, without rows between nodes.
+        instants: Those so far.
+        motion: The motion.
+        values: Its values of :func:`seen`.
+        backoff: Margins of all constraints at the nodes (K, rows).
+        least: In the unit of each constraint.
+    """
+    rows, offsets, u = [], [], problem.control_rows(motion)
+    for i, (near, margin) in enumerate(zip(values, backoff, strict=True)):
+        if near is None:
+            continue
+        peak, c = _peaks(near)
+        beyond: NDArray[np.bool_] = np.asarray((peak & (c + margin[:, None] > least)).any(axis=2))
+        beyond[tuple(instants.of(i).T)] = True
+        places = np.argwhere(beyond)
+        if not len(places):
+            continue
+        bound = _bound(problem, i, places)
+        cubic, true = bound.value(motion.q, motion.v, u), c[tuple(places.T)]
+        # Rows without a value are made to hold.
+        offset = np.where(np.isfinite(true), true, -bound.scale) - cubic
+        rows.append(np.column_stack([np.full(len(places), i), places]))
+        offsets.append(offset.ravel())
+    if not rows:
+        return NOWHERE
+    return Instants(np.concatenate(rows), np.concatenate(offsets))
+
+
+def _peaks(near: Floats) -> tuple[NDArray[np.bool_], Floats]:
+    """Which of the values (N, instants + 2, rows) at instants are greatest beside their neighbours, and their peaks.
+
+    The value of an instant is that at the peak of the parabola through it and its neighbours, if this is between them:
+    both instants beside a peak have its value, so that it goes on from one to the other without a jump.
+    """
+    before, here, after = near[:, :-2], near[:, 1:-1], near[:, 2:]
+    peak = (here >= before) & (here >= after) & np.isfinite(here)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bent = 2.0 * here - before - after
+        inside = (bent > 0.0) & (np.abs(after - before) <= 2.0 * bent)
+        above = 0.125 * (after - before) ** 2 / bent
+    return peak, np.where(inside, here + above, here)
+
+
+def carried(
+    problem: OptimalControlProblem, old: Instants, new: Instants, parts: list[Floats], least: float = 0.0
+) -> list[Floats]:
+    """Values (K, rows) of all constraints and their rows at instants ``old``, for those at ``new``.
+
+    Rows that are not in ``old`` have ``least``.
+    """
+    count = len(problem.bound_constraints)
+    found, before = list(parts[:count]), dict(zip(old.constraints, parts[count:], strict=True))
+    for i in new.constraints:
+        rows = new.of(i)
+        values = np.full((len(rows), len(problem.bound_constraints[i].rows)), least)
+        if i in before:
+            number, numbers = (at[:, 0] * len(SHARES) + at[:, 1] for at in (old.of(i), rows))
+            known = np.isin(numbers, number)
+            values[known] = before[i][np.searchsorted(number, numbers[known])]
+        found.append(values)
+    return found
