@@ -383,7 +383,8 @@ def _search_of(problem: OptimalControlProblem, controls: object, resume: Solutio
 
 def _at_rounding(limits: Floats) -> Floats:
     """Rounding errors of controls at their limits (2, m); (m,)."""
-    return 8.0 * _EPS * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+    rounding: Floats = 8.0 * _EPS * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+    return rounding
 
 
 def _onto_limits(u: Floats, limits: Floats, rounding: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -75,7 +75,7 @@ class _Explicit(Integrator):
 
     def fork(self, state: ExplicitRun) -> ExplicitRun:
         """See :meth:`Integrator.fork`."""
-        return replace(state, paths=state.paths.copy())
+        return ExplicitRun(state.paths.copy(), state.start)
 
     def step_in_python(
         self, scene: Scene, state: ExplicitRun, command: Commands, increment: Floats, dt: float
