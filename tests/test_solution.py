@@ -254,11 +254,12 @@ def test_monte_carlo_interrupted_holds_the_paths_done():
             raise KeyboardInterrupt
 
     with refused(vp.MonteCarloInterrupted, "paths") as caught:
-        sol.monte_carlo(600, 5, workers=1, progress=stop)
+        sol.monte_carlo(6000, 5, workers=1, progress=stop)
     assert len(seen) == 1
-    done = seen[0][0]
-    assert done < 600
-    assert sol.monte_carlo(done, 5, workers=2) == caught.value.result
+    # Those that the worker had begun are kept, too.
+    kept = caught.value.result.paths
+    assert seen[0][0] <= kept < 6000
+    assert sol.monte_carlo(kept, 5, workers=2) == caught.value.result
     own = vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)
 
     def stop_at_once(done, paths):
