@@ -161,6 +161,44 @@ def test_karush_kuhn_tucker(name):
     assert kkt_residual(problem, plan) <= 1e-6
 
 
+def test_bounds_that_are_nearly_met_count_in_the_conditions_of_an_optimum():
+    """A joint keeps to its greatest speed for eight nodes, most of them 1e-8 rad/s below it after the search."""
+    robot = vp.load_robot("kinova")
+    begin = [-0.0711748649960309, 1.9930761174675944, 1.7271682700264162, 0.07818165024080687, 1.8578307798284002]
+    goal = [-0.3670625074091858, 1.691437829695649, 1.2497085561698789, 0.09824501637093636, 1.936600800564796]
+    cost = vp.ControlCost(0.1 / robot.effort_limit**2)
+    cost += vp.Terminal(vp.TrackingCost([*goal, 0.13025307794264052], 1e3) + vp.VelocityCost(10.0))
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.5),
+        cost,
+        [*begin, -0.09503175088201599],
+        np.zeros(6),
+        dt=0.025,
+        steps=40,
+        constraints=[vp.WithinVelocityLimits(robot, (-0.8, 0.8))],
+    )
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    motion, (bound,) = plan.trajectory, problem.bound_constraints
+    met = bound.value(motion.q, motion.v, motion.u) > -1e-6
+    assert met.sum() >= 8
+
+    def parts(w):
+        policy = vp.LinearPolicy(plan.controls + w, plan.gains, np.hstack([motion.q, motion.p])[:-1], on="momentum")
+        grid = {"dt": problem.dt, "steps": problem.steps, "integrator": problem.integrator}
+        found = vp.simulate(problem.scene, problem.q0, problem.v0, controls=policy, check=False, **grid)
+        return np.append(bound.value(found.q, found.v, found.u)[met], problem.shares(found))
+
+    # The gradient of the cost is one of the rows that are met, with multipliers that push inwards.
+    ways = 1e-6 * np.abs(motion.u).max(axis=0) * np.eye(motion.u.size).reshape(-1, *motion.u.shape)
+    slopes = np.array([parts(way) - parts(-way) for way in ways[::5]])
+    rows, shares = slopes[:, : met.sum()], slopes[:, met.sum() :]
+    multipliers, *_ = np.linalg.lstsq(rows, -shares.sum(axis=1), rcond=None)
+    assert (multipliers > 0.0).all()
+    left = shares.sum(axis=1) + rows @ multipliers
+    assert np.abs(left).max() <= 1e-6 * np.abs(shares).sum(axis=1).max()
+
+
 def test_conditions_of_an_optimum_hold_after_the_last_step():
     """A goal, and speeds at their limits: a last step with the least change of the controls would spoil the optimum."""
     robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.0})

@@ -6,6 +6,7 @@ the metric of the cost to go: a step onto the constraints then keeps to the opti
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,8 @@ _LENGTHS = (1.0, 0.5, 0.25, 0.0)
 _TRANSIENT = 1e-9
 # Distance from its bound at which a row counts as met, relative to the constraint's scale.
 _NEAR = 1e-8
+# Distance up to which the decrease of the cost at a motion counts with a row's bound.
+_CLOSE = 1e-4
 # Regularization of the dual problem for linearly dependent rows, relative to its diagonal; and its rounding error.
 _LITTLE, _ROUNDED = 1e-13, 1e-12
 # Pivots of the dual problem: of whole blocks without progress before single ones, and least number in all.
@@ -155,17 +158,29 @@ class _Step:
         self.found = self._judged()
 
     def _judged(self) -> Polished:
-        """The residuals of the motion with its best multipliers, without a step."""
+        """The residuals of the motion with its best multipliers, without a step.
+
+        Rows that are close to their bounds may be met after a short way, so that the cost cannot fall by more.
+        """
         problem, loop, motion = self.problem, self.loop, self.motion
-        multipliers, pull = self._dual([np.zeros_like(c) for c in self.c], np.zeros(self.free.shape))
+        met = self.rows
+        room = [np.where(rows, 0.0, c) for rows, c in zip(met, self.c, strict=True)]
+        self.rows = [rows | (c > -_CLOSE * item.scale) for rows, (item, c) in zip(met, self._values(), strict=True)]
+        multipliers, pull = self._dual(room, np.zeros(self.free.shape))
+        self.rows = met
         self.tangent = -np.einsum("kij,kj->ki", loop.inverse, pull)
         u, (lower, upper) = problem.decided(motion), problem.control_limits
         # A control at its limit is free again where the cost decreases inwards.
         self.inwards = ~self.free & (((u <= lower) & (pull < 0.0)) | ((u >= upper) & (pull > 0.0)))
         steep = np.where(loop.curvature > 0.0, loop.curvature, np.inf)
         decrease = float(np.einsum("ki,kij,kj->", pull, loop.inverse, pull) + (pull**2 / steep)[self.inwards].sum())
-        violation = max(0.0, *(_violation(item, c) for item, c in zip(self.bound, self.c, strict=True)))
-        return Polished(motion, violation, multipliers, 0.5 * decrease, loop.stake.moved)
+        decrease = 0.5 * decrease - sum(float((lam * c).sum()) for lam, c in zip(multipliers, room, strict=True))
+        violation = max(0.0, *(_violation(item, c) for item, c in self._values()))
+        return Polished(motion, violation, multipliers, decrease, loop.stake.moved)
+
+    def _values(self) -> Iterator[tuple[BoundConstraint, Floats]]:
+        """Each constraint with its values (K, rows)."""
+        return zip(self.bound, self.c, strict=True)
 
     def _dual(self, values: list[Floats], ahead: Floats) -> tuple[list[Floats], Floats]:
         """Multipliers (K, rows) of the step for constraints' ``values``, and the pull g + G' lambda (R, m).
