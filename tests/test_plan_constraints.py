@@ -452,6 +452,19 @@ def test_what_is_refused():
         vp.WithinControlRate(0.0)
     with refused(vp.InputError, "margin", "0"):
         vp.WithinJointLimits(ROBOT, (-1, 1), margin=-1.0)
+    with refused(vp.InputError, "before", "nan"):
+        two_links([vp.WithinControlRate(1.0, before=np.nan)])
+    ball = vp.Obstacle.sphere([1.0, 0.0, 0.0], 0.1)
+    arm = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05)}
+    for given, told in [
+        ({"obstacles": None}, "obstacles"),
+        ({"itself": "no"}, "itself"),
+        ({"links": ["joint1", "joint1"]}, "twice"),
+        ({"capsules": {"joint1": 0.05}}, "begin"),
+        ({"capsules": [0.05]}, "capsules"),
+    ]:
+        with refused(vp.InputError, told):
+            vp.KeepClear(ROBOT, **{"obstacles": [ball], "capsules": arm, **given})
 
 
 def test_clearance_derivatives():
@@ -867,8 +880,9 @@ def test_references_of_rows_go_with_constraints():
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("time_limit", -1.0), ("time_limit", np.nan), ("max_iterations", -3), ("callback", 3), ("progress", 3)],
-)
+    [("time_limit", -1.0), ("time_limit", np.nan), ("max_iterations", -3), ("callback", 3), ("progress", 3),
+     ("check", "no"), ("second_order", "yes")],
+)  # fmt: skip
 def test_options_are_checked_with_constraints_as_without(option, value):
     told = []
     for constraints in ([], FAMILIES["velocities"]):

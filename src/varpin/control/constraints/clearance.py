@@ -21,7 +21,7 @@ from varpin.control.constraints.base import (
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.clearance import Clearance, Obstacle, clearance
-from varpin.support.checks import finite, path_like
+from varpin.support.checks import finite, flag, path_like
 
 # Scale: a tenth of an arm's reach [m].
 _LENGTH = 0.1
@@ -86,9 +86,10 @@ class KeepClear(PlanConstraint):
             InputError: There are no pairs, a link has no shapes, or a value is invalid.
         """
         self.robot = require_robot(robot, type(self).__name__)
-        if isinstance(obstacles, Obstacle) or not all(isinstance(item, Obstacle) for item in obstacles):
+        if not isinstance(obstacles, Sequence) or not all(isinstance(item, Obstacle) for item in obstacles):
             raise InputError(f"KeepClear obstacles must be a list of varpin.Obstacle, got {obstacles!r}")
         self.obstacles = tuple(obstacles)
+        itself = flag("KeepClear itself", itself)
         self.distance = finite("KeepClear distance", distance)
         self.margin = checked_margin(self, margin)
         file = None if srdf is None else path_like("KeepClear srdf", srdf)

@@ -19,7 +19,7 @@ from varpin.control.constraints.base import (
 )
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
-from varpin.support.checks import JointValues, as_floats, control_array, finite_array, named_limits, real
+from varpin.support.checks import JointValues, as_floats, control_array, finite, finite_array, named_limits, real
 
 # Scales of joints without a finite range [rad or m; rad/s or m/s].
 _POSITION, _SPEED = 0.1, 0.5
@@ -216,7 +216,7 @@ class WithinControlRate(PlanConstraint):
             if isinstance(given, Mapping):
                 command = control_array(f"{name} before", given, joints)
             elif np.ndim(given) == 0:
-                command = np.full(m, real(f"{name} before", given))
+                command = np.full(m, finite(f"{name} before", given))
             else:
                 command = finite_array(f"{name} before", given, (m,))
             if before is not None and not np.array_equal(before, command):
