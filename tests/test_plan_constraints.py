@@ -490,6 +490,19 @@ def test_what_is_refused():
         vp.WithinControlRate(0.0)
     with refused(vp.InputError, "margin", "0"):
         vp.WithinJointLimits(ROBOT, (-1, 1), margin=-1.0)
+    with refused(vp.InputError, "before", "nan"):
+        two_links([vp.WithinControlRate(1.0, before=np.nan)])
+    ball = vp.Obstacle.sphere([1.0, 0.0, 0.0], 0.1)
+    arm = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05)}
+    for given, told in [
+        ({"obstacles": None}, "obstacles"),
+        ({"itself": "no"}, "itself"),
+        ({"links": ["joint1", "joint1"]}, "twice"),
+        ({"capsules": {"joint1": 0.05}}, "begin"),
+        ({"capsules": [0.05]}, "capsules"),
+    ]:
+        with refused(vp.InputError, told):
+            vp.KeepClear(ROBOT, **{"obstacles": [ball], "capsules": arm, **given})
 
 
 def test_clearance_derivatives():
@@ -757,6 +770,24 @@ def test_a_margin_without_noise_is_told_of():
     assert naming(plan.warnings, "margin", "noise")
 
 
+@pytest.mark.parametrize(("strength", "told"), [(0.2, False), (1.5, True)])
+def test_a_margin_that_noise_is_too_strong_for_is_told_of(strength, told):
+    """The tip of a hanging chain is higher whichever way noise pushes it, which the linear model does not know."""
+    hanging = np.array([np.pi / 2 - 0.3, 0.0])
+    scene = vp.Scene(ROBOT, damping=0.5, noise=vp.AdditiveNoise(strength))
+    cost = vp.ControlCost(1.0) + vp.VelocityCost(0.3) + vp.TrackingCost(hanging, 10.0)
+    lid = vp.KeepInHalfSpace(ROBOT, "tip", [0.0, 0.0, -1.0], 1.86, margin=2.0)
+    grid = {"dt": 0.05, "steps": 20}
+    problem = vp.OptimalControlProblem(scene, cost, hanging, np.zeros(2), constraints=[lid], **grid)
+    plan = vp.solve(problem)
+    assert plan.status is vp.Status.CONVERGED
+    assert bool(about(plan.warnings, "small margin")) == told
+    options = {"controls": plan.policy, "integrator": problem.integrator}
+    found = vp.simulate_ensemble(scene, hanging, np.zeros(2), paths=500, rng=1, **grid, **options)
+    c = problem.bound_constraints[0].value(found.q, found.v, np.zeros((500, 20, 2)))
+    assert ((c > 0.0).mean(axis=0).max() > 0.06) == told
+
+
 def told_of(problem):
     return [finding.sentence for finding in hints(problem)]
 
@@ -887,8 +918,9 @@ def test_references_of_rows_go_with_constraints():
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("time_limit", -1.0), ("time_limit", np.nan), ("max_iterations", -3), ("callback", 3), ("progress", 3)],
-)
+    [("time_limit", -1.0), ("time_limit", np.nan), ("max_iterations", -3), ("callback", 3), ("progress", 3),
+     ("check", "no"), ("second_order", "yes")],
+)  # fmt: skip
 def test_options_are_checked_with_constraints_as_without(option, value):
     told = []
     for constraints in ([], FAMILIES["velocities"]):
