@@ -269,13 +269,6 @@ def finite(name: str, value: Any) -> float:
     return number
 
 
-def flag(name: str, value: object) -> bool:
-    """``value``, True or False, as a bool; 0 and 1 are taken too. Raises an InputError that names it otherwise."""
-    if isinstance(value, bool | np.bool_) or (isinstance(value, int) and value in (0, 1)):
-        return bool(value)
-    raise InputError(f"{name} must be True or False, got {reprlib.repr(value)}")
-
-
 def counting(name: str, function: Any, arguments: str) -> None:
     """Raise an InputError that names a progress function unless it is None or can be called with ``arguments``."""
     if function is not None and not (callable(function) and takes(function, arguments.count(",") + 1)):
