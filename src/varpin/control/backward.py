@@ -81,6 +81,7 @@ class Plan:
     limited: bool
     loss: float  # estimated relative rounding error of Quu, or of its root
     model: Model  # of the cost along the motion
+    left: Floats | None = None  # (R, m) the model's gradient after a full step, which presses controls against limits
 
     @property
     def expected_decrease(self) -> float:
@@ -331,11 +332,15 @@ class _Rows:
         way, of_held = to - at, np.where(counts, weights, 0.0)
         least = 0.5 * float(of_held @ flat(self.signed) ** 2) - plan.expected_decrease
         gap = self.cost + 0.5 * float(of_held @ at**2) - least
+        states, moves = self.ahead_of
+        # Within limits the model's slope at its minimum is that of the controls pressed against them.
+        last = 0.0 if plan.left is None else min(float((plan.left * (moves - self.moves)).sum()), 0.0)
+        curved = max(gap + last, 0.0)
 
         def slope(t: float) -> float:
             s = at + t * way
             pull = np.where(equal | (s > 0.0), weights, 0.0) - of_held
-            return float((pull * s) @ way) - 2.0 * (1.0 - t) * gap
+            return float((pull * s) @ way) + last - 2.0 * (1.0 - t) * curved
 
         low, high = 0.0, 1.0
         if slope(high) <= 0.0:
@@ -344,8 +349,8 @@ class _Rows:
             middle = 0.5 * (low + high)
             low, high = (middle, high) if slope(middle) <= 0.0 else (low, middle)
         self.at = [a + low * (b - a) for a, b in zip(self.at, ahead, strict=True)]
-        self.cost = least + (1.0 - low) ** 2 * gap - 0.5 * float(of_held @ (at + low * way) ** 2)
-        states, moves = self.ahead_of
+        rest = 1.0 - low
+        self.cost = least - rest * last + rest**2 * curved - 0.5 * float(of_held @ (at + low * way) ** 2)
         self.states, self.moves = self.states + low * (states - self.states), self.moves + low * (moves - self.moves)
         self.slope += low * (along - self.slope)
 
@@ -587,7 +592,8 @@ class _Box:
             ahead -= np.einsum("kmi,ki->km", plan.previous, at.expected[:, x : x + at.moves.shape[1]])
         slope = float((plan.gradient * at.moves).sum())
         value = at.value - 0.5 * float((self.proximal * at.moves**2).sum())
-        return replace(plan, feedforward=ahead, slope=slope, curvature=2.0 * (value - slope), limited=True)
+        curvature, left = 2.0 * (value - slope), at.pressure - self.proximal * at.moves
+        return replace(plan, feedforward=ahead, slope=slope, curvature=curvature, limited=True, left=left)
 
 
 class _Point(NamedTuple):
