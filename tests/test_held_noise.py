@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from mechanisms import slider
-from refusals import refused
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 import varpin as vp
@@ -123,14 +122,103 @@ def test_moments_of_velocities_that_are_wrong_have_a_warning(integrator, caplog)
     assert len(caplog.messages) >= 1
 
 
-def test_drives_at_their_limits_do_not_cut_noise_off():
-    """A mass under noise far above what its drive has: its velocity is that of the impulses; held noise is refused."""
+SERVO = (40.0, 3.0)
+
+
+def servoed(limit, **more):
+    """A chain of two links, the first of which a servo with a limit drives."""
+    servo = vp.PositionServo(*({"joint1": value} for value in (*SERVO, limit)))
+    return vp.Scene(vp.planar_chain(2), damping=0.1, forces=[servo], noise=vp.AdditiveNoise([0.3, 0.2]), **more)
+
+
+@pytest.mark.parametrize("kick", ["held", None])
+def test_drives_at_their_limits_do_not_cut_noise_off(kick):
+    """A mass under noise far above what its drive has: its velocity is that of the impulses."""
     mass, strength = 2.0, 3.0
     servo = vp.PositionServo(1e-9, 1e-9, 0.1)
     scene = vp.Scene(slider(mass), gravity=False, forces=[servo], noise=vp.AdditiveNoise(strength))
-    start = {"q0": [0.0], "v0": [0.0], "dt": 0.01, "steps": 50, "rng": 0}
-    motion = vp.simulate(scene, **start)
+    given = {} if kick is None else {"integrator": vp.Midpoint(kick=kick)}
+    motion = vp.simulate(scene, [0.0], [0.0], dt=0.01, steps=50, rng=0, **given)
     np.testing.assert_allclose(motion.v[-1], strength * motion.dw.sum(axis=0) / mass, rtol=1e-6)
-    assert integrator_for(scene, np.zeros(1), 0.1).kick == "left"
-    with refused(vp.InputError, "kick='held'", "effort limit"):
-        vp.simulate(scene, **start, integrator=vp.Midpoint(kick="held"))
+    assert integrator_for(scene, np.zeros(1), 0.1).kick == "held"
+
+
+@pytest.mark.parametrize("integrator", HELD, ids=str)
+def test_a_servo_far_from_its_limit_is_one_without(integrator):
+    """The stationary covariance of held noise and a motion's nodes, with a limit and without."""
+    found, motions = [], []
+    for limit in (np.inf, 1e3):
+        servo = vp.PositionServo(20.0, 0.5, limit)
+        scene = vp.Scene(vp.planar_chain(2), gravity=False, damping=0.5, forces=[servo], noise=vp.AdditiveNoise(0.3))
+        lin = at_rest(scene, integrator, 0.1)
+        found.append(solve_discrete_lyapunov(lin.A[0], 0.1 * lin.G[0] @ lin.G[0].T))
+        start = {"q0": [0.1, 0.2], "v0": [0.0, 1.0], "dt": 0.05, "steps": 40, "rng": 3, "integrator": integrator}
+        motions.append(vp.simulate(scene, **start))
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-12 * np.abs(found[0]).max())
+    np.testing.assert_allclose(motions[1].q, motions[0].q, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(motions[1].v, motions[0].v, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("integrator", HELD, ids=str)
+@pytest.mark.parametrize("command", [0.2, 0.45, 0.9], ids=["free", "bent", "saturated"])
+@pytest.mark.parametrize("constraints", [(), [vp.JointTie("joint2", "joint1")]], ids=["single", "tied"])
+def test_derivatives_beside_a_limited_drive(integrator, command, constraints):
+    """Those in the noise and in the control, by differences of steps, below, around and beyond the servo's limit."""
+    if constraints and isinstance(integrator, vp.Radau):
+        pytest.skip("Radau's methods keep no constraints")
+    scene, n = servoed(10.0, constraints=constraints), 2
+    q, v = np.array([0.2, 0.2]), np.array([0.1, 0.1])
+    u = np.array([command, 0.5])
+    options = {"dt": 0.02, "steps": 1, "integrator": integrator, "check": False}
+
+    def end(du, dw):
+        motion = vp.simulate(scene, q, v, controls=(u + du)[None], increments=dw[None], **options)
+        return np.concatenate([motion.q[-1], motion.p[-1]])
+
+    lin = vp.linearize(scene, vp.simulate(scene, q, v, controls=u[None], increments=0, **options))
+    step, none = 1e-4, np.zeros(n)
+    by_noise = [(end(none, step * e) - end(none, -step * e)) / (2.0 * step) for e in np.eye(n)]
+    by_control = [(end(step * e, none) - end(-step * e, none)) / (2.0 * step) for e in np.eye(n)]
+    for own, differences in ((lin.G[0], by_noise), (lin.B[0], by_control)):
+        expected = np.stack(differences, axis=1)
+        np.testing.assert_allclose(own, expected, rtol=0, atol=2e-7 * np.abs(expected).max())
+    assert np.abs(lin.G[0, n:, 0]).max() > 0.05
+    # The demand at the start is 0, 0.97 and 2.77 times the limit.
+    assert (np.abs(lin.B[0, :, 0]).max() < 1e-12) == (command == 0.9)
+
+
+def test_noise_of_a_saturated_drive_has_the_variance_of_fine_impulses():
+    """Held over steps of 20 ms against impulses before steps of 1 ms, of the same noise, at the servo's limit."""
+    scene, paths, coarse, parts = servoed(2.0), 150, 25, 20
+    rng = np.random.default_rng(1)
+    fine = np.sqrt(1e-3) * rng.normal(size=(paths, coarse * parts, 2))
+    start = {"q0": [0.0, 0.0], "v0": [0.0, 0.0], "check": False}
+    ends = {}
+    for name, dt, dw, integrator in (
+        ("held", 0.02, fine.reshape(paths, coarse, parts, 2).sum(axis=2), vp.Midpoint(kick="held")),
+        ("left", 1e-3, fine, vp.Midpoint()),
+    ):
+        u = np.tile([3.0, 0.0], (dw.shape[1], 1))
+        given = {"dt": dt, "steps": dw.shape[1], "controls": u, "integrator": integrator}
+        motions = [vp.simulate(scene, **start, **given, increments=own) for own in dw]
+        ends[name] = np.array([np.concatenate([motion.q[-1], motion.v[-1]]) for motion in motions])
+    # The drive is at its limit all along.
+    assert (SERVO[0] * (3.0 - ends["left"][:, 0]) > 1.5 * 2.0).all()
+    deviations = {name: own.std(axis=0) for name, own in ends.items()}
+    np.testing.assert_allclose(deviations["held"], deviations["left"], rtol=0.03)
+    apart = np.abs(ends["held"].mean(axis=0) - ends["left"].mean(axis=0))
+    assert (apart < 0.05 * deviations["left"]).all()
+
+
+def test_steps_divided_beside_a_limited_drive_are_those_of_a_force_on_the_joint():
+    """The motion of the drive's limit plus F dw / dt as controls, energies included, also in steps that are divided."""
+    guard = vp.Guard(branch_margin=0.9, energy_balance=1e-6)
+    for given in (None, guard):
+        integrator = vp.Gauss(2, guard=given, kick="held")
+        start = {"q0": [1.0, 0.5], "v0": [2.0, -9.0], "dt": 0.1, "steps": 8, "integrator": integrator, "check": False}
+        motion = vp.simulate(servoed(0.5), **start, controls=np.tile([90.0, 0.4], (8, 1)), rng=0)
+        forces = np.array([0.5, 0.4]) + motion.dw * [0.3, 0.2] / 0.1
+        same = vp.simulate(vp.Scene(vp.planar_chain(2), damping=0.1), **start, controls=forces)
+        assert (motion.statistics.split_steps > 0) == (given is not None)
+        for name in ("q", "p", "energy"):
+            np.testing.assert_allclose(getattr(motion, name), getattr(same, name), rtol=0, atol=1e-10)

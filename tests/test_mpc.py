@@ -581,3 +581,16 @@ def test_a_fault_of_the_plant_is_logged_once(caplog):
     for joint in robot.joint_names:
         assert sum("dry friction is faster" in told and repr(joint) in told for told in logged) <= 1
     assert not [record for record in caplog.records if record.name == "varpin.simulation.run"]
+
+
+def test_what_a_tick_refuses():
+    cost = vp.TrackingCost([0.1, 0.1]) + vp.ControlCost(1.0)
+    problem = vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2)), cost, [0, 0], [0, 0], dt=0.05, steps=4)
+    mpc = vp.Mpc(problem)
+    first = mpc.plan(0.0, [0, 0], [0, 0])
+    with refused(vp.InputError, "previous", "int"):
+        mpc.plan(0.05, [0, 0], [0, 0], 3)
+    with refused(vp.InputError, "decisions", "-1"):
+        mpc.plan(0.05, [0, 0], [0, 0], first, decisions=-1)
+    with refused(vp.InputError, "rng"):
+        mpc.run(duration=0.1, rng="a")

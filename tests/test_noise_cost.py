@@ -1,5 +1,7 @@
 """What noise costs a plan, against the exact covariance in continuous time; and the warning where steps are long."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -9,7 +11,8 @@ from scipy.linalg import expm
 import varpin as vp
 from varpin.control.moments import noise_cost
 from varpin.control.spread import Feedback
-from varpin.control.within_steps import mean_of_decay
+from varpin.control.within_steps import beyond_samples, mean_of_decay
+from varpin.linearization import linearize_steps
 
 LEVEL, DAMPING = 0.3, 1.5
 WEIGHTS = {"q": 5.0, "v": 1.0, "u": 0.05}
@@ -158,3 +161,18 @@ def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, 
     assert abs(halves - found.noise_cost) < 0.05 * (found.cost + halves)
     assert (halves > 0.01 * (found.cost + halves)) == told
     assert bool(about(found.warnings, "noise within steps")) == told
+
+
+def test_steps_in_which_noise_grows_without_bound_have_no_cost(recwarn):
+    """As in trials that run away: no warning of NumPy, and an error that rejects the trial."""
+    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
+    cost = vp.VelocityCost(1.0) + vp.ControlCost(1.0)
+    problem = vp.OptimalControlProblem(scene, cost, np.zeros(2), np.zeros(2), dt=0.05, steps=4)
+    motion = problem.simulate(np.zeros((4, 2)))
+    lin = linearize_steps(scene, motion, problem.integrator, problem.q0)
+    A = np.array(lin.A)
+    A[2, 2:, 2:] = 1e5 * np.eye(2)
+    hessian = problem.expand_running(motion).hessian
+    with pytest.raises(vp.LinearizationError, match="without bound"):
+        beyond_samples(problem, motion, replace(lin, A=A), hessian, len(problem.rule))
+    assert not recwarn.list

@@ -162,7 +162,10 @@ def test_karush_kuhn_tucker(name):
 
 
 def test_bounds_that_are_nearly_met_count_in_the_conditions_of_an_optimum():
-    """A joint keeps to its greatest speed for eight nodes, most of them 1e-8 rad/s below it after the search."""
+    """A joint keeps to its greatest speed for eight nodes, most of them 1e-8 rad/s below it after the search.
+
+    The multipliers of such rows are small beside what the cost to go weighs.
+    """
     robot = vp.load_robot("kinova")
     begin = [-0.0711748649960309, 1.9930761174675944, 1.7271682700264162, 0.07818165024080687, 1.8578307798284002]
     goal = [-0.3670625074091858, 1.691437829695649, 1.2497085561698789, 0.09824501637093636, 1.936600800564796]
@@ -193,7 +196,7 @@ def test_bounds_that_are_nearly_met_count_in_the_conditions_of_an_optimum():
     ways = 1e-6 * np.abs(motion.u).max(axis=0) * np.eye(motion.u.size).reshape(-1, *motion.u.shape)
     slopes = np.array([parts(way) - parts(-way) for way in ways[::5]])
     rows, shares = slopes[:, : met.sum()], slopes[:, met.sum() :]
-    multipliers, *_ = np.linalg.lstsq(rows, -shares.sum(axis=1), rcond=None)
+    multipliers = plan.constraints[0].multipliers[met]
     assert (multipliers > 0.0).all()
     left = shares.sum(axis=1) + rows @ multipliers
     assert np.abs(left).max() <= 1e-6 * np.abs(shares).sum(axis=1).max()
@@ -497,6 +500,19 @@ def test_what_is_refused():
         vp.WithinControlRate(0.0)
     with refused(vp.InputError, "margin", "0"):
         vp.WithinJointLimits(ROBOT, (-1, 1), margin=-1.0)
+    with refused(vp.InputError, "before", "nan"):
+        two_links([vp.WithinControlRate(1.0, before=np.nan)])
+    ball = vp.Obstacle.sphere([1.0, 0.0, 0.0], 0.1)
+    arm = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05)}
+    for given, told in [
+        ({"obstacles": None}, "obstacles"),
+        ({"itself": "no"}, "itself"),
+        ({"links": ["joint1", "joint1"]}, "twice"),
+        ({"capsules": {"joint1": 0.05}}, "begin"),
+        ({"capsules": [0.05]}, "capsules"),
+    ]:
+        with refused(vp.InputError, told):
+            vp.KeepClear(ROBOT, **{"obstacles": [ball], "capsules": arm, **given})
 
 
 def test_clearance_derivatives():
@@ -764,6 +780,24 @@ def test_a_margin_without_noise_is_told_of():
     assert naming(plan.warnings, "margin", "noise")
 
 
+@pytest.mark.parametrize(("strength", "told"), [(0.2, False), (1.5, True)])
+def test_a_margin_that_noise_is_too_strong_for_is_told_of(strength, told):
+    """The tip of a hanging chain is higher whichever way noise pushes it, which the linear model does not know."""
+    hanging = np.array([np.pi / 2 - 0.3, 0.0])
+    scene = vp.Scene(ROBOT, damping=0.5, noise=vp.AdditiveNoise(strength))
+    cost = vp.ControlCost(1.0) + vp.VelocityCost(0.3) + vp.TrackingCost(hanging, 10.0)
+    lid = vp.KeepInHalfSpace(ROBOT, "tip", [0.0, 0.0, -1.0], 1.86, margin=2.0)
+    grid = {"dt": 0.05, "steps": 20}
+    problem = vp.OptimalControlProblem(scene, cost, hanging, np.zeros(2), constraints=[lid], **grid)
+    plan = vp.solve(problem)
+    assert plan.status is vp.Status.CONVERGED
+    assert bool(about(plan.warnings, "small margin")) == told
+    options = {"controls": plan.policy, "integrator": problem.integrator}
+    found = vp.simulate_ensemble(scene, hanging, np.zeros(2), paths=500, rng=1, **grid, **options)
+    c = problem.bound_constraints[0].value(found.q, found.v, np.zeros((500, 20, 2)))
+    assert ((c > 0.0).mean(axis=0).max() > 0.06) == told
+
+
 def told_of(problem):
     return [finding.sentence for finding in hints(problem)]
 
@@ -894,8 +928,9 @@ def test_references_of_rows_go_with_constraints():
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("time_limit", -1.0), ("time_limit", np.nan), ("max_iterations", -3), ("callback", 3), ("progress", 3)],
-)
+    [("time_limit", -1.0), ("time_limit", np.nan), ("max_iterations", -3), ("callback", 3), ("progress", 3),
+     ("check", "no"), ("second_order", "yes")],
+)  # fmt: skip
 def test_options_are_checked_with_constraints_as_without(option, value):
     told = []
     for constraints in ([], FAMILIES["velocities"]):

@@ -1,9 +1,12 @@
 // Rollouts under holonomic constraints, and the derivatives of their steps.
 #include "varpin/constrained.hpp"
 
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
 #include <memory>
+#include <optional>
+#include <stdexcept>
 #include <tuple>
 #include <vector>
 
@@ -41,11 +44,14 @@ class ConstrainedRollout : public Rollout<AnyConstrainedStepper, ConstrainedStat
 
     ConstrainedRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
-    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes) {
+    void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes,
+              const std::optional<In<4>>& impulses) {
+        if (impulses && !stepper_->held) throw std::invalid_argument("under constraints, impulses have to be held");
+        const double* pushes = impulses_of(*mechanism_, impulses, nodes);
         roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, nodes,
                    [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
                        stepper_->guards = guards_;
-                       stepper_->roll(h, by, dw, more, states_, to);
+                       stepper_->roll(h, by, dw, more, pushes, states_, to);
                    });
     }
 
@@ -62,11 +68,13 @@ class ConstrainedRollout : public Rollout<AnyConstrainedStepper, ConstrainedStat
 
 std::tuple<Out, Out, Out, std::int64_t, std::size_t> constrained_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, In<2> places, double tolerance, const Guards& guards, double h,
-    In<2> q, In<2> p, In<3> force, In<2> rates, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp) {
+    In<2> q, In<2> p, In<3> force, In<2> rates, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp,
+    bool external) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     ConstrainedLinearization work(mechanism, tableau, places_of(tableau, places), tolerance, guards);
     work.varies = at.varies;
     work.ramp = ramp;
+    if (external) work.take_external();
     const std::size_t moved = mechanism.constraints.driven().size();
     require(rates, "rates", {at.N, moved});
     double* by_rate = nullptr;
@@ -88,7 +96,8 @@ void register_constrained(nb::module_& m) {
              nb::keep_alive<1, 2>())
         .def("fork", &ConstrainedRollout::fork, "guards"_a, nb::keep_alive<0, 1>())
         .def("begin", &ConstrainedRollout::begin, "q"_a, "v"_a)
-        .def("roll", &ConstrainedRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a)
+        .def("roll", &ConstrainedRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,
+             "impulses"_a = nb::none())
         .def("kick", &ConstrainedRollout::kick, "impulse"_a)
         .def("nodes", &ConstrainedRollout::nodes)
         .def("halvings", &ConstrainedRollout::halvings, "path"_a)
@@ -96,7 +105,7 @@ void register_constrained(nb::module_& m) {
         .def("weakest", &ConstrainedRollout::weakest, "path"_a);
     m.def("constrained_derivatives", &constrained_derivatives, "mechanism"_a, "tableau"_a, "places"_a, "tolerance"_a,
           "guards"_a, "dt"_a, "q"_a, "p"_a, "force"_a, "rates"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a,
-          "ramp"_a = false);
+          "ramp"_a = false, "external"_a = false);
 }
 
 }  // namespace varpin::border

@@ -72,12 +72,13 @@ class VariationalRollout : public Rollout<Stepper, PathState> {
 
 std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double h, In<2> q,
-    In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, Solver solver) {
+    In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, bool external, Solver solver) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     std::unique_ptr<StepDerivatives> work = small_derivatives(mechanism, tableau, tolerance, guards, solver);
     if (!work) work = std::make_unique<VariationalLinearization<>>(mechanism, tableau, tolerance, guards, solver);
     work->varies = at.varies;
     work->ramp = ramp;
+    if (external) work->take_external();
     return derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
         return work->first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf, at.past(s));
     });
@@ -163,7 +164,7 @@ void register_rollouts(nb::module_& m) {
         .def("halvings", &VariationalRollout::halvings, "path"_a);
     m.def("variational_derivatives", &variational_derivatives, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
           "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "ramp"_a = false,
-          "solver"_a = Solver::automatic);
+          "external"_a = false, "solver"_a = Solver::automatic);
     m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
           "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "z"_a,
           "solver"_a = Solver::automatic);

@@ -36,7 +36,7 @@ from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.soundness import announce
-from varpin.support.checks import count, positive
+from varpin.support.checks import count, flag, positive
 from varpin.trajectory import Trajectory
 
 P = ParamSpec("P")
@@ -139,7 +139,7 @@ class _Rounds:
         # The problem of a round, with its rows between nodes.
         self.whole = problem
         self.options = dict(options)
-        self.check = bool(self.options.pop("check", True))
+        self.check = flag("check", self.options.pop("check", True))
         self.progress = self.options.pop("progress", None)
         self.controls = self.options.pop("controls", None)
         self.states = self.options.pop("states", None)

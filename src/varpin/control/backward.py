@@ -766,7 +766,11 @@ class Along:
         for begin, end in [(0, problem.steps)] if problem.linear else self.blocks:
             part, points = self.trajectory.part(begin, end), slice(begin * samples, end * samples)
             own = hessian[points] if len(hessian) > 1 else hessian
-            more = beyond_samples(problem, part, self.linearized(begin, end)[0], own, samples)
+            lin = self.linearized(begin, end)[0]
+            try:
+                more = beyond_samples(problem, part, lin, own, samples)
+            except LinearizationError as error:
+                raise _in_whole(error, begin, problem.dt) from None
             if more is None:
                 return None
             found.append(more)
@@ -1098,5 +1102,10 @@ def _linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> 
     try:
         return linearize_steps(problem.scene, part, problem.integrator, problem.q0, ramps=problem.linear)
     except LinearizationError as error:
-        step = begin + error.step
-        raise LinearizationError(step, step * problem.dt, error.reason) from None
+        raise _in_whole(error, begin, problem.dt) from None
+
+
+def _in_whole(error: LinearizationError, begin: int, dt: float) -> LinearizationError:
+    """An error of a part of a motion, with the step's number in the whole motion."""
+    step = begin + error.step
+    return LinearizationError(step, step * dt, error.reason)

@@ -12,6 +12,7 @@ from varpin.control.between_nodes import enforced
 from varpin.control.constraints import BoundConstraint
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
+from varpin.control.margins import too_small
 from varpin.control.moments import noise_cost, noise_cost_in_halves
 from varpin.control.multipliers import FEASIBLE, REPORTED, split
 from varpin.control.problem import OptimalControlProblem, integrator_for
@@ -94,6 +95,7 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
         _unfinished(solution)
         + _noise_left_out(solution)
         + _margins_of_velocities(solution)
+        + too_small(solution)
         + _friction_under_noise(solution)
         + _noise_in_halves(solution)
         + (_alternating(solution) or _restless(solution))

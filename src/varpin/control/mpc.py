@@ -22,7 +22,7 @@ from varpin.integrators.base import Failure
 from varpin.mechanics.inputs import in_parts_of_steps, with_ends
 from varpin.mechanics.policy import FirstOrderHold
 from varpin.mechanics.scene import Scene, require_scene
-from varpin.mechanics.wiener import wiener_increments
+from varpin.mechanics.wiener import generator, wiener_increments
 from varpin.simulation.chatter import alternation
 from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
@@ -249,7 +249,9 @@ class Mpc:
             StepFailure, CostError: The initial motion of the search cannot be integrated, or its cost is not finite.
         """
         deadline = np.inf if self.budget == np.inf else time.perf_counter() + self.budget
-        scene = self.problem.scene
+        if previous is not None and not isinstance(previous, Solution):
+            raise InputError(f"previous must be the last plan, a Solution, got {type(previous).__name__}")
+        scene, decisions = self.problem.scene, count("decisions", decisions)
         if before is not None:
             before = control_values("before", before, scene.control_joints, scene.controls)
         elif self.problem.remembers and previous is not None:
@@ -332,13 +334,13 @@ class Mpc:
                 )
         ticks = max(1, round(positive("duration", duration, "s") / self.period))
         dt = self.period / plant.substeps
-        generator = None if rng is None else np.random.default_rng(rng)
+        drawn_by = None if rng is None else generator(rng)
         q, v = problem.q0, problem.v0
         before = applied = problem.before
         (active, of_plan), age = self._first_plan(problem), 0
         if active.status is Status.INTERRUPTED or any(finding.kind == "interrupted" for finding in of_plan):
             raise KeyboardInterrupt
-        noisy = generator is not None and plant.scene.processes > 0
+        noisy = drawn_by is not None and plant.scene.processes > 0
         method = _method(plant, active.trajectory, dt, noisy=noisy)
         # The integrator was chosen for the first plan: the plant may leave it.
         watched = plant.integrator is None and not noisy and changes_along(plant.scene)
@@ -368,7 +370,7 @@ class Mpc:
                     # A fresh plan begins at the measured state; one that acts on, where the line before ended.
                     begun = active.controls[0] if age == 0 or applied is None else applied
                 applied = _decision(active, age, q, v, before if begun is None else begun)
-                parts.append(_simulated(plant, method, dt, q, v, applied, generator, parts, begun))
+                parts.append(_simulated(plant, method, dt, q, v, applied, drawn_by, parts, begun))
                 if watched and not unfit:
                     unfit = _unfit(plant.scene, method, parts[-1], tick * self.period)
                 q, v = parts[-1].q[-1], parts[-1].v[-1]

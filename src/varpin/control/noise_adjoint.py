@@ -18,6 +18,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.within_steps import mean_of_decay, mean_of_decay_slopes
 from varpin.integrators.variational import Variational
 from varpin.linearization import Linearization, velocity_at_nodes, velocity_curvature
+from varpin.mechanics.forces import limited_servos
 from varpin.trajectory import Trajectory
 
 # Step of the central differences of costs' Hessians, relative to the largest value of each variable.
@@ -40,9 +41,14 @@ class LinearizedSteps:
 
 
 def is_exact(problem: OptimalControlProblem) -> bool:
-    """Whether :func:`slopes` is there: for variational steps with second derivatives and constant controls."""
+    """Whether :func:`slopes` is there: for variational steps with second derivatives and constant controls.
+
+    It takes the effect of held noise for that of a control's force, which a drive's limit tells apart.
+    """
     scene, integrator = problem.scene, problem.integrator
     smooth = scene.custom is None and not scene.constraints and not scene.inputs and scene.noise.diffusion is not None
+    told_apart = integrator.holds_noise and bool(limited_servos(scene.elements))
+    smooth = smooth and not told_apart
     return isinstance(integrator, Variational) and integrator.left == 1.0 and smooth and not problem.linear
 
 

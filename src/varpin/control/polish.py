@@ -7,7 +7,7 @@ the metric of the cost to go: a step onto the constraints then keeps to the opti
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,8 @@ _NEAR = 1e-8
 _CLOSE = 1e-4
 # Regularization of the dual problem for linearly dependent rows, relative to its diagonal; and its rounding error.
 _LITTLE, _ROUNDED = 1e-13, 1e-12
+# Least size of a control, relative to the largest one.
+_SMALL = 1e-3
 # Pivots of the dual problem: of whole blocks without progress before single ones, and least number in all.
 _TRIES, _PIVOTS = 3, 50
 
@@ -54,7 +56,7 @@ class Polished:
     Attributes:
         motion: The motion.
         violation: The largest violation over all constraints, each in its own unit.
-        multipliers: For each constraint (K, rows), those of least residual.
+        multipliers: For each constraint (K, rows), those of the Lagrangian's least slope in the controls.
         decrease: Decrease of the cost that its quadratic model expects within the linearized active constraints and the
             limits of the controls; zero at an optimum.
         stake: The cost at stake along the motion.
@@ -112,7 +114,7 @@ def polished(
                 break
         else:
             break
-    return step.found
+    return replace(step.found, multipliers=step.least_slope())
 
 
 def _closer(one: Polished, other: Polished, length: float) -> bool:
@@ -190,18 +192,39 @@ class _Step:
         loop = self.loop
         G = loop.rows(self.rows)
         c = np.concatenate([value[rows] for value, rows in zip(values, self.rows, strict=True)])
-        equal = np.concatenate(
-            [np.full(int(rows.sum()), item.source.equality) for item, rows in zip(self.bound, self.rows, strict=True)]
-        )
-        active = np.concatenate([lam[rows] != 0.0 for lam, rows in zip(self.multipliers, self.rows, strict=True)])
+        equal, active = self._kinds(self.rows)
         flat = G.reshape(len(G), loop.gradient.size)
         weighed = np.einsum("akm,kmi->aki", G, loop.inverse).reshape(flat.shape)
         found = _least(weighed @ flat.T, c + flat @ ahead.ravel() - weighed @ loop.gradient.ravel(), equal, active)
-        multipliers = [np.zeros(rows.shape) for rows in self.rows]
-        ends = np.cumsum([int(rows.sum()) for rows in self.rows])
-        for array, rows, part in zip(multipliers, self.rows, np.split(found, ends[:-1]), strict=True):
-            array[rows] = part
-        return multipliers, loop.gradient + np.einsum("akm,a->km", G, found)
+        return _in_rows(found, self.rows), loop.gradient + np.einsum("akm,a->km", G, found)
+
+    def least_slope(self) -> list[Floats]:
+        """Multipliers (K, rows) with which the Lagrangian's gradient in the free controls is least.
+
+        In the metric of the cost to go, the directions in which penalties are stiff would hardly count: there a tiny
+        gradient in other directions changes the multipliers by any part.
+        """
+        loop = self.loop
+        pushing = [lam > 0.0 for lam in self.found.multipliers]
+        rows = [met | push for met, push in zip(self.rows, pushing, strict=True)]
+        equal, active = self._kinds(rows)
+        size = np.abs(self.problem.decided(self.motion)).max(axis=0)
+        size = np.where(self.free, np.maximum(size, _SMALL * size.max()), 0.0)
+        slopes = (loop.rows(rows) * size).reshape(len(equal), size.size)
+        gradient = (loop.gradient * size).ravel()
+        found = _least(slopes @ slopes.T, -slopes @ gradient, equal, active)
+        # The same without the squares, in which digits are lost.
+        pushed = equal | (found > 0.0)
+        exact = np.linalg.lstsq(slopes[pushed].T, -gradient, rcond=None)[0]
+        if (equal[pushed] | (exact > 0.0)).all():
+            found[pushed] = exact
+        return _in_rows(found, rows)
+
+    def _kinds(self, rows: list[Mask]) -> tuple[Mask, Mask]:
+        """Which of the given rows (a,) are equalities, and which had multipliers."""
+        equal = [np.full(int(own.sum()), item.source.equality) for item, own in zip(self.bound, rows, strict=True)]
+        active = [lam[own] != 0.0 for lam, own in zip(self.multipliers, rows, strict=True)]
+        return np.concatenate(equal), np.concatenate(active)
 
     def solve(self) -> None:
         """Solve for the step, its active rows and the controls that it brings to their limits."""
@@ -261,6 +284,15 @@ class _Step:
             gains=np.ascontiguousarray(gains),
             reference=np.ascontiguousarray(reference),
         )
+
+
+def _in_rows(numbers: Floats, rows: list[Mask]) -> list[Floats]:
+    """Numbers (a,) of the given rows of all constraints, in arrays (K, rows); others are zero."""
+    found = [np.zeros(own.shape) for own in rows]
+    ends = np.cumsum([int(own.sum()) for own in rows])
+    for array, own, part in zip(found, rows, np.split(numbers, ends[:-1]), strict=True):
+        array[own] = part
+    return found
 
 
 def _violation(item: BoundConstraint, c: Floats) -> float:

@@ -705,8 +705,7 @@ def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
     A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4), and rings after each jump
     of a held control. In reaches of damped arms, plans of the L-stable method lose less from z = 10 on, and those of
     the default up to 5. With constraints of the scene it is always the default, since Radau's methods do not support
-    them. Noise is held over the step where :func:`usual_kick` allows it: in the long steps of plans an impulse costs
-    two to five times as much.
+    them. Noise is held over the step: in the long steps of plans an impulse costs two to five times as much.
     """
     stages: int = default_integrator().stages
     kick = usual_kick(scene)

@@ -197,11 +197,11 @@ def solve(
             of it, a local one of the model. ``"held"``: as in the paper, with the Hessian of the value function held;
             it neglects the derivatives of that Hessian, and ends next to the minimum. By default it is the whole one
             where steps have second derivatives: with a variational integrator, constant controls and a kick that is
-            left or held, without custom forces, custom noise, kinematic inputs and constraints of the scene. It then
-            takes two to four times as long as the search with it held, more where that ends far from the minimum;
-            elsewhere, by differences, ``"whole"`` takes 10 to 50 times as long. With ``second_order`` and within
-            control limits it is held. Problems with constraints are solved for the least cost without noise, which
-            then affects only their feedback and margins.
+            left or held, without custom forces, custom noise, kinematic inputs and constraints of the scene, and
+            without servos with an effort limit if the kick is held. It then takes two to four times as long as the
+            search with it held, more where that ends far from the minimum; elsewhere, by differences, ``"whole"`` takes
+            10 to 50 times as long. With ``second_order`` and within control limits it is held. Problems with
+            constraints are solved for the least cost without noise, which then affects only their feedback and margins.
         states: Initial states, which need not be feasible: configurations at the nodes (N + 1, n), the first one q0; a
             pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of another planner
             will do: auxiliary joint forces hold the first motion on it, and the first iterations remove them (multiple
@@ -229,6 +229,7 @@ def solve(
         raise InputError(f"backtracking must be in (0, 1), got {backtracking}")
     if not real("regularization", regularization) >= 0.0:
         raise InputError(f"regularization must be >= 0, got {regularization}")
+    second_order, check = flag("second_order", second_order), flag("check", check)
     if noise is not None and not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held', 'whole' or None, got {noise!r}")
     whole_noise = noise == "whole" or (noise is None and is_exact(problem))

@@ -9,6 +9,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.linear_controls import after_impulse, of_samples
 from varpin.control.problem import OptimalControlProblem
+from varpin.errors import LinearizationError
 from varpin.linearization import Linearization, velocity_at_nodes
 from varpin.trajectory import Trajectory
 
@@ -34,6 +35,9 @@ def beyond_samples(
         lin: The linearized steps.
         hessian: Hessians of the running cost at the samples of each step, first those of the problem's rule.
         samples: Number of samples of a step.
+
+    Raises:
+        LinearizationError: Velocities grow without bound within a step.
     """
     n, h, rule, N = problem.scene.robot.dof, problem.dt, problem.rule, lin.steps
     speeds, held = slice(n, 2 * n), problem.integrator.holds_noise and problem.sampling != "start"
@@ -47,7 +51,13 @@ def beyond_samples(
     slope, to_impulse = velocity[:-1, :, n:], np.linalg.pinv(lin.J[:, n:])
     whole = np.einsum("s,Nsab->Nab", h * rule[:, 0], of_speeds[:, :, speeds, speeds])
     decay = (np.eye(n) - lin.A[:, n:, n:]) @ to_impulse
-    mean = mean_of_decay(decay, np.swapaxes(slope, 1, 2) @ whole @ slope)
+    # A step in which velocities grow without bound, as in a trial that runs away, has no mean.
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean = mean_of_decay(decay, np.swapaxes(slope, 1, 2) @ whole @ slope)
+    lost = ~np.isfinite(mean).all(axis=(1, 2))
+    if lost.any():
+        step = int(lost.argmax())
+        raise LinearizationError(step, step * h, "what noise adds to velocities grows without bound within the step")
     found[:, n:, n:] += np.swapaxes(to_impulse, 1, 2) @ mean @ to_impulse
     return found
 

@@ -209,7 +209,7 @@ class VariationalRollout(_Rollout):
         """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays.
 
         A watch may stop a single path. ``impulses`` (P, N, 2, n), in addition to noise, are added to the momenta before
-        and after each step.
+        and after each step, or held over it as the noise.
         """
 
 class ConstrainedRollout(_Rollout):
@@ -228,8 +228,19 @@ class ConstrainedRollout(_Rollout):
     def fork(self, guards: Guards) -> ConstrainedRollout:
         """An independent copy of the paths."""
 
-    def roll(self, dt: float, commands: Commands, increments: Floats, drift: Floats, nodes: RolloutArrays) -> None:
-        """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays."""
+    def roll(
+        self,
+        dt: float,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        nodes: RolloutArrays,
+        impulses: Floats | None = None,
+    ) -> None:
+        """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays.
+
+        ``impulses`` (P, N, 2, n), in addition to noise, have to be held over the steps.
+        """
 
     def impulses(self, path: int) -> Floats:
         """Constraint impulses (steps, c) in each step of the last roll of a path; joints feel dg/dq' times them."""
@@ -253,6 +264,7 @@ def constrained_derivatives(
     *,
     guess: Floats,
     ramp: bool = False,
+    external: bool = False,
 ) -> tuple[Floats, Floats, Floats, int, int]:
     """As variational_derivatives, and derivatives (N, 2n, i) in the rates (N, i) of driven joints."""
 
@@ -270,12 +282,14 @@ def variational_derivatives(
     *,
     guess: Floats,
     ramp: bool = False,
+    external: bool = False,
     solver: Solver = Solver.automatic,
 ) -> tuple[Floats, Floats, int, int]:
     """d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n), the outcome, and the number of steps done.
 
     ``force`` is (N, 1, n), constant over each step, or (N, s, n) at its stages. f is constant over the step, or with
-    ``ramp`` grows linearly from 0 at its start to f at its end.
+    ``ramp`` grows linearly from 0 at its start to f at its end. ``external``: f is not the force of the controls, which
+    drives limit, but acts beside it.
 
     ``halvings`` are those of the parts of all steps with more than one of ``substeps``. The same parts are repeated;
     parts that active ``guards`` refuse are halved.

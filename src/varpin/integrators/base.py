@@ -236,7 +236,8 @@ class Integrator(ABC):
     ) -> list[Segment]:
         """:meth:`rollout` with fields that the core evaluates; ``drift`` is a force (P, N, n), or (0, 0, n).
 
-        ``impulses`` (P, N, 2, n) are added to the momenta before and after each step, but not under constraints.
+        ``impulses`` (P, N, 2, n) are added to the momenta before and after each step, but not under constraints; an
+        integrator that holds the noise spreads them over the step.
         """
 
     def motions(
@@ -252,7 +253,8 @@ class Integrator(ABC):
         """Configurations and velocities (P, N, n) after each step of P motions from (q0, v0) (P, n), without noise.
 
         ``commands`` and ``drift`` are as for :meth:`rollout_compiled`; ``impulses`` (P, N, 2, n) are added to the
-        momenta before and after each step. Returns None if a motion fails, or if the integrator takes no impulses.
+        momenta before and after each step, or spread over it by an integrator that holds the noise. Returns None if a
+        motion fails, or if the integrator takes no impulses.
         """
         if impulses is not None:
             return None
@@ -400,15 +402,6 @@ def ends_at(trajectory: Trajectory, k: int) -> tuple[Floats, Floats] | None:
     """The controls (1, m) at both ends of step k where they are linear between nodes; else None."""
     nodes = trajectory.u_nodes
     return (nodes[k : k + 1], nodes[k + 1 : k + 2]) if nodes.shape[1] else None
-
-
-def held_noise(scene: Scene, trajectory: Trajectory, steps: slice | Integers = slice(None)) -> Floats:
-    """The constant forces over some steps of a motion (N, n) whose impulses are those of its noise.
-
-    Zero for joints of kinematic inputs, whose drives absorb the noise.
-    """
-    q, v = trajectory.q[:-1][steps], trajectory.v[:-1][steps]
-    return without_inputs(scene, noise_impulses(scene, trajectory, q, v, steps) / trajectory.dt)
 
 
 def noise_fields(

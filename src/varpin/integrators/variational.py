@@ -222,11 +222,6 @@ class Variational(Integrator):
     def _begun(self, scene: Scene, q0: Floats, v0: Floats) -> VariationalRun:
         rollout: VariationalRollout | ConstrainedRollout
         guards = self._guards_of(driven=bool(scene.inputs))
-        if self.holds_noise and scene.processes and limited_servos(scene.elements):
-            raise InputError(
-                "kick='held' does not go with a PositionServo with an effort limit, which would cut the noise off with "
-                "its command: take kick='left' or kick='split'"
-            )
         if scene.constraints:
             rollout = ConstrainedRollout(
                 scene.core,
@@ -299,18 +294,14 @@ class Variational(Integrator):
         dt: float,
         impulses: Floats | None = None,
     ) -> tuple[Floats, Floats] | None:
-        """See :meth:`Integrator.motions`; impulses are not available under constraints."""
-        if impulses is not None and scene.constraints:
+        """See :meth:`Integrator.motions`; under constraints impulses are available if they are held."""
+        if impulses is not None and scene.constraints and not self.holds_noise:
             return None
         try:
             run = self._begun(scene, q0, v0)
         except SingularMassMatrix:
             return None
-        nodes = new_nodes(len(q0), steps_of(commands), scene.robot.dof, scene.controls)
-        if isinstance(run.paths, ConstrainedRollout):
-            run.paths.roll(dt, commands, scene.silence, drift, nodes)
-        else:
-            run.paths.roll(dt, commands, scene.silence, drift, nodes, impulses=impulses)
+        nodes = _rolled(scene, run, commands, scene.silence, drift, dt, impulses)
         return None if nodes.ended.any() else (nodes.q, nodes.v)
 
     def step_in_python(
@@ -327,11 +318,11 @@ class Variational(Integrator):
                 (with_ends(scene, ends[0], after), with_ends(scene, ends[1], after)),
             )
         F, drift = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0], ends)
-        drift = self.drift_share * drift
+        drift, held = self.drift_share * drift, None
         if len(increment):
             impulse = noise_of_step(scene, F, q[0], v[0], ends, state.start[0], increment[0, 0])
             if self.holds_noise:
-                drift = drift + without_inputs(scene, impulse) / dt
+                held = np.stack([impulse, np.zeros_like(impulse)])[None, None]
             else:
                 state.paths.kick(self.left * impulse[None])
         (segment,) = self.rollout_compiled(
@@ -341,6 +332,7 @@ class Variational(Integrator):
             scene.silence,
             drift[None, None],
             dt,
+            held,
         )
         if len(increment) and self.left < 1.0 and segment.failure is None:
             q, p, v, _ = state.paths.nodes()
@@ -359,29 +351,35 @@ class Variational(Integrator):
         Jx, Jf = self._derivatives(scene, trajectory)
         n = scene.robot.dof
         if self.holds_noise:
-            return Jx, Jf, without_inputs(scene, Jf[:, :, :n] / trajectory.dt)
+            # Drives limit the force of the controls, not the noise.
+            limits = bool(limited_servos(scene.elements))
+            of_noise = self._derivatives(scene, trajectory, external=True)[1] if limits else Jf
+            return Jx, Jf, without_inputs(scene, of_noise[:, :, :n] / trajectory.dt)
         kicks = Jx[:, :, n:]
         if max(scene.rates, default=-1) >= 0:
             # A noise impulse does not change the velocity of a joint with a cubic input.
             kicks = kicks @ _along(scene, trajectory.q[:-1])
         return Jx, Jf, kicks
 
-    def _derivatives(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> tuple[Floats, Floats]:
+    def _derivatives(
+        self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False, external: bool = False
+    ) -> tuple[Floats, Floats]:
         """Derivatives of each step in (q, p) and in a constant force, with ``ramp`` one that grows linearly from 0.
 
-        The columns of velocities of cubic inputs follow those of the force, as in :attr:`Scene.transmission`.
+        With ``external`` it is a force that drives do not limit. The columns of velocities of cubic inputs follow those
+        of the force, as in :attr:`Scene.transmission`.
         """
         steps = self._steps(scene, trajectory)
         guess = np.ascontiguousarray(self._guess(trajectory))
         if scene.constraints:
             rates, cubic = _rates(scene, trajectory)
             Jx, Jf, Jr, outcome, done = constrained_derivatives(
-                **steps, rates=rates, places=self._places(scene), guess=guess, ramp=ramp
+                **steps, rates=rates, places=self._places(scene), guess=guess, ramp=ramp, external=external
             )
             if cubic:
                 Jf = np.concatenate([Jf, Jr[:, :, cubic]], axis=2)
         else:
-            Jx, Jf, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp)
+            Jx, Jf, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp, external=external)
         _require_solved(trajectory, outcome, done)
         return Jx, Jf
 
@@ -571,8 +569,5 @@ def _rolled(
 ) -> RolloutArrays:
     """Advance ``state`` by the steps of ``commands``; the nodes after them."""
     nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
-    if impulses is None or isinstance(state.paths, ConstrainedRollout):
-        state.paths.roll(dt, commands, increments, drift, nodes)
-    else:
-        state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
+    state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
     return nodes

@@ -293,7 +293,14 @@ def clearance(
         RobotError: A mesh is missing, or the SRDF file cannot be read.
         InputError: A link has no shape, or nothing is left to keep clear of.
     """
+    if capsules is not None and not isinstance(capsules, Mapping):
+        raise InputError(f"capsules must be a dictionary, link: (begin, end, radius), got {type(capsules).__name__}")
     given = dict(capsules or {})
+    for name, capsule in given.items():
+        if not isinstance(capsule, Sequence) or len(capsule) != 3:
+            raise InputError(f"capsules[{name!r}] must be (begin, end, radius), got {capsule!r}")
+    if links is not None and len(set(links)) < len(links):
+        raise InputError(f"links has a name twice: {', '.join(map(str, links))}")
     fitted = {} if links is not None and set(links) <= set(given) else _vertices(robot)
     names = list(dict.fromkeys([*fitted, *given])) if links is None else list(links)
     bodies = []

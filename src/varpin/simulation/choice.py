@@ -15,7 +15,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.core import fastest_damping, pulls_fast
 from varpin.integrators import Gauss, Integrator, Midpoint, Radau
-from varpin.mechanics.forces import limited_servos, of_kind
+from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
 from varpin.simulation.damping import fast_damping, stops_ahead, turns_fast
 from varpin.simulation.refinement import candidates, first_steps
@@ -44,7 +44,7 @@ def usual_integrator(
     With ``ahead`` the choice covers all stops that joints may run into, for a motion that cannot be repeated.
     """
     if noisy:
-        return replace(_NOISY, kick=usual_kick(scene))
+        return _NOISY
     # Radau's methods do not keep constraints.
     if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt, ahead=ahead):
         return _of(_STOPPING, scene)
@@ -57,11 +57,8 @@ def _of(chosen: Gauss | Radau, scene: Scene) -> Integrator:
 
 
 def usual_kick(scene: Scene) -> Literal["left", "held"]:
-    """How noise acts where no integrator is given: held over the step, but for drives at their limits.
-
-    A servo with an effort limit takes a force that is held on its joint for a part of its command, and cuts it off.
-    """
-    return "held" if scene.processes and not limited_servos(scene.elements) else "left"
+    """How noise acts where no integrator is given."""
+    return "held" if scene.processes else "left"
 
 
 def changes_along(scene: Scene) -> bool:

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats, Integers
 from varpin.errors import LinearizationError
 from varpin.integrators import Gauss, Integrator, Radau, Reference
-from varpin.integrators.base import held_noise, open_loop
+from varpin.integrators.base import open_loop
 from varpin.integrators.collocation import MOST_STAGES
 from varpin.integrators.within import Times
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, travel_scales
 from varpin.simulation.kinks import kinks
 from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bounds
-from varpin.simulation.retaking import Finer, finer, impulses_at, noise_left_out, shortest_parts, taken_again
+from varpin.simulation.retaking import Finer, finer, impulses_of_parts, noise_left_out, shortest_parts, taken_again
 from varpin.trajectory import Trajectory
 
 # First words of the warning, where errors grow and where they only add up.
@@ -218,11 +218,8 @@ def _steps_off(
     else:
         # The mean control of the step stands for controls that change within it.
         forces, kicks, parts = trajectory.u[at] @ scene.actuation.T, None, parts * other.parts
-        if trajectory.dw.any() and integrator.holds_noise:
-            forces = forces + held_noise(scene, trajectory, at)
-        elif trajectory.dw.any():
-            kicks = np.zeros((len(at), parts, 2, scene.robot.dof))
-            kicks[:, 0, 0], kicks[:, -1, 1] = impulses_at(scene, integrator, trajectory, at)
+        if trajectory.dw.any():
+            kicks = impulses_of_parts(scene, integrator, trajectory, at, parts)
         held = np.repeat(forces[:, None], parts, axis=1)
         nothing = open_loop(np.zeros((parts, scene.controls)))
         once = other.method.motions(scene, q[at], v[at], nothing, held, trajectory.dt / parts, kicks)

@@ -10,7 +10,7 @@ import numpy as np
 from varpin.arrays import Floats, Integers
 from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, RungeKutta4
-from varpin.integrators.base import held_noise, noise_impulses, open_loop
+from varpin.integrators.base import noise_impulses, open_loop
 from varpin.integrators.collocation import MOST_STAGES
 from varpin.integrators.variational import Variational
 from varpin.integrators.within import Times, changing, in_parts
@@ -104,7 +104,7 @@ def shortest_parts(trajectory: Trajectory) -> Integers:
 def impulses_at(scene: Scene, integrator: Integrator, trajectory: Trajectory, steps: Integers) -> tuple[Floats, Floats]:
     """Impulses of the noise of a motion (..., n) before and after some of its steps (...), of compiled fields.
 
-    Not for an integrator that holds the noise.
+    For an integrator that holds the noise, those before a step are held over it.
     """
     # Explicit Euler's kicks come after the step.
     left = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
@@ -117,6 +117,19 @@ def impulses_at(scene: Scene, integrator: Integrator, trajectory: Trajectory, st
         return share * noise_impulses(scene, trajectory, *at, steps.ravel()).reshape(*steps.shape, n)
 
     return part(left, steps), part(1.0 - left, steps + 1)
+
+
+def impulses_of_parts(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, steps: Integers, parts: int
+) -> Floats:
+    """The impulses of :func:`impulses_at` for some steps (K,) in so many parts each (K, parts, 2, n)."""
+    before, after = impulses_at(scene, integrator, trajectory, steps)
+    found = np.zeros((len(steps), parts, 2, before.shape[1]))
+    if integrator.holds_noise:
+        found[:, :, 0] = before[:, None] / parts
+    else:
+        found[:, 0, 0], found[:, -1, 1] = before, after
+    return found
 
 
 def noise_left_out(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
@@ -209,15 +222,14 @@ class Again:
             if self.ended:
                 return
         taken = slice(self._step + begin, self._step + end)
-        drawn, drift, kicks = scene.silence, scene.no_drift, None
-        if trajectory.dw.any() and method.holds_noise:
-            drift = np.repeat(held_noise(scene, trajectory, taken), parts, axis=0)[None]
-        elif not trajectory.dw.any() or noise_left_out(scene, method, trajectory):
+        drawn, kicks = scene.silence, None
+        held = bool(trajectory.dw.any()) and method.holds_noise
+        if not held and (not trajectory.dw.any() or noise_left_out(scene, method, trajectory)):
             pass
-        elif _of_whole_steps(scene, trajectory):
-            kicks = np.zeros((1, (end - begin) * parts, 2, scene.robot.dof))
+        elif held or _of_whole_steps(scene, trajectory):
             steps = np.arange(taken.start, taken.stop)
-            kicks[0, ::parts, 0], kicks[0, parts - 1 :: parts, 1] = impulses_at(scene, method, trajectory, steps)
+            kicks = impulses_of_parts(scene, method, trajectory, steps, parts)
+            kicks = kicks.reshape(1, -1, 2, scene.robot.dof)
         else:
             drawn = np.zeros((1, (end - begin) * parts, trajectory.dw.shape[1]))
             if isinstance(method, ExplicitEuler):
@@ -233,7 +245,9 @@ class Again:
             at = method.stage_times
             parted = changing(in_parts(trajectory.u_stages[taken], self._times, parts, at), at)
             commands = prescribing(scene, parted, commands.u)
-        (segment,) = method.rollout_compiled(scene, self._state, commands, drawn, drift, trajectory.dt / parts, kicks)
+        (segment,) = method.rollout_compiled(
+            scene, self._state, commands, drawn, scene.no_drift, trajectory.dt / parts, kicks
+        )
         done = len(segment.q) // parts
         for nodes, values in ((self.q, segment.q), (self.v, segment.v)):
             nodes[begin + 1 : begin + done + 1] = values[parts - 1 :: parts][:done]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats, Integers
 from varpin.core import energy_turnover, glance, windows_agree
 from varpin.integrators import Integrator, Reference
-from varpin.integrators.base import held_noise, noise_impulses, open_loop
+from varpin.integrators.base import noise_impulses, open_loop
 from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -604,21 +604,19 @@ def resolution_of(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
         # All paths have the same commands; their forces may differ.
         held = u[begins[:, None] + np.arange(length)].reshape(len(begins), length // times, times, -1)
         commands, drift = open_loop(np.zeros_like(u[:length:times])), held.mean(axis=2) @ scene.actuation.T
-    kicks, of_noise = None, scene.no_drift
-    if noisy and integrator.holds_noise:
-        of_noise = held_noise(scene, trajectory)[begins[:, None] + np.arange(length)]
-        of_noise = of_noise.reshape(len(begins), length // times, times, -1).mean(axis=2)
-        drift = drift + of_noise if drift.size else of_noise
-    elif noisy:
+    kicks = None
+    if noisy:
         before, after = impulses_at(scene, integrator, trajectory, begins[:, None] + np.arange(length))
-        if times == 2:
+        if times == 2 and integrator.holds_noise:
+            before, after = before[:, ::2] + before[:, 1::2], after[:, ::2]
+        elif times == 2:
             # Half of the kick in the middle of a double step comes before and half after it, which gives the same
             # position and momentum at its end to first order in the step.
             half = 0.5 * (after[:, ::2] + before[:, 1::2])
             before, after = before[:, ::2] + half, half + after[:, 1::2]
         kicks = np.stack([before, after], axis=2)
     if trajectory.u_stages.shape[1]:
-        again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks, of_noise)
+        again = _windows_under(scene, integrator, trajectory, begins, length, other, times, kicks)
     else:
         again = other.motions(scene, q[begins], v[begins], commands, drift, times * trajectory.dt, kicks)
     if times == 1 and not (jumps or pulled) and again is not None:
@@ -722,7 +720,6 @@ def _windows_under(
     other: Integrator,
     times: int,
     kicks: Floats | None,
-    drift: Floats,
 ) -> tuple[Floats, Floats] | None:
     """Windows of a motion with controls that change within steps, repeated by another method or in double steps."""
     at, mine, found = other.stage_times, integrator.stage_times, []
@@ -730,7 +727,7 @@ def _windows_under(
         values = trajectory.u_stages[begin : begin + length]
         commands = changing(in_parts(values, mine, 1, at) if times == 1 else in_pairs(values, mine, at), at)
         node = slice(begin, begin + 1)
-        given = commands, drift[window : window + 1], times * trajectory.dt
+        given = commands, scene.no_drift, times * trajectory.dt
         kick = None if kicks is None else kicks[window : window + 1]
         again = other.motions(scene, trajectory.q[node], trajectory.v[node], *given, kick)
         if again is None:

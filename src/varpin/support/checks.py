@@ -308,6 +308,17 @@ def count(name: str, value: Any, least: int = 0) -> int:
     return int(value)
 
 
+def flag(name: str, value: Any) -> bool:
+    """``value`` as a bool.
+
+    Raises:
+        InputError: It is neither True nor False; a text such as "no" would count as True.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
 def path_like(name: str, path: Any) -> Path:
     """``path`` as a Path, with ~ expanded.
 

@@ -53,6 +53,7 @@ struct Start {
     const Compensated* p = nullptr;        // (n)
     const double* force = nullptr;         // (n) of controls and drift of noise, or (s, n) at the stages
     int stride = 0;                        // distance of rows; 0 for a constant force
+    const double* external = nullptr;      // (n) another constant force, which drives do not limit; null for none
 
     const double* force_at(int stage) const { return force + stage * stride; }
 };
@@ -114,6 +115,7 @@ class Collocation {
     std::vector<double> coupled_v;           // (s, n, n) dF/dv
     std::vector<double> weight;              // (s) factor of the force f at each stage, for derivatives in f
     bool weighted = false;                   // whether any factor is not 1
+    bool by_external = false;                // whether derivatives in f are those in the external force
 
     // Take derivatives in f for a force that grows linearly from 0 to f over the whole step, of which this is the part
     // at `begin` with length `share`, both in units of the step.
@@ -422,6 +424,7 @@ class Collocation {
             double* const by_v = coupled() ? &coupled_v[i * n * n] : nullptr;
             sum_forces(mechanism, &Q[i * n], &V[i * n], start.force_at(i), &acting[i * n], stage[i].couplings, by_q,
                        by_v);
+            if (start.external || by_external) pass_drives(start, i);
         }
         if (!eliminated()) return;
         std::fill(element_curvature.begin(), element_curvature.end(), 0.0);
@@ -429,6 +432,18 @@ class Collocation {
             double* curvature = &element_curvature[i * n];
             mechanism.forces.potentials(
                 &Q[i * n], [curvature](int c, const Potential<double>& element) { curvature[c] += element.curvature; });
+        }
+    }
+
+    // Add the external force to those of elements at stage i. Nothing but F itself depends on it.
+    [[gnu::noinline]] void pass_drives(const Start& start, int i) {
+        for (int c = 0; c < n; ++c) {
+            JointForce<double>& element = acting[i * n + c];
+            if (start.external) {
+                element.value += start.external[c];
+                element.scale += std::abs(start.external[c]);
+            }
+            if (by_external) element.by_f = 0.0;
         }
     }
 

@@ -89,7 +89,7 @@ class AnyConstrainedStepper {
     virtual bool look_at(ConstrainedState& state) = 0;
     virtual void kick(const double* push, ConstrainedState& state) = 0;
     virtual void roll(double h, const Commands& commands, const double* increments, const double* drift,
-                      std::vector<ConstrainedState>& states, const Nodes& nodes) = 0;
+                      const double* impulses, std::vector<ConstrainedState>& states, const Nodes& nodes) = 0;
 };
 
 // Steps that make the action (H1) stationary. Numbers of joints and stages may be known at compile time.
@@ -120,6 +120,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
           scaled(n),
           row_scale(m),
           y(n),
+          extras(n),
           bent(n * n),
           pushed(stages * n),
           push_size(stages * n),
@@ -156,6 +157,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     [[no_unique_address]] Stages stages;
     std::vector<double> force;           // (n) constant over the step; (s, n) at its stages, or those of a part of it
     int stride = 0;                      // from one row of `force` to the next
+    const double* outer = nullptr;       // (n) external force, null for none
     Effort effort;                       // work of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; none if it was taken whole
 
@@ -279,7 +281,8 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
         return attempt(h, state, true);
     }
 
-    void roll(double h, const Commands& commands, const double* increments, const double* drift,
+    // As of VariationalStepper; `impulses` (P, N, 2, n) are held over the step, as the noise is.
+    void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
               std::vector<ConstrainedState>& states, const Nodes& nodes) override {
         const std::int64_t steps = nodes.steps;
         const int controls = mechanism.controls;
@@ -302,24 +305,21 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
                 const std::int64_t row = p * steps + s;
                 const double* dw = noisy ? increments + row * width : nullptr;
                 apply_policy(commands, p, s, n, path.q.data(), path.momentum.data(), u);
-                const double* extra = drift ? drift + row * n : nullptr;
                 const Felt felt = noisy ? felt_controls(commands, p, s, u, seen) : Felt{};
-                if (noisy && held) {
-                    held_noise(mechanism, h, extra, path.q.data(), path.center.data(), felt, dw, y.data());
-                    // The entry of a driven joint is its goal, and its drive absorbs the noise.
-                    for (const DrivenRow& own : mechanism.constraints.driven())
-                        y[own.coordinate] = extra ? extra[own.coordinate] : 0.0;
-                    extra = y.data();
-                } else if (noisy) {
+                if (noisy && !held) {
                     noise_impulse(mechanism, 1.0, path.q.data(), path.center.data(), felt, dw, y.data());
                     kick(y.data(), state);
                 }
                 const double* within = stage_controls(commands, p, s, stages, u, line);
+                const Extra extra =
+                    held_noise(mechanism, h, row_of(drift, row, n), row_of(impulses, row, 2 * n), path.q.data(),
+                               path.center.data(), felt, held ? dw : nullptr, extras.data());
+                outer = extra.external;
                 stride = within ? static_cast<int>(n) : 0;
-                constant_force(mechanism, extra, u + s * controls, force.data());
+                constant_force(mechanism, extra.driven, u + s * controls, force.data());
                 take_goals();
                 if (within) {
-                    stage_forces(mechanism, extra, within, stages, given.data());
+                    stage_forces(mechanism, extra.driven, within, stages, given.data());
                     take_stages(given.data());
                 }
                 for (std::size_t d = 0; d < goal_rate.size(); ++d) {
@@ -337,6 +337,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
                 nodes.done[p] = s + 1;
             }
         }
+        outer = nullptr;
     }
 
     // Derivatives of the last substep, from (q0, p0) under the force f, as a map on all of R^2n: of (q1, p1) in (q0,
@@ -400,7 +401,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     std::vector<double> last;          // (m) Lam_s
     std::vector<double> rate;          // (m) rates of kinematic inputs in the part
     double unresolved = 0.0;           // velocity below the rounding of the last residuals
-    std::vector<double> Qk, scaled, row_scale, y, bent, pushed, push_size, unit;
+    std::vector<double> Qk, scaled, row_scale, y, extras, bent, pushed, push_size, unit;
     std::vector<double> block, saddle, right, solution;
     std::vector<int> rows;
     std::vector<double> null, reduced_mass, reduced;
@@ -921,7 +922,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     // A correction that is certain to be the last one is not evaluated unless `jets_wanted`. With `jets_wanted` it ends
     // with the jets and C at the root, else with those of the last iterate.
     Outcome solve(double h, const PathState& path, bool jets_wanted) {
-        const Start start{path.position.data(), path.p.data(), force.data(), stride};
+        const Start start{path.position.data(), path.p.data(), force.data(), stride, outer};
         scale_unknowns();
         const int size = stages * (n + here.rank());
         double before = infinity, worst = infinity, worst_before = infinity;
@@ -1393,6 +1394,7 @@ class ConstrainedLinearization {
 
     // As of VariationalLinearization.
     bool varies = false, ramp = false;
+    void take_external() { stepper.equation.by_external = true; }
 
   private:
     ConstrainedStepper<> stepper;

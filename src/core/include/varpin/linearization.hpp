@@ -31,6 +31,9 @@ class StepDerivatives {
     // those in a force that grows linearly from 0 at the start of the step to f at its end.
     bool varies = false, ramp = false;
 
+    // Take derivatives in an external force in the place of f, which drives limit.
+    virtual void take_external() = 0;
+
     virtual Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
                           std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past) = 0;
 };
@@ -65,6 +68,8 @@ class VariationalLinearization final : public StepDerivatives {
           along_f(n) {
         for (int c = 0; c < n; ++c) df[c * 3 * n + 2 * n + c] = 1.0;
     }
+
+    void take_external() override { stepper.step_equation.by_external = true; }
 
     // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f. An undivided step
     // is solved again from a guess (s, n) close to its root; the arrays q, p and force have `past` earlier steps before

@@ -4,6 +4,7 @@
 // steps of each decision, from the previous control to u at the end.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -156,12 +157,35 @@ inline void noise_impulse(const Mechanism& mechanism, double part, const double*
     if (felt.change) add_slope_noise(mechanism, part, felt.change, increments, impulse);
 }
 
-// The constant force over a step of length h whose impulse is that of the noise, (N2), plus a drift (n), which may be
-// null.
-inline void held_noise(const Mechanism& mechanism, double h, const double* drift, const double* q, const double* center,
-                       const Felt& felt, const double* increments, double* force) {
-    noise_impulse(mechanism, 1.0 / h, q, center, felt, increments, force);
-    for (int i = 0; drift && i < mechanism.dof(); ++i) force[i] += drift[i];
+// A row of an array, or null where there is none.
+inline const double* row_of(const double* array, std::int64_t row, std::int64_t size) {
+    return array ? array + row * size : nullptr;
+}
+
+// The constant forces (n) over a step in addition to its controls; both may be null.
+struct Extra {
+    const double* driven = nullptr;    // on the joint's drive, with its limit
+    const double* external = nullptr;  // on the joint itself; null where no drive has a limit, which is the same
+};
+
+// The extra forces of a step of length h over which the impulses of the noise, (N2), are held, and `impulses` (2, n) in
+// addition to it; `increments` and `impulses` may be null. `sum` (n) is work space.
+inline Extra held_noise(const Mechanism& mechanism, double h, const double* drift, const double* impulses,
+                        const double* q, const double* center, const Felt& felt, const double* increments,
+                        double* sum) {
+    if (!increments && !impulses) return {drift, nullptr};
+    const int n = mechanism.dof();
+    if (increments) {
+        noise_impulse(mechanism, 1.0 / h, q, center, felt, increments, sum);
+    } else {
+        std::fill(sum, sum + n, 0.0);
+    }
+    for (int i = 0; impulses && i < n; ++i) sum[i] += (impulses[i] + impulses[n + i]) / h;
+    // The entry of a driven joint is its goal, and its drive absorbs the noise.
+    for (const DrivenRow& own : mechanism.constraints.driven()) sum[own.coordinate] = 0.0;
+    if (mechanism.forces.limits()) return {drift, sum};
+    for (int i = 0; drift && i < n; ++i) sum[i] += drift[i];
+    return {sum, nullptr};
 }
 
 // The centres of the diffusion fields for a rollout from q.

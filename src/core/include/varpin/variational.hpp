@@ -129,6 +129,7 @@ class VariationalStepper final : public Stepper {
           given(step_equation.stages * n),
           guess(step_equation.stages * n),
           bend(2 * n),
+          extras(n),
           at(n) {}
 
     const Mechanism& mechanism;
@@ -140,6 +141,7 @@ class VariationalStepper final : public Stepper {
     [[no_unique_address]] Size n;
     std::vector<double> force;           // (n) constant over the step, or (s, n) at the stages of the step or its part
     int stride = 0;                      // distance of rows of `force`; 0 for a constant
+    const double* outer = nullptr;       // (n) external force, null for none
     Effort effort;                       // of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; empty for an undivided step
 
@@ -234,15 +236,16 @@ class VariationalStepper final : public Stepper {
     // Advances every path by N steps. Writes the node after each step, its controls and its statistics into `nodes`. A
     // path that fails stops; nodes.ended and nodes.done hold the reason and the number of steps. These may be null:
     // `increments` of the Wiener processes (P, N, K) with K = increments_of_step, `drift`, a force in addition to the
-    // controls (P, N, n), and `impulses` in addition to the noise, before and after each step (P, N, 2, n). A `watch`
-    // may stop a single path.
+    // controls (P, N, n), and `impulses` in addition to the noise, before and after each step, or held over it as the
+    // noise (P, N, 2, n). A `watch` may stop a single path.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
               std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) override {
         const std::int64_t steps = nodes.steps;
         const int m = mechanism.controls, stages = step_equation.stages;
         const std::int64_t width = increments_of_step(mechanism, commands);
         const bool noisy = increments != nullptr && width > 0;
-        const bool kicks = noisy && !held, spreads = noisy && held;
+        const bool kicks = noisy && !held;
+        const double *pushes = held ? nullptr : impulses, *spread = held ? impulses : nullptr;
         for (std::int64_t path = 0; path < nodes.paths; ++path) {
             PathState& state = states[path];
             double* u = nodes.u + path * steps * m;
@@ -256,18 +259,17 @@ class VariationalStepper final : public Stepper {
                 apply_policy(commands, path, s, n, state.q.data(), state.momentum.data(), u);
                 const Felt felt = noisy ? felt_controls(commands, path, s, u, seen) : Felt{};
                 if (kicks) noise_kick(left, felt, dw, state);
-                if (impulses) kick(impulses + 2 * row * n, state);
+                if (pushes) kick(pushes + 2 * row * n, state);
                 const double* within = stage_controls(commands, path, s, stages, u, line);
-                const double* extra = drift ? drift + row * n : nullptr;
-                if (spreads) {
-                    held_noise(mechanism, h, extra, state.q.data(), state.center.data(), felt, dw, bend.data());
-                    extra = bend.data();
-                }
+                const Extra extra =
+                    held_noise(mechanism, h, row_of(drift, row, n), row_of(spread, row, 2 * n), state.q.data(),
+                               state.center.data(), felt, held ? dw : nullptr, extras.data());
+                outer = extra.external;
                 stride = within ? static_cast<int>(n) : 0;
                 if (within) {
-                    stage_forces(mechanism, extra, within, stages, given.data());
+                    stage_forces(mechanism, extra.driven, within, stages, given.data());
                 } else {
-                    constant_force(mechanism, extra, u + s * m, force.data());
+                    constant_force(mechanism, extra.driven, u + s * m, force.data());
                 }
                 const Outcome outcome = step(h, state);
                 record_effort(effort, nodes, row);
@@ -275,12 +277,13 @@ class VariationalStepper final : public Stepper {
                 if (outcome != Outcome::solved) break;
                 state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
                 if (kicks && left < 1.0) noise_kick(1.0 - left, felt, dw, state);
-                if (impulses) kick(impulses + (2 * row + 1) * n, state);
+                if (pushes) kick(pushes + (2 * row + 1) * n, state);
                 record_node(state, n, nodes, row);
                 nodes.done[path] = s + 1;
                 if (watch && !watch->after(s, effort.substeps)) break;
             }
         }
+        outer = nullptr;
     }
 
     // Whether the Lagrangian is periodic in coordinate i, so that whole turns may be removed.
@@ -294,12 +297,16 @@ class VariationalStepper final : public Stepper {
 
   private:
     Trial trial;
-    std::vector<double> given;  // (s, n) varying force at the stages of the whole step
-    std::vector<double> line;   // (s, m) linear controls at these stages
-    std::vector<double> seen;   // (2, m) what the noise sees of them
-    std::vector<double> guess;  // (s, n) extrapolated stage velocities
-    std::vector<double> bend;   // (2, n)
-    std::vector<double> at;     // (n)
+    std::vector<double> given;   // (s, n) varying force at the stages of the whole step
+    std::vector<double> line;    // (s, m) linear controls at these stages
+    std::vector<double> seen;    // (2, m) what the noise sees of them
+    std::vector<double> guess;   // (s, n) extrapolated stage velocities
+    std::vector<double> bend;    // (2, n)
+    std::vector<double> extras;  // (n) forces in addition to the controls
+    std::vector<double> at;      // (n)
+
+    // The force on coordinate c, without those of elements, if it is constant over the step.
+    double constant(int c) const { return outer ? force[c] + outer[c] : force[c]; }
 
     void guess_velocity(const PathState& state) {
         for (int i = 0; i < step_equation.stages; ++i)
@@ -309,7 +316,7 @@ class VariationalStepper final : public Stepper {
     // One substep from the guess in step_equation.V; advances the path only if the substep is accepted.
     Outcome attempt(double h, PathState& state, bool jets_wanted) {
         auto& equation = step_equation;
-        const Outcome solved = equation.solve(h, {state.position.data(), state.p.data(), force.data(), stride},
+        const Outcome solved = equation.solve(h, {state.position.data(), state.p.data(), force.data(), stride, outer},
                                               tolerance, jets_wanted, effort);
         if (solved != Outcome::solved) return solved;
         const double margin = guards.active ? energy_guard.branch_margin(h, guards, equation) : infinity;
@@ -365,7 +372,7 @@ class VariationalStepper final : public Stepper {
         double *change = bend.data(), *acceleration = change + n;
         bool changed = false;
         for (int c = 0; c < n; ++c) {
-            change[c] = stride == 0 ? force[c] - state.past_force[c] : 0.0;
+            change[c] = stride == 0 ? constant(c) - state.past_force[c] : 0.0;
             changed = changed || change[c] != 0.0;
         }
         if (changed) {
@@ -395,7 +402,7 @@ class VariationalStepper final : public Stepper {
                                         state.miss.data());
         }
         std::copy(state.v.begin(), state.v.end(), state.past_end.begin());
-        std::copy(force.begin(), force.begin() + n, state.past_force.begin());
+        for (int c = 0; c < n; ++c) state.past_force[c] = constant(c);
         state.known = std::min(state.known + 1, PathState::most_misses + 1);
     }
 

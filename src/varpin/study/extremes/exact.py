@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.core import ForwardDynamics
 from varpin.integrators import ExplicitEuler, Integrator
+from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import DISTURBANCE, error_units, grown, light_joint_speed, masses, velocity_change
@@ -37,11 +38,21 @@ class EndsHereError(ArithmeticError):
     """The exact motion goes no further, or takes too long."""
 
 
-def integrated(dynamics: ForwardDynamics, force: Floats, x: Floats, dt: float, steps: int, end: float) -> Floats:
-    """(q, v) after each of some steps (K, 2n) under one force."""
+def integrated(
+    dynamics: ForwardDynamics,
+    force: Floats,
+    x: Floats,
+    dt: float,
+    steps: int,
+    end: float,
+    beside: tuple[Scene, Floats] | None = None,
+) -> Floats:
+    """(q, v) after each of some steps (K, 2n) under one force, and one ``beside`` it that drives do not limit."""
 
     def rate(_: float, x: Floats) -> Floats:
         slope, regular = dynamics.rate(x, force)
+        if beside is not None:
+            slope[len(force) :] += np.linalg.solve(masses(beside[0], x[None, : len(force)])[0], beside[1])
         if not (regular and np.isfinite(slope).all()) or time.process_time() > end:
             raise EndsHereError
         return slope
@@ -135,12 +146,15 @@ def exact_motion(
         states = np.append(q0 + by, v0)[None]
         for begin, after in zip(first, np.append(first[1:], steps), strict=True):
             x, force, given = states[-1], scene.actuation @ u[begin], (u[begin], dw[begin], trajectory.q[0])
-            if noisy and held:
+            beside = None
+            if noisy and held and limited_servos(scene.elements):
+                beside = scene, impulse(scene, x, *given) / dt
+            elif noisy and held:
                 force = force + impulse(scene, x, *given) / dt
             elif noisy and not late:
                 x = kicked(scene, x, *given)
             try:
-                more = integrated(dynamics, force, x, dt, int(after - begin), end)
+                more = integrated(dynamics, force, x, dt, int(after - begin), end, beside)
             except EndsHereError:
                 break
             if noisy and late:
