@@ -278,6 +278,51 @@ def test_wide_limits_change_nothing():
     assert not free.problem.limited
 
 
+@pytest.mark.parametrize("hold", [1, 5])
+def test_model_within_limits_by_interior_points(hold, monkeypatch):
+    """Where active sets do not settle, an interior-point method finds the limits that hold: SciPy's solution."""
+    lower, upper = np.array([-3.0, -0.8]), np.array([2.0, 5.0])
+    problem = pushed((lower, upper), integrator=vp.Midpoint(), hold=hold, dt=0.2 / hold, steps=10 * hold)
+    real, calls = passes._Box._active_sets, []
+
+    def second_time(box, plan, held):
+        calls.append(held)
+        return real(box, plan, held) if len(calls) % 2 == 0 else None
+
+    monkeypatch.setattr(passes._Box, "_active_sets", second_time)
+    sol = vp.solve(problem, max_iterations=1)
+    assert calls
+    g, H = transcribed(problem)
+    L, R = np.linalg.cholesky(H), problem.decisions
+    bounds = np.tile(lower, R), np.tile(upper, R)
+    reference = lsq_linear(L.T, -np.linalg.solve(L, g), bounds, method="bvls", tol=1e-15, max_iter=1000).x
+    np.testing.assert_allclose(sol.controls.ravel(), reference, atol=2e-5)
+
+
+def test_swing_with_most_torques_at_limits_converges():
+    """Torques too weak to hold the chain: the plan is a minimum by differences of its cost."""
+    robot = vp.planar_chain(2)
+    cost = vp.ControlCost(1e-3) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([1.5, -1.0], 100.0) + vp.VelocityCost(10.0))
+    limits = np.array([[-6.0, -2.0], [6.0, 2.0]])
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.05), cost, np.full(2, 0.1), np.zeros(2), dt=0.05, steps=24, control_limits=limits
+    )
+    plan = vp.solve(problem, max_iterations=60, check=False)
+    assert plan.status.converged
+    u = plan.controls
+    assert ((u <= limits[0]) | (u >= limits[1])).mean() > 0.4
+    gained = 0.0
+    for index in np.ndindex(*u.shape):
+        step = np.zeros(u.shape)
+        step[index] = 1e-5
+        ahead, back = (problem.cost_of(problem.simulate(u + sign * step)) for sign in (1.0, -1.0))
+        slope, stiffness = (ahead - back) / 2e-5, (ahead - 2.0 * plan.cost + back) / 1e-10
+        way = np.clip(u[index] - slope / max(stiffness, 1e-2), *limits[:, index[1]]) - u[index]
+        gained = max(gained, -0.5 * slope * way)
+    assert gained <= 1e-5 * plan.cost
+
+
 def test_control_that_is_fixed():
     """Equal limits leave a control no choice."""
     sol = vp.solve(pushed(([-np.inf, 0.3], [np.inf, 0.3])))

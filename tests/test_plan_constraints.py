@@ -315,6 +315,13 @@ def test_multipliers_are_slopes_of_the_least_cost():
     assert told == pytest.approx((costs[1] - costs[0]) / 2e-3, rel=1e-2)
 
 
+def test_given_limits_that_are_all_infinite():
+    robot = vp.planar_chain(2)
+    for made in (vp.WithinJointLimits, vp.WithinVelocityLimits):
+        with pytest.raises(vp.InputError, match="all limits given are infinite"):
+            made(robot, (-np.inf, np.inf))
+
+
 def test_control_limits_and_hold():
     """Within the box of the controls, each held over two steps, other integrators and samplings included."""
     limits = (-30.0, 30.0)

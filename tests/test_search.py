@@ -466,7 +466,7 @@ def test_a_step_is_extended_while_the_cost_falls_on():
     robot = vp.planar_chain(2)
     swing = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
     swing += vp.Terminal(vp.TrackingCost([np.pi / 2, 0.0], 1e3) + vp.VelocityCost(1e2))
-    options = {"dt": 2.0 / 28, "steps": 28, "integrator": vp.RungeKutta4(), "control_limits": (-20.0, 20.0)}
+    options = {"dt": 2.0 / 36, "steps": 36, "integrator": vp.RungeKutta4(), "control_limits": (-20.0, 20.0)}
     problem = vp.OptimalControlProblem(vp.Scene(robot), swing, [-np.pi / 2, 0.0], np.zeros(2), **options)
     plan = vp.solve(problem, tolerance=1e-4, check=False)
     assert plan.status.converged

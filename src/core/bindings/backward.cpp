@@ -97,13 +97,16 @@ struct HeldSteps {
 // Arrays of gains to be filled in; unwanted ones are empty.
 struct HeldGains {
     HeldGains(InOut<2> feedforward_, InOut<3> feedback_, InOut<3> previous_, InOut<2> control_gradient_,
-              InOut<2> costate_, InOut<3> spread_)
+              InOut<2> costate_, InOut<3> spread_, std::optional<InOut<2>> stiffness_,
+              std::optional<InOut<2>> pressure_)
         : feedforward(feedforward_),
           feedback(feedback_),
           previous(previous_),
           control_gradient(control_gradient_),
           costate(costate_),
-          spread(spread_) {}
+          spread(spread_),
+          stiffness(stiffness_),
+          pressure(pressure_) {}
 
     // Views, after a check that the arrays fit these steps, with each control held over `hold` of them.
     Gains fitting(const HeldSteps& held, int hold) const {
@@ -122,13 +125,16 @@ struct HeldGains {
                 .previous = previous.data(),
                 .control_gradient = control_gradient.data(),
                 .costate = given(costate, "costate", {N, x}) ? costate.data() : nullptr,
-                .spread = spread.data()};
+                .spread = spread.data(),
+                .stiffness = stiffness && given(*stiffness, "stiffness", {R, m}) ? stiffness->data() : nullptr,
+                .pressure = pressure && given(*pressure, "pressure", {R, m}) ? pressure->data() : nullptr};
     }
 
     InOut<2> feedforward;
     InOut<3> feedback, previous;
     InOut<2> control_gradient, costate;
     InOut<3> spread;
+    std::optional<InOut<2>> stiffness, pressure;
 };
 
 void make_pass(BackwardPass* self, int controls, In<1> gradient, In<2> hessian) {
@@ -243,9 +249,11 @@ void register_backward(nb::module_& m) {
              nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a, "Gu"_a, "rule"_a, "gradient"_a, "hessian"_a, "velocity"_a,
              "curvature"_a, "slack"_a, "expected"_a, "rate"_a, "pull"_a, "within"_a.none() = nb::none());
     nb::class_<HeldGains>(m, "Gains")
-        .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>>(), nb::kw_only(),
-             "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "previous"_a.noconvert(),
-             "control_gradient"_a.noconvert(), "costate"_a.noconvert(), "spread"_a.noconvert());
+        .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>, std::optional<InOut<2>>,
+                      std::optional<InOut<2>>>(),
+             nb::kw_only(), "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "previous"_a.noconvert(),
+             "control_gradient"_a.noconvert(), "costate"_a.noconvert(), "spread"_a.noconvert(),
+             "stiffness"_a.noconvert().none() = nb::none(), "pressure"_a.noconvert().none() = nb::none());
     nb::class_<HeldSquares>(m, "Squares").def(nb::init<In<3>, In<2>, In<2>>(), "root"_a, "shift"_a, "linear"_a);
     auto pass = nb::class_<BackwardPass>(m, "BackwardPass");
     pass.def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a)

@@ -57,6 +57,10 @@ _BLOCK = 2048
 # Bisections of the line search between two passes.
 _BISECTIONS = 40
 
+# Greatest numbers of active sets and of interior-point steps to the model's minimum within limits, its gap relative to
+# the model's change, and rounding errors of changes and slopes relative to the largest ones.
+_ACTIVE_SETS, _INTERIOR_STEPS, _GAP, _ROUNDED = 8, 40, 1e-5, 1e-11
+
 # Greatest relative rounding error of Quu; above, the pass is repeated on square roots.
 TRUSTED = 1e-9
 
@@ -77,6 +81,7 @@ class Plan:
     limited: bool
     loss: float  # estimated relative rounding error of Quu, or of its root
     model: Model  # of the cost along the motion
+    left: Floats | None = None  # (R, m) the model's gradient after a full step, which presses controls against limits
 
     @property
     def expected_decrease(self) -> float:
@@ -327,11 +332,15 @@ class _Rows:
         way, of_held = to - at, np.where(counts, weights, 0.0)
         least = 0.5 * float(of_held @ flat(self.signed) ** 2) - plan.expected_decrease
         gap = self.cost + 0.5 * float(of_held @ at**2) - least
+        states, moves = self.ahead_of
+        # Within limits the model's slope at its minimum is that of the controls pressed against them.
+        last = 0.0 if plan.left is None else min(float((plan.left * (moves - self.moves)).sum()), 0.0)
+        curved = max(gap + last, 0.0)
 
         def slope(t: float) -> float:
             s = at + t * way
             pull = np.where(equal | (s > 0.0), weights, 0.0) - of_held
-            return float((pull * s) @ way) - 2.0 * (1.0 - t) * gap
+            return float((pull * s) @ way) + last - 2.0 * (1.0 - t) * curved
 
         low, high = 0.0, 1.0
         if slope(high) <= 0.0:
@@ -340,8 +349,8 @@ class _Rows:
             middle = 0.5 * (low + high)
             low, high = (middle, high) if slope(middle) <= 0.0 else (low, middle)
         self.at = [a + low * (b - a) for a, b in zip(self.at, ahead, strict=True)]
-        self.cost = least + (1.0 - low) ** 2 * gap - 0.5 * float(of_held @ (at + low * way) ** 2)
-        states, moves = self.ahead_of
+        rest = 1.0 - low
+        self.cost = least - rest * last + rest**2 * curved - 0.5 * float(of_held @ (at + low * way) ** 2)
         self.states, self.moves = self.states + low * (states - self.states), self.moves + low * (moves - self.moves)
         self.slope += low * (along - self.slope)
 
@@ -379,43 +388,232 @@ class _Rows:
 
 
 def _within_limits(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
-    """The pass with controls within their limits at the states of the linearized motion.
+    """The pass to the model's minimum with controls within their limits.
 
     Around the nominal states, late decisions seem to reach their limits because each would have to make up for the
-    earlier ones. So the first pass has no limits, and the next ones take the limits into account that the linearized
-    motion reaches, until these do not change. If ever more of them change, the pass is made around the nominal states.
+    earlier ones. So the first pass has no limits, and where its linearized motion reaches some, further passes lead to
+    the minimum.
     """
-    if not along.problem.limited or along.clipped:
+    problem = along.problem
+    if not problem.limited or along.clipped:
         return _pass(along, regularization, curvature=curvature)[0]
-    plan = _pass(along, regularization, curvature=curvature)[0]
-    lower, upper = along.slack[:, 0], along.slack[:, 1]
-    held: NDArray[np.bool_] = np.zeros(lower.shape, dtype=np.bool_)
-    others, moves = held.size + 1, None
-    while plan is not None and others > 0:
-        expected, moves = _foreseen(along, plan)
-        if not held.any() and not ((moves <= lower) | (moves >= upper)).any():
-            break
-        plan, moves = _pass(along, regularization, curvature=curvature, limits=_Limits(along.slack, expected))[0], None
-        if plan is None:
-            break
-        now = np.logical_not(plan.feedback.any(axis=2))
+    stiffness = np.zeros((problem.decisions, problem.scene.controls))
+    nowhere = np.zeros((0, along.states + problem.scene.controls))
+    free = _Limits(along.slack[:0], nowhere, stiffness=stiffness)
+    plan = _pass(along, regularization, curvature=curvature, limits=free)[0]
+    if plan is not None:
+        moves = _foreseen(along, plan)[1]
+        lower, upper = along.slack[:, 0], along.slack[:, 1]
+        if not ((moves <= lower) | (moves >= upper)).any():
+            return _sloped(plan, moves)
+        if problem.processes:
+            plan = _matching(along, regularization, curvature, plan)
+        else:
+            plan = _Box(along, regularization * np.abs(stiffness), curvature).minimum(plan, moves)
+        if plan is not None:
+            return plan
+    return _pass(along, regularization, curvature=curvature, limits=_Limits(along.slack, nowhere))[0]
+
+
+def _sloped(plan: Plan, moves: Floats) -> Plan:
+    """A plan with the slope of the controls' changes (R, m) on its linearized motion.
+
+    The feed-forward parts belong together with the feedback, so the slope is that of both.
+    """
+    slope = float((plan.gradient * moves).sum())
+    if not (plan.expected_decrease > 0.0 and slope < 0.0):
+        return plan
+    return replace(plan, slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
+
+
+def _matching(along: Along, regularization: float, curvature: Floats | None, plan: Plan) -> Plan | None:
+    """Under noise: passes within the limits that the linearized motion reaches, until these do not change.
+
+    None if ever more of them change. The noise cost depends on the gains, so passes have no common model.
+    """
+    held: NDArray[np.bool_] = np.zeros(plan.feedforward.shape, dtype=np.bool_)
+    others, found, (expected, moves) = held.size + 1, plan, _foreseen(along, plan)
+    while others > 0:
+        limits = _Limits(along.slack, expected)
+        passed = _pass(along, regularization, curvature=curvature, limits=limits)[0]
+        if passed is None:
+            return None
+        found = passed
+        now = np.logical_not(found.feedback.any(axis=2))
         # Where motions stay at limits for long, these passes may not converge.
         changed = int((now != held).sum())
         if changed >= others:
-            plan = None
+            return None
         held, others = now, changed
-    if plan is not None and plan.expected_decrease > 0.0:
-        # The feed-forward parts belong together with the feedback, so the slope is that of both.
-        moves = _foreseen(along, plan)[1] if moves is None else moves
-        slope = float((plan.gradient * moves).sum())
-        if slope < 0.0:
-            return replace(plan, slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
-    nominal = _Limits(along.slack, np.zeros((0, along.states + along.problem.scene.controls)))
-    return _pass(along, regularization, curvature=curvature, limits=nominal)[0]
+        expected, moves = _foreseen(along, found)
+    made = _sloped(found, moves)
+    return made if made is not found else None
 
 
-def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
-    """The linearized motion under a plan whose controls are clipped to their limits.
+class _Box:
+    """The model of a motion in the changes of its controls (R, m), which have to stay within their limits.
+
+    Its minimum is found by passes with the controls at limits fixed, whose set changes until no other control exceeds a
+    limit and no fixed one would leave its own; where these do not end, after a primal-dual interior-point method, whose
+    steps are passes, too. ``proximal`` (R, m) regularizes: the Hessian of a further cost of the changes.
+    """
+
+    def __init__(self, along: Along, proximal: Floats, curvature: Floats | None) -> None:
+        self.along, self.proximal, self.curvature = along, proximal, curvature
+        self.lower, self.upper = along.slack[:, 0], along.slack[:, 1]
+
+    def minimum(self, plan: Plan, moves: Floats) -> Plan | None:
+        """The plan to the minimum, from the plan without limits and the controls' changes of its linearized motion."""
+        found = self._active_sets(plan, (moves <= self.lower, moves >= self.upper))
+        if found is None:
+            inner = self._interior(plan, np.clip(moves, self.lower, self.upper))
+            if inner is None:
+                return None
+            at, held = inner
+            found = self._active_sets(plan, held) or self._with_gains(at, held)
+        if found is None or not found[1].value < 0.0:
+            return None
+        return self._leading(*found)
+
+    def _active_sets(self, plan: Plan, held: tuple[Mask, Mask]) -> tuple[Plan, _Point] | None:
+        """The last pass and the minimum by a primal-dual active set; None if it takes too many passes.
+
+        It begins with the controls ``held`` at a lower and at an upper limit (Hintermueller, Ito and Kunisch 2002).
+        """
+        low, high = self.lower, self.upper
+        for _ in range(_ACTIVE_SETS):
+            found = self._fixed(held)
+            if found is None:
+                return None
+            at = self._at(plan, _foreseen(self.along, found, self._slack(held))[1])
+            if at is None:
+                return None
+            size, force = _ROUNDED * np.abs(at.moves).max(axis=0), _ROUNDED * np.abs(at.pressure).max(axis=0)
+            now = (
+                np.where(held[0], at.pressure >= -force, at.moves < low - size),
+                np.where(held[1], at.pressure <= force, at.moves > high + size),
+            )
+            fixed = low >= high
+            now = now[0] | fixed, now[1] & ~fixed
+            if np.array_equal(now[0], held[0]) and np.array_equal(now[1], held[1]):
+                return found, at._replace(moves=np.clip(at.moves, low, high))
+            held = now
+        return None
+
+    def _slack(self, held: tuple[Mask, Mask]) -> Floats:
+        """Limits (R, 2, m) that fix the held controls only."""
+        at = np.where(held[0], self.lower, np.where(held[1], self.upper, 0.0))
+        either = held[0] | held[1]
+        return np.stack([np.where(either, at, -np.inf), np.where(either, at, np.inf)], axis=1)
+
+    def _fixed(self, held: tuple[Mask, Mask]) -> Plan | None:
+        slack = self._slack(held)
+        return self._passed(_Limits(slack, np.zeros((0, self.along.states + slack.shape[2]))))
+
+    def _with_gains(self, moves: Floats, held: tuple[Mask, Mask]) -> tuple[Plan, _Point] | None:
+        """The pass with held controls, whose gains go with the given changes, and the model there."""
+        found = self._fixed(held)
+        at = None if found is None else self._at(found, moves)
+        return None if found is None or at is None else (found, at)
+
+    def _interior(self, plan: Plan, begin: Floats) -> tuple[Floats, tuple[Mask, Mask]] | None:
+        """Changes near the minimum by a primal-dual interior-point method, and which controls are at each limit."""
+        low, high = self.lower, self.upper
+        fixed = low >= high
+        bounded = [np.isfinite(low) & ~fixed, np.isfinite(high) & ~fixed]
+        count = int(bounded[0].sum() + bounded[1].sum())
+        if count == 0:
+            return None
+        # The size of changes of each control.
+        moved = np.abs(plan.feedforward).max(axis=0) + np.abs(begin).max(axis=0)
+        both = bounded[0] & bounded[1]
+        size = np.where(both, np.where(both, high, 0.0) - np.where(both, low, 0.0), np.where(moved > 0.0, moved, 1.0))
+        z = np.where(fixed, low, np.clip(begin, low + 0.1 * size, high - 0.1 * size))
+        slack = self._slack((fixed, np.zeros_like(fixed)))
+        nowhere = np.zeros((0, self.along.states + z.shape[1]))
+        gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+        mu = plan.expected_decrease / count
+        duals = [mu / gap for gap in gaps]
+        length = 1.0
+        for _ in range(_INTERIOR_STEPS):
+            products = [dual[rows] * gap[rows] for dual, gap, rows in zip(duals, gaps, bounded, strict=True)]
+            mu = float(sum(product.sum() for product in products)) / count
+            mu *= 0.1 if length > 0.9 else 0.3 if length > 0.5 else 0.7
+            stiff = duals[0] / gaps[0] + duals[1] / gaps[1]
+            pull = mu / gaps[1] - mu / gaps[0] - stiff * z
+            found = self._passed(_Limits(slack, nowhere), stiff, pull)
+            if found is None:
+                return None
+            to = _foreseen(self.along, found, slack)[1]
+            d = np.where(fixed, 0.0, to - z)
+            after = [(mu - duals[0] * d) / gaps[0], (mu + duals[1] * d) / gaps[1]]
+            ways = [(-d, gaps[0]), (d, gaps[1]), *((dual - new, dual) for dual, new in zip(duals, after, strict=True))]
+            length = 1.0
+            for way, room in ways:
+                closing = way > 0.0
+                if closing.any():
+                    length = min(length, 0.995 * float((room[closing] / way[closing]).min()))
+            z = z + length * d
+            gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+            duals = [dual + length * (new - dual) for dual, new in zip(duals, after, strict=True)]
+            value = -found.expected_decrease - float(((0.5 * stiff * to + pull) * to).sum())
+            if length > 0.9 and count * mu <= _GAP * abs(value):
+                break
+        # A limit binds where its multiplier exceeds its gap, each relative to its size.
+        scale = np.maximum(duals[0] + duals[1], 1e-300).max(axis=0)
+        held = gaps[0] / size < duals[0] / scale, gaps[1] / size < duals[1] / scale
+        moves = np.where(held[0], low, np.where(held[1], high, z))
+        return np.clip(moves, low, high), (held[0] | fixed, held[1] & ~held[0] & ~fixed)
+
+    def _passed(self, limits: _Limits, stiff: Floats | None = None, pull: Floats | None = None) -> Plan | None:
+        """A pass with a further cost of the controls' changes: its Hessian's diagonal and its gradient (R, m)."""
+        along = self.along
+        if stiff is not None and pull is not None:
+            along = along.with_cost_of_controls(self.proximal + stiff, pull)
+        elif self.proximal.any():
+            along = along.with_cost_of_controls(self.proximal)
+        return _pass(along, 0.0, curvature=self.curvature, limits=limits)[0]
+
+    def _at(self, plan: Plan, moves: Floats) -> _Point | None:
+        """The model and its gradient at changes of the controls."""
+        still = replace(plan, feedforward=moves, feedback=np.zeros(plan.feedback.shape))
+        if plan.previous is not None:
+            still = replace(still, previous=np.zeros(plan.previous.shape))
+        slack, pressure = np.stack([moves, moves], axis=1), np.zeros(moves.shape)
+        expected = _foreseen(self.along, still, slack)[0]
+        found = self._passed(_Limits(slack, expected, pressure=pressure))
+        return None if found is None else _Point(moves, expected, -found.expected_decrease, pressure)
+
+    def _leading(self, plan: Plan, at: _Point) -> Plan:
+        """The plan to a point of the model, with the feedback of ``plan``."""
+        x = 2 * self.along.problem.scene.robot.dof
+        ahead = at.moves - np.einsum("kmx,kx->km", plan.feedback, at.expected[:, :x])
+        if plan.previous is not None:
+            ahead -= np.einsum("kmi,ki->km", plan.previous, at.expected[:, x : x + at.moves.shape[1]])
+        slope = float((plan.gradient * at.moves).sum())
+        value = at.value - 0.5 * float((self.proximal * at.moves**2).sum())
+        curvature, left = 2.0 * (value - slope), at.pressure - self.proximal * at.moves
+        return replace(plan, feedforward=ahead, slope=slope, curvature=curvature, limited=True, left=left)
+
+
+class _Point(NamedTuple):
+    """A point of a model within limits.
+
+    Attributes:
+        moves: Changes of the controls (R, m).
+        expected: States and previous controls before each decision (R, 2n + m).
+        value: The model's change.
+        pressure: Its gradient in the controls (R, m).
+    """
+
+    moves: Floats
+    expected: Floats
+    value: float
+    pressure: Floats
+
+
+def _foreseen(along: Along, plan: Plan, slack: Floats | None = None) -> tuple[Floats, Floats]:
+    """The linearized motion under a plan whose controls are clipped to their limits, or to ``slack`` (R, 2, m).
 
     Returns the state and the change of the previous control before each decision (R, 2n + m), and the controls' changes
     (R, m). Where controls are linear between nodes the state is X of :mod:`varpin.control.linear_controls`.
@@ -439,7 +637,8 @@ def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
             costate=np.zeros((0, x)),
             spread=spread[begin:end],
         )
-        steps = along.steps(begin, end, None, _Limits(along.slack, np.zeros((0, x + m))))
+        within = _Limits(along.slack if slack is None else slack, np.zeros((0, x + m)))
+        steps = along.steps(begin, end, None, within)
         core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows])
     return expected, moves
 
@@ -447,11 +646,21 @@ def _foreseen(along: Along, plan: Plan) -> tuple[Floats, Floats]:
 class _Limits(NamedTuple):
     """Control limits for a pass: their ``slack`` (R, 2, m), and the ``expected`` states (R, 2n + m).
 
-    The slack is empty without limits, the expected states around the nominal ones.
+    The slack is empty without limits, the expected states around the nominal ones. The pass fills in the diagonal of
+    Quu without regularization in ``stiffness`` (R, m), and the gradient at the expected states in ``pressure`` (R, m).
     """
 
     slack: Floats
     expected: Floats
+    stiffness: Floats | None = None
+    pressure: Floats | None = None
+
+    def part(self, rows: slice) -> dict[str, Floats | None]:
+        """What the pass fills in for some decisions."""
+        return {
+            "stiffness": None if self.stiffness is None else self.stiffness[rows],
+            "pressure": None if self.pressure is None else self.pressure[rows],
+        }
 
 
 class Along:
@@ -479,6 +688,8 @@ class Along:
         # With linear controls in (x, w, u) of each step (N, 2n + 2m).
         self.pulled: Floats | None = None
         self.noise_differentiated = False
+        # Hessians of a further cost of controls, added to those of steps (N, 2n + m, 2n + m).
+        self.firm: Floats | None = None
 
     def beside(self, trajectory: Trajectory) -> Along:
         """Expansions of the cost along a motion close by, with the linearization of this one, which is one block."""
@@ -520,6 +731,25 @@ class Along:
         added = np.zeros((N, len(rule), x + m))
         added[:, 0] = np.linalg.solve(np.swapaxes(D, 1, 2), pull[:, :, None])[:, :, 0] / (problem.dt * rule[0, 0])
         self.added, self.noise_differentiated = added.reshape(-1, x + m), True
+
+    def with_cost_of_controls(self, diagonal: Floats, gradient: Floats | None = None) -> Along:
+        """These expansions with a further cost of the changes of decided controls: both (R, m)."""
+        made, problem, (R, m), x = copy(self), self.problem, diagonal.shape, self.states
+        made.firm = np.zeros((R * problem.hold, x + m, x + m))
+        entries = np.arange(x, x + m)
+        made.firm[:, entries, entries] = np.repeat(diagonal / problem.hold, problem.hold, axis=0)
+        if gradient is None:
+            return made
+        if problem.linear:
+            total = self.line.gradient.copy()
+            total[:, -m:] += gradient / problem.dt
+            vars(made)["line"] = self.line._replace(gradient=total)
+            return made
+        rule = problem.model_rule
+        added = np.zeros((problem.steps, len(rule), x + m))
+        added[:, 0, x:] = np.repeat(gradient / problem.hold, problem.hold, axis=0) / (problem.dt * rule[0, 0])
+        made.added = added.reshape(-1, x + m) if self.added is None else self.added + added.reshape(-1, x + m)
+        return made
 
     @property
     def slopes(self) -> Floats:
@@ -634,6 +864,8 @@ class Along:
 
     def steps(self, begin: int, end: int, curvature: Floats | None, limits: _Limits) -> core.ExpandedSteps:
         """The expansions of a block of steps for the core."""
+        if self.firm is not None:
+            curvature = self.firm if curvature is None else curvature + self.firm
         if self.problem.linear:
             return self._on_lines(curvature, limits)
         problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.model_rule)
@@ -691,7 +923,8 @@ def _pass(
 ) -> tuple[Plan | None, Floats]:
     """The plain recursion, or, where its rounding errors are large and the model is convex, that on square roots."""
     plain = _one_pass(along, regularization, costates, curvature, limits, roots=False)
-    if curvature is not None or (plain[0] is not None and plain[0].loss <= TRUSTED):
+    curved = curvature is not None or along.firm is not None
+    if curved or (plain[0] is not None and plain[0].loss <= TRUSTED):
         return plain
     by_roots = _one_pass(along, regularization, costates, None, limits, roots=True)
     return plain if by_roots[0] is None else by_roots
@@ -765,6 +998,7 @@ def _one_pass(
             control_gradient=gradient[rows],
             costate=costate[steps] if costates else costate,
             spread=spread[steps],
+            **limits.part(rows),
         )
         how = (problem.dt, problem.hold, float(regularization))
         if by_roots is None:
@@ -815,6 +1049,7 @@ def _one_pass_on_lines(
     line, k = along.line, problem.processes
     spread, costate = np.empty((R if k else 0, X, X)), np.empty((R if costates else 0, X))
     of_states = costate[1:, :x]
+    limits = _Limits(np.zeros((0, 2, m)), np.zeros((0, X + m))) if limits is None else limits
     gains = core.Gains(
         feedforward=feedforward,
         feedback=feedback,
@@ -822,8 +1057,9 @@ def _one_pass_on_lines(
         control_gradient=gradient,
         costate=costate,
         spread=spread,
+        **limits.part(slice(0, R)),
     )
-    steps = along.steps(0, R, curvature, limits or _Limits(np.zeros((0, 2, m)), np.zeros((0, X + m))))
+    steps = along.steps(0, R, curvature, limits)
     how = (problem.dt, 1, float(regularization))
     found: core.BackwardPass | core.RootPass
     if roots:
@@ -855,7 +1091,7 @@ def _one_pass_on_lines(
         noise,
         jumps,
         after,
-        limits is not None,
+        limits.slack.size > 0,
         found.loss,
         along.model,
     )

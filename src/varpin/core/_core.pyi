@@ -382,7 +382,9 @@ class Gains:
 
     ``feedforward`` (R, m), ``feedback`` (R, m, 2n), ``previous`` (R, m, m) on the previous control if its change has a
     cost, ``control_gradient`` (R, m) of the cost, ``costate`` (N, 2n), its gradient in the state after each step, empty
-    if not wanted, and ``spread`` (N, 2n, 2n), S, with noise only.
+    if not wanted, and ``spread`` (N, 2n, 2n), S, with noise only. On request ``stiffness`` (R, m), the diagonal of Quu
+    without regularization, and ``pressure`` (R, m), with limits only: the model's gradient in each control at the
+    decision within limits and its expected state, under the later gains.
     """
 
     def __init__(
@@ -394,6 +396,8 @@ class Gains:
         control_gradient: Floats,
         costate: Floats,
         spread: Floats,
+        stiffness: Floats | None = None,
+        pressure: Floats | None = None,
     ) -> None: ...
 
 class Squares:

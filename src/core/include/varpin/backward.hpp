@@ -253,8 +253,10 @@ class BackwardPass {
         solve_ldl(factors.data(), m, {0, m}, k, k);
         if (steps.slack) {
             const double* ahead = steps.expected ? steps.expected + r * size : nullptr;
-            if (!keep_within(steps.slack + r * 2 * m, ahead, rate, k)) return false;
+            double* pressure = gains.pressure ? gains.pressure + r * m : nullptr;
+            if (!keep_within(steps.slack + r * 2 * m, ahead, rate, k, pressure)) return false;
         }
+        for (int i = 0; gains.stiffness && i < m; ++i) gains.stiffness[r * m + i] = Q[x + i][x + i];
         for (int i = 0; i < m; ++i) {
             if (box.held[i]) continue;
             const double largest = std::max(terms[x + i] * terms[x + i], std::abs(Q[x + i][x + i]));
@@ -269,8 +271,9 @@ class BackwardPass {
     }
 
     // k within limits, (O4), at deviations `ahead` (2n + m) of the state and the previous control from the nominal
-    // ones, null for zero; the result applies at zero deviation again.
-    bool keep_within(const double* slack, const double* ahead, const double* rate, double* k) {
+    // ones, null for zero; the result applies at zero deviation again. Writes the gradient there into `pressure`,
+    // unless null.
+    bool keep_within(const double* slack, const double* ahead, const double* rate, double* k, double* pressure) {
         const double* Qu = Qz.data() + x;
         std::copy_n(Qu, m, pulled.data());
         if (ahead) {
@@ -283,6 +286,10 @@ class BackwardPass {
             solve_ldl(factors.data(), m, {0, m}, k, k);
         }
         if (!box.solve(Quu.data(), pulled.data(), slack, slack + m, k)) return false;
+        for (int i = 0; pressure && i < m; ++i) {
+            pressure[i] = pulled[i];
+            for (int j = 0; j < m; ++j) pressure[i] += Q[x + i][x + j] * k[j];
+        }
         factors = box.factors;
         if (!ahead) return true;
         for (int i = 0; i < m; ++i) {

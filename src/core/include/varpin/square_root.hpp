@@ -91,6 +91,7 @@ class RootPass {
           weight(m),
           Qu(m),
           pulled(m),
+          pressed(m),
           Ruu_k(m),
           forced(m),
           H(m * m),
@@ -288,6 +289,8 @@ class RootPass {
         const double* ahead = steps.expected ? steps.expected + r * size : nullptr;
         if (!minimize(steps.slack ? steps.slack + r * 2 * m : nullptr, ahead, others, k)) return false;
         for (int i = 0; i < m; ++i) {
+            if (gains.stiffness) gains.stiffness[r * m + i] = control_norm[i] * control_norm[i];
+            if (gains.pressure && steps.slack) gains.pressure[r * m + i] = pressed[i];
             std::copy_n(&K[i * others], x, gains.feedback + (r * m + i) * x);
             if (steps.rate) std::copy_n(&K[i * others + x], m, gains.previous + (r * m + i) * m);
             gains.control_gradient[r * m + i] = costate[x + i];
@@ -363,7 +366,15 @@ class RootPass {
                 for (int c = 0; c < others; ++c) pulled[i] += stack[l][i] * stack[l][m + c] * ahead[c];
             }
         }
-        return box.solve(H.data(), pulled.data(), slack, slack + m, k);
+        if (!box.solve(H.data(), pulled.data(), slack, slack + m, k)) return false;
+        for (int i = 0; i < m; ++i) {
+            pressed[i] = pulled[i];
+            for (int j = 0; j < m; ++j) {
+                // Without what the regularization adds.
+                for (int l = 0; l <= std::min(i, j); ++l) pressed[i] += stack[l][i] * stack[l][j] * k[j];
+            }
+        }
+        return true;
     }
 
     // Write the firm rows of the controls that are free to U, with those at a limit in the shift; returns their number.
@@ -478,7 +489,7 @@ class RootPass {
     // Work arrays of a decision.
     RowStack firm, U;                          // regularized rows of the controls; rows of the free controls
     std::vector<double> control_norm, weight;  // (m) norms of the controls' columns; regularization
-    std::vector<double> Qu, pulled;            // gradient; gradient at the expected state
+    std::vector<double> Qu, pulled, pressed;   // gradient; gradient at the expected state; the same at the minimum
     std::vector<double> Ruu_k, forced, H, K;   // R_uu k; U'^-1 linear; (m, m); (m, others)
     std::vector<int> free;
     BoxMinimum box;

@@ -60,6 +60,8 @@ struct Gains {
     double* control_gradient = nullptr;  // (R, m) gradient of the cost in each control
     double* costate = nullptr;           // (N, 2n) gradient of the cost after each step in the state there, or null
     double* spread = nullptr;            // (N, 2n, 2n) S, with noise only
+    double* stiffness = nullptr;         // (R, m) diagonal of Quu without regularization, or null
+    double* pressure = nullptr;          // (R, m) gradient of the model at the decision within limits, or null
 };
 
 // The linearized motion under the gains, each control clipped to its limits, from `state` (2n + m): the deviation of

@@ -69,7 +69,8 @@ class _WithinLimits(PlanConstraint):
         given = self._limits_of(robot) if limits is None else limits
         self.limits = named_limits(f"{name} limits", given, robot.joint_names, robot.dof)
         if not np.isfinite(self.limits).any():
-            raise InputError(f"{name}: robot {robot.name!r} has no such limits; give limits=(lower, upper)")
+            why = f"robot {robot.name!r} has no such limits" if limits is None else "all limits given are infinite"
+            raise InputError(f"{name}: {why}; give limits=(lower, upper) of which one is finite")
         self.margin = checked_margin(self, margin)
 
     @staticmethod

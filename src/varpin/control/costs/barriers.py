@@ -62,7 +62,8 @@ class _Barrier(TaskCost):
         super().__init__(robot, weight)
         self.limits = checked_limits(f"{name} limits", self._limits_of(robot) if limits is None else limits, self.size)
         if not np.isfinite(self.limits).any():
-            raise InputError(f"{name}: robot {robot.name!r} has no such limits; give limits=(lower, upper)")
+            why = f"robot {robot.name!r} has no such limits" if limits is None else "all limits given are infinite"
+            raise InputError(f"{name}: {why}; give limits=(lower, upper) of which one is finite")
         self.margin = joint_array(f"{name} margin", margin, robot.joint_names, uniform=True)
         if (self.margin < 0.0).any():
             raise InputError(f"{name} margin must be >= 0, got {self.margin.min():g}")
