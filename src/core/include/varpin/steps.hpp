@@ -60,6 +60,7 @@ struct Gains {
     double* control_gradient = nullptr;  // (R, m) gradient of the cost in each control
     double* costate = nullptr;           // (N, 2n) gradient of the cost after each step in the state there, or null
     double* spread = nullptr;            // (N, 2n, 2n) S, with noise only
+    double* factors = nullptr;           // (R, m, m) L D L' of the regularized Quu without limits, or null
 };
 
 // The linearized motion under the gains, each control clipped to its limits, from `state` (2n + m): the deviation of
