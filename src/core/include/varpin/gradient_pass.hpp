@@ -1,6 +1,6 @@
 // The backward pass again with other gradients of the cost: the feed-forward part alone, of the gains and factors of a
 // pass with the same dynamics and Hessians. Linear in the gradients, and O(n^2) a step where a pass takes O(n^3).
-// docs/mathematics.md, "The line search".
+// docs/mathematics.md, "The search".
 #pragma once
 
 #include <algorithm>
