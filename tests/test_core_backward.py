@@ -166,6 +166,50 @@ def test_both_passes_are_the_equations(dof, m, hold, options, k, regularization)
     np.testing.assert_allclose((roots.slope, roots.curvature, roots.noise), sums, rtol=1e-9)
 
 
+@pytest.mark.parametrize("regularization", [0.0, 0.3])
+@pytest.mark.parametrize(
+    ("dof", "m", "k", "hold", "options"),
+    [
+        (1, 1, 0, 1, {}),
+        (2, 3, 2, 3, {"velocity": False}),
+        (6, 6, 0, 1, {"samples": 1}),
+        (3, 2, 1, 3, {"rated": True}),
+        (3, 3, 1, 1, {"rated": True, "within": True}),
+    ],
+)
+def test_gradients_alone_give_the_feedforward_part_of_a_whole_pass(dof, m, k, hold, options, regularization):
+    given = random_steps(dof, m, k, seed=dof, hold=hold, **options)
+    gradient, hessian = terminal(2 * dof)
+    rng = np.random.default_rng(3)
+    other = {name: rng.normal(size=given[name].shape) for name in ("gradient", "pull")}
+    end = rng.normal(size=2 * dof)
+    right, _ = plainly(given | other, hold, regularization, end, hessian)
+    steps = core.ExpandedSteps(**given)
+    plain = core.BackwardPass(m, gradient, hessian)
+    roots = core.RootPass(m, squares_of(gradient[None], hessian[None]).core, gradient)
+    running, change = squares_of(given["gradient"], given["hessian"]), squares_of(given["pull"], given["rate"])
+    more = running.core, change.core, squares_of(np.zeros(given["within"].shape[:2]), given["within"]).core
+    for run, squares in ((plain, ()), (roots, more)):
+        ours = gains_for(given, hold) | {"factors": np.full((6 // hold, m, m), np.nan)}
+        gains = core.Gains(**ours)
+        assert run.run(H, hold, regularization, steps, gains, *squares) == -1
+        core.run_gradients(H, hold, regularization, core.ExpandedSteps(**given | other), gains, end)
+        close(ours, {"feedforward": right["feedforward"]}, 9)
+
+
+def test_gradients_alone_need_factors_and_no_limits():
+    given = random_steps(2, 2, 0, seed=3)
+    gains, end = core.Gains(**gains_for(given, 1)), np.zeros(4)
+    with refused(ValueError, "factors"):
+        core.run_gradients(H, 1, 0.0, core.ExpandedSteps(**given), gains, end)
+    gains = core.Gains(**gains_for(given, 1), factors=np.zeros((6, 2, 2)))
+    limited = core.ExpandedSteps(**given | {"slack": np.zeros((6, 2, 2))})
+    with refused(ValueError, "limits"):
+        core.run_gradients(H, 1, 0.0, limited, gains, end)
+    with refused(ValueError, ("terminal", "3", "4")):
+        core.run_gradients(H, 1, 0.0, core.ExpandedSteps(**given), gains, end[:3])
+
+
 def test_curvature_and_blocks():
     """Second derivatives are added, and two blocks of steps are one."""
     given = random_steps(3, 2, 1, seed=1, hold=2, curved=True)

@@ -512,7 +512,7 @@ def test_searches_that_correct_trials_go_on_as_if_not_interrupted(before):
 def test_a_correction_brings_a_poor_trial_close_to_the_cost_that_the_model_promises(iterations, monkeypatch):
     problem = steep_reach()
     part = vp.solve(problem, max_iterations=iterations, check=False)
-    monkeypatch.setattr(search._Search, "_corrects", True)
+    monkeypatch.setattr(search._Search, "_corrects", lambda *_: True)
     monkeypatch.setattr(search, "_CORRECTIONS", 1)
     at = search._Search(problem, second_order=False)
     at.resume(part.search)

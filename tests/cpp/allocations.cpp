@@ -12,6 +12,7 @@
 #include "varpin/constrained.hpp"
 #include "varpin/costs.hpp"
 #include "varpin/explicit.hpp"
+#include "varpin/gradient_pass.hpp"
 #include "varpin/linearization.hpp"
 #include "varpin/variational.hpp"
 
@@ -152,7 +153,7 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
     std::vector<double> gradient(N * size, 0.1), hessian(size * size), terminal(x, 1.0), terminal_hessian(x * x);
     for (int i = 0; i < size; ++i) hessian[i * size + i] = 1.0;
     for (int i = 0; i < x; ++i) terminal_hessian[i * x + i] = 1.0;
-    std::vector<double> k(N * n), K(N * n * x), slopes(N * n);
+    std::vector<double> k(N * n), K(N * n * x), slopes(N * n), factors(N * n * n);
     const varpin::ExpandedSteps steps{.steps = N,
                                       .dof = n,
                                       .controls = n,
@@ -165,7 +166,15 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
     varpin::BackwardPass pass(n, n, terminal.data(), terminal_hessian.data());
     right &= without_allocation("the backward pass", [&] {
         return pass.run(h, 1, 0.0, steps,
-                        {.feedforward = k.data(), .feedback = K.data(), .control_gradient = slopes.data()}) < 0;
+                        {.feedforward = k.data(),
+                         .feedback = K.data(),
+                         .control_gradient = slopes.data(),
+                         .factors = factors.data()}) < 0;
+    });
+    varpin::GradientPass gradients(n, n, terminal.data());
+    right &= without_allocation("the pass with gradients alone", [&] {
+        gradients.run(h, 1, 0.0, steps, {.feedforward = k.data(), .feedback = K.data(), .factors = factors.data()});
+        return true;
     });
     const varpin::Links links{mechanism.tree.bodies, n};
     const varpin::Placement tip{{{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}}, {1.0, 0.0, 0.0}};

@@ -10,6 +10,7 @@
 #include "arrays.hpp"
 #include "registrations.hpp"
 #include "varpin/box.hpp"
+#include "varpin/gradient_pass.hpp"
 #include "varpin/square_root.hpp"
 #include "varpin/steps.hpp"
 
@@ -98,7 +99,7 @@ struct HeldSteps {
 struct HeldGains {
     HeldGains(InOut<2> feedforward_, InOut<3> feedback_, InOut<3> previous_, InOut<2> control_gradient_,
               InOut<2> costate_, InOut<3> spread_, std::optional<InOut<2>> stiffness_,
-              std::optional<InOut<2>> pressure_)
+              std::optional<InOut<2>> pressure_, std::optional<InOut<3>> factors_)
         : feedforward(feedforward_),
           feedback(feedback_),
           previous(previous_),
@@ -106,7 +107,8 @@ struct HeldGains {
           costate(costate_),
           spread(spread_),
           stiffness(stiffness_),
-          pressure(pressure_) {}
+          pressure(pressure_),
+          factors(factors_) {}
 
     // Views, after a check that the arrays fit these steps, with each control held over `hold` of them.
     Gains fitting(const HeldSteps& held, int hold) const {
@@ -127,7 +129,8 @@ struct HeldGains {
                 .costate = given(costate, "costate", {N, x}) ? costate.data() : nullptr,
                 .spread = spread.data(),
                 .stiffness = stiffness && given(*stiffness, "stiffness", {R, m}) ? stiffness->data() : nullptr,
-                .pressure = pressure && given(*pressure, "pressure", {R, m}) ? pressure->data() : nullptr};
+                .pressure = pressure && given(*pressure, "pressure", {R, m}) ? pressure->data() : nullptr,
+                .factors = factors && given(*factors, "factors", {R, m, m}) ? factors->data() : nullptr};
     }
 
     InOut<2> feedforward;
@@ -135,6 +138,7 @@ struct HeldGains {
     InOut<2> control_gradient, costate;
     InOut<3> spread;
     std::optional<InOut<2>> stiffness, pressure;
+    std::optional<InOut<3>> factors;
 };
 
 void make_pass(BackwardPass* self, int controls, In<1> gradient, In<2> hessian) {
@@ -201,6 +205,18 @@ std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regulariz
     return pass.run(h, hold, regularization, steps, samples, changes, jumps, gains);
 }
 
+// The feed-forward parts of a pass again, with other gradients, from the gradient (2n) of the terminal cost.
+void run_gradients(double h, int hold, double regularization, const HeldSteps& given, const HeldGains& held,
+                   In<1> terminal) {
+    const ExpandedSteps& steps = given.steps;
+    require(terminal, "terminal", {static_cast<std::size_t>(steps.states())});
+    const Gains gains = held.fitting(given, hold);
+    if (!gains.factors) throw std::invalid_argument("gradients alone need the factors of a pass");
+    if (steps.slack) throw std::invalid_argument("gradients alone need a pass without limits");
+    nb::gil_scoped_release release;
+    GradientPass(steps.dof, steps.controls, terminal.data()).run(h, hold, regularization, steps, gains);
+}
+
 // The linearized motion under gains from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
 void foresee(int hold, const HeldSteps& given, const HeldGains& held, InOut<1> state, InOut<2> expected,
              InOut<2> moves) {
@@ -250,10 +266,11 @@ void register_backward(nb::module_& m) {
              "curvature"_a, "slack"_a, "expected"_a, "rate"_a, "pull"_a, "within"_a.none() = nb::none());
     nb::class_<HeldGains>(m, "Gains")
         .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>, std::optional<InOut<2>>,
-                      std::optional<InOut<2>>>(),
+                      std::optional<InOut<2>>, std::optional<InOut<3>>>(),
              nb::kw_only(), "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "previous"_a.noconvert(),
              "control_gradient"_a.noconvert(), "costate"_a.noconvert(), "spread"_a.noconvert(),
-             "stiffness"_a.noconvert().none() = nb::none(), "pressure"_a.noconvert().none() = nb::none());
+             "stiffness"_a.noconvert().none() = nb::none(), "pressure"_a.noconvert().none() = nb::none(),
+             "factors"_a.noconvert().none() = nb::none());
     nb::class_<HeldSquares>(m, "Squares").def(nb::init<In<3>, In<2>, In<2>>(), "root"_a, "shift"_a, "linear"_a);
     auto pass = nb::class_<BackwardPass>(m, "BackwardPass");
     pass.def("__init__", &make_pass, "controls"_a, "gradient"_a, "hessian"_a)
@@ -264,6 +281,7 @@ void register_backward(nb::module_& m) {
         .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a,
              "change"_a.none() = nb::none(), "within"_a.none() = nb::none());
     define_results(root_pass);
+    m.def("run_gradients", &run_gradients, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "terminal"_a);
     m.def("foresee", &foresee, "hold"_a, "steps"_a, "gains"_a, "state"_a.noconvert(), "expected"_a.noconvert(),
           "moves"_a.noconvert());
     m.def("box_minimum", &box_minimum, "H"_a, "g"_a, "limits"_a, "guess"_a);

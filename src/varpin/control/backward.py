@@ -81,6 +81,7 @@ class Plan:
     limited: bool
     loss: float  # estimated relative rounding error of Quu, or of its root
     model: Model  # of the cost along the motion
+    factors: Floats | None  # (R, m, m) L D L' of the regularized Quu, without limits and along motions of one block
     left: Floats | None = None  # (R, m) the model's gradient after a full step, which presses controls against limits
 
     @property
@@ -210,6 +211,30 @@ def backward(
     return _foreseeing(along, regularization, curvature if damping is None else curvature + damping)
 
 
+def feedforward_beside(along: Along, plan: Plan, regularization: float, trajectory: Trajectory) -> Floats:
+    """The feed-forward part (R, m) of a plan around a motion close to its own, of which it has ``factors``.
+
+    The cost's gradients are those along the motion close by; its Hessians, those of the dynamics and the gains are the
+    plan's.
+    """
+    problem, m = along.problem, along.problem.scene.controls
+    terminal, x = along.terminal, along.states
+    end = problem.expand_terminal(trajectory).gradient[0, :x]
+    feedforward = np.empty_like(plan.feedforward)
+    gains = core.Gains(
+        feedforward=feedforward,
+        feedback=plan.feedback,
+        previous=np.zeros((0, m, m)) if plan.previous is None else plan.previous,
+        control_gradient=plan.gradient,
+        costate=np.zeros((0, x)),
+        spread=plan.spread,
+        factors=plan.factors,
+    )
+    steps = along.beside(trajectory).steps(0, problem.steps, None, _without_limits(m, x))
+    core.run_gradients(problem.dt, problem.hold, regularization, steps, gains, terminal.slopes.T @ end)
+    return feedforward
+
+
 def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
     """The pass with the penalties that are active on the linearized motion.
 
@@ -243,7 +268,7 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
             break
     if best is None:
         return _within_limits(along, regularization, curvature)
-    return replace(best, model=along.model)
+    return replace(best, model=along.model, factors=None)
 
 
 class _Rows:
@@ -663,6 +688,10 @@ class _Limits(NamedTuple):
         }
 
 
+def _without_limits(controls: int, states: int) -> _Limits:
+    return _Limits(np.zeros((0, 2, controls)), np.zeros((0, states + controls)))
+
+
 class Along:
     """Expansions along a motion that all its passes share; the linearization is kept where it is one block."""
 
@@ -692,15 +721,11 @@ class Along:
         self.firm: Floats | None = None
 
     def beside(self, trajectory: Trajectory) -> Along:
-        """Expansions of the cost along a motion close by, with the linearization of this one, which is one block."""
+        """The expansions with the gradients of the running cost along a motion close by."""
         made, problem = copy(self), self.problem
-        made.trajectory, made.kept = trajectory, self.linearized(0, problem.steps)
-        for name in ("running", "within", "stake", "model", "terminal", "line", "demands"):
-            vars(made).pop(name, None)
+        made.running = Expansion(problem.expand_running(trajectory).gradient, self.running.hessian)
         if problem.rate is not None:
-            made.pull, made.rate = problem.rate.expand(problem.decided(trajectory), problem.period)
-        if problem.limited:
-            made.slack = problem.control_limits - problem.decided(trajectory)[:, None]
+            made.pull, _ = problem.rate.expand(problem.decided(trajectory), problem.period)
         return made
 
     @cached_property
@@ -982,8 +1007,11 @@ def _one_pass(
         if final is None or squares is None or change is None or (within is None and along.within is not None):
             return None, costate
         by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change, within)
+    factors = None
     if limits is None:
-        limits = _Limits(np.zeros((0, 2, m)), np.zeros((0, 2 * n + m)))
+        limits = _without_limits(m, 2 * n)
+        if len(along.blocks) == 1:
+            factors = np.empty((R, m, m))
     samples = len(problem.model_rule)
     for begin, end in reversed(along.blocks):
         steps, points = slice(begin, end), slice(begin * samples, end * samples)
@@ -998,6 +1026,7 @@ def _one_pass(
             control_gradient=gradient[rows],
             costate=costate[steps] if costates else costate,
             spread=spread[steps],
+            factors=factors,
             **limits.part(rows),
         )
         how = (problem.dt, problem.hold, float(regularization))
@@ -1025,6 +1054,7 @@ def _one_pass(
         limits.slack.size > 0,
         found.loss,
         along.model,
+        factors,
     )
     return plan, costate
 
@@ -1059,7 +1089,7 @@ def _one_pass_on_lines(
         spread=spread,
         **limits.part(slice(0, R)),
     )
-    steps = along.steps(0, R, curvature, limits)
+    steps = along.steps(0, R, curvature, limits or _without_limits(m, X))
     how = (problem.dt, 1, float(regularization))
     found: core.BackwardPass | core.RootPass
     if roots:
@@ -1094,6 +1124,7 @@ def _one_pass_on_lines(
         limits.slack.size > 0,
         found.loss,
         along.model,
+        None,
     )
     return plan, of_states
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.control.backward import Along, Plan, backward, noise_shares
+from varpin.control.backward import Along, Plan, backward, feedforward_beside, noise_shares
 from varpin.control.commands import controls_along, first_commands, shifted_commands, with_feedback
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
@@ -1058,31 +1058,26 @@ class _Search:
     ) -> tuple[_Trial, int, float]:
         """A poor trial moved towards the motion that the plan's model has there.
 
-        A correction is a Newton step with the derivatives of the dynamics along the current motion, and those of the
-        cost along the trial. It removes what the curvature of motions adds to steep costs, such as those of the end.
+        A correction is a Newton step with the cost's gradients along the trial, and the second derivatives of the cost
+        and the first of the dynamics along the current motion. It removes what the curvature of motions adds to steep
+        costs, such as those of the end.
 
         Returns:
             The trial, the number of further trials, and the longest step of the line search to correct from now on.
         """
         trials, longest, most = 0, np.inf, -_FAR * step * plan.slope
-        while trials < _CORRECTIONS and trial.motion is not None and trial.expected <= most and self._corrects:
+        while trials < _CORRECTIONS and trial.motion is not None and trial.expected <= most and self._corrects(plan):
             motion = trial.motion.trajectory()
-            beside = self.along.beside(motion)
-            try:
-                there = backward(self.problem, motion, self.regularization, along=beside, clipped=self.clipping)
-            except _TRIAL_ERRORS:
-                break
-            if there is None:
-                break
-            # The plan there also has what this plan has left.
-            change = there.feedforward - (1.0 - step) * plan.feedforward
+            # Around the trial, the plan also has what it has left.
+            there = feedforward_beside(self.along, plan, self.regularization, motion)
+            change = there - (1.0 - step) * plan.feedforward
             size = _relative(change, step * plan.feedforward)
             if not _SMALLEST <= size <= _LARGEST:
                 # The size is about proportional to the step.
                 longest = step * _LARGEST / size if size > _LARGEST else 0.0
                 break
-            around = here._replace(feedback=with_feedback(self.problem, motion, there, closed=True))
-            more = self._run(step, self.problem.decided(motion) + change, plan, around, bounds)
+            around = here._replace(feedback=with_feedback(self.problem, motion, plan, closed=True))
+            more = self._run(step, around.feedback.u + change, plan, around, bounds)
             trials += 1
             if not more.expected < trial.expected:
                 break
@@ -1091,11 +1086,10 @@ class _Search:
                 break
         return trial, trials, longest
 
-    @property
-    def _corrects(self) -> bool:
-        """Whether poor trials are corrected: after short steps, along motions of one block, with first derivatives."""
+    def _corrects(self, plan: Plan) -> bool:
+        """Whether poor trials are corrected: after short steps, with first derivatives, where no control is held."""
         special = self.exact or self.whole or self.saturated or self.forward != "closed"
-        if special or not self.anew or len(self.along.blocks) > 1:
+        if special or not self.anew or plan.factors is None:
             return False
         return any(_TINY < item.step <= _BENT for item in self.history[-2:])
 

@@ -37,6 +37,7 @@ from varpin.core._core import inside_bounds as inside_bounds
 from varpin.core._core import linearize_explicit as linearize_explicit
 from varpin.core._core import longest_alternation as longest_alternation
 from varpin.core._core import pulls_fast as pulls_fast
+from varpin.core._core import run_gradients as run_gradients
 from varpin.core._core import sample_steps as sample_steps
 from varpin.core._core import stake_of as stake_of
 from varpin.core._core import variational_bends as variational_bends

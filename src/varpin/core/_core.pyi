@@ -384,7 +384,8 @@ class Gains:
     cost, ``control_gradient`` (R, m) of the cost, ``costate`` (N, 2n), its gradient in the state after each step, empty
     if not wanted, and ``spread`` (N, 2n, 2n), S, with noise only. On request ``stiffness`` (R, m), the diagonal of Quu
     without regularization, and ``pressure`` (R, m), with limits only: the model's gradient in each control at the
-    decision within limits and its expected state, under the later gains.
+    decision within limits and its expected state, under the later gains, and ``factors`` (R, m, m), L D L' of the
+    regularized Quu, of passes without limits.
     """
 
     def __init__(
@@ -398,6 +399,7 @@ class Gains:
         spread: Floats,
         stiffness: Floats | None = None,
         pressure: Floats | None = None,
+        factors: Floats | None = None,
     ) -> None: ...
 
 class Squares:
@@ -448,6 +450,15 @@ class RootPass(_Found):
 
         ``within`` has those of the noise's jumps where the steps have them.
         """
+
+def run_gradients(
+    h: float, hold: int, regularization: float, steps: ExpandedSteps, gains: Gains, terminal: Floats
+) -> None:
+    """The feed-forward part of a pass without limits, again with other gradients of the cost.
+
+    ``terminal`` (2n,) is that of the terminal cost in x. Overwrites the feed-forward part of ``gains``, whose other
+    arrays are those of the pass.
+    """
 
 def foresee(hold: int, steps: ExpandedSteps, gains: Gains, state: Floats, expected: Floats, moves: Floats) -> None:
     """The linearized motion under gains, each control clipped to its limits.

@@ -264,6 +264,7 @@ class BackwardPass {
         }
         find_feedback();
         for (int i = 0; i < m; ++i) std::copy_n(K[i], x, gains.feedback + (r * m + i) * x);
+        if (gains.factors) std::copy_n(factors.begin(), m * m, gains.factors + r * m * m);
         std::copy_n(Cz.begin() + x, m, gains.control_gradient + r * m);
         minimized_value(k);
         if (rate) value_of_previous(rate, pull, k, gains.previous + r * m * m);

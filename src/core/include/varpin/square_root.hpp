@@ -299,6 +299,7 @@ class RootPass {
             found.slope += Qu[i] * k[i];
             found.curvature += Ruu_k[i] * Ruu_k[i];
         }
+        if (gains.factors) write_factors(gains.factors + r * m * m);
         // The rest of the controls' rows; zero up to rounding without regularization and limits.
         const bool whole = regular && std::none_of(box.held.begin(), box.held.end(), [](char held) { return held; });
         minimized_value(others, !whole);
@@ -408,6 +409,14 @@ class RootPass {
                     std::max(found.loss, epsilon * std::max(scale[x + control], control_norm[control]) / pivot);
         }
         return true;
+    }
+
+    // L D L' of the regularized Quu from its root U, where all controls are free.
+    void write_factors(double* factors) {
+        for (int i = 0; i < m; ++i) {
+            factors[i * m + i] = U[i][i] * U[i][i];
+            for (int j = i + 1; j < m; ++j) factors[j * m + i] = U[i][j] / U[i][i];
+        }
     }
 
     // k and K of the free controls: U (k, K) = -(U_shift + U'^-1 linear, U_others).

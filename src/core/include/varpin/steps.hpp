@@ -62,6 +62,7 @@ struct Gains {
     double* spread = nullptr;            // (N, 2n, 2n) S, with noise only
     double* stiffness = nullptr;         // (R, m) diagonal of Quu without regularization, or null
     double* pressure = nullptr;          // (R, m) gradient of the model at the decision within limits, or null
+    double* factors = nullptr;           // (R, m, m) L D L' of the regularized Quu without limits, or null
 };
 
 // The linearized motion under the gains, each control clipped to its limits, from `state` (2n + m): the deviation of
