@@ -202,6 +202,20 @@ def test_bounds_that_are_nearly_met_count_in_the_conditions_of_an_optimum():
     assert np.abs(left).max() <= 1e-6 * np.abs(shares).sum(axis=1).max()
 
 
+def test_multipliers_of_more_rows_than_controls():
+    """The conditions of the least of a quadratic form, where rows depend on each other and most are met."""
+    rng = np.random.default_rng(0)
+    ways = rng.normal(size=(120, 30))
+    equal = np.arange(120) % 40 == 0
+    S, d = ways @ ways.T, ways @ rng.normal(size=30) - 1e-3 * rng.uniform(size=120)
+    x = polish._least(S.copy(), d.copy(), equal, np.ones(120, dtype=bool))
+    slope = S @ x - d
+    assert (x[~equal] >= 0.0).all()
+    assert np.abs(slope[equal | (x > 0.0)]).max() <= 1e-8
+    assert slope.min() >= -1e-8
+    assert 0 < (x[~equal] > 0.0).sum() < 30
+
+
 def test_conditions_of_an_optimum_hold_after_the_last_step():
     """A goal, and speeds at their limits: a last step with the least change of the controls would spoil the optimum."""
     robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.0})

@@ -481,8 +481,10 @@ class _Rounds:
         closing = (
             f"constraints hold to {plan.violation:.1e}, and within them the cost would fall by {found.decrease:.1e}"
         )
-        if kept.status is Status.CONVERGED and (self._clearly_beyond(plan) or not found.decrease <= bound):
-            plan = replace(plan, status=Status.STALLED)
+        if kept.status in (Status.CONVERGED, Status.STALLED):
+            # The decrease is a bound, whatever the multipliers, and the search may have stalled at a finer tolerance.
+            there = found.decrease <= bound and not self._clearly_beyond(plan)
+            plan = replace(plan, status=Status.CONVERGED if there else Status.STALLED)
         return plan, closing
 
     def _clearly_beyond(self, plan: Solution) -> bool:

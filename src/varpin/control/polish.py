@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
@@ -35,6 +36,8 @@ _DONE, _FLAT = 1e-12, 1e-13
 # Lengths of the part of a step along the constraints: its model is without second derivatives of the dynamics and of
 # the constraints. The part onto the constraints is whole.
 _LENGTHS = (1.0, 0.5, 0.25, 0.0)
+# Greatest number of steps onto the constraints that follow one along them.
+_CORRECTIONS = 2
 # Violation that steps along the constraints may cause; the next one removes it.
 _TRANSIENT = 1e-9
 # Distance from its bound at which a row counts as met, relative to the constraint's scale.
@@ -45,8 +48,8 @@ _CLOSE = 1e-4
 _LITTLE, _ROUNDED = 1e-13, 1e-12
 # Least size of a control, relative to the largest one.
 _SMALL = 1e-3
-# Pivots of the dual problem: of whole blocks without progress before single ones, and least number in all.
-_TRIES, _PIVOTS = 3, 50
+# Pivots of the dual problem: of whole blocks without progress, and greatest number of single ones for each row.
+_TRIES, _PIVOTS = 4, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +108,13 @@ def polished(
         step.solve()
         # Where the model's curvature is too small, it is so in the next step, too.
         for length in (item for item in _LENGTHS if item <= (longest if left >= _LAST else 0.0)):
-            attempt = trials.attempt(step.commands(length))
-            if not attempt.whole:
-                continue
-            after = _Step(problem, attempt.trajectory(), weights, backoff, step.multipliers, step.free)
-            if _closer(after.found, step.found, length):
+            after = step.after(trials, length)
+            for _ in range(_CORRECTIONS if length > 0.0 else 0):
+                if after is None or after.found.violation <= max(step.found.violation, _TRANSIENT):
+                    break
+                after.solve()
+                after = after.after(trials, 0.0)
+            if after is not None and _closer(after.found, step.found, length):
                 step, longest = after, length or longest
                 break
         else:
@@ -117,11 +122,11 @@ def polished(
     return replace(step.found, multipliers=step.least_slope())
 
 
-def _closer(one: Polished, other: Polished, length: float) -> bool:
+def _closer(after: Polished, before: Polished, length: float) -> bool:
     """Whether a motion is closer to the KKT conditions than another one, from which it is a step of given length."""
     if length == 0.0:
-        return one.violation < other.violation
-    return one.decrease < other.decrease and one.violation <= max(other.violation, _TRANSIENT)
+        return after.violation < before.violation
+    return after.decrease < before.decrease and after.violation <= max(before.violation, _TRANSIENT)
 
 
 class _Step:
@@ -146,6 +151,7 @@ class _Step:
         free: Mask,
     ) -> None:
         self.problem, self.motion, self.free, self.multipliers = problem, motion, free, multipliers
+        self.weights, self.backoff = weights, backoff
         self.bound = problem.bound_constraints
         u = problem.control_rows(motion)
         self.c = [item.value(motion.q, motion.v, u) + b for item, b in zip(self.bound, backoff, strict=True)]
@@ -168,9 +174,8 @@ class _Step:
         met = self.rows
         room = [np.where(rows, 0.0, c) for rows, c in zip(met, self.c, strict=True)]
         self.rows = [rows | (c > -_CLOSE * item.scale) for rows, (item, c) in zip(met, self._values(), strict=True)]
-        multipliers, pull = self._dual(room, np.zeros(self.free.shape))
+        multipliers, pull = self._dual(room, np.zeros(self.free.shape), loop.gradient)
         self.rows = met
-        self.tangent = -np.einsum("kij,kj->ki", loop.inverse, pull)
         u, (lower, upper) = problem.decided(motion), problem.control_limits
         # A control at its limit is free again where the cost decreases inwards.
         self.inwards = ~self.free & (((u <= lower) & (pull < 0.0)) | ((u >= upper) & (pull > 0.0)))
@@ -184,7 +189,7 @@ class _Step:
         """Each constraint with its values (K, rows)."""
         return zip(self.bound, self.c, strict=True)
 
-    def _dual(self, values: list[Floats], ahead: Floats) -> tuple[list[Floats], Floats]:
+    def _dual(self, values: list[Floats], ahead: Floats, gradient: Floats) -> tuple[list[Floats], Floats]:
         """Multipliers (K, rows) of the step for constraints' ``values``, and the pull g + G' lambda (R, m).
 
         ``ahead`` (R, m) are given changes of the controls that are not free.
@@ -195,8 +200,8 @@ class _Step:
         equal, active = self._kinds(self.rows)
         flat = G.reshape(len(G), loop.gradient.size)
         weighed = np.einsum("akm,kmi->aki", G, loop.inverse).reshape(flat.shape)
-        found = _least(weighed @ flat.T, c + flat @ ahead.ravel() - weighed @ loop.gradient.ravel(), equal, active)
-        return _in_rows(found, self.rows), loop.gradient + np.einsum("akm,a->km", G, found)
+        found = _least(weighed @ flat.T, c + flat @ ahead.ravel() - weighed @ gradient.ravel(), equal, active)
+        return _in_rows(found, self.rows), gradient + np.einsum("akm,a->km", G, found)
 
     def least_slope(self) -> list[Floats]:
         """Multipliers (K, rows) with which the Lagrangian's gradient in the free controls is least.
@@ -237,7 +242,7 @@ class _Step:
             loop.close(self.free)
         for _ in range(_PASSES):
             fixed = np.where(self.free, 0.0, self.ahead)
-            self.multipliers, pull = self._dual(self.c, fixed)
+            self.multipliers, pull = self._dual(self.c, fixed, loop.gradient)
             self.ahead = fixed - np.einsum("kij,kj->ki", loop.inverse, pull)
             response, change = loop.response(self.ahead)
             beyond = self.free & ((u + change < lower) | (u + change > upper))
@@ -254,17 +259,27 @@ class _Step:
             if all(np.array_equal(a, b) for a, b in zip(met, self.rows, strict=True)) or self._crowded(met):
                 break
             self.rows = met
+        # The least step onto the constraints alone.
+        _, pull = self._dual(self.c, np.zeros(u.shape), np.zeros(u.shape))
+        self.onto = -np.einsum("kij,kj->ki", loop.inverse, pull)
 
     def _crowded(self, met: list[Mask]) -> bool:
         """Whether there are more rows than controls that could meet them, with rows between nodes among them."""
         between = any(isinstance(item, BoundBetween) for item in self.bound)
         return between and sum(int(rows.sum()) for rows in met) > self.free.size
 
-    def commands(self, length: float) -> Commands:
+    def after(self, trials: Trials, length: float) -> _Step | None:
+        """The next step, after ``length`` of this one's part along the constraints; None where the motion fails."""
+        attempt = trials.attempt(self._commands(length))
+        if not attempt.whole:
+            return None
+        return _Step(self.problem, attempt.trajectory(), self.weights, self.backoff, self.multipliers, self.free)
+
+    def _commands(self, length: float) -> Commands:
         """The commands of the motion after the step, ``length`` of its part along the constraints, with feedback."""
         problem, loop = self.problem, self.loop
         u = problem.decided(self.motion)
-        response, change = loop.response(self.ahead - (1.0 - length) * np.where(self.free, self.tangent, 0.0))
+        response, change = loop.response(length * self.ahead + (1.0 - length) * self.onto)
         gains, reference = loop.gains, (states(problem, self.motion) + response)[: -1 : problem.hold]
         after = u + change
         if problem.linear:
@@ -305,14 +320,16 @@ def _least(S: Floats, d: Floats, equal: Mask, active: Mask) -> Floats:
 
     Block principal pivoting, after Portugal, Judice and Vicente, "A comparison of block pivoting and interior-point
     algorithms for linear least squares problems with nonnegative variables" (1994). Begins with the ``active`` rows.
+    Where that does not progress, as with more rows than controls that could meet them, the algorithm of Lawson and
+    Hanson on the Cholesky factor, which has half the digits of S to lose.
     """
     length = np.sqrt(np.maximum(np.diagonal(S), 0.0))
     length = np.where(length > 0.0, length, 1.0)
     S, d = S / np.outer(length, length), d / length
     S[np.diag_indices(len(S))] += _LITTLE * len(S)
-    active, x = active | equal, np.zeros(len(d))
+    active = active | equal
     least, tries = len(d) + 1, _TRIES
-    for _ in range(_PIVOTS + 2 * len(d)):
+    while tries:
         x = np.zeros(len(d))
         x[active] = np.linalg.solve(S[np.ix_(active, active)], d[active])
         y = S @ x - d
@@ -321,15 +338,25 @@ def _least(S: Floats, d: Floats, equal: Mask, active: Mask) -> Floats:
         count = int(wrong.sum())
         if not count:
             break
-        if count < least:
-            least, tries = count, _TRIES
-        elif tries:
-            tries -= 1
-        else:
-            # One at a time, which ends surely.
-            wrong = np.arange(len(d)) == np.flatnonzero(wrong)[-1]
-        active = active ^ wrong
+        tries = _TRIES if count < least else tries - 1
+        least, active = min(least, count), active ^ wrong
+    else:
+        x = _nonnegative(S, d, equal)
     found: Floats = np.where(equal, x, np.maximum(x, 0.0)) / length
+    return found
+
+
+def _nonnegative(S: Floats, d: Floats, equal: Mask) -> Floats:
+    """The x (a,) of :func:`_least` as nonnegative least squares, with the unknowns of equalities eliminated first."""
+    order = np.argsort(~equal, kind="stable")
+    first = int(equal.sum())
+    upper = np.linalg.cholesky(S[np.ix_(order, order)]).T
+    goal = scipy.linalg.solve_triangular(upper, d[order], trans="T")
+    x = np.zeros(len(d))
+    x[first:] = scipy.optimize.nnls(upper[first:, first:], goal[first:], maxiter=_PIVOTS * len(d))[0]
+    x[:first] = scipy.linalg.solve_triangular(upper[:first, :first], goal[:first] - upper[:first, first:] @ x[first:])
+    found = np.empty(len(d))
+    found[order] = x
     return found
 
 
