@@ -6,6 +6,7 @@ from findings import about
 from scipy.optimize import minimize
 
 import varpin as vp
+from varpin.control.between_nodes import Instants, enforced
 
 N = 8
 ROBOT = vp.planar_chain(2)
@@ -220,6 +221,32 @@ def test_scipy_finds_no_less_within_speeds_between_nodes():
         constraints=rules, options={"maxiter": 50, "ftol": 1e-10},
     )  # fmt: skip
     assert abs(best.fun - plan.cost) <= 1e-4 * plan.cost
+
+
+@pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.RungeKutta4()], ids=repr)
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_derivatives_of_rows_between_nodes(controls, integrator):
+    """Beside central differences of the rows, which are those of a motion of the step in eighths."""
+    robot, rng = vp.planar_chain(2), np.random.default_rng(0)
+    problem = reach(robot, 0.6, dt=0.1, steps=4, controls=controls, integrator=integrator)
+    rows = np.array([[0, 0, 0], [0, 1, 3], [0, 1, 6], [0, 3, 2]])
+    offsets = np.zeros(16)
+    bound = enforced(problem, Instants(rows, offsets)).bound_constraints[1]
+    shape = (5, 2), (5, 2), (5 if problem.linear else 4, 2)
+    at, way = ([rng.normal(size=size) for size in shape] for _ in range(2))
+    q, v, u = at
+    lines = vp.FirstOrderHold(u[1:3]).refined(8) if problem.linear else np.tile(u[1], (8, 1))
+    given = {"dt": 0.1 / 8, "steps": 8, "controls": lines, "integrator": integrator, "check": False}
+    motion = vp.simulate(problem.scene, q[1], v[1], **given)
+    speeds = np.abs(motion.v[[4, 7]])
+    np.testing.assert_allclose(bound.value(*at)[1:3].reshape(2, 2, 2).max(axis=1), speeds - 0.6, atol=1e-12)
+    after, before = (bound.value(*(x + size * dx for x, dx in zip(at, way, strict=True))) for size in (1e-5, -1e-5))
+    slopes = bound.slopes(*at)
+    dq, dv, du = way
+    ends = [du[slopes.nodes], du[slopes.nodes + 1]] if problem.linear else [du[slopes.nodes]]
+    moved = np.concatenate([dq[slopes.nodes], dv[slopes.nodes], *ends], axis=1)
+    found = np.einsum("krz,kz->kr", slopes.in_step(), moved)
+    np.testing.assert_allclose(found, (after - before) / 2e-5, rtol=1e-6, atol=1e-7)
 
 
 def test_rounds_with_rows_between_nodes_go_on_where_they_stopped(tmp_path):

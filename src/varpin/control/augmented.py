@@ -390,7 +390,7 @@ class _Rounds:
         assert known is not None
         values = split(self.bound, known.values)
         if not self.problem.linear or (ended is None and not len(before.rows)):
-            # Under held controls motions between nodes are close to them, or too fast for a cubic.
+            # Motions under held controls stay closer to their nodes.
             return False
         if ended is not None:
             if begun.round + 1 >= _BETWEEN or ended not in (Status.CONVERGED, Status.STALLED):

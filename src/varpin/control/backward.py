@@ -32,7 +32,7 @@ from varpin.control.linear_controls import (
     with_pull,
 )
 from varpin.control.moments import noise_gradient
-from varpin.control.penalties import PenalizedProblem, PenalizedRate, flat, rate_columns
+from varpin.control.penalties import PenalizedProblem, PenalizedRate, controls_of_steps, flat, rate_columns
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.spread import Feedback, state_slopes
 from varpin.control.square_root import Squares, squares_of
@@ -285,7 +285,7 @@ class _Rows:
         self.unpenalized = problem.expand_cost(motion)
         self.signed = [item.signed(item.bound.value(q, v, u)) for item in self.penalties]
         self.begun = [item.held(s) for item, s in zip(self.penalties, self.signed, strict=True)]
-        self.jacobians = [item.bound.jacobian(q, v) for item in self.of_nodes]
+        self.slopes = [item.bound.slopes(q, v, u) for item in self.of_nodes]
         # The present point of the steps to the model's minimum: its rows, and the change of the cost without penalties.
         self.at, self.cost = self.signed, 0.0
         # Changes of controls and states at this point, and the model's slope from its start in that direction.
@@ -296,9 +296,7 @@ class _Rows:
         slopes = np.tile(np.eye(2 * n), (len(q), 1, 1))
         if problem.integrator.variational:
             slopes[:, n:] = velocity
-        self.by_state = [
-            [(nodes, J @ slopes[nodes]) for nodes, J in item.bound.of_nodes(q, v)] for item in self.of_nodes
-        ]
+        self.by_state = [found.by_state @ slopes[found.nodes] for found in self.slopes]
 
     def along(self, held: list[Mask]) -> Along:
         """Expansions for a pass with the active rows ``held``."""
@@ -306,7 +304,7 @@ class _Rows:
         for name in ("model", "line"):
             vars(passing).pop(name, None)
         count = len(self.of_nodes)
-        passing.running = self.problem.with_held(self.unpenalized, self.signed[:count], self.jacobians, held[:count])
+        passing.running = self.problem.with_held(self.unpenalized, self.signed[:count], self.slopes, held[:count])
         rate = self.problem.rate
         if isinstance(rate, PenalizedRate):
             u = self.problem.decided(self.whole.trajectory)
@@ -330,10 +328,12 @@ class _Rows:
         # With linear controls the first step is the one that sets the first control.
         states = states[len(A) - problem.steps :, :x]
         self.ahead_of = states, moves
-        found = [
-            s + sum(np.einsum("krx,kx->kr", J, states[nodes]) for nodes, J in parts)
-            for s, parts in zip(self.signed[: len(self.of_nodes)], self.by_state, strict=True)
-        ]
+        found = []
+        for s, J, rows in zip(self.signed[: len(self.of_nodes)], self.by_state, self.slopes, strict=True):
+            after = s + np.einsum("krx,kx->kr", J, states[rows.nodes])
+            if rows.by_controls.size:
+                after += np.einsum("krc,kc->kr", rows.by_controls, controls_of_steps(problem, moves, rows.nodes))
+            found.append(after)
         for item, s in zip(self.of_rate, self.signed[len(self.of_nodes) :], strict=True):
             bound = item.bound
             rate = np.diff(moves, axis=0, prepend=np.zeros_like(moves[:1])) / problem.period
@@ -830,7 +830,7 @@ class Along:
     def line(self) -> LinearSteps:
         """The steps with the control in the state, where controls are linear between nodes."""
         problem, found, lines = self.problem, self.running, self.of_lines
-        steps = linear_steps(problem, lines, found.gradient, found.hessian, self.rate, self.pull)
+        steps = linear_steps(problem, lines, found, self.rate, self.pull)
         if problem.processes:
             x = lines.A.shape[1]
             kicked = after_impulse(problem.model_rule, found.hessian, lines.velocity, problem.steps, x, problem.dt)

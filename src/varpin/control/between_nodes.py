@@ -1,8 +1,8 @@
 """Constraints of a plan between its nodes: where the motion violates them, and rows that forbid it there.
 
-A row is at one of a few instants of a step. Its value is that of the cubic through the nodes, as a function of these,
-plus an offset, the difference to the motion itself. So its derivatives are those of the cubic, and its value, once
-the offset is that of the plan, is exact.
+A row is at one of a few instants of a step, the ends of equal parts of it. Its value, and its derivatives in the state
+before the step and the controls over it, are those of the motion integrated in these parts. An offset is added where
+the motion has a peak between two instants.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.control.constraints import BoundBetween, BoundConstraint, Horizon, PlanConstraint
-from varpin.control.problem import OptimalControlProblem, cubics
-from varpin.integrators.base import open_line, open_loop
-from varpin.mechanics.forces import limited_servos
-from varpin.simulation.record import rollout
+from varpin.control.parts import Parts
+from varpin.control.problem import OptimalControlProblem
+from varpin.mechanics.scene import quiet
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
@@ -27,6 +26,8 @@ SHARES: Floats = np.arange(1, _PARTS) / _PARTS
 SHARES.setflags(write=False)
 # Violation of the start from which on a row cannot hold in the first step.
 _OUTSIDE = 1e-6
+# Change of an offset between rounds up to which it is halved, relative to the constraint's scale.
+_SAME = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +81,12 @@ def _bound(problem: OptimalControlProblem, constraint: int, rows: Integers) -> B
     times = problem.t0 + problem.dt * (steps + SHARES[samples])
     inner = _at_times(problem, of_nodes.source, times)
     zeros = np.zeros((len(times), len(of_nodes.rows)))
-    rule = cubics(SHARES, problem.dt)[samples]
     given = of_nodes.source, steps + 1, times, of_nodes.rows, of_nodes.unit, of_nodes.scale
-    return BoundBetween(*given, inner, SHARES, samples, rule, zeros)
+    return BoundBetween(*given, inner, _parts(problem), samples, zeros)
+
+
+def _parts(problem: OptimalControlProblem) -> Parts:
+    return Parts(quiet(problem.scene), problem.integrator, problem.dt, _PARTS, problem.linear)
 
 
 def _at_times(problem: OptimalControlProblem, constraint: PlanConstraint, times: Floats) -> BoundConstraint:
@@ -108,7 +112,9 @@ def seen(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats | No
     """
     N, n = motion.steps, problem.scene.robot.dof
     looks = watched(problem)
-    parted = _parted(problem, motion) if any(looks) else None
+    parts, u = _parts(problem), problem.control_rows(motion)
+    controls = parts.controls(u, np.arange(N))
+    parted = parts.states(motion.q[:-1], motion.v[:-1], controls) if any(looks) else None
     if parted is None:
         return None
     q, v = (
@@ -129,25 +135,6 @@ def seen(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats | No
     return found
 
 
-def _parted(problem: OptimalControlProblem, motion: Trajectory) -> tuple[Floats, Floats] | None:
-    """The q and v (N, parts - 1, n) between the nodes of a motion, each step on its own; None where one fails."""
-    scene, integrator, dt, N = problem.scene, problem.integrator, problem.dt / _PARTS, motion.steps
-    lines = problem.linear
-    if not (lines or scene.inputs or scene.custom or limited_servos(scene.elements)):
-        commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=_PARTS)
-        forces = np.repeat((motion.u @ scene.actuation.T)[:, None], _PARTS, axis=1)
-        found = integrator.motions(scene, motion.q[:-1].copy(), motion.v[:-1].copy(), commands, forces, dt)
-        return None if found is None else (found[0][:, :-1], found[1][:, :-1])
-    q, v = (np.empty((N, _PARTS - 1, scene.robot.dof)) for _ in range(2))
-    for k in range(N):
-        own = open_line(motion.u_nodes[k : k + 2], integrator.stage_times) if lines else open_loop(motion.u[k : k + 1])
-        part, failure = rollout(scene, integrator, motion.q[k], motion.v[k], own._replace(hold=_PARTS), dt)
-        if failure is not None:
-            return None
-        q[k], v[k] = part.q[1:-1], part.v[1:-1]
-    return q, v
-
-
 def updated(
     problem: OptimalControlProblem,
     instants: Instants,
@@ -158,7 +145,8 @@ def updated(
 ) -> Instants:
     """The instants, with the offsets of a motion, and further ones where it violates a constraint by > ``least``.
 
-    These are where a row is greatest between its neighbours in the step.
+    These are where a row is greatest between its neighbours in the step. Small changes of offsets are halved:
+    else rounds may go to and fro between two motions whose peaks are on either side of an instant.
 
     Args:
         problem: The problem, without rows between nodes.
@@ -169,6 +157,11 @@ def updated(
         least: In the unit of each constraint.
     """
     rows, offsets, u = [], [], problem.control_rows(motion)
+    former, begin = {}, 0
+    for i in instants.constraints:
+        count, width = len(instants.of(i)), len(problem.bound_constraints[i].rows)
+        former[i] = instants.offsets[begin : begin + count * width].reshape(count, width)
+        begin += count * width
     for i, (near, margin) in enumerate(zip(values, backoff, strict=True)):
         if near is None:
             continue
@@ -179,14 +172,25 @@ def updated(
         if not len(places):
             continue
         bound = _bound(problem, i, places)
-        cubic, true = bound.value(motion.q, motion.v, u), c[tuple(places.T)]
+        row, true = bound.value(motion.q, motion.v, u), c[tuple(places.T)]
         # Rows without a value are made to hold.
-        offset = np.where(np.isfinite(true), true, -bound.scale) - cubic
+        offset = np.where(np.isfinite(true), true, -bound.scale) - row
+        before = former.get(i)
+        if before is not None:
+            own = np.isin(_numbers(places), _numbers(instants.of(i)))
+            change = offset[own] - before
+            offset[own] = before + np.where(np.abs(change) <= _SAME * bound.scale, 0.5, 1.0) * change
         rows.append(np.column_stack([np.full(len(places), i), places]))
         offsets.append(offset.ravel())
     if not rows:
         return NOWHERE
     return Instants(np.concatenate(rows), np.concatenate(offsets))
+
+
+def _numbers(rows: Integers) -> Integers:
+    """Ascending numbers (K,) of the step and instant of ``rows`` (K, 2)."""
+    found: Integers = rows[:, 0] * len(SHARES) + rows[:, 1]
+    return found
 
 
 def _peaks(near: Floats) -> tuple[NDArray[np.bool_], Floats]:
@@ -217,7 +221,7 @@ def carried(
         rows = new.of(i)
         values = np.full((len(rows), len(problem.bound_constraints[i].rows)), least)
         if i in before:
-            number, numbers = (at[:, 0] * len(SHARES) + at[:, 1] for at in (old.of(i), rows))
+            number, numbers = _numbers(old.of(i)), _numbers(rows)
             known = np.isin(numbers, number)
             values[known] = before[i][np.searchsorted(number, numbers[known])]
         found.append(values)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control.backward import Along
-from varpin.control.constraints import BoundRate
+from varpin.control.constraints import BoundConstraint, BoundRate, Slopes
 from varpin.control.descent import Model, Stake, at_stake
 from varpin.control.linear_controls import at_samples, linear_steps
-from varpin.control.penalties import PenalizedRate, penalized
+from varpin.control.penalties import PenalizedRate, controls_of_steps, penalized
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.spread import state_slopes
 from varpin.trajectory import Trajectory
@@ -64,6 +64,8 @@ class ClosedLoop:
         self._linear, self._velocity = self._along.linearized(0, problem.steps)
         self._active = active
         self._goal = goal
+        # By the identity of the constraint.
+        self._known: dict[int, Slopes] = {}
         self._expand()
         # With linear controls the state contains the control, and a first step sets the first one.
         x = self._A.shape[1]
@@ -89,13 +91,13 @@ class ClosedLoop:
         expansion = goal.with_held(
             costs,
             [np.zeros(item.shape) for item, _ in of_nodes],
-            [item.jacobian(motion.q, motion.v) if rows.any() else np.zeros(()) for item, rows in of_nodes],
+            [self._slopes_of(item) if rows.any() else None for item, rows in of_nodes],
             [rows for _, rows in of_nodes],
         )
         lin, rule, N = self._linear, goal.model_rule, problem.steps
         rate = self._expand_rate(of_rates)
         if problem.linear:
-            steps = linear_steps(goal, self._along.of_lines, expansion.gradient, expansion.hessian, rate[1], rate[0])
+            steps = linear_steps(goal, self._along.of_lines, expansion, rate[1], rate[0])
             self._A, self._B = steps.A, steps.B
             self._steps = problem.dt * steps.gradient, problem.dt * steps.hessian
             R, m = problem.decisions, problem.scene.controls
@@ -187,13 +189,22 @@ class ClosedLoop:
     def _slopes(self) -> Floats:
         return state_slopes(self.problem, self.motion)
 
+    def _slopes_of(self, item: BoundConstraint) -> Slopes:
+        """The derivatives of a constraint's rows along the motion."""
+        found = self._known.get(id(item))
+        if found is None:
+            motion = self.motion
+            found = item.slopes(motion.q, motion.v, self.problem.control_rows(motion))
+            self._known[id(item)] = found
+        return found
+
     def rows(self, active: list[Mask]) -> Floats:
         """Derivatives (a, R, m) of the active rows of all constraints in w."""
-        problem, motion = self.problem, self.motion
+        problem = self.problem
         R, m, x = self.gains.shape
         total, hold = sum(int(rows.sum()) for rows in active), problem.hold
         G = np.zeros((total, R, m))
-        # For each row and each of its nodes, which may be two, the row's derivatives in the state there.
+        # For each row its derivatives in the state at its node.
         carried: list[Floats] = [np.zeros((0, x))]
         node: list[NDArray[np.int64]] = []
         of_row: list[NDArray[np.int64]] = []
@@ -205,11 +216,19 @@ class ClosedLoop:
             if isinstance(item, BoundRate):
                 G[part] = _of_rate(item, k, r, R, m)
             elif len(k):
-                for places, J in item.of_nodes(motion.q, motion.v):
-                    by_state = np.einsum("ax,axy->ay", J[k, r], self._slopes[places[k]])
-                    carried.append(np.pad(by_state, ((0, 0), (0, x - by_state.shape[1]))))
-                    node.append(places[k] + self._before)
-                    of_row.append(np.arange(begin - len(k), begin))
+                found = self._slopes_of(item)
+                by_state = np.einsum("ax,axy->ay", found.by_state[k, r], self._slopes[found.nodes[k]])
+                wide = np.pad(by_state, ((0, 0), (0, x - by_state.shape[1])))
+                pulled, steps, index = found.by_controls[k, r], found.nodes[k], np.arange(begin - len(k), begin)
+                if pulled.size and problem.linear:
+                    # The control at the begin is a part of the state.
+                    wide[:, by_state.shape[1] :][:, :m] = pulled[:, :m]
+                    G[index, steps + 1] += pulled[:, m:]
+                elif pulled.size:
+                    G[index, steps // hold] += pulled
+                carried.append(wide)
+                node.append(steps + self._before)
+                of_row.append(index)
         slopes, nodes, owners = np.concatenate(carried), _joined(node), _joined(of_row)
         back = np.zeros((total, x))
         for j in reversed(range(len(self._A))):
@@ -242,18 +261,21 @@ class ClosedLoop:
 
     def values_after(self, values: list[Floats], response: Floats, change: Floats) -> list[Floats]:
         """The constraints' values (K, rows) after changes of states and controls, to first order."""
-        problem, motion, found = self.problem, self.motion, []
+        problem, found = self.problem, []
         for item, c in zip(problem.bound_constraints, values, strict=True):
             if isinstance(item, BoundRate):
                 rate = np.diff(change, axis=0, prepend=np.zeros_like(change[:1])) / problem.period
                 rate = rate[item.places][:, item.limited]
                 found.append(c + np.concatenate([rate, -rate], axis=1))
             else:
-                change_of = np.zeros_like(c)
-                for nodes, J in item.of_nodes(motion.q, motion.v):
-                    by_state = np.einsum("kxy,ky->kx", self._slopes[nodes], response[nodes])
-                    change_of += np.einsum("krx,kx->kr", J, by_state)
-                found.append(c + change_of)
+                of_rows = self._slopes_of(item)
+                nodes = of_rows.nodes
+                by_state = np.einsum("kxy,ky->kx", self._slopes[nodes], response[nodes])
+                after = c + np.einsum("krx,kx->kr", of_rows.by_state, by_state)
+                if of_rows.by_controls.size:
+                    moved = controls_of_steps(problem, change, nodes)
+                    after += np.einsum("krc,kc->kr", of_rows.by_controls, moved)
+                found.append(after)
         return found
 
 

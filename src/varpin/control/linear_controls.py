@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.control.costs import Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.linearization import Linearization, linearize_steps, node_jets
 from varpin.mechanics.inputs import with_ends
@@ -90,15 +91,14 @@ def size(problem: OptimalControlProblem) -> int:
 
 
 def linear_steps(
-    problem: OptimalControlProblem, found: Derivatives, gradient: Floats, hessian: Floats, rate: Floats, pull: Floats
+    problem: OptimalControlProblem, found: Derivatives, running: Expansion, rate: Floats, pull: Floats
 ) -> LinearSteps:
     """The steps of a plan with linear controls, (O11).
 
     Args:
         problem: The problem.
         found: Derivatives along the motion.
-        gradient: Gradient of the running cost at its samples (N s, 2n + m).
-        hessian: Its Hessian (N s, 2n + m, 2n + m), or (1, 2n + m, 2n + m) for all samples.
+        running: Expansion of the running cost at its samples.
         rate: Hessian of the cost of control changes (N + 1, m, m), or (0, m, m) without one.
         pull: Its gradient (N + 1, m).
     """
@@ -114,8 +114,15 @@ def linear_steps(
     sampled = on_lines(problem.model_rule, problem.model_places, after, found.velocity, m)
     for s, (D, weight) in enumerate(zip(sampled, problem.model_rule[:, 0], strict=True)):
         across = weight * np.swapaxes(D, 1, 2)
-        g[1:] += (across @ gradient[s::samples, :, None])[:, :, 0]
-        H[1:] += across @ (of_samples(hessian, samples, s) @ D)
+        g[1:] += (across @ running.gradient[s::samples, :, None])[:, :, 0]
+        H[1:] += across @ (of_samples(running.hessian, samples, s) @ D)
+    if running.begun is not None:
+        D = np.tile(np.eye(x + 2 * m), (N, 1, 1))
+        if len(found.velocity):
+            D[:, n:x, :x] = found.velocity[:-1]
+        across = np.swapaxes(D, 1, 2)
+        g[1:] += (across @ running.begun.gradient[:, :, None])[:, :, 0]
+        H[1:] += across @ running.begun.hessian @ D
     if len(rate):
         change = np.concatenate([np.zeros((m, x)), -np.eye(m), np.eye(m)], axis=1)
         change = np.stack([np.where(np.arange(x + 2 * m) < x + m, 0.0, change), *[change] * N])

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats
-from varpin.control.constraints import BoundBetween, BoundConstraint, BoundRate
+from varpin.arrays import Floats, Integers
+from varpin.control.constraints import BoundBetween, BoundConstraint, BoundRate, Slopes
 from varpin.control.costs import ControlRate, Expansion
-from varpin.control.problem import OptimalControlProblem, cubics
-from varpin.core import sample_steps
+from varpin.control.problem import OptimalControlProblem
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 
@@ -130,6 +129,14 @@ def flat(parts: Sequence[Floats]) -> Floats:
     return np.concatenate([np.ravel(part) for part in parts]) if parts else np.zeros(0)
 
 
+def controls_of_steps(problem: OptimalControlProblem, u: Floats, steps: Integers) -> Floats:
+    """Of decisions (R, m) those of steps (K,): the control of each (K, m), or those at both its ends (K, 2m)."""
+    if problem.linear:
+        return np.concatenate([u[steps], u[steps + 1]], axis=1)
+    found: Floats = u[steps // problem.hold]
+    return found
+
+
 def rate_columns(penalty: Penalty) -> NDArray[np.int64]:
     """Indices of the controls that a rate penalty limits."""
     return _rate_of(penalty).limited
@@ -144,12 +151,12 @@ def _rate_of(penalty: Penalty) -> BoundRate:
 class PenalizedProblem(OptimalControlProblem):
     """A problem with the penalties of its constraints in the cost. Made by :func:`penalized`.
 
-    Penalties of states are evaluated at the end of each step, and at instants within steps where there are such rows,
-    in addition to the samples of the cost.
+    Penalties of states are evaluated at the end of each step, in addition to the samples of the cost. Those at instants
+    within steps are functions of the state at the begin of their step and of its controls.
 
     Attributes:
         penalties: Penalties of constraints on states.
-        instants: Where these instants are in a step of unit length (i,), empty without rows within steps.
+        within: Whether there are rows within steps.
         all_penalties: Penalties of all constraints, in the problem's order.
         quiet: Whether plans leave the scene's noise out: otherwise stiff penalties would add to the noise cost.
         passes: Greatest number of passes that determine the active rows; 0 keeps those of the nominal motion.
@@ -158,7 +165,7 @@ class PenalizedProblem(OptimalControlProblem):
     """
 
     penalties: tuple[Penalty, ...]
-    instants: Floats
+    within: bool
     all_penalties: tuple[Penalty, ...]
     quiet: bool
     passes: int
@@ -185,15 +192,14 @@ class PenalizedProblem(OptimalControlProblem):
         """See :attr:`OptimalControlProblem.model_rule`."""
         # Weight, and coefficients that select q and v at the end of the step.
         node = [self.rule[0, 0], 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-        return np.vstack([self.rule, node, self._within])
+        # With linear controls rows within steps depend on the controls at both ends, see Expansion.begun.
+        begin = [self.rule[0, 0], 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
+        return np.vstack([self.rule, node, begin] if self._begins else [self.rule, node])
 
     @property
-    def _within(self) -> Floats:
-        """Sample points of the instants within steps, as :attr:`rule`."""
-        if not len(self.instants):
-            return np.zeros((0, 9))
-        weights = np.full(len(self.instants), self.rule[0, 0])
-        return np.column_stack([weights, cubics(self.instants, self.dt)])
+    def _begins(self) -> bool:
+        """Whether the begin of each step is a sample point."""
+        return self.within and not self.linear
 
     @property
     def at_velocities(self) -> bool:
@@ -203,7 +209,7 @@ class PenalizedProblem(OptimalControlProblem):
     @property
     def model_places(self) -> Floats:
         """See :attr:`OptimalControlProblem.model_places`."""
-        return np.concatenate([self.places, [1.0], self.instants])
+        return np.concatenate([self.places, [1.0, 0.0] if self._begins else [1.0]])
 
     def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """See :meth:`OptimalControlProblem.model_samples`."""
@@ -214,15 +220,9 @@ class PenalizedProblem(OptimalControlProblem):
             np.concatenate([x.reshape(steps, -1, x.shape[-1]), y[:, None]], axis=1)
             for x, y in zip(samples, nodes, strict=True)
         ]
-        if len(self.instants):
-            share, begin = self.instants[:, None], u[:-1, None] if self.linear else u[:, None]
-            end = u[1:, None] if self.linear else begin
-            at_q, at_v = sample_steps(self._within, q[None], v[None])
-            within = at_q[0], at_v[0], (1.0 - share) * begin + share * end
-            joined = [
-                np.concatenate([x, y.reshape(steps, -1, y.shape[-1])], axis=1)
-                for x, y in zip(joined, within, strict=True)
-            ]
+        if self._begins:
+            begins = (q[:-1], v[:-1], u)
+            joined = [np.concatenate([x, y[:, None]], axis=1) for x, y in zip(joined, begins, strict=True)]
         q, v, u = (x.reshape(-1, x.shape[-1]) for x in joined)
         return q, v, u
 
@@ -236,41 +236,47 @@ class PenalizedProblem(OptimalControlProblem):
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
         s = [penalty.signed(penalty.bound.value(q, v, u)) for penalty in self.penalties]
         held = [penalty.held(signed) for penalty, signed in zip(self.penalties, s, strict=True)]
-        J = [
-            penalty.bound.jacobian(q, v) if mask.any() else np.zeros(())
+        slopes = [
+            penalty.bound.slopes(q, v, u) if mask.any() else None
             for penalty, mask in zip(self.penalties, held, strict=True)
         ]
-        return self.with_held(super().expand_running(trajectory), s, J, held)
+        return self.with_held(super().expand_running(trajectory), s, slopes, held)
 
     def expand_cost(self, trajectory: Trajectory) -> Expansion:
         """The expansion of the running costs at their own samples, without penalties."""
         return super().expand_running(trajectory)
 
     def with_held(
-        self, expansion: Expansion, shifted: Sequence[Floats], jacobians: Sequence[Floats], held: Sequence[Mask]
+        self, expansion: Expansion, shifted: Sequence[Floats], slopes: Sequence[Slopes | None], held: Sequence[Mask]
     ) -> Expansion:
         """The running costs' expansion plus the penalties of the rows in ``held``, each (K, rows).
 
-        ``shifted`` are the values whose squares are penalized (:meth:`Penalty.signed`), ``jacobians`` their
-        derivatives.
+        ``shifted`` are the values whose squares are penalized (:meth:`Penalty.signed`), ``slopes`` their derivatives,
+        None where no row is in ``held``.
         """
-        N, size, x = self.steps, expansion.gradient.shape[1], 2 * self.scene.robot.dof
-        # At the end of each step, then at the instants within it.
-        places = 1 + len(self.instants)
-        gradient, hessian = np.zeros((N, places, size)), np.zeros((N, places, size, size))
-        for penalty, s, J, rows in zip(self.penalties, shifted, jacobians, held, strict=True):
-            if not rows.any():
+        N, size, x, m = self.steps, expansion.gradient.shape[1], 2 * self.scene.robot.dof, self.scene.controls
+        ends = np.zeros((N, size)), np.zeros((N, size, size))
+        wide = x + 2 * m if self.linear else size
+        begins = np.zeros((N, wide)), np.zeros((N, wide, wide))
+        for penalty, s, found, rows in zip(self.penalties, shifted, slopes, held, strict=True):
+            if found is None or not rows.any():
                 continue
-            bound, counted = penalty.bound, rows.astype(float)
-            at = (bound.places - 1, 1 + bound.samples if isinstance(bound, BoundBetween) else 0)
-            gradient[*at, :x] += penalty.weight * np.einsum("kr,krx->kx", s * counted, J)
-            hessian[*at, :x, :x] += penalty.weight * (np.swapaxes(J, 1, 2) @ (counted[:, :, None] * J))
+            within, counted = isinstance(penalty.bound, BoundBetween), rows.astype(float)
+            J = found.in_step()
+            z, (gradient, hessian) = slice(0, J.shape[2]), begins if within else ends
+            # A step may have several places within it.
+            steps = found.nodes if within else found.nodes - 1
+            np.add.at(gradient[:, z], steps, penalty.weight * np.einsum("kr,krx->kx", s * counted, J))
+            np.add.at(hessian[:, z, z], steps, penalty.weight * (np.swapaxes(J, 1, 2) @ (counted[:, :, None] * J)))
         # All samples of the model have the same weight.
         weight = self.dt * float(self.rule[0, 0])
-        gradients = np.concatenate([expansion.gradient.reshape(N, -1, size), gradient / weight], axis=1)
         there = np.broadcast_to(expansion.hessian, (len(expansion.gradient), size, size)).reshape(N, -1, size, size)
-        hessians = np.concatenate([there, hessian / weight], axis=1)
-        return Expansion(gradients.reshape(-1, size), hessians.reshape(-1, size, size))
+        samples = [ends, begins] if self._begins else [ends]
+        parts = [expansion.gradient.reshape(N, -1, size), *(gradient[:, None] / weight for gradient, _ in samples)]
+        curved = [there, *(hessian[:, None] / weight for _, hessian in samples)]
+        begun = Expansion(begins[0] / self.dt, begins[1] / self.dt) if self.within and self.linear else None
+        gradients, hessians = np.concatenate(parts, axis=1), np.concatenate(curved, axis=1)
+        return Expansion(gradients.reshape(-1, size), hessians.reshape(-1, size, size), begun)
 
 
 def penalized(
@@ -304,7 +310,7 @@ def penalized(
     changes: dict[str, object] = {
         "penalties": tuple(part for part in parts if not part.bound.of_controls),
         "all_penalties": tuple(parts),
-        "instants": next((part.bound.shares for part in parts if isinstance(part.bound, BoundBetween)), np.zeros(0)),
+        "within": any(isinstance(part.bound, BoundBetween) for part in parts),
     }
     changes |= {"constraints": (), "bound_constraints": (), "quiet": quiet, "passes": passes, "until": until}
     if on_rate:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,18 @@ class Horizon(Frozen):
     def steps(self) -> int:
         """N."""
         return len(self.t) - 1
+
+
+class Slopes(NamedTuple):
+    """Derivatives of a constraint's rows in the states of nodes and the controls of the steps after them."""
+
+    nodes: Integers  # (K,)
+    by_state: Floats  # (K, rows, 2n) in (q, v) at the node
+    by_controls: Floats  # (K, rows, c) in the step's control, c = m, or in those at its ends, 2m; c = 0 for neither
+
+    def in_step(self) -> Floats:
+        """The derivatives (K, rows, 2n + c) in (q, v) and the controls."""
+        return np.concatenate([self.by_state, self.by_controls], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +105,13 @@ class BoundConstraint(Frozen, ABC):
         """
         raise NotImplementedError
 
-    def of_nodes(self, q: Floats, v: Floats) -> list[tuple[Integers, Floats]]:
-        """Nodes (K,) of one motion and dc/d(q, v) at them (K, rows, 2n), one entry for each node of a place."""
-        return [(self.places, self.jacobian(q, v))]
+    def slopes(self, q: Floats, v: Floats, u: Floats) -> Slopes:  # noqa: ARG002
+        """The derivatives of the rows along one motion, whose arguments are those of :meth:`value`.
+
+        Raises:
+            NotImplementedError: The constraint is on controls.
+        """
+        return Slopes(self.places, self.jacobian(q, v), np.zeros((*self.shape, 0)))
 
 
 class PlanConstraint(Frozen, ABC):

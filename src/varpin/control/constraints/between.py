@@ -7,59 +7,66 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats, Integers
-from varpin.control.constraints.base import BoundConstraint
+from varpin.control.constraints.base import BoundConstraint, Slopes
+from varpin.control.parts import Parts
 
 
 @dataclass(frozen=True, eq=False)
 class BoundBetween(BoundConstraint):
-    """A constraint at instants within steps, on the cubic through the nodes of the step and their velocities.
+    """A constraint at instants within steps, each integrated in parts from the node at its begin.
 
     The places are the nodes at the ends of the steps; several instants may be in one step.
 
     Attributes:
         inner: The constraint, bound to a grid whose nodes after the first are the instants.
-        shares: Where instants are in a step of unit length (i,).
-        samples: Which of them each one is (K,).
-        rule: Coefficients (K, 8) of (q, v) at the begin and the end of the step for q, then those for v.
-        offset: What is added to the values (K, rows): those of the motion less those of the cubic.
+        parts: The steps in parts, whose ends are the instants.
+        samples: Which end of a part each instant is (K,), from 0.
+        offset: What is added to the values (K, rows), for peaks between instants.
     """
 
     inner: BoundConstraint
-    shares: Floats
+    parts: Parts
     samples: Integers
-    rule: Floats
     offset: Floats
 
-    def states(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
-        """The q and v (..., K, n) of the cubics at the instants, from those at the nodes (..., N + 1, n)."""
-        ends = (q[..., self.places - 1, :], v[..., self.places - 1, :], q[..., self.places, :], v[..., self.places, :])
-        at_q, at_v = (
-            sum(row[:, None] * end for row, end in zip(rule.T, ends, strict=True))
-            for rule in (self.rule[:, :4], self.rule[:, 4:])
-        )
-        return np.asarray(at_q), np.asarray(at_v)
+    @property
+    def begins(self) -> Integers:
+        """Indices of the nodes at the begin of the steps (K,)."""
+        return self.places - 1
+
+    def _steps(self, q: Floats, v: Floats, u: Floats) -> tuple[Integers, tuple[Floats, Floats, Floats]]:
+        """The index (K,) of each instant's step in the steps that have any, and q, v and controls of these."""
+        steps, index = np.unique(self.begins, return_inverse=True)
+        return index, (q[steps], v[steps], self.parts.controls(u, steps))
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """See :meth:`BoundConstraint.value`."""
-        found: Floats = self.at(*self.states(q, v), u) + self.offset
+        """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
+        index, steps = self._steps(q, v, u)
+        within = self.parts.states(*steps)
+        if within is None:
+            return np.full(self.shape, np.inf)
+        q, v = (x[index, self.samples] for x in within)
+        found: Floats = self.inner.value(_after_first(q), _after_first(v), u) + self.offset
         return found
 
-    def at(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """The values (..., K, rows) at states (..., K, n) of the instants, without offsets."""
-        q, v = (np.concatenate([x[..., :1, :], x], axis=-2) for x in (q, v))
-        return self.inner.value(q, v, u)
-
     def jacobian(self, q: Floats, v: Floats) -> Floats:
-        """The derivatives (K, rows, 2n) in (q, v) at the instants."""
-        q, v = self.states(q, v)
-        return self.inner.jacobian(np.concatenate([q[:1], q]), np.concatenate([v[:1], v]))
+        """dc/d(q, v) (K, rows, 2n) as at the ends of the steps."""
+        return self.inner.jacobian(_after_first(q[self.places]), _after_first(v[self.places]))
 
-    def of_nodes(self, q: Floats, v: Floats) -> list[tuple[Integers, Floats]]:
-        """See :meth:`BoundConstraint.of_nodes`."""
-        J, n = self.jacobian(q, v), q.shape[-1]
-        by_q, by_v, rule = J[:, :, :n], J[:, :, n:], self.rule[:, :, None, None]
-        parts = [rule[:, i] * by_q + rule[:, 4 + i] * by_v for i in range(4)]
-        return [
-            (self.places - 1, np.concatenate(parts[:2], axis=2)),
-            (self.places, np.concatenate(parts[2:], axis=2)),
-        ]
+    def slopes(self, q: Floats, v: Floats, u: Floats) -> Slopes:
+        """See :meth:`BoundConstraint.slopes`.
+
+        Raises:
+            LinearizationError: A part of a step has no derivative.
+        """
+        index, steps = self._steps(q, v, u)
+        inner, D = self.parts.slopes(*steps)
+        q, v = (x[index, self.samples] for x in inner)
+        J = self.inner.jacobian(_after_first(q), _after_first(v)) @ D[index, self.samples]
+        x = 2 * q.shape[1]
+        return Slopes(self.begins, J[:, :, :x], J[:, :, x:])
+
+
+def _after_first(x: Floats) -> Floats:
+    """Nodes (K + 1, n) whose last are the instants (K, n)."""
+    return np.concatenate([x[:1], x])
