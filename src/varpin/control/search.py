@@ -229,7 +229,6 @@ def solve(
         raise InputError(f"backtracking must be in (0, 1), got {backtracking}")
     if not real("regularization", regularization) >= 0.0:
         raise InputError(f"regularization must be >= 0, got {regularization}")
-    second_order, check = flag("second_order", second_order), flag("check", check)
     if noise is not None and not is_one_of(noise, ("held", "whole")):
         raise InputError(f"noise must be 'held', 'whole' or None, got {noise!r}")
     whole_noise = noise == "whole" or (noise is None and is_exact(problem))
