@@ -202,9 +202,8 @@ def _lengths(constraint: PlanConstraint) -> dict[str, float]:
         for body in constraint.obstacles:
             label = f"{name}: the obstacle {body.name!r}"
             found[f"{label}: its distance"] = float(min(np.linalg.norm(x - root) for x in (body.begin, body.end)))
-            found[f"{label}: its radius or side"] = max(
-                body.radius, 0.0 if body.sides is None else float(body.sides.max())
-            )
+            sides = body.sides if body.hull is None else body.hull.sides
+            found[f"{label}: its radius or side"] = body.radius if sides is None else float(sides.max())
         return found
     if isinstance(constraint, KeepInSphere | KeepOutOfSphere):
         found = {f"{name}: radius": constraint.radius}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
+from varpin.model.hull import Hull, hull_around, mesh_points
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.model.robot import Robot, geometry
 from varpin.model.tree import place_of_frame, z_to
@@ -22,21 +25,25 @@ from varpin.support.checks import finite_array, over_time, positive, rotation_ma
 from varpin.support.frozen import Frozen
 
 coal = pin.coal
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Obstacle(Frozen):
-    """A body in the world, fixed or moving. Made by :meth:`sphere`, :meth:`capsule` and :meth:`box`.
+    """A body in the world, fixed or moving.
+
+    Made by :meth:`sphere`, :meth:`capsule`, :meth:`box`, :meth:`convex` and :meth:`mesh`.
 
         ball = vp.Obstacle.sphere([0.5, 0.0, 0.4], 0.1).moving(lambda t: [0.0, 0.2 * np.sin(t), 0.0])
 
     Attributes:
         name: Name in messages.
-        begin: One end of its axis (3,) [m]; the centre of a sphere or a box.
+        begin: One end of its axis (3,) [m]; the centre of a sphere, a box or the box around a hull.
         end: The other end (3,) [m].
-        radius: Radius [m]; 0 for a box.
+        radius: Radius [m]; 0 for a box or a hull.
         sides: Sides of a box (3,) [m], else None.
-        rotation: Axes of a box in the world (3, 3).
+        rotation: Axes of a box or a hull in the world (3, 3).
+        hull: A convex hull around its centre and in its axes, else None.
         shift: Displacement (3,) [m] at a time [s]; None if the obstacle is fixed.
     """
 
@@ -46,6 +53,7 @@ class Obstacle(Frozen):
     radius: float
     sides: Floats | None
     rotation: Floats
+    hull: Hull | None = None
     shift: Callable[[float], ArrayLike] | None = None
 
     @classmethod
@@ -68,6 +76,47 @@ class Obstacle(Frozen):
             raise InputError(f"box sides must be > 0 [m], got {size}")
         R = np.eye(3) if rotation is None else rotation_matrix("box rotation", rotation)
         return cls(str(name), at, at, 0.0, size, R)
+
+    @classmethod
+    def convex(
+        cls,
+        points: ArrayLike,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        rotation: ArrayLike | None = None,
+        name: str = "convex",
+    ) -> Obstacle:
+        """The convex hull of ``points`` (N, 3) [m], N >= 4, that do not lie in a plane.
+
+        The points are in axes with their origin at ``position`` (3,) [m] in the world, turned by a ``rotation`` (3, 3).
+        """
+        return cls._placed(hull_around("convex points", points), position, rotation, name)
+
+    @classmethod
+    def mesh(
+        cls,
+        path: str | os.PathLike[str],
+        scale: float = 1.0,
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        rotation: ArrayLike | None = None,
+        name: str | None = None,
+    ) -> Obstacle:
+        """The convex hull of the vertices of a mesh file (STL, OBJ, DAE), times ``scale``, placed as in :meth:`convex`.
+
+        Hollows of the mesh are filled. It has the file's name if ``name`` is left out.
+
+        Raises:
+            FileError: The file is missing or is no mesh that can be read.
+        """
+        found = hull_around(f"vertices of the mesh {path}", mesh_points(path, scale))
+        return cls._placed(found, position, rotation, Path(path).stem if name is None else name)
+
+    @classmethod
+    def _placed(cls, hull: Hull, position: ArrayLike, rotation: ArrayLike | None, name: str) -> Obstacle:
+        at = finite_array(f"{name} position", position, (3,))
+        R = np.eye(3) if rotation is None else rotation_matrix(f"{name} rotation", rotation)
+        middle = 0.5 * (hull.points.min(axis=0) + hull.points.max(axis=0))
+        center = at + R @ middle
+        return cls(str(name), center, center, 0.0, None, R, hull.changed(points=hull.points - middle))
 
     def moving(self, shift: Callable[[float], ArrayLike]) -> Obstacle:
         """The obstacle displaced by ``shift(t)`` (3,) [m] from its described position at each time t [s].
@@ -98,6 +147,9 @@ class Obstacle(Frozen):
         if self.sides is not None:
             sides, turn = self.sides.tolist(), self.rotation.tolist()
             return f"Obstacle.box({self.begin.tolist()}, {sides}, {turn}, {self.name!r}){moving}"
+        if self.hull is not None:
+            points, turn = self.hull.points.tolist(), self.rotation.tolist()
+            return f"Obstacle.convex({points}, {self.begin.tolist()}, {turn}, {self.name!r}){moving}"
         if self.begin is self.end:
             return f"Obstacle.sphere({self.begin.tolist()}, {self.radius!r}, {self.name!r}){moving}"
         return f"Obstacle.capsule({self.begin.tolist()}, {self.end.tolist()}, {self.radius!r}, {self.name!r}){moving}"
@@ -105,16 +157,17 @@ class Obstacle(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """A capsule or a box, on a link or in the world.
+    """A capsule, a box or a hull, on a link or in the world.
 
     Attributes:
         name: Name of the link or obstacle.
         kinematics: Kinematics of the link; None in the world.
-        begin: One end of its axis (3,) [m]; the centre of a box.
+        begin: One end of its axis (3,) [m]; the centre of a box or a hull.
         end: The other end (3,) [m].
-        radius: Radius [m]; 0 for a box.
+        radius: Radius [m]; 0 for a box or a hull.
         sides: Sides of a box (3,) [m], else None.
-        rotation: Axes of a box (3, 3).
+        rotation: Axes of a box or a hull (3, 3).
+        hull: A hull around its centre, else None.
         obstacle: The obstacle; None for a link.
         shifts: Displacements of the obstacle at the times in question (K, 3) [m].
     """
@@ -126,8 +179,14 @@ class _Body:
     radius: float
     sides: Floats | None
     rotation: Floats
+    hull: Hull | None = None
     obstacle: Obstacle | None = None
     shifts: Floats = field(default_factory=lambda: np.zeros((1, 3)))
+
+    @property
+    def edged(self) -> bool:
+        """Whether it is a box or a hull."""
+        return self.sides is not None or self.hull is not None
 
 
 class Clearance(Frozen):
@@ -188,13 +247,13 @@ class Clearance(Frozen):
         first, second = np.empty((N, P, 3)), np.empty((N, P, 3))
         for p, (i, k) in enumerate(self._pairs):
             one, other = self._bodies[i], self._bodies[k]
-            measure = _boxed if one.sides is not None or other.sides is not None else _round
+            measure = _edged if one.edged or other.edged else _round
             d[:, p], normal[:, p], first[:, p], second[:, p] = measure(one, other, placed[i], placed[k])
         return d, normal, first, second
 
     @staticmethod
     def _placed(body: _Body, q: Floats) -> tuple[Floats, Floats, Floats]:
-        """Ends of the axis (N, 3) and (N, 3), and the axes of a box (N, 3, 3), in the world."""
+        """Ends of the axis (N, 3) and (N, 3), and the axes of a box or a hull (N, 3, 3), in the world."""
         if body.kinematics is None:
             way = np.tile(body.shifts, (len(q) // len(body.shifts), 1))
             ends = (x + way for x in (body.begin, body.end))
@@ -238,8 +297,8 @@ def _round(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Flo
     )
 
 
-def _boxed(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
-    """As :func:`_round`, for two bodies of which at least one is a box, computed by coal."""
+def _edged(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
+    """As :func:`_round`, for two bodies of which at least one is a box or a hull, computed by coal."""
     N = len(here[0])
     d, normal, first, second = np.empty(N), np.empty((N, 3)), np.empty((N, 3)), np.empty((N, 3))
     shapes = [_shape(body) for body in (one, other)]
@@ -256,13 +315,15 @@ def _boxed(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Flo
 def _shape(body: _Body) -> Any:
     if body.sides is not None:
         return coal.Box(*map(float, body.sides))
+    if body.hull is not None:
+        return body.hull.shape
     length = float(np.linalg.norm(body.end - body.begin))
     return coal.Capsule(body.radius, length) if length > 0.0 else coal.Sphere(body.radius)
 
 
 def _transform(body: _Body, at: _Placed, k: int) -> Any:
     begin, end, R = at[0][k], at[1][k], at[2][k]
-    if body.sides is None:
+    if not body.edged:
         way = end - begin
         length = float(np.linalg.norm(way))
         R = z_to(way / length) if length > 0.0 else np.eye(3)
@@ -291,7 +352,7 @@ def clearance(
 
     Raises:
         RobotError: A mesh is missing, or the SRDF file cannot be read.
-        InputError: A link has no shape, or nothing is left to keep clear of.
+        InputError: A link has no shape, the SRDF file has no link of the robot, or nothing is left to keep clear of.
     """
     if capsules is not None and not isinstance(capsules, Mapping):
         raise InputError(f"capsules must be a dictionary, link: (begin, end, radius), got {type(capsules).__name__}")
@@ -327,10 +388,10 @@ def clearance(
     moving = [i for i, part in enumerate(parts) if part.kinematics is not None]
     pairs = []
     if itself:
-        pairs = _of_links(robot, bodies, _disabled(srdf))
+        pairs = _of_links(robot, bodies, _disabled(robot, srdf))
     for obstacle in obstacles:
         pairs += [(i, len(parts)) for i in moving]
-        solid = (obstacle.begin, obstacle.end, obstacle.radius, obstacle.sides, obstacle.rotation)
+        solid = (obstacle.begin, obstacle.end, obstacle.radius, obstacle.sides, obstacle.rotation, obstacle.hull)
         parts.append(_Body(obstacle.name, None, *solid, obstacle=obstacle))
     if not pairs:
         raise InputError(
@@ -358,7 +419,7 @@ def _of_links(
     return [pair for pair, d in zip(found, apart, strict=True) if d > 0.0]
 
 
-def _disabled(srdf: Path | None) -> set[frozenset[str]]:
+def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
     """Pairs of links that an SRDF file excludes from collision checks."""
     if srdf is None:
         return set()
@@ -366,7 +427,21 @@ def _disabled(srdf: Path | None) -> set[frozenset[str]]:
         root = parsed(decoded(srdf)[0])
     except expat.ExpatError as error:
         raise RobotError(f"{srdf} is not an SRDF: it is not well-formed XML: {error}") from None
-    return {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
+    pairs = {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
+    links = {link for pair in pairs for link in pair}
+    unknown = sorted(links - {frame.name for frame in robot.free_model.frames})
+    if len(unknown) == len(links):
+        what = f"of {', '.join(map(repr, unknown[:3]))}{', ...' if unknown[3:] else ''}" if links else "no pairs at all"
+        raise InputError(
+            f"{srdf} leaves out no pair of links of robot {robot.name!r}: its disable_collisions are {what}. Give the "
+            "robot's own SRDF"
+        )
+    if 2 * len(unknown) > len(links):
+        logger.warning(
+            "%s: robot %r does not have %d of the %d links in disable_collisions, such as %r: is it another robot's?",
+            srdf, robot.name, len(unknown), len(links), unknown[0],
+        )  # fmt: skip
+    return pairs
 
 
 def _vertices(robot: Robot) -> dict[str, Floats]:

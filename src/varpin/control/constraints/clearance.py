@@ -46,7 +46,8 @@ class KeepClear(PlanConstraint):
     """distance(q) >= distance for every pair, at every node after the first: links stay clear of obstacles.
 
     Each link is modelled by the smallest capsule around its shapes, which is larger than the link; ``capsules`` gives
-    others. Distances between capsules and spheres are exact; coal computes those of boxes. Derivatives are those of the
+    others. Distances between capsules and spheres are exact; coal computes those of boxes and
+    convex hulls. Derivatives are those of the
     nearest points.
     """
 
@@ -69,13 +70,14 @@ class KeepClear(PlanConstraint):
 
         Args:
             robot: The robot.
-            obstacles: From :meth:`Obstacle.sphere`, :meth:`Obstacle.capsule` and :meth:`Obstacle.box`; they may move
-                (:meth:`Obstacle.moving`).
+            obstacles: From :meth:`Obstacle.sphere`, :meth:`Obstacle.capsule`, :meth:`Obstacle.box`,
+                :meth:`Obstacle.convex` and :meth:`Obstacle.mesh`; they may move (:meth:`Obstacle.moving`).
             distance: Least distance between the bodies of a pair [m].
             links: Names of the links; by default all moving links with shapes or a given capsule.
             itself: Keep links clear of each other, too, except for pairs on one joint or on two consecutive joints, and
                 pairs that overlap at q = 0; ``pairs`` lists the rest.
-            srdf: An SRDF file, whose ``disable_collisions`` leave out more pairs of links.
+            srdf: An SRDF file, whose ``disable_collisions`` leave out more pairs of links;
+                a warning tells if the robot lacks most of the links that they name.
             capsules: By the name of a link, or of another frame, (begin (3,), end (3,), radius) in its own axes [m], in
                 place of the fitted one.
             margin: In standard deviations of a distance under noise.
@@ -83,7 +85,8 @@ class KeepClear(PlanConstraint):
         Raises:
             RobotError: A mesh is missing or cannot be read, or the file is no SRDF.
             UnknownFrame: The robot has no such link.
-            InputError: There are no pairs, a link has no shapes, or a value is invalid.
+            InputError: There are no pairs, a link has no shapes, the SRDF file has no link of the robot, or
+                a value is invalid.
         """
         self.robot = require_robot(robot, type(self).__name__)
         if not isinstance(obstacles, Iterable) or not all(isinstance(item, Obstacle) for item in obstacles):

@@ -64,6 +64,7 @@ def _clear(robot: Robot, given: Given) -> PlanConstraint:
     obstacles = [Obstacle.sphere(x[:3], x[3], f"sphere[{k}]") for k, x in enumerate(given["spheres"])]
     obstacles += [Obstacle.capsule(x[:3], x[3:6], x[6], f"capsule[{k}]") for k, x in enumerate(given["capsules"])]
     obstacles += [Obstacle.box(x[:3], x[3:], name=f"box[{k}]") for k, x in enumerate(given["boxes"])]
+    obstacles += [Obstacle.convex(x, name=f"hull[{k}]") for k, x in enumerate(given["hulls"])]
     links = None if given["links"] is None else list(given["links"])
     return KeepClear(robot, obstacles, given["distance"], links=links, itself=given["itself"], margin=given["margin"])
 
@@ -73,6 +74,11 @@ def _rows(length: int) -> Rule:
     return Rule(tuple[one, ...], f"a list of lists of {length} numbers [m]", parts=True)
 
 
+_POINTS = Rule(
+    tuple[Annotated[tuple[Annotated[tuple[float, ...], numbers(3, "m")], ...], _rows(3)], ...],
+    "a list of lists of points, each of 3 numbers [m]",
+    parts=True,
+)
 _MARGIN = {"margin": (number(least=0.0), 0.0)}
 _FRAME = {"frame": (TEXT, ...)}
 _SPHERE = _FRAME | {"center": (numbers(3, "m"), ...), "radius": (number("m", above=0.0), ...)} | _MARGIN
@@ -115,6 +121,7 @@ PLAN_CONSTRAINTS: dict[str, Kind] = {
             "spheres": (_rows(4), ()),
             "capsules": (_rows(7), ()),
             "boxes": (_rows(6), ()),
+            "hulls": (_POINTS, ()),
             "links": (Rule(tuple[Annotated[str, TEXT], ...], "a list of texts", parts=True), None),
             "itself": (FLAG, False),
         }

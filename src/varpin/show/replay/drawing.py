@@ -313,7 +313,10 @@ class _Drawing:
                 continue
             color, node = REGION_COLORS[region.kind], f"{root}/regions/{k} {label(region.name)}"
             pose = np.eye(4)
-            if region.box is None:
+            if region.hull is not None:
+                pose[:3, :3], pose[:3, 3] = region.rotation, region.begin
+                self.viewer[node].set_object(marks.hull(region.hull, color))
+            elif region.box is None:
                 axis = region.end - region.begin
                 length = float(np.linalg.norm(axis))
                 pose[:3, :3] = z_to(axis / length) if length > 0.0 else np.eye(3)

@@ -12,6 +12,7 @@ from meshcat.geometry import MeshBasicMaterial, MeshPhongMaterial, Object, Trian
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
+from varpin.model.hull import Hull
 from varpin.model.tree import z_to
 
 _SIDES = 6
@@ -73,6 +74,12 @@ def capsule(radius: float, length: float, color: int) -> Object:
 def box(sides: Floats, color: int) -> Object:
     """A translucent box with ``sides`` (3,) [m], centred at the origin."""
     return meshcat.geometry.Mesh(meshcat.geometry.Box(sides.tolist()), _glass(MeshPhongMaterial, color, 0.3))
+
+
+def hull(form: Hull, color: int) -> Object:
+    """A translucent convex hull."""
+    material = _glass(MeshPhongMaterial, color, 0.3, flatShading=True)
+    return meshcat.geometry.Mesh(TriangularMeshGeometry(form.points, form.faces), material)
 
 
 def _glass(kind: Any, color: int, opacity: float, **options: Any) -> Any:

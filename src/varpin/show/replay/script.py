@@ -10,6 +10,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.model import Robot
+from varpin.model.hull import Hull
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +84,13 @@ class Region:
     Attributes:
         kind: Which of these.
         name: Name of the obstacle, or of the frame.
-        begin: One end of its axis in the world (3,) [m]; the centre of a sphere, the origin of a box.
+        begin: One end of its axis in the world (3,) [m]; the centre of a sphere, the origin of a box or a hull.
         end: The other end (3,) [m].
         radius: Radius of a sphere or a capsule [m].
         box: Lower and upper sides of a box from its origin (2, 3) [m], infinite where it is open; None for others.
-        rotation: Axes of the box in the world (3, 3).
+        rotation: Axes of the box or the hull in the world (3, 3).
         way: Displacement at the keyframes (K, 3) [m]; None if it is fixed.
+        hull: Its convex hull; None for others.
     """
 
     kind: Literal["obstacle", "out", "in"]
@@ -99,6 +101,7 @@ class Region:
     box: Floats | None = None
     rotation: Floats = field(default_factory=lambda: np.eye(3))
     way: Floats | None = None
+    hull: Hull | None = None
 
     @property
     def moves(self) -> bool:
@@ -108,7 +111,9 @@ class Region:
     @property
     def corners(self) -> Floats:
         """Points (k, 3) [m] around its finite part, over its whole motion."""
-        if self.box is None:
+        if self.hull is not None:
+            found = np.asarray(self.begin + self.hull.points @ self.rotation.T)
+        elif self.box is None:
             reach = self.radius * np.vstack([np.eye(3), -np.eye(3)])
             found = np.concatenate([self.begin + reach, self.end + reach])
         else:

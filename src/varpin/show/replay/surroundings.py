@@ -84,7 +84,7 @@ def regions(constraints: Sequence[PlanConstraint], times: Floats) -> tuple[Regio
                 if body.shift is not None:
                     shifts = body.shifts(times)
                     ends, way = (body.begin + shifts[0], body.end + shifts[0]), shifts - shifts[0]
-                region = Region("obstacle", body.name, *ends, body.radius, box, body.rotation, way)
+                region = Region("obstacle", body.name, *ends, body.radius, box, body.rotation, way, body.hull)
                 # Several constraints may share an obstacle.
                 found[repr(body)] = region
         elif isinstance(constraint, kinds.KeepInSphere | kinds.KeepOutOfSphere):

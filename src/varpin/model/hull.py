@@ -1,0 +1,101 @@
+"""Convex hulls of points and of mesh files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from varpin.arrays import Floats
+from varpin.errors import FileError, InputError
+from varpin.support.checks import as_floats, is_file, path_like, positive, require_finite
+from varpin.support.frozen import Frozen
+
+coal = pin.coal
+
+# A hull whose least thickness is below this share of its greatest extent is flat.
+_FLAT = 1e-9
+# coal counts the edges that meet in a vertex with 8 bits.
+_EDGES = 254
+
+
+@dataclass(frozen=True, eq=False)
+class Hull(Frozen):
+    """A convex polyhedron. Made by :func:`hull_around`.
+
+    Attributes:
+        points: Its vertices (P, 3) [m].
+        faces: Indices of the vertices of its triangles (F, 3), anticlockwise from outside.
+    """
+
+    points: Floats
+    faces: NDArray[np.int64]
+
+    @property
+    def sides(self) -> Floats:
+        """Sides of the box around it along its axes (3,) [m]."""
+        found: Floats = np.ptp(self.points, axis=0)
+        return found
+
+    @cached_property
+    def shape(self) -> Any:
+        """The polyhedron for coal."""
+        points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+        points.extend(self.points)
+        triangles.extend(coal.Triangle(*map(int, face)) for face in self.faces)
+        return coal.Convex(points, triangles)
+
+
+def hull_around(name: str, points: ArrayLike) -> Hull:
+    """The convex hull of points (N, 3) [m], N >= 4.
+
+    Raises:
+        InputError: They are not such points, lie in a plane, or one vertex of the hull has too many edges for coal.
+    """
+    given = as_floats(name, points)
+    if given.ndim != 2 or given.shape[1] != 3 or len(given) < 4:
+        raise InputError(f"{name} must have shape (N, 3) with N >= 4, got {given.shape}")
+    require_finite(name, given)
+    extents = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
+    flat = InputError(f"{name} lie in a plane, and a hull needs a volume: give points on both sides of it")
+    if extents[2] <= _FLAT * extents[0]:
+        raise flat
+    try:
+        found = scipy.spatial.ConvexHull(given)
+    except scipy.spatial.QhullError:
+        raise flat from None
+    place = np.full(len(given), -1)
+    place[found.vertices] = np.arange(len(found.vertices))
+    corners, faces = given[found.vertices], place[found.simplices]
+    a, b, c = (corners[faces[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * found.equations[:, :3]).sum(axis=1) < 0.0
+    faces[inward] = faces[inward][:, ::-1]
+    most = int(np.bincount(faces.ravel()).max())
+    if most > _EDGES:
+        raise InputError(f"{name} have a hull with {most} edges at one vertex, more than {_EDGES}: give fewer points")
+    return Hull(corners, faces)
+
+
+def mesh_points(path: str | os.PathLike[str], scale: float) -> Floats:
+    """The vertices (N, 3) [m] of a mesh file, times ``scale``.
+
+    Raises:
+        FileError: The file is missing or is no mesh that can be read.
+        InputError: ``path`` is no path or ``scale`` is not > 0.
+    """
+    file = path_like("mesh path", path)
+    factor = positive("mesh scale", scale, "1")
+    if not is_file(file):
+        raise FileError(f"no mesh file {str(file)!r}")
+    try:
+        mesh = coal.MeshLoader().load(str(file), np.full(3, factor))
+    except (ValueError, RuntimeError) as error:
+        reason = str(error).partition("message: ")[2].replace("\n", " ").partition(" Hint")[0].strip()
+        raise FileError(f"cannot read the mesh {file}: {reason or error}") from None
+    return np.array(mesh.vertices(), dtype=np.float64).reshape(-1, 3)

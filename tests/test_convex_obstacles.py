@@ -1,0 +1,282 @@
+"""Convex hulls as obstacles of a plan, against boxes, least squares and differences; SRDF files of other robots."""
+
+import pickle
+import struct
+from itertools import product
+
+import numpy as np
+import pytest
+from chromium import commands
+from refusals import naming, refused
+from scipy.optimize import nnls
+from scipy.spatial.transform import Rotation
+
+import varpin as vp
+from varpin.control.hints import hints
+from varpin.model.clearance import clearance
+from varpin.model.kinematics import frame_kinematics
+from varpin.show.replay import replay
+from varpin.show.replay.surroundings import regions
+
+ARM = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
+CUBE = np.array(list(product([-0.5, 0.5], repeat=3)))
+TURN = Rotation.from_euler("xyz", [0.3, -0.5, 0.8]).as_matrix()
+# The base of a wedge, whose edge lies above one of its sides.
+WEDGE = np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.3, 0], [0.4, 0.3, 0], [0, 0, 0.25], [0, 0.3, 0.25]], dtype=float)
+
+
+UR5 = {"forearm_link": ([0, 0, 0], [0, 0, 0.4], 0.06), "wrist_3_link": ([0, 0, 0], [0, 0.1, 0], 0.05)}
+
+
+def drum(corners=64):
+    """A cylinder's corners: more than coal looks through one by one, and flat ends."""
+    turn = 2.0 * np.pi * np.arange(corners) / corners
+    return np.vstack([np.c_[0.3 * np.cos(turn), 0.3 * np.sin(turn), np.full(corners, z)] for z in (-0.4, 0.4)])
+
+
+def apart(points, segment):
+    """Distance of a hull to a segment: least squares with non-negative shares that sum to 1 on each side."""
+    heavy = 1e5
+    ones, none = np.ones(len(points)), np.zeros(len(points))
+    rows = np.vstack(
+        [
+            np.hstack([points.T, -segment.T]),
+            heavy * np.r_[ones, 0.0, 0.0],
+            heavy * np.r_[none, 1.0, 1.0],
+        ]
+    )
+    shares, _ = nnls(rows, np.r_[0.0, 0.0, 0.0, heavy, heavy])
+    one, other = shares[: len(points)], shares[len(points) :]
+    return np.linalg.norm(points.T @ one / one.sum() - segment.T @ other / other.sum())
+
+
+def write_stl(path, points, faces):
+    with path.open("wb") as stream:
+        stream.write(bytes(80) + struct.pack("<I", len(faces)))
+        for face in faces:
+            stream.write(struct.pack("<12fH", 0.0, 0.0, 0.0, *points[face].ravel(), 0))
+
+
+def test_eight_points_are_a_box():
+    """Clear of it and inside; placed by its points, or by position and rotation; with slopes and on the move."""
+    robot = vp.load_robot("ur5")
+    center, sides = np.array([0.4, 0.2, 0.4]), np.array([0.3, 0.2, 0.5])
+
+    def measured(obstacle):
+        return clearance(robot, [obstacle], links=list(UR5), capsules=UR5)
+
+    def way(t):
+        return [0.1 * t, 0.0, -0.2 * t]
+
+    box = vp.Obstacle.box(center, sides, TURN).moving(way)
+    made = [
+        vp.Obstacle.convex([*(CUBE * sides), [0, 0, 0], *(CUBE * sides)], center, TURN).moving(way),
+        vp.Obstacle.convex((CUBE * sides) @ TURN.T + center).moving(way),
+    ]
+    assert made[0].hull.points.shape == (8, 3)
+    q = np.random.default_rng(0).normal(size=(40, 6))
+    times = np.arange(20.0) / 10.0
+    known = measured(box).over(times)
+    assert known.distances(q).min() < -0.05
+    assert known.distances(q).max() > 0.5
+    for hull in (*made, pickle.loads(pickle.dumps(vp.Obstacle.convex(CUBE * sides, center, TURN)))):
+        expected = known if hull.shift else measured(vp.Obstacle.box(center, sides, TURN))
+        measure = measured(hull).over(times)
+        np.testing.assert_allclose(measure.distances(q), expected.distances(q), atol=1e-9)
+        np.testing.assert_allclose(measure.slopes(q), expected.slopes(q), atol=1e-8)
+
+
+@pytest.mark.parametrize("points", [WEDGE, drum()], ids=["wedge", "drum"])
+def test_distances_are_those_of_least_squares(points):
+    rng = np.random.default_rng(1)
+    robot = vp.planar_chain(1)
+    (R,), (p,) = frame_kinematics(robot, "joint1").placements(np.zeros((1, 1)))
+    hull = vp.Obstacle.convex(points)
+    clear = 0
+    for _ in range(40):
+        segment = 0.7 * rng.normal(size=(2, 3))
+        here = (segment - p) @ R
+        found = clearance(robot, [hull], capsules={"joint1": (*here, 0.05)}).distances(np.zeros((1, 1)))[0, 0]
+        known = apart(points, segment)
+        if known > 1e-6:
+            clear += 1
+            assert found == pytest.approx(known - 0.05, abs=1e-9)
+        else:
+            assert found < -0.05 + 1e-6
+    assert clear > 15
+
+
+def test_slopes_are_differences():
+    robot = vp.load_robot("ur5")
+    hulls = [
+        vp.Obstacle.convex(WEDGE, [-0.5, 0.2, 0.3], TURN),
+        vp.Obstacle.convex(drum(), [0.6, -0.4, 0.4], TURN.T),
+    ]
+    measure = clearance(robot, hulls, links=list(UR5), capsules=UR5)
+    q = np.random.default_rng(2).normal(size=(12, 6))
+    slopes = measure.slopes(q)
+    for c in range(6):
+        e = 1e-6 * np.eye(6)[c]
+        found = (measure.distances(q + e) - measure.distances(q - e)) / 2e-6
+        np.testing.assert_allclose(slopes[:, :, c], found, atol=1e-7)
+
+
+def around(obstacle, steps=30):
+    robot = vp.planar_chain(2)
+    cost = vp.ControlCost(1e-3) + vp.VelocityCost(1e-2) + vp.Terminal(vp.TrackingCost([1.5, 0.3], 10.0))
+    clear = vp.KeepClear(robot, [obstacle], 0.02, links=["joint2"], capsules=ARM)
+    options = {"dt": 0.05, "steps": steps, "constraints": [clear]}
+    return vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, [0.0, 0.0], np.zeros(2), **options)
+
+
+def test_a_plan_around_a_wedge():
+    """The plan without the wedge goes through it."""
+    wedge = vp.Obstacle.convex(WEDGE - [0.2, 0.15, 0.1], [1.75, 0.0, -0.85], TURN, "wedge")
+    problem = around(wedge)
+    direct = vp.solve(
+        vp.OptimalControlProblem(
+            problem.scene, problem.cost, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps
+        )
+    )
+    measure = clearance(problem.scene.robot, [wedge], links=["joint2"], capsules=ARM)
+    assert measure.distances(direct.trajectory.q).min() < -0.05
+    plan = vp.solve(problem)
+    assert plan.status is vp.Status.CONVERGED
+    assert plan.violation <= 1e-6
+    assert measure.distances(plan.trajectory.q).min() == pytest.approx(0.02, abs=1e-6)
+
+
+def test_mesh_files(tmp_path):
+    """The hull of a mesh's vertices, scaled; the same obstacle as of its points."""
+    hull = vp.Obstacle.convex(1000.0 * WEDGE).hull
+    path = tmp_path / "wedge.stl"
+    write_stl(path, 1000.0 * WEDGE, np.array([[0, 1, 2], [1, 3, 2], [0, 4, 1], [2, 3, 5], [4, 5, 1]]))
+    read = vp.Obstacle.mesh(path, 0.001, [0.1, 0.2, 0.3], TURN)
+    own = vp.Obstacle.convex(WEDGE, [0.1, 0.2, 0.3], TURN)
+    assert read.name == "wedge"
+    assert len(hull.faces) == 8
+    np.testing.assert_allclose(read.begin, own.begin, atol=1e-7)
+    np.testing.assert_allclose(np.sort(read.hull.points, axis=0), np.sort(own.hull.points, axis=0), atol=1e-7)
+    with refused(vp.FileError, "none.stl"):
+        vp.Obstacle.mesh(tmp_path / "none.stl")
+    path.write_text("no mesh", encoding="utf-8")
+    with refused(vp.FileError, "wedge.stl"):
+        vp.Obstacle.mesh(path)
+    with refused(vp.InputError, "scale"):
+        vp.Obstacle.mesh(path, -1.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "facts"),
+    [
+        ({"points": WEDGE[:3]}, ("points", "(N, 3)", "4")),
+        ({"points": np.zeros((5, 3))}, ("points", "plane")),
+        ({"points": WEDGE[:4]}, ("points", "plane")),
+        ({"points": WEDGE * [1.0, np.nan, 1.0]}, ("points", "finite")),
+        ({"points": np.vstack([drum(300)[:300], [[0.0, 0.0, 1.0]]])}, ("300", "254", "fewer")),
+        ({"points": WEDGE, "rotation": 2.0 * np.eye(3)}, ("rotation",)),
+        ({"points": WEDGE, "position": [0.0]}, ("position",)),
+    ],
+)
+def test_what_is_no_hull_is_refused(given, facts):
+    with refused(vp.InputError, *facts):
+        vp.Obstacle.convex(**given)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+def test_millimetres(scale):
+    problem = around(vp.Obstacle.convex(scale * WEDGE, [2.0, 1.0, 1.0], name="wedge"), steps=2)
+    told = naming([found.sentence for found in hints(problem)], "millimetres", "'wedge'")
+    assert bool(told) == (scale > 1.0)
+
+
+def test_drawn_where_it_is(tmp_path):
+    """Its corners in the world, over its way, in the page, and its triangles closed and facing outwards."""
+    hull = vp.Obstacle.convex(WEDGE, [0.5, 0.1, 0.2], TURN).moving(lambda t: [t, 0.0, 0.0])
+    problem = around(hull)
+    (region,) = regions(problem.constraints, np.array([0.0, 1.0]))
+    known = WEDGE @ TURN.T + [0.5, 0.1, 0.2]
+    np.testing.assert_allclose(region.corners.min(axis=0), known.min(axis=0), atol=1e-12)
+    np.testing.assert_allclose(region.corners.max(axis=0), known.max(axis=0) + np.eye(3)[0], atol=1e-12)
+    a, b, c = (region.hull.points[region.hull.faces[:, k]] for k in range(3))
+    # The divergence theorem: the volume within the triangles.
+    volume = (a * np.cross(b, c)).sum() / 6.0
+    assert volume == pytest.approx(0.5 * 0.4 * 0.25 * 0.3, rel=1e-12)
+    page = replay(problem.scene.robot, np.zeros((2, 2)), dt=1.0, constraints=problem, html=tmp_path / "wedge.html")
+    drawn, placed = (command for command in commands(page) if command.get("path", "").endswith("regions/0 convex"))
+    corners = drawn["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
+    R, at = np.split(np.array(placed["matrix"]).reshape(4, 4).T[:3], [3], axis=1)
+    seen = np.frombuffer(corners, dtype=np.float32).reshape(-1, 3) @ R.T + at[:, 0]
+    np.testing.assert_allclose(np.sort(seen, axis=0), np.sort(known, axis=0), atol=1e-6)
+
+
+def test_plans_are_stored_with_their_hulls(tmp_path):
+    plan = vp.solve(around(vp.Obstacle.convex(WEDGE, [3.0, 0.0, 0.0]), steps=4))
+    plan.save(tmp_path / "plan.npz")
+    again = vp.Solution.load(tmp_path / "plan.npz", plan.problem)
+    np.testing.assert_array_equal(again.controls, plan.controls)
+    with refused(vp.FileError, "constraints"):
+        vp.Solution.load(tmp_path / "plan.npz", around(vp.Obstacle.convex(1.1 * WEDGE, [3.0, 0.0, 0.0]), steps=4))
+
+
+SCENE = """
+[robot]
+source = "ur5"
+[initial]
+q = [0.0, -1.2, 1.4, -1.8, -1.57, 0.0]
+[horizon]
+dt = 0.05
+steps = 2
+[[cost]]
+type = "control"
+[[plan_constraint]]
+type = "clearance"
+links = ["wrist_3_link"]
+hulls = [
+    [[1, 0, 0], [1.4, 0, 0], [1, 0.3, 0], [1, 0, 0.25]],
+    [[1, 0, 1], [1.4, 0, 1], [1, 0.3, 1], [1, 0, 1.25], [1.1, 0.1, 1.1]],
+]
+"""
+
+
+def test_scene_files(tmp_path):
+    path = tmp_path / "arm.toml"
+    path.write_text(SCENE, encoding="utf-8")
+    (clear,) = vp.load_scene(path).problem.constraints
+    assert clear.pairs == ("wrist_3_link and hull[0]", "wrist_3_link and hull[1]")
+    one, other = clear.obstacles
+    np.testing.assert_allclose(one.begin + one.hull.points.max(axis=0), [1.4, 0.3, 0.25])
+    assert len(other.hull.points) == 4
+    for old, new, facts in [
+        ("[1.4, 0, 0]", "[1.4, 0]", ("plan_constraint[0].hulls[0][1]",)),
+        ("[1, 0, 0.25]", "[1.2, 0.3, 0]", ("plan_constraint[0]", "plane")),
+    ]:
+        path.write_text(SCENE.replace(old, new), encoding="utf-8")
+        with refused(vp.SceneFileError, *facts):
+            vp.load_scene(path)
+
+
+def srdf_of(path, *pairs):
+    rows = "".join(f'<disable_collisions link1="{one}" link2="{other}" reason="Never"/>' for one, other in pairs)
+    path.write_text(f'<robot name="r">{rows}</robot>', encoding="utf-8")
+    return path
+
+
+def test_an_srdf_of_another_robot_is_told(tmp_path, caplog):
+    robot = vp.planar_chain(4)
+    capsules = {f"joint{k}": ([0, 0, 0], [1, 0, 0], 0.05) for k in range(1, 5)}
+
+    def pairs(*disabled):
+        path = srdf_of(tmp_path / "arm.srdf", *disabled)
+        return vp.KeepClear(robot, itself=True, links=list(capsules), capsules=capsules, srdf=path).pairs
+
+    pair = ("joint4", "joint1")
+    assert pairs(pair) == ("joint1 and joint3", "joint2 and joint4")
+    for disabled, facts in [((("panda_link1", "panda_link4"),), ("'panda_link1'",)), ((), ("no pairs",))]:
+        with refused(vp.InputError, "arm.srdf", repr(robot.name), *facts):
+            pairs(*disabled)
+    # Those of a gripper that the robot does not have are the lesser part.
+    pairs(pair, ("joint4", "finger"))
+    assert not caplog.messages
+    pairs(pair, ("a", "b"), ("a", "c"))
+    assert naming(caplog.messages, "arm.srdf", "3", "5", "'a'")
