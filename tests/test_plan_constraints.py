@@ -992,6 +992,39 @@ def test_verification_tells_what_the_continuous_robot_violates():
     assert "limit of joint" in speed.where
 
 
+def test_verification_counts_the_first_step():
+    """Lines that push and brake within the first step; against an integration by SciPy."""
+    robot = vp.planar_chain(1)
+    model, data = robot.model, robot.model.createData()
+    model.gravity.setZero()
+    nodes = np.array([[20.0], [-20.0], [0.0], [0.0]])
+    limits = vp.WithinVelocityLimits(robot, (-100.0, 0.1))
+    free, limited = (
+        vp.OptimalControlProblem(
+            vp.Scene(robot, damping=0.1, gravity=False),
+            vp.ControlCost(1.0),
+            [0.0],
+            [0.0],
+            dt=0.1,
+            steps=3,
+            controls="linear",
+            constraints=constraints,
+        )
+        for constraints in ([], [limits])
+    )
+    # Without iterations and constraints, the plan has the given controls.
+    plan = replace(vp.solve(free, nodes, max_iterations=0, check=False), problem=limited)
+    (speed,) = plan.verify(tolerance=1e-8).constraints
+
+    def rate(t, x):
+        torque = np.array([20.0 - 400.0 * t])
+        return np.append(x[1:], pin.aba(model, data, x[:1], x[1:], torque - 0.1 * x[1:]))
+
+    fine = solve_ivp(rate, (0.0, 0.1), np.zeros(2), "DOP853", rtol=1e-11, atol=1e-12, max_step=1e-3).y[1]
+    assert fine.max() - 0.1 > 0.1 > fine[-1]
+    assert speed.open_loop == pytest.approx(fine.max() - 0.1, rel=1e-3)
+
+
 def test_a_motion_with_feedback_that_runs_away_is_no_small_violation():
     kept = ViolationOnRobot("one", "m", 0.0, 0.1, 0.2, "")
     lost = ViolationOnRobot("other", "m", 0.0, 0.1, np.nan, "")
