@@ -351,6 +351,29 @@ def test_control_limits_and_hold():
         assert np.abs(plan.controls).max() <= limits[1]
 
 
+@pytest.mark.parametrize("torque", [1e-6, 1e-3])
+def test_a_first_motion_that_costs_next_to_nothing_does_not_call_a_goal_infeasible(torque):
+    """The plan is that of the same cost without the small reference, whose first motion costs nothing."""
+
+    def plan(reference):
+        cost = vp.ControlCost(0.1, reference=[reference, 0.0]) + vp.VelocityCost(0.02)
+        problem = vp.OptimalControlProblem(
+            vp.Scene(ROBOT, gravity=False, damping=0.1),
+            cost + vp.Terminal(vp.VelocityCost(10.0)),
+            [0.0, 0.1],
+            [0.0, 0.0],
+            dt=0.05,
+            steps=24,
+            constraints=[vp.ReachFrame(ROBOT, "tip", position=ROBOT.frame_positions([1.0, 0.5], "tip"))],
+        )
+        return vp.solve(problem, check=False)
+
+    found, exact = plan(torque), plan(0.0)
+    assert found.status is vp.Status.CONVERGED, found.reason
+    assert found.violation <= 1e-9
+    assert found.cost == pytest.approx(exact.cost, rel=1e-3)
+
+
 def test_what_cannot_be_met_is_named():
     """A goal out of reach, and how far out."""
     plan = vp.solve(two_links([vp.ReachFrame(ROBOT, "tip", position=[2.5, 0.0, 0.0])]), check=False)
@@ -981,6 +1004,39 @@ def test_verification_tells_what_the_continuous_robot_violates():
     assert seen.violation == max(speed.closed_loop, goal.closed_loop)
     assert not unnamed(str(seen), "WithinVelocityLimits", "[rad/s or m/s]")
     assert "limit of joint" in speed.where
+
+
+def test_verification_counts_the_first_step():
+    """Lines that push and brake within the first step; against an integration by SciPy."""
+    robot = vp.planar_chain(1)
+    model, data = robot.model, robot.model.createData()
+    model.gravity.setZero()
+    nodes = np.array([[20.0], [-20.0], [0.0], [0.0]])
+    limits = vp.WithinVelocityLimits(robot, (-100.0, 0.1))
+    free, limited = (
+        vp.OptimalControlProblem(
+            vp.Scene(robot, damping=0.1, gravity=False),
+            vp.ControlCost(1.0),
+            [0.0],
+            [0.0],
+            dt=0.1,
+            steps=3,
+            controls="linear",
+            constraints=constraints,
+        )
+        for constraints in ([], [limits])
+    )
+    # Without iterations and constraints, the plan has the given controls.
+    plan = replace(vp.solve(free, nodes, max_iterations=0, check=False), problem=limited)
+    (speed,) = plan.verify(tolerance=1e-8).constraints
+
+    def rate(t, x):
+        torque = np.array([20.0 - 400.0 * t])
+        return np.append(x[1:], pin.aba(model, data, x[:1], x[1:], torque - 0.1 * x[1:]))
+
+    fine = solve_ivp(rate, (0.0, 0.1), np.zeros(2), "DOP853", rtol=1e-11, atol=1e-12, max_step=1e-3).y[1]
+    assert fine.max() - 0.1 > 0.1 > fine[-1]
+    assert speed.open_loop == pytest.approx(fine.max() - 0.1, rel=1e-3)
 
 
 def test_a_motion_with_feedback_that_runs_away_is_no_small_violation():

@@ -103,6 +103,17 @@ def test_controls_are_steps_held_to_the_end_of_the_last_interval():
     np.testing.assert_array_equal(line.get_ydata(), [1.0, -2.0, 0.5, 0.5])
 
 
+def test_linear_controls_are_lines_through_the_nodes():
+    problem = vp.OptimalControlProblem(
+        vp.Scene(vp.planar_chain(1)), vp.ControlCost(1.0), [0.3], [0.0], dt=0.01, steps=3, controls="linear"
+    )
+    nodes = np.array([[1.0], [-2.0], [3.0], [0.5]])
+    motion = vp.solve(problem, nodes, max_iterations=0, check=False).trajectory
+    (line,) = plots.plot_controls(motion)[1].get_lines()
+    assert line.get_drawstyle() == "default"
+    np.testing.assert_allclose(line.get_xydata(), np.column_stack([motion.t, nodes]), atol=1e-12)
+
+
 def test_controls_that_are_no_joints_have_their_own_names():
     robot = vp.planar_chain(3)
     scene = vp.Scene(robot, actuation=["joint1", "joint3"])

@@ -56,6 +56,9 @@ _FINAL, _FINEST = 1e-2, 1e-7
 _GROWTH, _ENOUGH = 10.0, 0.2
 # Greatest weight of a penalty, relative to its first one: rounding errors of a heavier penalty exceed the cost.
 _HEAVIEST = 1e9
+# First penalties are light if the model would remove less than _LIGHT of them. They are made heavier until that is no
+# longer so, by at most _HEAVIER at a time, in at most _LIFTS times. Shares up to _ROUNDED may be rounding errors.
+_LIGHT, _HEAVIER, _LIFTS, _ROUNDED = 1e-2, 1e8, 8, 1e-9
 # Rounds in which margins are updated, and the relative change below which they have settled.
 _MOVING, _SETTLED = 12, 1e-3
 # A plan is infeasible when _STUCK rounds in a row have left more than _LOWERED of the worst violation.
@@ -230,9 +233,43 @@ class _Rounds:
             # Where the auxiliary forces are dropped at once, the motion may fall, and its cost says nothing.
             cost = min(cost, abs(closing_of(plain, self.states, self.controls).motion.cost))
         weights = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
+        if self.states is None:
+            weights = weights * self._heavier(first.trajectory, weights)
         nothing = np.full(len(self.bound), np.inf)
         self.state = _State(zeros, weights, weights, zeros, nothing, _LOOSE)
         return first
+
+    def _heavier(self, motion: Trajectory, weights: Floats) -> float:
+        """Factor of first weights that are light: those of a first motion that costs next to nothing.
+
+        The share of the penalties that the model along the motion removes grows in proportion to light weights, and
+        then goes towards the share that controls can remove at all. Where that is none, the factor is 1.
+        """
+        zeros = [np.zeros(item.shape) for item in self.bound]
+
+        def removed(factor: float) -> float:
+            made = penalized(self.problem, zeros, factor * weights, zeros)
+            rows = self.problem.control_rows(motion)
+            whole = float(sum(part.shares(motion.q, motion.v, rows).sum() for part in made.penalties))
+            found = backward(made, motion, 0.0) if whole > 0.0 else None
+            return np.nan if found is None else (found.expected_decrease - base) / whole
+
+        base, factor = 0.0, 1.0
+        try:
+            plain = backward(penalized(self.problem, zeros, 0.0 * weights, zeros), motion, 0.0)
+            base = 0.0 if plain is None else plain.expected_decrease
+            share = removed(factor)
+            for _ in range(_LIFTS):
+                if not share < _LIGHT:
+                    break
+                before = share
+                factor *= float(np.clip(_LIGHT / max(share, 1e-300), 10.0, _HEAVIER))
+                share = removed(factor)
+                if before > _ROUNDED and share < 2.0 * before:
+                    break
+        except (CostError, NoiseFieldError, LinearizationError):
+            return 1.0
+        return factor if share >= _LIGHT else 1.0
 
     def _take_up(self, resumed: object) -> Solution:
         """Continue from the state of a solution."""

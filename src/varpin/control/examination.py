@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from varpin.arrays import Floats
 from varpin.control.between_nodes import enforced
-from varpin.control.constraints import BoundConstraint
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
@@ -18,7 +16,7 @@ from varpin.control.multipliers import FEASIBLE, REPORTED, split
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes
-from varpin.control.verification import accurate_cost, percent
+from varpin.control.verification import accurate_cost, at_start, percent
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, VarpinError
 from varpin.integrators import Integrator
@@ -176,15 +174,6 @@ def _unfinished(solution: Solution) -> list[Finding]:
     return [Finding("not converged", f"the search ended before it converged: {solution.reason}")]
 
 
-def _at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
-    """Rows of a state inequality at the fixed start; None for other constraints."""
-    if bound.of_controls or bound.source.equality:
-        return None
-    q, v = (np.tile(state, (problem.steps + 1, 1)) for state in (problem.q0, problem.v0))
-    c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
-    return c
-
-
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about a problem before any search; values in wrong units come first."""
     found = hints(problem)
@@ -196,7 +185,7 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about constraints that the start violates, so that the first step has to satisfy them."""
     found = []
     for bound in problem.bound_constraints:
-        c = _at_start(problem, bound)
+        c = at_start(problem, bound)
         if c is None:
             continue
         row = int(np.argmax(c))
@@ -356,7 +345,7 @@ def _between(solution: Solution) -> list[Finding]:
         c = bound.value(motion.q, motion.v, problem.control_rows(motion))
         # The margin is that of the plan's node at the end of the step.
         c = c + margin.repeat(PARTS, axis=0)
-        outside = _at_start(problem, whole)
+        outside = at_start(problem, whole)
         if outside is not None:
             # A row that is violated at the start cannot hold before the first node, so it is not reported there.
             c[: PARTS - 1, outside > 0.0] = -np.inf

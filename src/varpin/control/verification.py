@@ -379,9 +379,10 @@ def _violations(
                 where = ""
                 continue
             excess = _excess(bound, bound.value(motion.q, motion.v, problem.control_rows(motion)))
-            if not bound.of_controls and not bound.source.equality:
-                # The plan can change nothing before its first node.
-                excess[: substeps - 1] = 0.0
+            outside = at_start(problem, whole)
+            if outside is not None:
+                # A row that is violated at the start cannot hold before the first node.
+                excess[: substeps - 1, outside > 0.0] = 0.0
             sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
             worst.append(float(excess[sample, row]))
             where = f"{bound.rows[row]} at t = {bound.times[sample]:.4g} s" if worst[-1] > 0.0 else ""
@@ -389,6 +390,15 @@ def _violations(
         opened, closed = worst
         found.append(ViolationOnRobot(label, unit, float(planned.max(initial=0.0)), opened, closed, where))
     return tuple(found)
+
+
+def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
+    """Rows of a state inequality at the fixed start; None for other constraints."""
+    if bound.of_controls or bound.source.equality:
+        return None
+    q, v = (np.tile(state, (problem.steps + 1, 1)) for state in (problem.q0, problem.v0))
+    c: Floats = bound.value(q, v, np.zeros((problem.steps, problem.scene.controls)))[0]
+    return c
 
 
 def _excess(bound: BoundConstraint, c: Floats) -> Floats:

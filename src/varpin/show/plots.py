@@ -81,7 +81,7 @@ def plot_controls(
     robot: Robot | None = None,
     labels: Sequence[str] | None = None,
 ) -> tuple[Figure | SubFigure, Axes]:
-    """Controls over time, as step functions.
+    """Controls over time: step functions, or lines where they are linear between nodes.
 
     Controls of position servos and kinematic inputs are commanded positions [rad or m]; the second control of a cubic
     input is a velocity [rad/s or m/s].
@@ -126,12 +126,16 @@ def plot_controls(
             unit = "rad/s or m/s" if slides is None else ("rad/s", "m/s")[int(slides[joint])]
             names[control] = f"{plain[control]}, velocity [{unit}]"
         unit = "units of each"
-    for row, name, style in zip(trajectory.u.T, names, _styles(controls), strict=True):
-        edges, values = _thin_steps(trajectory.t, row)
-        axes.step(edges, values, where="post", label=name, **style)
+    linear = trajectory.u_nodes.shape[1] > 0
+    drawn = trajectory.u_nodes if linear else trajectory.u
+    for row, name, style in zip(drawn.T, names, _styles(controls), strict=True):
+        if linear:
+            axes.plot(*_thin(trajectory.t, row), label=name, **style)
+        else:
+            axes.step(*_thin_steps(trajectory.t, row), where="post", label=name, **style)
     limits = _control_limits(robot, joints)
     if limits is not None:
-        _draw_limits(axes, trajectory.u, limits)
+        _draw_limits(axes, drawn, limits)
     _finish(axes, trajectory, f"{what} [{unit}]", controls)
     return figure, axes
 
