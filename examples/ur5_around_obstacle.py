@@ -35,6 +35,6 @@ problem = vp.OptimalControlProblem(
 )
 plan = vp.solve(problem)
 print(plan)
-print(f"{len(plan.history)} iterations, violations of {plan.violation:.1e} at most: {plan.status.value}")
+print(f"{plan.iterations} iterations, violations of {plan.violation:.1e} at most: {plan.status.value}")
 
 print(vp.replay(robot, plan, trace="tool0", html=out / "ur5_around_obstacle.html"))

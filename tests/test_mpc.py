@@ -12,6 +12,7 @@ import varpin as vp
 import varpin.control.mpc
 from varpin.control import backward
 from varpin.control.mpc import _decision
+from varpin.simulation.soundness import examined
 
 
 def cart(steps=40, **options):
@@ -594,3 +595,20 @@ def test_what_a_tick_refuses():
         mpc.plan(0.05, [0, 0], [0, 0], first, decisions=-1)
     with refused(vp.InputError, "rng"):
         mpc.run(duration=0.1, rng="a")
+
+
+def test_errors_of_steps_do_not_add_up_in_the_loop():
+    """Upright, the recorded torques alone let the arm fall; the loop of a far better plant is the same."""
+    robot, up = vp.planar_chain(2), np.array([-np.pi / 2, 0.0])
+    cost = vp.TrackingCost(up, 10.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-2)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.1), cost, np.add(up, [0.1, 0.0]), np.zeros(2), dt=0.05, steps=12
+    )
+    noisy, coarse = vp.Scene(robot, damping=0.1, noise=vp.AdditiveNoise(1e-2)), vp.Midpoint(kick="held")
+    run, better = (
+        vp.Mpc(problem, iterations=1).run(vp.Plant(noisy, integrator=method), duration=3.0, rng=0)
+        for method in (coarse, vp.Gauss(4, kick="held"))
+    )
+    np.testing.assert_allclose(run.motion.q, better.motion.q, rtol=0, atol=1e-4)
+    assert [finding.kind for finding in examined(noisy, coarse, run.motion)[1]] == ["growing errors"]
+    assert run.warnings == ()

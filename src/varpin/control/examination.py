@@ -315,7 +315,7 @@ def _margins_of_velocities(solution: Solution) -> list[Finding]:
         return []
     wrong = wrong_variances(problem.scene, motion, problem.integrator)
     where = ", ".join(sorted(labels))
-    return [Finding("margins of velocities", f"{where}: a margin= of velocities is as wrong: {why}") for why in wrong]
+    return [Finding("margins of velocities", f"the margin= of {where} may be wrong: {why}") for why in wrong]
 
 
 def _between(solution: Solution) -> list[Finding]:

@@ -383,7 +383,7 @@ class Mpc:
             if not parts:
                 raise
             raise Interrupted(_so_far(plant, method, parts)) from None
-        motion, found = examined_in_loop(plant.scene, method, chained(parts), plant.substeps)
+        motion, found = examined_in_loop(plant.scene, method, chained(parts), plant.substeps, corrected=True)
         found = (*noise_forgotten(plant.scene, rng), *unfit, *found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
         found = (*found, *_whole_ticks(duration, ticks, self.period))

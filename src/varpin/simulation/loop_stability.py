@@ -158,13 +158,20 @@ class Loop:
 
 @np.errstate(over="ignore", invalid="ignore")
 def examined_in_loop(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, hold: int | None, error: float | None = None
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    hold: int | None,
+    error: float | None = None,
+    *,
+    corrected: bool = False,
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
     """:func:`varpin.simulation.soundness.examined`, and the check of the control loop.
 
     ``hold`` is the period of the loop in steps, None without feedback; ``error`` the largest of q [rad or m], if known.
+    ``corrected``: the controller brings the motion back, so that errors of steps do not add up.
     """
-    trajectory, found = examined(scene, integrator, trajectory, error)
+    trajectory, found = examined(scene, integrator, trajectory, error, corrected=corrected)
     if hold is not None:
         loop = unstable_loop(scene, trajectory, hold) or _flipping(scene, trajectory, hold)
         found = (*(loop or _cycling(scene, trajectory, hold)), *found)

@@ -120,18 +120,24 @@ class Finding:
 # Squares of the numbers of a motion that blows up may be infinite, and their differences undefined.
 @np.errstate(over="ignore", invalid="ignore")
 def examined(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, error: float | None = None
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    error: float | None = None,
+    *,
+    corrected: bool = False,
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
     """The motion with its energy balance, if the integrator keeps none, and its warnings; and the findings.
 
-    ``error`` is the largest error of q at all nodes [rad or m], where it is known.
+    ``error`` is the largest error of q at all nodes [rad or m], where it is known. ``corrected``: a controller acts on
+    the state that has the errors of the steps before, so that they do not add up over the motion.
     """
     if not integrator.variational:
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
         trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
     right = clearly_right(scene, integrator, trajectory, error)
-    errors = () if right else _errors_found(scene, integrator, trajectory)
+    errors = () if right else _errors_found(scene, integrator, trajectory, corrected=corrected)
     found = (
         *errors,
         *alternating(scene, integrator, trajectory),
@@ -258,7 +264,9 @@ def _resolved_width(scene: Scene, stop: Stop, turned: float) -> float:
     return stop.slope * stop.width / left if left > 0.0 else np.inf
 
 
-def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+def _errors_found(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, *, corrected: bool
+) -> tuple[Finding, ...]:
     """Errors from the energy balance and from repeated steps."""
     if not trajectory.steps:
         return ()
@@ -267,7 +275,7 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
     at_rest = _wrong_at_rest(scene, integrator, trajectory)
     resolution = resolution_of(scene, integrator, trajectory)
     if resolution.resolved:
-        more = () if found else _accumulated(scene, integrator, trajectory, resolution)
+        more = () if found or corrected else _accumulated(scene, integrator, trajectory, resolution)
         return (*found, *more, *at_rest)
     error = motion_error(scene, integrator, trajectory)
     if error is not None and is_wrong(error):
@@ -294,7 +302,7 @@ def _errors_found(scene: Scene, integrator: Integrator, trajectory: Trajectory) 
             found.append(_ringing(scene, _damping_of(scene, trajectory), trajectory.dt))
     if scene.constraints and not found:
         found.extend(_unresolved_damping(scene, integrator, trajectory))
-    if not found:
+    if not (found or corrected):
         found.extend(_accumulated(scene, integrator, trajectory, Resolution(False)))
     return (*found, *(finding for finding in at_rest if finding.kind not in {other.kind for other in found}))
 
@@ -311,7 +319,10 @@ def _unresolved_damping(scene: Scene, integrator: Integrator, trajectory: Trajec
 def _accumulated(
     scene: Scene, integrator: Integrator, trajectory: Trajectory, resolution: Resolution
 ) -> tuple[Finding, ...]:
-    """Errors that add up or grow over a motion whose steps resolve each period."""
+    """Errors that add up or grow over a motion whose steps resolve each period.
+
+    They come from a repetition of the whole motion under its recorded controls, without feedback.
+    """
     phase = () if resolution.in_phase else _out_of_phase(scene, integrator, trajectory)
     return phase or _growing(scene, integrator, trajectory, resolution)
 
