@@ -284,3 +284,11 @@ def test_the_default_integrator_is_chosen_on_each_grid() -> None:
         assert problem.at(dt=0.05).integrator == finer
         assert problem.at(dt=0.05, integrator=vp.Midpoint()).integrator == vp.Midpoint()
         assert _halved(problem).integrator == finer
+
+
+def test_a_loss_within_the_wish_is_no_warning() -> None:
+    plan = vp.solve(reach(4, "linear"), true_cost=1e-2)
+    assert plan.refinement.met
+    assert 2e-3 < plan.verify().closed_loop_loss < 1e-2
+    assert not naming(plan.warnings, "in quarters of dt")
+    assert naming(vp.solve(plan.problem, plan.controls).warnings, "in quarters of dt")

@@ -104,13 +104,19 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
     except VarpinError as error:
         steps = f"{1.0 / PARTS:g} dt"
         return *warnings, Finding("replay", f"the plan cannot be replayed in steps of {steps}: {error}")
-    if replay.holds:
+    if replay.holds or _as_wished(solution, replay):
         return tuple(warnings)
     warnings.append(Finding("replay", _sentence(problem, replay)))
     reasons = [finding for finding in found if finding.kind in _OF_STEPS]
     # Findings about steps that are negligible for the motion may explain the plan's loss.
     record = findings_from_record(problem.scene, problem.integrator, motion)
     return *warnings, *(reasons or [finding for finding in record if finding.kind in _OF_STEPS])
+
+
+def _as_wished(solution: Solution, replay: Replay) -> bool:
+    """Whether the plan's refinement met its wish, and the replay with feedback confirms that."""
+    refinement = solution.refinement
+    return refinement is not None and refinement.met and -GAIN <= replay.feedback <= refinement.wish
 
 
 def replayed(solution: Solution) -> Replay:
