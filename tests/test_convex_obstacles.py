@@ -86,6 +86,20 @@ def test_eight_points_are_a_box():
         np.testing.assert_allclose(measure.slopes(q), expected.slopes(q), atol=1e-8)
 
 
+def test_directions_are_as_exact_as_distances():
+    """Of many postures beside a plate, a box and its corners: close ones among them."""
+    robot = vp.load_robot("ur5")
+    center, sides = [0.5, 0.2, 0.4], np.array([1.0, 1.0, 0.1])
+    q = np.random.default_rng(0).normal(size=(1500, 6))
+    link = {"links": ["forearm_link"], "capsules": {"forearm_link": UR5["forearm_link"]}}
+    box = clearance(robot, [vp.Obstacle.box(center, sides)], **link)
+    hull = clearance(robot, [vp.Obstacle.convex(CUBE * sides, center)], **link)
+    apart = box.distances(q)[:, 0]
+    clear = apart > -0.05
+    np.testing.assert_allclose(hull.distances(q)[clear, 0], apart[clear], atol=1e-9)
+    np.testing.assert_allclose(hull.slopes(q)[clear], box.slopes(q)[clear], atol=1e-7)
+
+
 @pytest.mark.parametrize("points", [WEDGE, drum()], ids=["wedge", "drum"])
 def test_distances_are_those_of_least_squares(points):
     rng = np.random.default_rng(1)
