@@ -321,7 +321,7 @@ def _least(S: Floats, d: Floats, equal: Mask, active: Mask) -> Floats:
     Block principal pivoting, after Portugal, Judice and Vicente, "A comparison of block pivoting and interior-point
     algorithms for linear least squares problems with nonnegative variables" (1994). Begins with the ``active`` rows.
     Where that does not progress, as with more rows than controls that could meet them, the algorithm of Lawson and
-    Hanson on the Cholesky factor, which has half the digits of S to lose.
+    Hanson on a triangular factor, which has half the digits of S to lose.
     """
     length = np.sqrt(np.maximum(np.diagonal(S), 0.0))
     length = np.where(length > 0.0, length, 1.0)
@@ -350,7 +350,10 @@ def _nonnegative(S: Floats, d: Floats, equal: Mask) -> Floats:
     """The x (a,) of :func:`_least` as nonnegative least squares, with the unknowns of equalities eliminated first."""
     order = np.argsort(~equal, kind="stable")
     first = int(equal.sum())
-    upper = np.linalg.cholesky(S[np.ix_(order, order)]).T
+    values, vectors = np.linalg.eigh(S[np.ix_(order, order)])
+    # Rounding errors may leave S without a Cholesky factor; this one has values of the size of these errors instead.
+    root = np.sqrt(np.maximum(values, _LITTLE * len(S) * values[-1]))[:, None] * vectors.T
+    upper = np.linalg.qr(root, mode="r")
     goal = scipy.linalg.solve_triangular(upper, d[order], trans="T")
     x = np.zeros(len(d))
     x[first:] = scipy.optimize.nnls(upper[first:, first:], goal[first:], maxiter=_PIVOTS * len(d))[0]
