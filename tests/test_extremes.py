@@ -60,7 +60,7 @@ def worried(monkeypatch):
     def worry():
         monkeypatch.setattr("varpin.simulation.soundness.clearly_right", lambda *_: False)
         found = (Finding("test", "all is not well"),)
-        monkeypatch.setattr("varpin.simulation.soundness._errors_found", lambda *_: found)
+        monkeypatch.setattr("varpin.simulation.soundness._errors_found", lambda *_, **__: found)
 
     return worry
 

@@ -9,7 +9,7 @@ import pytest
 from findings import about
 from refusals import naming, refused, unnamed
 from scipy.integrate import solve_ivp
-from scipy.optimize import lsq_linear, minimize
+from scipy.optimize import lsq_linear, minimize, nnls
 
 import varpin as vp
 from varpin.control import ViolationOnRobot, polish, search
@@ -268,6 +268,18 @@ def test_dual_problems_are_those_of_scipy():
         assert (found[~equal] >= 0.0).all()
         values = [0.5 * x @ S @ x - d @ x for x in (found, best.x)]
         assert values[0] <= values[1] + 1e-9 * abs(values[1])
+
+
+def test_dual_problem_whose_matrix_rounding_has_made_indefinite():
+    """The residual of SciPy's nonnegative least squares, for a matrix without a Cholesky factor."""
+    rng = np.random.default_rng(1)
+    B, b = rng.normal(size=(3, 10)), rng.normal(size=3)
+    S = B.T @ B - 1e-12 * np.eye(10)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(S)
+    x = polish._nonnegative(S, B.T @ b, np.zeros(10, dtype=bool))
+    assert x.min() >= 0.0
+    assert np.linalg.norm(B @ x - b) <= nnls(B, b)[1] + 1e-6
 
 
 def test_first_penalties_on_given_states_are_light():

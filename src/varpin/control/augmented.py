@@ -59,6 +59,8 @@ _HEAVIEST = 1e9
 # First penalties are light if the model would remove less than _LIGHT of them. They are made heavier until that is no
 # longer so, by at most _HEAVIER at a time, in at most _LIFTS times. Shares up to _ROUNDED may be rounding errors.
 _LIGHT, _HEAVIER, _LIFTS, _ROUNDED = 1e-2, 1e8, 8, 1e-9
+# Violation of the first motion, relative to the constraint's scale, up to which its penalties are not made heavier.
+_FAR = 1e-2
 # Rounds in which margins are updated, and the relative change below which they have settled.
 _MOVING, _SETTLED = 12, 1e-3
 # A plan is infeasible when _STUCK rounds in a row have left more than _LOWERED of the worst violation.
@@ -243,9 +245,13 @@ class _Rounds:
         """Factor of first weights that are light: those of a first motion that costs next to nothing.
 
         The share of the penalties that the model along the motion removes grows in proportion to light weights, and
-        then goes towards the share that controls can remove at all. Where that is none, the factor is 1.
+        then goes towards the share that controls can remove at all. Where that is none, the factor is 1. So it is near
+        the constraints, as along a plan within them.
         """
         zeros = [np.zeros(item.shape) for item in self.bound]
+        known = reports_of(self.whole, motion, zeros, zeros)
+        if not any(item.violation > _FAR * bound.scale for item, bound in zip(known, self.bound, strict=True)):
+            return 1.0
 
         def removed(factor: float) -> float:
             made = penalized(self.problem, zeros, factor * weights, zeros)

@@ -353,7 +353,7 @@ def _nonnegative(S: Floats, d: Floats, equal: Mask) -> Floats:
     values, vectors = np.linalg.eigh(S[np.ix_(order, order)])
     # Rounding errors may leave S without a Cholesky factor; this one has values of the size of these errors instead.
     root = np.sqrt(np.maximum(values, _LITTLE * len(S) * values[-1]))[:, None] * vectors.T
-    upper = np.linalg.qr(root, mode="r")
+    upper: Floats = np.linalg.qr(root)[1]
     goal = scipy.linalg.solve_triangular(upper, d[order], trans="T")
     x = np.zeros(len(d))
     x[first:] = scipy.optimize.nnls(upper[first:, first:], goal[first:], maxiter=_PIVOTS * len(d))[0]
