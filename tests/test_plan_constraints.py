@@ -270,8 +270,10 @@ def test_dual_problems_are_those_of_scipy():
         assert values[0] <= values[1] + 1e-9 * abs(values[1])
 
 
-def test_dual_problem_whose_matrix_rounding_has_made_indefinite():
-    """The residual of SciPy's nonnegative least squares, for a matrix without a Cholesky factor."""
+@pytest.mark.parametrize("pivots", [10, 0])
+def test_dual_problem_whose_matrix_rounding_has_made_indefinite(monkeypatch, pivots):
+    """The residual of SciPy's nonnegative least squares for a matrix without a Cholesky factor; without pivots, too."""
+    monkeypatch.setattr(polish, "_PIVOTS", pivots)
     rng = np.random.default_rng(1)
     B, b = rng.normal(size=(3, 10)), rng.normal(size=3)
     S = B.T @ B - 1e-12 * np.eye(10)

@@ -236,17 +236,17 @@ class _Rounds:
             cost = min(cost, abs(closing_of(plain, self.states, self.controls).motion.cost))
         weights = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
         if self.states is None:
-            weights = weights * self._heavier(first.trajectory, weights)
+            weights = weights * self._heavier(plain, first.trajectory, weights)
         nothing = np.full(len(self.bound), np.inf)
         self.state = _State(zeros, weights, weights, zeros, nothing, _LOOSE)
         return first
 
-    def _heavier(self, motion: Trajectory, weights: Floats) -> float:
+    def _heavier(self, plain: OptimalControlProblem, motion: Trajectory, weights: Floats) -> float:
         """Factor of first weights that are light: those of a first motion that costs next to nothing.
 
         The share of the penalties that the model along the motion removes grows in proportion to light weights, and
         then goes towards the share that controls can remove at all. Where that is none, the factor is 1. So it is near
-        the constraints, as along a plan within them.
+        the constraints, as along a plan within them. ``plain`` is the problem whose penalties have no weight.
         """
         zeros = [np.zeros(item.shape) for item in self.bound]
         known = reports_of(self.whole, motion, zeros, zeros)
@@ -262,8 +262,8 @@ class _Rounds:
 
         base, factor = 0.0, 1.0
         try:
-            plain = backward(penalized(self.problem, zeros, 0.0 * weights, zeros), motion, 0.0)
-            base = 0.0 if plain is None else plain.expected_decrease
+            alone = backward(plain, motion, 0.0)
+            base = 0.0 if alone is None else alone.expected_decrease
             share = removed(factor)
             for _ in range(_LIFTS):
                 if not share < _LIGHT:

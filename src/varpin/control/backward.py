@@ -423,8 +423,7 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
     if not problem.limited or along.clipped:
         return _pass(along, regularization, curvature=curvature)[0]
     stiffness = np.zeros((problem.decisions, problem.scene.controls))
-    nowhere = np.zeros((0, along.states + problem.scene.controls))
-    free = _Limits(along.slack[:0], nowhere, stiffness=stiffness)
+    free = _at_limits(along.slack[:0], along.states)._replace(stiffness=stiffness)
     plan = _pass(along, regularization, curvature=curvature, limits=free)[0]
     if plan is not None:
         moves = _foreseen(along, plan)[1]
@@ -437,7 +436,7 @@ def _within_limits(along: Along, regularization: float, curvature: Floats | None
             plan = _Box(along, regularization * np.abs(stiffness), curvature).minimum(plan, moves)
         if plan is not None:
             return plan
-    return _pass(along, regularization, curvature=curvature, limits=_Limits(along.slack, nowhere))[0]
+    return _pass(along, regularization, curvature=curvature, limits=_at_limits(along.slack, along.states))[0]
 
 
 def _sloped(plan: Plan, moves: Floats) -> Plan:
@@ -533,7 +532,7 @@ class _Box:
 
     def _fixed(self, held: tuple[Mask, Mask]) -> Plan | None:
         slack = self._slack(held)
-        return self._passed(_Limits(slack, np.zeros((0, self.along.states + slack.shape[2]))))
+        return self._passed(_at_limits(slack, self.along.states))
 
     def _with_gains(self, moves: Floats, held: tuple[Mask, Mask]) -> tuple[Plan, _Point] | None:
         """The pass with held controls, whose gains go with the given changes, and the model there."""
@@ -555,7 +554,6 @@ class _Box:
         size = np.where(both, np.where(both, high, 0.0) - np.where(both, low, 0.0), np.where(moved > 0.0, moved, 1.0))
         z = np.where(fixed, low, np.clip(begin, low + 0.1 * size, high - 0.1 * size))
         slack = self._slack((fixed, np.zeros_like(fixed)))
-        nowhere = np.zeros((0, self.along.states + z.shape[1]))
         gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
         mu = plan.expected_decrease / count
         duals = [mu / gap for gap in gaps]
@@ -566,7 +564,7 @@ class _Box:
             mu *= 0.1 if length > 0.9 else 0.3 if length > 0.5 else 0.7
             stiff = duals[0] / gaps[0] + duals[1] / gaps[1]
             pull = mu / gaps[1] - mu / gaps[0] - stiff * z
-            found = self._passed(_Limits(slack, nowhere), stiff, pull)
+            found = self._passed(_at_limits(slack, self.along.states), stiff, pull)
             if found is None:
                 return None
             to = _foreseen(self.along, found, slack)[1]
@@ -662,7 +660,7 @@ def _foreseen(along: Along, plan: Plan, slack: Floats | None = None) -> tuple[Fl
             costate=np.zeros((0, x)),
             spread=spread[begin:end],
         )
-        within = _Limits(along.slack if slack is None else slack, np.zeros((0, x + m)))
+        within = _at_limits(along.slack if slack is None else slack, x)
         steps = along.steps(begin, end, None, within)
         core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows])
     return expected, moves
@@ -689,7 +687,12 @@ class _Limits(NamedTuple):
 
 
 def _without_limits(controls: int, states: int) -> _Limits:
-    return _Limits(np.zeros((0, 2, controls)), np.zeros((0, states + controls)))
+    return _at_limits(np.zeros((0, 2, controls)), states)
+
+
+def _at_limits(slack: Floats, states: int) -> _Limits:
+    """Limits around the nominal states, with ``slack`` (R, 2, m)."""
+    return _Limits(slack, np.zeros((0, states + slack.shape[2])))
 
 
 class Along:
@@ -1079,7 +1082,7 @@ def _one_pass_on_lines(
     line, k = along.line, problem.processes
     spread, costate = np.empty((R if k else 0, X, X)), np.empty((R if costates else 0, X))
     of_states = costate[1:, :x]
-    limits = _Limits(np.zeros((0, 2, m)), np.zeros((0, X + m))) if limits is None else limits
+    limits = _without_limits(m, X) if limits is None else limits
     gains = core.Gains(
         feedforward=feedforward,
         feedback=feedback,
@@ -1089,7 +1092,7 @@ def _one_pass_on_lines(
         spread=spread,
         **limits.part(slice(0, R)),
     )
-    steps = along.steps(0, R, curvature, limits or _without_limits(m, X))
+    steps = along.steps(0, R, curvature, limits)
     how = (problem.dt, 1, float(regularization))
     found: core.BackwardPass | core.RootPass
     if roots:

@@ -63,16 +63,23 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
     """The problem with further bound constraints, one for each constraint with rows at ``instants``."""
     if not len(instants.rows):
         return problem
-    made, begin = object.__new__(type(problem)), 0
+    made = object.__new__(type(problem))
     found: list[BoundConstraint] = list(problem.bound_constraints)
-    for i in instants.constraints:
-        own = _bound(problem, i, instants.of(i))
-        offset = instants.offsets[begin : begin + own.size].reshape(own.shape)
-        begin += own.size
-        found.append(replace(own, offset=offset))
+    for i, offset in _offsets(problem, instants).items():
+        found.append(replace(_bound(problem, i, instants.of(i)), offset=offset))
     # The dataclass is frozen: attributes are set in its dictionary.
     vars(made).update(vars(problem) | {"bound_constraints": tuple(found)})
     return made
+
+
+def _offsets(problem: OptimalControlProblem, instants: Instants) -> dict[int, Floats]:
+    """The offsets (K, rows) of each constraint with rows at ``instants``."""
+    found, begin = {}, 0
+    for i in instants.constraints:
+        shape = len(instants.of(i)), len(problem.bound_constraints[i].rows)
+        end = begin + shape[0] * shape[1]
+        found[i], begin = instants.offsets[begin:end].reshape(shape), end
+    return found
 
 
 def _bound(problem: OptimalControlProblem, constraint: int, rows: Integers) -> BoundBetween:
@@ -157,11 +164,7 @@ def updated(
         least: In the unit of each constraint.
     """
     rows, offsets, u = [], [], problem.control_rows(motion)
-    former, begin = {}, 0
-    for i in instants.constraints:
-        count, width = len(instants.of(i)), len(problem.bound_constraints[i].rows)
-        former[i] = instants.offsets[begin : begin + count * width].reshape(count, width)
-        begin += count * width
+    former = _offsets(problem, instants)
     for i, (near, margin) in enumerate(zip(values, backoff, strict=True)):
         if near is None:
             continue

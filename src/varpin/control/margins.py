@@ -16,9 +16,7 @@ from varpin.control.spread import Feedback, decided, state_slopes
 from varpin.errors import VarpinError
 from varpin.linearization import linearize_steps
 from varpin.mechanics.wiener import wiener_increments
-from varpin.simulation.run import simulate
 from varpin.simulation.soundness import Finding
-from varpin.trajectory import Trajectory
 
 # Pairs of motions with opposite noise, and how much more often than promised a bound may be violated.
 _PAIRS, _OFTEN = 32, 1.2
@@ -44,7 +42,9 @@ def too_small(solution: Solution) -> list[Finding]:
     dw = np.stack([wiener_increments(width, problem.dt, problem.steps, rng) for _ in range(_PAIRS)])
     try:
         linear = _linear(solution, dw)
-        ahead, back = ([_noisy(solution, sign * noise) for noise in dw] for sign in (1.0, -1.0))
+        ahead, back = (
+            [problem.simulate(solution.policy, increments=sign * noise) for noise in dw] for sign in (1.0, -1.0)
+        )
     except VarpinError:
         # Without such motions nothing is known; plan.monte_carlo() tells of motions that fail.
         return []
@@ -83,21 +83,6 @@ def too_small(solution: Solution) -> list[Finding]:
             )
         )
     return found
-
-
-def _noisy(solution: Solution, dw: Floats) -> Trajectory:
-    problem = solution.problem
-    return simulate(
-        problem.scene,
-        problem.q0,
-        problem.v0,
-        dt=problem.dt,
-        steps=problem.steps,
-        controls=solution.policy,
-        integrator=problem.integrator,
-        increments=dw,
-        check=False,
-    )
 
 
 def _linear(solution: Solution, dw: Floats) -> Floats:

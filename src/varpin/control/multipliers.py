@@ -42,7 +42,7 @@ class Multipliers(Frozen):
         stuck: Number of successive rounds that have hardly lowered the worst violation.
         instants: Constraint, step and instant (I, 3) of each instant between nodes at which a constraint has rows; None
             where all hold there without.
-        offsets: What is added to the values of these rows (O,), which are those of cubics through the nodes.
+        offsets: What is added to the values of these rows (O,), where the motion has a peak between two instants.
     """
 
     values: Annotated[Floats, Axes("rows", finite=True)]

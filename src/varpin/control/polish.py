@@ -356,7 +356,12 @@ def _nonnegative(S: Floats, d: Floats, equal: Mask) -> Floats:
     upper: Floats = np.linalg.qr(root)[1]
     goal = scipy.linalg.solve_triangular(upper, d[order], trans="T")
     x = np.zeros(len(d))
-    x[first:] = scipy.optimize.nnls(upper[first:, first:], goal[first:], maxiter=_PIVOTS * len(d))[0]
+    A, b = upper[first:, first:], goal[first:]
+    try:
+        x[first:] = scipy.optimize.nnls(A, b, maxiter=_PIVOTS * len(d))[0]
+    except RuntimeError:
+        # Its pivots did not end; an interior method has fewer digits.
+        x[first:] = scipy.optimize.lsq_linear(A, b, bounds=(0.0, np.inf)).x
     x[:first] = scipy.linalg.solve_triangular(upper[:first, :first], goal[:first] - upper[:first, first:] @ x[first:])
     found = np.empty(len(d))
     found[order] = x

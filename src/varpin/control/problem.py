@@ -651,9 +651,16 @@ class OptimalControlProblem(Frozen):
         return tuple(found)
 
     def simulate(
-        self, controls: JointValues | LinearPolicy | OpenLoop, *, rng: np.random.Generator | int | None = None
+        self,
+        controls: JointValues | LinearPolicy | OpenLoop,
+        *,
+        rng: np.random.Generator | int | None = None,
+        increments: Floats | None = None,
     ) -> Trajectory:
-        """The motion from (q0, v0) under controls (N, m), a policy or an OpenLoop; with noise if rng is given.
+        """The motion from (q0, v0) under controls (N, m), a policy or an OpenLoop.
+
+        Noise acts where a generator ``rng`` is given, or its ``increments`` [sqrt(s)], as :func:`varpin.simulate`
+        takes them.
 
         Raises:
             StepFailure: A step cannot be integrated.
@@ -668,7 +675,7 @@ class OptimalControlProblem(Frozen):
             controls=controls,
             integrator=self.integrator,
             rng=rng if self.scene.processes else None,
-            increments=0.0 if rng is None else None,
+            increments=0.0 if rng is None and increments is None else increments,
             check=False,
         )
 

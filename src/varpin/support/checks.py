@@ -191,6 +191,21 @@ def named_limits(
     return checked_limits(name, sides, size)
 
 
+def some_limits(
+    name: str,
+    limits: tuple[JointValues, JointValues] | None,
+    own: tuple[Floats, Floats],
+    robot: str,
+    joints: Sequence[str],
+) -> Floats:
+    """:func:`named_limits` of joints, by default a robot's ``own``, of which one has to be finite."""
+    found = named_limits(f"{name} limits", own if limits is None else limits, joints, len(joints))
+    if not np.isfinite(found).any():
+        why = f"robot {robot!r} has no such limits" if limits is None else "all limits given are infinite"
+        raise InputError(f"{name}: {why}; give limits=(lower, upper) of which one is finite")
+    return found
+
+
 def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, size: int) -> Floats:
     """Values (N, size) of a function of time at times (N,) [s].
 

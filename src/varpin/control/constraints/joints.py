@@ -19,7 +19,7 @@ from varpin.control.constraints.base import (
 )
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
-from varpin.support.checks import JointValues, as_floats, control_array, finite, finite_array, named_limits, real
+from varpin.support.checks import JointValues, as_floats, control_array, finite, finite_array, real, some_limits
 
 # Scales of joints without a finite range [rad or m; rad/s or m/s].
 _POSITION, _SPEED = 0.1, 0.5
@@ -66,11 +66,7 @@ class _WithinLimits(PlanConstraint):
         """
         self.robot = require_robot(robot, type(self).__name__)
         name = type(self).__name__
-        given = self._limits_of(robot) if limits is None else limits
-        self.limits = named_limits(f"{name} limits", given, robot.joint_names, robot.dof)
-        if not np.isfinite(self.limits).any():
-            why = f"robot {robot.name!r} has no such limits" if limits is None else "all limits given are infinite"
-            raise InputError(f"{name}: {why}; give limits=(lower, upper) of which one is finite")
+        self.limits = some_limits(name, limits, self._limits_of(robot), robot.name, robot.joint_names)
         self.margin = checked_margin(self, margin)
 
     @staticmethod

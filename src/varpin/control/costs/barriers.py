@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.control.costs.base import BoundCost, CompiledCost, Cost, Points, Scaled, Terminal
@@ -15,7 +14,7 @@ from varpin.control.costs.residual import TaskCost
 from varpin.control.costs.terms import Terms
 from varpin.errors import InputError
 from varpin.model import Robot
-from varpin.support.checks import JointValues, checked_limits, joint_array
+from varpin.support.checks import JointValues, joint_array, some_limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +39,7 @@ class _Barrier(TaskCost):
         robot: Robot,
         weight: JointValues = 1.0,
         margin: JointValues = 0.0,
-        limits: tuple[ArrayLike, ArrayLike] | None = None,
+        limits: tuple[JointValues, JointValues] | None = None,
     ) -> None:
         """Describe the cost.
 
@@ -49,8 +48,8 @@ class _Barrier(TaskCost):
             weight: One number, (n,), by joint name, or a matrix (n, n), positive semidefinite.
             margin: One number, (n,) or by joint name, >= 0, in the units of the limits. At most half the distance
                 between the limits of a joint is used.
-            limits: (lower, upper), each one number or (n,), infinite where there is none; the robot's if left out
-                [rad or m; of velocities rad/s or m/s].
+            limits: (lower, upper), each one number, (n,) or by joint name, infinite where there is none; the robot's if
+                left out [rad or m; of velocities rad/s or m/s].
 
         Raises:
             InputError: There is no limit, or an argument has a wrong shape or value.
@@ -60,10 +59,7 @@ class _Barrier(TaskCost):
         if isinstance(weight, Mapping) and isinstance(robot, Robot):
             weight = joint_array(f"{name} weight", weight, robot.joint_names)
         super().__init__(robot, weight)
-        self.limits = checked_limits(f"{name} limits", self._limits_of(robot) if limits is None else limits, self.size)
-        if not np.isfinite(self.limits).any():
-            why = f"robot {robot.name!r} has no such limits" if limits is None else "all limits given are infinite"
-            raise InputError(f"{name}: {why}; give limits=(lower, upper) of which one is finite")
+        self.limits = some_limits(name, limits, self._limits_of(robot), robot.name, robot.joint_names)
         self.margin = joint_array(f"{name} margin", margin, robot.joint_names, uniform=True)
         if (self.margin < 0.0).any():
             raise InputError(f"{name} margin must be >= 0, got {self.margin.min():g}")
