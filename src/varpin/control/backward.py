@@ -61,6 +61,8 @@ _BISECTIONS = 40
 # Greatest numbers of active sets and of interior-point steps to the model's minimum within limits, its gap relative to
 # the model's change, and rounding errors of changes and slopes relative to the largest ones.
 _ACTIVE_SETS, _INTERIOR_STEPS, _GAP, _ROUNDED = 8, 40, 1e-5, 1e-11
+# Active sets end where, after the first ones, a change is not smaller than this share of the one before.
+_SETTLING, _SHRINKING = 1, 0.75
 
 # Pivot of a control that cannot move.
 _FIRM = 1e300
@@ -508,8 +510,8 @@ class _Box:
 
         It begins with the controls ``held`` at a lower and at an upper limit (Hintermueller, Ito and Kunisch 2002).
         """
-        low, high = self.lower, self.upper
-        for _ in range(_ACTIVE_SETS):
+        low, high, changed = self.lower, self.upper, math.inf
+        for done in range(_ACTIVE_SETS):
             found = self._fixed(held)
             if found is None:
                 return None
@@ -525,6 +527,9 @@ class _Box:
             now = now[0] | fixed, now[1] & ~fixed
             if np.array_equal(now[0], held[0]) and np.array_equal(now[1], held[1]):
                 return found, at._replace(moves=np.clip(at.moves, low, high))
+            before, changed = changed, int((now[0] != held[0]).sum() + (now[1] != held[1]).sum())
+            if done >= _SETTLING and changed > _SHRINKING * before:
+                return None
             held = now
         return None
 
@@ -556,7 +561,7 @@ class _Box:
         moved = np.abs(plan.feedforward).max(axis=0) + np.abs(begin).max(axis=0)
         both = bounded[0] & bounded[1]
         size = np.where(both, np.where(both, high, 0.0) - np.where(both, low, 0.0), np.where(moved > 0.0, moved, 1.0))
-        z = np.where(fixed, low, np.clip(begin, low + 0.1 * size, high - 0.1 * size))
+        z = np.where(fixed, low, np.clip(0.0, low + 0.1 * size, high - 0.1 * size))
         slack = self._slack((fixed, np.zeros_like(fixed)))
         gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
         mu = plan.expected_decrease / count
@@ -584,7 +589,7 @@ class _Box:
             to = corrected
             d = np.where(fixed, 0.0, to - z)
             after = [(aims[0] - duals[0] * d) / gaps[0], (aims[1] + duals[1] * d) / gaps[1]]
-            turning = tuple(new - dual for new, dual in zip(after, duals, strict=True))
+            turning = after[0] - duals[0], after[1] - duals[1]
             length = min(1.0, 0.995 * _free_length((*gaps, *duals), (d, -d, *turning)))
             z = z + length * d
             gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
