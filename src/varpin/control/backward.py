@@ -555,7 +555,7 @@ class _Box:
         fixed = low >= high
         bounded = [np.isfinite(low) & ~fixed, np.isfinite(high) & ~fixed]
         count = int(bounded[0].sum() + bounded[1].sum())
-        if count == 0:
+        if count == 0 or not plan.expected_decrease > 0.0:
             return None
         # The size of changes of each control.
         moved = np.abs(plan.feedforward).max(axis=0) + np.abs(begin).max(axis=0)
