@@ -299,6 +299,59 @@ def test_model_within_limits_by_interior_points(hold, monkeypatch):
     np.testing.assert_allclose(sol.controls.ravel(), reference, atol=2e-5)
 
 
+@pytest.mark.parametrize("rate", [None, 2e-3])
+@pytest.mark.parametrize(("upper", "lower"), [((2.0, 5.0), (-3.0, -0.8)), ((2.0, 0.3), (-np.inf, 0.3))])
+def test_interior_points_where_no_active_set_ends(rate, upper, lower, monkeypatch):
+    """The last interior point is the plan then, in a dozen steps: by its gap at most above SciPy's solution."""
+    problem, steps = pushed((lower, upper), integrator=vp.Midpoint(), dt=0.2, steps=10), []
+    if rate is not None:
+        problem = vp.OptimalControlProblem(
+            problem.scene, problem.cost + vp.ControlRateCost(rate), problem.q0, problem.v0, dt=problem.dt,
+            steps=problem.steps, integrator=vp.Midpoint(), control_limits=(lower, upper),
+        )  # fmt: skip
+    real = passes._Box._pushed
+    monkeypatch.setattr(passes._Box, "_active_sets", lambda *_: None)
+    monkeypatch.setattr(passes._Box, "_pushed", lambda *given: steps.append(None) or real(*given))
+    sol = vp.solve(problem, max_iterations=1)
+    assert 1 < len(steps) <= 14
+    g, H = transcribed(problem)
+    L, least, most = np.linalg.cholesky(H), np.tile(lower, 10), np.tile(upper, 10)
+    free = least < most
+    reference = least.copy()
+    shift = np.linalg.solve(L, g + H @ np.where(free, 0.0, least))
+    bounds = least[free], most[free]
+    reference[free] = lsq_linear(L.T[:, free], -shift, bounds, method="bvls", tol=1e-15, max_iter=1000).x
+    assert (sol.controls >= lower).all()
+    assert (sol.controls <= upper).all()
+    best = problem.cost_of(problem.simulate(reference.reshape(-1, 2)))
+    decrease = problem.cost_of(problem.simulate(np.clip(np.zeros((10, 2)), lower, upper))) - best
+    # The complementarity of the last point bounds what it costs above the minimum.
+    assert -1e-9 * decrease <= sol.cost - best <= 1e-5 * decrease
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_interior_points_are_corrected_as_by_whole_passes(controls, monkeypatch):
+    """A correction by the gradient alone is that of another pass."""
+    scene, apart = vp.Scene(vp.planar_chain(2), damping=0.05), []
+    cost = vp.ControlCost(1e-2) + vp.ControlRateCost(1e-3) + vp.Terminal(vp.TrackingCost([1.0, -0.5], 10.0))
+    problem = vp.OptimalControlProblem(
+        scene, cost, [0, 0], [0, 0], dt=0.05, steps=10, control_limits=([-8, -0.5], [np.inf, -0.5]), controls=controls
+    )
+    real = passes._Box._pushed
+
+    def both(box, plan, limits, *others):
+        whole = real(box, plan, limits._replace(factors=None), *others)
+        quick = real(box, plan, limits, *others)
+        apart.append(np.abs(quick - whole).max() / np.abs(whole).max())
+        return quick
+
+    monkeypatch.setattr(passes._Box, "_active_sets", lambda *_: None)
+    monkeypatch.setattr(passes._Box, "_pushed", both)
+    vp.solve(problem, max_iterations=1, check=False)
+    assert 1 < len(apart) < 20
+    assert max(apart) < 1e-9
+
+
 def test_swing_with_most_torques_at_limits_converges():
     """Torques too weak to hold the chain: the plan is a minimum by differences of its cost."""
     robot = vp.planar_chain(2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -60,6 +61,11 @@ _BISECTIONS = 40
 # Greatest numbers of active sets and of interior-point steps to the model's minimum within limits, its gap relative to
 # the model's change, and rounding errors of changes and slopes relative to the largest ones.
 _ACTIVE_SETS, _INTERIOR_STEPS, _GAP, _ROUNDED = 8, 40, 1e-5, 1e-11
+# Active sets end where, after the first ones, a change is not smaller than this share of the one before.
+_SETTLING, _SHRINKING = 1, 0.75
+
+# Pivot of a control that cannot move.
+_FIRM = 1e300
 
 # Greatest relative rounding error of Quu; above, the pass is repeated on square roots.
 TRUSTED = 1e-9
@@ -504,8 +510,8 @@ class _Box:
 
         It begins with the controls ``held`` at a lower and at an upper limit (Hintermueller, Ito and Kunisch 2002).
         """
-        low, high = self.lower, self.upper
-        for _ in range(_ACTIVE_SETS):
+        low, high, changed = self.lower, self.upper, math.inf
+        for done in range(_ACTIVE_SETS):
             found = self._fixed(held)
             if found is None:
                 return None
@@ -521,6 +527,9 @@ class _Box:
             now = now[0] | fixed, now[1] & ~fixed
             if np.array_equal(now[0], held[0]) and np.array_equal(now[1], held[1]):
                 return found, at._replace(moves=np.clip(at.moves, low, high))
+            before, changed = changed, int((now[0] != held[0]).sum() + (now[1] != held[1]).sum())
+            if done >= _SETTLING and changed > _SHRINKING * before:
+                return None
             held = now
         return None
 
@@ -546,47 +555,81 @@ class _Box:
         fixed = low >= high
         bounded = [np.isfinite(low) & ~fixed, np.isfinite(high) & ~fixed]
         count = int(bounded[0].sum() + bounded[1].sum())
-        if count == 0:
+        if count == 0 or not plan.expected_decrease > 0.0:
             return None
         # The size of changes of each control.
         moved = np.abs(plan.feedforward).max(axis=0) + np.abs(begin).max(axis=0)
         both = bounded[0] & bounded[1]
         size = np.where(both, np.where(both, high, 0.0) - np.where(both, low, 0.0), np.where(moved > 0.0, moved, 1.0))
-        z = np.where(fixed, low, np.clip(begin, low + 0.1 * size, high - 0.1 * size))
+        z = np.where(fixed, low, np.clip(0.0, low + 0.1 * size, high - 0.1 * size))
         slack = self._slack((fixed, np.zeros_like(fixed)))
         gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
         mu = plan.expected_decrease / count
         duals = [mu / gap for gap in gaps]
-        length = 1.0
         for _ in range(_INTERIOR_STEPS):
-            products = [dual[rows] * gap[rows] for dual, gap, rows in zip(duals, gaps, bounded, strict=True)]
-            mu = float(sum(product.sum() for product in products)) / count
-            mu *= 0.1 if length > 0.9 else 0.3 if length > 0.5 else 0.7
+            # A step without centring, and one corrected by what that foresees (Mehrotra 1992).
             stiff = duals[0] / gaps[0] + duals[1] / gaps[1]
-            pull = mu / gaps[1] - mu / gaps[0] - stiff * z
-            found = self._passed(_at_limits(slack, self.along.states), stiff, pull)
+            limits = _at_limits(slack, self.along.states)._replace(factors=np.empty((*z.shape, z.shape[1])))
+            found = self._passed(limits, stiff, -stiff * z)
             if found is None:
                 return None
             to = _foreseen(self.along, found, slack)[1]
             d = np.where(fixed, 0.0, to - z)
-            after = [(mu - duals[0] * d) / gaps[0], (mu + duals[1] * d) / gaps[1]]
-            ways = [(-d, gaps[0]), (d, gaps[1]), *((dual - new, dual) for dual, new in zip(duals, after, strict=True))]
-            length = 1.0
-            for way, room in ways:
-                closing = way > 0.0
-                if closing.any():
-                    length = min(length, 0.995 * float((room[closing] / way[closing]).min()))
+            opening, turning = (d, -d), (-duals[0] * (1.0 + d / gaps[0]), -duals[1] * (1.0 - d / gaps[1]))
+            length = min(1.0, _free_length((*gaps, *duals), (*opening, *turning)))
+            mu = _complementarity(gaps, duals, bounded) / count
+            ahead = [gap + length * more for gap, more in zip(gaps, opening, strict=True)]
+            aims = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
+            mu *= (_complementarity(ahead, aims, bounded) / (count * mu)) ** 3
+            aims = [np.where(rows, mu - a * b, 0.0) for rows, a, b in zip(bounded, opening, turning, strict=True)]
+            push = aims[1] / gaps[1] - aims[0] / gaps[0]
+            corrected = self._pushed(found, limits, to, stiff, push - stiff * z, push)
+            if corrected is None:
+                return None
+            to = corrected
+            d = np.where(fixed, 0.0, to - z)
+            after = [(aims[0] - duals[0] * d) / gaps[0], (aims[1] + duals[1] * d) / gaps[1]]
+            turning = after[0] - duals[0], after[1] - duals[1]
+            length = min(1.0, 0.995 * _free_length((*gaps, *duals), (d, -d, *turning)))
             z = z + length * d
             gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
-            duals = [dual + length * (new - dual) for dual, new in zip(duals, after, strict=True)]
-            value = -found.expected_decrease - float(((0.5 * stiff * to + pull) * to).sum())
-            if length > 0.9 and count * mu <= _GAP * abs(value):
+            duals = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
+            value = 0.5 * float(((plan.gradient - stiff * (to - z) - push) * to).sum())
+            if length > 0.9 and _complementarity(gaps, duals, bounded) <= _GAP * abs(value):
                 break
         # A limit binds where its multiplier exceeds its gap, each relative to its size.
         scale = np.maximum(duals[0] + duals[1], 1e-300).max(axis=0)
         held = gaps[0] / size < duals[0] / scale, gaps[1] / size < duals[1] / scale
-        moves = np.where(held[0], low, np.where(held[1], high, z))
-        return np.clip(moves, low, high), (held[0] | fixed, held[1] & ~held[0] & ~fixed)
+        return z, (held[0] | fixed, held[1] & ~held[0] & ~fixed)
+
+    def _pushed(
+        self, plan: Plan, limits: _Limits, to: Floats, stiff: Floats, pull: Floats, push: Floats
+    ) -> Floats | None:
+        """Changes of the controls to the minimum with a further gradient ``push``, which brings its sum to ``pull``.
+
+        ``to`` are those without it, of a pass with the factors of ``limits``.
+        """
+        along, factors, (_, m), x = self.along, limits.factors, to.shape, self.along.states
+        if factors is None or len(along.blocks) > 1:
+            passed = self._passed(limits, stiff, pull)
+            return None if passed is None else _foreseen(along, passed, limits.slack)[1]
+        problem, alone = along.problem, along.with_gradient_alone(push)
+        decision, control = np.nonzero(self.lower >= self.upper)
+        factors[decision, control, control] = _FIRM
+        feedforward, (feedback, previous) = np.empty(to.shape), _gains_on_states(along, plan)
+        gains = core.Gains(
+            feedforward=feedforward,
+            feedback=feedback,
+            previous=previous,
+            control_gradient=plan.gradient,
+            costate=np.zeros((0, x)),
+            spread=np.zeros((0, x, x)),
+            factors=factors,
+        )
+        steps = alone.steps(0, problem.decisions * problem.hold, None, _without_limits(m, x))
+        core.run_gradients(problem.dt, problem.hold, 0.0, steps, gains, np.zeros(x))
+        more: Floats = _foreseen(alone, replace(plan, feedforward=feedforward), np.zeros((0, 2, m)))[1]
+        return to + more
 
     def _passed(self, limits: _Limits, stiff: Floats | None = None, pull: Floats | None = None) -> Plan | None:
         """A pass with a further cost of the controls' changes: its Hessian's diagonal and its gradient (R, m)."""
@@ -642,13 +685,8 @@ def _foreseen(along: Along, plan: Plan, slack: Floats | None = None) -> tuple[Fl
     (R, m). Where controls are linear between nodes the state is X of :mod:`varpin.control.linear_controls`.
     """
     problem, (R, m, _), x = along.problem, plan.feedback.shape, along.states
-    feedback = plan.feedback
-    if problem.linear and plan.previous is not None:
-        feedback = np.zeros((R, m, x))
-        feedback[:, :, : plan.feedback.shape[2]] = plan.feedback
-        feedback[:, :, plan.feedback.shape[2] :][:, :, :m] = plan.previous
+    feedback, previous = _gains_on_states(along, plan)
     expected, moves, state = np.empty((R, x + m)), np.empty((R, m)), np.zeros(x + m)
-    previous = np.zeros((0, m, m)) if plan.previous is None or problem.linear else plan.previous
     spread = np.zeros((R if plan.spread.size else 0, x, x)) if problem.linear else plan.spread
     for begin, end in along.blocks:
         rows = slice(begin // problem.hold, end // problem.hold)
@@ -666,23 +704,51 @@ def _foreseen(along: Along, plan: Plan, slack: Floats | None = None) -> tuple[Fl
     return expected, moves
 
 
+def _gains_on_states(along: Along, plan: Plan) -> tuple[Floats, Floats]:
+    """A plan's feedback on the states of its pass, and on previous controls where these are no part of the state."""
+    (R, m, n), x = plan.feedback.shape, along.states
+    if plan.previous is None or not along.problem.linear:
+        return plan.feedback, np.zeros((0, m, m)) if plan.previous is None else plan.previous
+    feedback = np.zeros((R, m, x))
+    feedback[:, :, :n] = plan.feedback
+    feedback[:, :, n : n + m] = plan.previous
+    return feedback, np.zeros((0, m, m))
+
+
+def _free_length(values: Sequence[Floats], changes: Sequence[Floats]) -> float:
+    """The greatest length of a step at which positive values do not become negative."""
+    length = math.inf
+    for value, change in zip(values, changes, strict=True):
+        closing = change < 0.0
+        if closing.any():
+            length = min(length, float((value[closing] / -change[closing]).min()))
+    return length
+
+
+def _complementarity(gaps: Sequence[Floats], duals: Sequence[Floats], bounded: Sequence[Mask]) -> float:
+    return sum(float((dual[rows] * gap[rows]).sum()) for gap, dual, rows in zip(gaps, duals, bounded, strict=True))
+
+
 class _Limits(NamedTuple):
     """Control limits for a pass: their ``slack`` (R, 2, m), and the ``expected`` states (R, 2n + m).
 
     The slack is empty without limits, the expected states around the nominal ones. The pass fills in the diagonal of
-    Quu without regularization in ``stiffness`` (R, m), and the gradient at the expected states in ``pressure`` (R, m).
+    Quu without regularization in ``stiffness`` (R, m), the gradient at the expected states in ``pressure`` (R, m), and
+    L D L' of the regularized Quu of free controls in ``factors`` (R, m, m).
     """
 
     slack: Floats
     expected: Floats
     stiffness: Floats | None = None
     pressure: Floats | None = None
+    factors: Floats | None = None
 
     def part(self, rows: slice) -> dict[str, Floats | None]:
         """What the pass fills in for some decisions."""
         return {
             "stiffness": None if self.stiffness is None else self.stiffness[rows],
             "pressure": None if self.pressure is None else self.pressure[rows],
+            "factors": None if self.factors is None else self.factors[rows],
         }
 
 
@@ -778,6 +844,16 @@ class Along:
         added[:, 0, x:] = np.repeat(gradient / problem.hold, problem.hold, axis=0) / (problem.dt * rule[0, 0])
         made.added = added.reshape(-1, x + m) if self.added is None else self.added + added.reshape(-1, x + m)
         return made
+
+    def with_gradient_alone(self, gradient: Floats) -> Along:
+        """These steps with a gradient of the changes of decided controls (R, m) as the only one."""
+        made = copy(self)
+        if self.problem.linear:
+            vars(made)["line"] = self.line._replace(gradient=np.zeros(self.line.gradient.shape))
+        else:
+            made.running = Expansion(np.zeros(self.running.gradient.shape), self.running.hessian)
+        made.added, made.pull = None, np.zeros(self.pull.shape)
+        return made.with_cost_of_controls(np.zeros(gradient.shape), gradient)
 
     @property
     def slopes(self) -> Floats:
@@ -1012,9 +1088,8 @@ def _one_pass(
         by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change, within)
     factors = None
     if limits is None:
-        limits = _without_limits(m, 2 * n)
-        if len(along.blocks) == 1:
-            factors = np.empty((R, m, m))
+        factors = np.empty((R, m, m)) if len(along.blocks) == 1 else None
+        limits = _without_limits(m, 2 * n)._replace(factors=factors)
     samples = len(problem.model_rule)
     for begin, end in reversed(along.blocks):
         steps, points = slice(begin, end), slice(begin * samples, end * samples)
@@ -1029,7 +1104,6 @@ def _one_pass(
             control_gradient=gradient[rows],
             costate=costate[steps] if costates else costate,
             spread=spread[steps],
-            factors=factors,
             **limits.part(rows),
         )
         how = (problem.dt, problem.hold, float(regularization))

@@ -389,10 +389,11 @@ def _at_rounding(limits: Floats) -> Floats:
 
 def _onto_limits(u: Floats, limits: Floats, rounding: Floats) -> Floats:
     """Controls (R, m), moved exactly onto a limit where they differ from it by no more than ``rounding`` (m,)."""
-    for limit in limits:
-        close = np.abs(u - limit) <= rounding
-        if close.any():
-            u = np.where(close, limit, u)
+    close = np.abs(u - limits[:, None]) <= rounding
+    if not close.any():
+        return u
+    for limit, onto in zip(limits, close, strict=True):
+        u = np.where(onto, limit, u)
     return u
 
 
@@ -969,7 +970,7 @@ class _Search:
             left = [step for step in cut if step > length]
             if not left or length > (_VERY_SHORT if bounds.parts == _PARTS else 0.0):
                 break
-        while self.anew and length >= 1.0 and taken.expected <= _EARLY * length * self.plan.slope:
+        while self._extends() and length >= 1.0 and taken.expected <= _EARLY * length * self.plan.slope:
             trials += 1
             trial = self._try(_EXTENSION * length, self.plan, here, bounds)
             if not trial.expected < taken.expected:
@@ -988,6 +989,11 @@ class _Search:
         elif tried is not None:
             hidden = rounding(self.problem, self.trajectory, self.shares, tried, self.plan.model)
         return _Step(length, trials, -taken.expected if length > 0.0 else 0.0, hidden)
+
+    def _extends(self) -> bool:
+        """Whether full steps that end early are extended: not after a last extension that did not lower the cost."""
+        last = self.history[-1:]
+        return self.anew and not any(item.step == 1.0 and item.rollouts == 2 for item in last)
 
     def _meets_limits(self, plan: Plan) -> bool:
         """Whether a plan holds controls at their limits, and no control is there on the motion it is around."""
