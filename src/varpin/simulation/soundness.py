@@ -23,6 +23,7 @@ from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
+from varpin.model import joint_unit
 from varpin.simulation.accuracy import (
     EVEN,
     FIRST,
@@ -344,7 +345,7 @@ def _growing(
         return (Finding("kinks of forces", sentence, found.joint),)
     sentence = (
         f"{GROWTH_WORDS if found.grows else ADDED_WORDS}: single steps of dt = {trajectory.dt:g} s by {integrator} are "
-        f"off by about {found.step:.1g} rad or m, and a method of more stages moves {off}; "
+        f"off by about {found.step:.1g} {joint_unit(scene.robot)}, and a method of more stages moves {off}; "
         "smaller steps or more stages keep the motion right for longer"
     )
     return (Finding("growing errors", sentence, found.joint),)
