@@ -117,7 +117,9 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
 def _as_wished(solution: Solution, replay: Replay) -> bool:
     """Whether the plan's refinement met its wish, and the replay with feedback confirms that."""
     refinement = solution.refinement
-    return refinement is not None and refinement.met and -GAIN <= replay.feedback <= refinement.wish
+    if refinement is None or not refinement.met:
+        return False
+    return -max(GAIN, refinement.wish) <= replay.feedback <= max(LOSS, refinement.wish)
 
 
 def replayed(solution: Solution) -> Replay:
