@@ -270,6 +270,35 @@ def test_scene_files(tmp_path):
             vp.load_scene(path)
 
 
+def test_scene_files_take_meshes_and_srdf_files(tmp_path):
+    """A mesh's file gives the hull of its vertices, a missing one an error at its key."""
+    (tmp_path / "tetra.obj").write_text("v 1 0 0\nv 1.4 0 0\nv 1 0.3 0\nv 1 0 0.25\nf 1 2 3\nf 1 2 4\n")
+    path, (head, _, last) = tmp_path / "arm.toml", SCENE.partition("    [[1, 0, 0]")
+    text = f'{head}    "tetra.obj",\n{last[last.index(chr(10)) + 1 :]}'
+    path.write_text(text, encoding="utf-8")
+    one, other = vp.load_scene(path).problem.constraints[0].obstacles
+    np.testing.assert_allclose(one.begin + one.hull.points.max(axis=0), [1.4, 0.3, 0.25])
+    assert (one.name, other.name) == ("hull[0]", "hull[1]")
+    for old, new, facts in [
+        ("tetra.obj", "lost.obj", ("plan_constraint[0].hulls[0]", "there is no file", "lost.obj")),
+        ('"tetra.obj"', "7", ("plan_constraint[0].hulls[0]", "a list of points", "mesh file", "7")),
+        ("links =", 'srdf = "lost.srdf"\nlinks =', ("plan_constraint[0].srdf", "lost.srdf")),
+        ("links =", 'srdf = "tetra.obj"\nlinks =', ("plan_constraint[0]", "srdf", "itself")),
+    ]:
+        assert old in text
+        path.write_text(text.replace(old, new), encoding="utf-8")
+        with refused(vp.SceneFileError, *facts):
+            vp.load_scene(path)
+
+
+def test_an_srdf_file_without_pairs_of_links(tmp_path):
+    robot, ball = vp.planar_chain(4), vp.Obstacle.sphere([3, 0, 3], 0.1)
+    capsules = {f"joint{k}": ([0, 0, 0], [1, 0, 0], 0.05) for k in range(1, 5)}
+    path = srdf_of(tmp_path / "arm.srdf", ("joint4", "joint1"))
+    with refused(vp.InputError, "KeepClear srdf", "itself=True"):
+        vp.KeepClear(robot, [ball], links=list(capsules), capsules=capsules, srdf=path)
+
+
 def srdf_of(path, *pairs):
     rows = "".join(f'<disable_collisions link1="{one}" link2="{other}" reason="Never"/>' for one, other in pairs)
     path.write_text(f'<robot name="r">{rows}</robot>', encoding="utf-8")

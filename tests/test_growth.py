@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from findings import about
+from refusals import naming
 
 import varpin as vp
 from varpin.model import longest_reach
 from varpin.simulation.accuracy import Window, travel_scales
+from varpin.simulation.soundness import examined
 
 
 def jumping(robot, seed, steps, share):
@@ -146,3 +150,32 @@ def test_errors_of_joints_that_slide_are_no_shares_of_what_others_turn(far):
         assert error.joint == joint
         assert error.motion == pytest.approx(0.07, rel=1e-9)
         assert error.worst > 1.0
+
+
+@pytest.mark.parametrize("noise", [None, 1e-2])
+def test_errors_that_feedback_corrects_are_not_said_to_grow(noise):
+    """Upright, the recorded torques let the arm fall; under its feedback it is that of a far better method."""
+    robot, up = vp.planar_chain(2), np.array([-np.pi / 2, 0.0])
+    scene = vp.Scene(robot, damping=0.1, noise=None if noise is None else vp.AdditiveNoise(noise))
+    cost = vp.TrackingCost(up, 10.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-2)
+    q0, coarse = np.add(up, [0.1, 0.0]), vp.Midpoint(kick="held")
+    options = {"dt": 0.005, "steps": 600}
+    problem = vp.OptimalControlProblem(scene, cost, q0, np.zeros(2), hold=10, integrator=coarse, **options)
+    plan = vp.solve(problem, check=False)
+
+    def moved(policy, method):
+        options["rng"] = None if noise is None else 0
+        return vp.simulate(scene, q0, np.zeros(2), **options, controls=policy, integrator=method)
+
+    motion, better = (moved(plan.policy, method) for method in (coarse, vp.Gauss(5, kick="held")))
+    np.testing.assert_allclose(motion.q, better.q, rtol=0, atol=1e-5)
+    assert [finding.kind for finding in examined(scene, coarse, motion)[1]] == ["growing errors"]
+    assert motion.warnings == ()
+    if noise is None:
+        # Its controls alone let it fall, and where it falls to is wrong: 8 rad.
+        assert naming(moved(plan.policy.without_feedback(), coarse).warnings, "disturbances grow")
+        # So does a feedback that corrects nothing.
+        weak = dataclasses.replace(plan.policy, gains=1e-9 * plan.policy.gains)
+        assert naming(moved(weak, coarse).warnings, "disturbances grow")
+    else:
+        assert not naming(plan.monte_carlo(2, rng=0).warnings, "grow")

@@ -123,10 +123,25 @@ def test_ticks_that_find_no_plan_are_told_of():
 
 def test_what_the_plant_violates_is_told_of():
     """A plant that is pushed harder than the model knows."""
-    noisy = vp.Plant(vp.Scene(ROBOT, damping=0.3, noise=vp.AdditiveNoise(1.0)))
+    noisy = vp.Plant(vp.Scene(ROBOT, damping=0.3, noise=vp.AdditiveNoise(0.1)))
     run = vp.Mpc(tracking(FAMILIES["speeds"])).run(noisy, duration=0.6, rng=1)
-    assert run.constraints[0].worst > 0.05
-    assert naming(run.warnings, "motion violates", "WithinVelocityLimits")
+    assert 0.05 < run.constraints[0].worst < 0.4
+    assert naming(run.warnings, "motion violates", "WithinVelocityLimits", "margin=", "narrower")
+
+
+def test_no_bound_is_to_be_narrower_than_nothing():
+    """Noise that moves the arm by more than its bound lets it, and a plan that goes on for want of time."""
+    noisy = vp.Plant(vp.Scene(ROBOT, damping=0.3, noise=vp.AdditiveNoise(2.0)))
+    run = vp.Mpc(tracking([vp.WithinVelocityLimits(ROBOT, (-0.8, 0.8))]), budget=1e-9).run(noisy, duration=0.15, rng=1)
+    (report,) = run.constraints
+    assert report.worst > 0.8
+    assert naming(run.warnings, "motion violates", "margin=")
+    assert not naming(run.warnings, "narrower")
+    # The older plan kept to the bound on the way that it planned.
+    assert report.older.tolist() == [False, *4 * [True]] == run.late.tolist()
+    assert not unnamed(str(report), "4 ticks an older plan", "rad/s")
+    first, bound = run.plans[0], run.plans[0].constraints[0].violation
+    assert first.violation == bound == report.planned.max()
 
 
 def test_passes_that_look_for_active_bounds_end_with_the_time(monkeypatch):

@@ -1016,7 +1016,7 @@ def test_verification_tells_what_the_continuous_robot_violates():
     assert speed.open_loop > 1e-3 < speed.closed_loop
     assert goal.closed_loop < goal.open_loop
     assert seen.violation == max(speed.closed_loop, goal.closed_loop)
-    assert not unnamed(str(seen), "WithinVelocityLimits", "[rad/s or m/s]")
+    assert not unnamed(str(seen), "WithinVelocityLimits", "[rad/s]")
     assert "limit of joint" in speed.where
 
 

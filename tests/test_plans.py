@@ -211,6 +211,11 @@ def test_alternation():
     assert alternation((1.0 - (2.0 - np.sqrt(3.0)) ** t * sign)[:, None]) is None
     # A joint at rest beside one that moves.
     assert alternation(np.stack([smooth, 1e-9 * sign], axis=1)) is None
+    # Swings of a slow joint that are next to nothing for the robot's motion are not worth a word; greater ones are.
+    slow = 0.02 * smooth
+    assert alternation(np.stack([smooth, slow + 5e-5 * sign], axis=1)) is None
+    assert alternation((slow + 5e-5 * sign)[:, None]).changes == 98
+    assert alternation(np.stack([smooth, slow + 2e-4 * sign], axis=1)).joint == 1
     # Where a control alternates, velocities may; where it is constant they may not.
     v, u = (smooth + 0.01 * sign)[:, None], sign[:100, None]
     assert alternation(v, u) is None

@@ -96,8 +96,9 @@ def test_robots_that_walk_are_refused(cache):
 
 
 def test_names_that_it_does_not_know(cache):
-    with refused(vp.RobotNotFound, "one_description"):
+    with refused(vp.RobotNotFound, "one_description") as info:
         vp.load_robot("ones_description")
+    assert "pip install" not in str(info.value)
 
 
 def test_without_the_package(monkeypatch):
@@ -106,3 +107,9 @@ def test_without_the_package(monkeypatch):
         vp.load_robot("iiwa14_description")
     with refused(vp.RobotNotFound, "ur5"):
         vp.load_robot("ur55")
+    # Names of the package without their ending are unknown, and the message has the pip command.
+    with refused(vp.RobotNotFound, "'iiwa14'", "panda", "iiwa14_description", "varpin[descriptions]"):
+        vp.load_robot("iiwa14")
+    with refused(vp.RobotNotFound, "arm.urdf") as info:
+        vp.load_robot("arm.urdf")
+    assert "descriptions" not in str(info.value)

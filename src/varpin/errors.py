@@ -28,11 +28,13 @@ class RobotNotFound(RobotError):
         matches: Similar names.
     """
 
-    def __init__(self, name: str, known: Iterable[str], note: str = "") -> None:
+    def __init__(self, name: str, known: Iterable[str], note: str = "", more: str = "") -> None:
         self.name = name
         known = sorted(known)
         self.matches = difflib.get_close_matches(name.lower(), known, n=5, cutoff=0.5)
         hint = f"close matches: {', '.join(self.matches)}" if self.matches else f"known names: {', '.join(known)}"
+        if more and name.lower() not in known:
+            hint += f"; {more}"
         super().__init__(f"no robot or URDF file {name!r}{note}; {hint}")
 
 

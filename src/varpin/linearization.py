@@ -19,6 +19,7 @@ from varpin.integrators.base import diffusion_and_drift, ends_at, noise_fields, 
 from varpin.integrators.same_scene import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
+from varpin.model import joint_unit
 from varpin.simulation.damping import fast_damping
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.markup import facts, table
@@ -453,8 +454,9 @@ def _require_steps_of(scene: Scene, trajectory: Trajectory, integrator: Integrat
         if not off <= _OF_CHANGE * change[k] + _OF_SPEED * speed:
             raise InputError(
                 f"the trajectory was made in another scene than the one given: taken again in this one, step {k} "
-                f"(t = {trajectory.t[k]:.6g} s) ends at velocities that are off by {off:.3g} rad/s or m/s. Give the "
-                "scene that made it, with its damping, gravity, springs and inertias, or simulate again in this one"
+                f"(t = {trajectory.t[k]:.6g} s) ends at velocities that are off by {off:.3g} "
+                f"{joint_unit(scene.robot, speed=True)}. Give the scene that made it, with its damping, gravity, "
+                "springs and inertias, or simulate again in this one"
             )
 
 

@@ -23,6 +23,7 @@ from varpin.integrators import Integrator
 from varpin.integrators.base import open_line, open_loop
 from varpin.linearization import wrong_variances
 from varpin.mechanics.forces import of_kind
+from varpin.model import joint_unit
 from varpin.simulation.chatter import alternation, restlessness
 from varpin.simulation.record import rollout
 from varpin.simulation.soundness import Finding, announce, examined, findings_from_record
@@ -116,7 +117,9 @@ def findings(solution: Solution) -> tuple[Finding, ...]:
 def _as_wished(solution: Solution, replay: Replay) -> bool:
     """Whether the plan's refinement met its wish, and the replay with feedback confirms that."""
     refinement = solution.refinement
-    return refinement is not None and refinement.met and -GAIN <= replay.feedback <= refinement.wish
+    if refinement is None or not refinement.met:
+        return False
+    return -max(GAIN, refinement.wish) <= replay.feedback <= max(LOSS, refinement.wish)
 
 
 def replayed(solution: Solution) -> Replay:
@@ -218,7 +221,7 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
     except LinearizationError:
         return []
     n = problem.scene.robot.dof
-    worst, name, width = 0.0, "", 0.0
+    worst, name, width, unit = 0.0, "", 0.0, ""
     for element in rubbing:
         c, own = element.coordinate, element.values[1]
         variance = np.einsum("kx,kxy,ky->k", slopes[:, n + c], P, slopes[:, n + c])
@@ -228,12 +231,13 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
         ratio = float((spread[slow] / own).max(initial=0.0))
         if ratio > worst:
             worst, name, width = ratio, motion.joint_names[c], own
+            unit = joint_unit(problem.scene.robot, c, speed=True)
     if worst <= _LINEAR_FRICTION:
         return []
     return [
         Finding(
             "friction under noise",
-            f"noise moves joint {name!r} by {worst:.2g} times the width of its dry friction ({width:g} rad/s or m/s), "
+            f"noise moves joint {name!r} by {worst:.2g} times the width of its dry friction ({width:g} {unit}), "
             "for which the friction is not linear: noise_cost, gains and margins are of the linearized friction and "
             "may be wrong many times over; plan.monte_carlo() and simulate_ensemble have the whole of it",
         )

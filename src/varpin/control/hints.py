@@ -29,6 +29,7 @@ from varpin.model import (
     IN_MILLIMETRES,
     Robot,
     degrees_hint,
+    joint_unit,
     looks_like_degrees,
     millimetres_hint,
 )
@@ -240,8 +241,8 @@ def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
             if beyond[joint] > _SAME:
                 yield Finding(
                     "goal outside constraints",
-                    f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} {beyond[joint]:.4g} rad or "
-                    f"m outside {limits.label}, where the plan will not end",
+                    f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} {beyond[joint]:.4g} "
+                    f"{joint_unit(robot, joint)} outside {limits.label}, where the plan will not end",
                 )
 
 

@@ -15,6 +15,7 @@ from varpin.arrays import Floats
 from varpin.control import Kept, OptimalControlProblem, Solution, kept, looked_at, replan, solve
 from varpin.control.costs import CostError
 from varpin.control.history import Status
+from varpin.control.multipliers import REPORTED
 from varpin.control.solution import rest_of
 from varpin.errors import InputError
 from varpin.integrators import Integrator
@@ -39,6 +40,9 @@ logger = logging.getLogger(__name__)
 
 # Share of late or slow ticks without a warning: other programs on the machine cause a few.
 _FEW = 0.05
+# Violation by the plant, in scales of a constraint (a tenth of its range), from which on no narrower bound is advised:
+# it would leave less than half of the range.
+_NARROWED = 2.5
 
 
 @dataclass(frozen=True)
@@ -388,7 +392,7 @@ class Mpc:
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
         found = (*found, *_whole_ticks(duration, ticks, self.period))
         held = kept(problem, tuple(plans), motion, plant.substeps)
-        found = (*found, *_outside(held))
+        found = (*found, *_outside(held, noisy=bool(motion.dw.any())))
         announce(logger, plant.scene, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
         first = [finding.sentence for finding in of_plan if (finding.kind, finding.joint) not in again]
@@ -408,7 +412,7 @@ class Mpc:
         )
 
 
-def _outside(held: Sequence[Kept]) -> tuple[Finding, ...]:
+def _outside(held: Sequence[Kept], *, noisy: bool) -> tuple[Finding, ...]:
     """Findings about constraints that the plant's motion violated, and about ticks without a feasible plan."""
     found = []
     for row in held:
@@ -424,12 +428,16 @@ def _outside(held: Sequence[Kept]) -> tuple[Finding, ...]:
             )
         if row.worst > row.tolerance:
             when = row.t[int(np.argmax(row.moved))]
+            advice = ["a smaller dt", "more iterations", "a longer horizon"]
+            if noisy:
+                advice.insert(0, "a margin=")
+            if row.worst < _NARROWED * row.tolerance / REPORTED:
+                advice.insert(0, "a bound narrower by as much")
             found.append(
                 Finding(
                     "motion outside constraints",
-                    f"the plant's motion violates {row.label} by {row.worst:.2g} {row.unit} at t = {when:.4g} s: a "
-                    "bound narrower by as much (under noise, a margin=), a smaller dt, more iterations or a longer "
-                    "horizon may keep it inside",
+                    f"the plant's motion violates {row.label} by {row.worst:.2g} {row.unit} at t = {when:.4g} s: "
+                    f"{', '.join(advice[:-1])} or {advice[-1]} may keep it inside",
                 )
             )
     return tuple(found)

@@ -32,6 +32,7 @@ from varpin.mechanics.inputs import as_moved, with_ends
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene, assisted, quiet
+from varpin.model import joint_unit
 from varpin.simulation.failures import StepFailure, named
 from varpin.simulation.record import Motions
 from varpin.support.checks import as_floats, finite_array
@@ -120,7 +121,11 @@ def path_of(problem: OptimalControlProblem, given: object) -> Path:
     if beyond.max() > _SAME:
         node, joint = divmod(int(np.argmax(beyond)), beyond.shape[1])
         logger.warning(
-            "states: joint %r is %.4g rad or m beyond its limit at node %d", names[joint], beyond[node, joint], node
+            "states: joint %r is %.4g %s beyond its limit at node %d",
+            names[joint],
+            beyond[node, joint],
+            joint_unit(problem.scene.robot, joint),
+            node,
         )
     speeds = np.gradient(positions, problem.dt, axis=0) if v is None else _rows("states: v", v, (nodes, n))
     speeds[0] = problem.v0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,6 +183,7 @@ class Kept(Frozen):
             goals, which apply to the end of each plan.
         t: Times of these nodes (T,) [s].
         infeasible: Ticks whose plan is INFEASIBLE and violates this constraint (K,).
+        older: Ticks in which the plan of an earlier one acts on, whose violation is that of its own horizon (K,).
     """
 
     label: str
@@ -191,6 +193,7 @@ class Kept(Frozen):
     moved: Floats
     t: Floats
     infeasible: NDArray[np.bool_]
+    older: NDArray[np.bool_]
 
     @property
     def worst(self) -> float:
@@ -199,11 +202,16 @@ class Kept(Frozen):
 
     def __str__(self) -> str:
         plans = int((self.planned > self.tolerance).sum())
-        text = f"violated by {self.planned.max():.1e} {self.unit} at most in plans, in {plans} of {len(self.planned)} "
-        text += f"ticks by more than {self.tolerance:.1g}"
+        most = self.planned.max()
+        text = f"not violated in the plans of {len(self.planned)} ticks"
+        if most > 0.0:
+            text = f"violated by {most:.1e} {self.unit} at most in plans, in {plans} of {len(self.planned)} ticks by "
+            text += f"more than {self.tolerance:.1g} {self.unit}"
+        if self.older.any():
+            text += f" (in {int(self.older.sum())} ticks an older plan acts on, as it was made)"
         if self.moved.size:
             where = f" at t = {self.t[int(np.argmax(self.moved))]:.4g} s" if self.worst > self.tolerance else ""
-            text += f"; by {self.worst:.1e} at most in the plant's motion{where}"
+            text += f"; by {self.worst:.1e} {self.unit} at most in the plant's motion{where}"
         return f"{self.label}: {text}"
 
     __repr__ = __str__
@@ -219,6 +227,7 @@ def kept(
     hold = 1 if problem.linear else substeps
     fine = problem.constraints_on(motion.dt, motion.steps, hold, linear=False)
     infeasible = np.array([plan.status is Status.INFEASIBLE for plan in plans])
+    older = np.array([False, *(plan is before for before, plan in pairwise(plans))])
     found = []
     for i, bound in enumerate(fine):
         planned = np.array([plan.constraints[i].violation for plan in plans])
@@ -228,5 +237,5 @@ def kept(
             violated, t = np.maximum(c, 0.0).max(axis=1), bound.times
         tolerance = REPORTED * bound.scale
         failed = infeasible & (planned > tolerance)
-        found.append(Kept(bound.source.label, bound.unit, tolerance, planned, violated, t, failed))
+        found.append(Kept(bound.source.label, bound.unit, tolerance, planned, violated, t, failed, older))
     return tuple(found)

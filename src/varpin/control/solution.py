@@ -26,6 +26,7 @@ from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
 from varpin.linearization import velocity_at_nodes
 from varpin.mechanics.policy import LinearPolicy
+from varpin.model import joint_unit
 from varpin.support.checks import JointValues, count, is_one_of, positive
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
@@ -189,7 +190,9 @@ class Solution(Frozen):
         if self.history:
             rows.insert(4, ("gradient", f"{self.history[-1].gradient:.2e} at most in the end"))
         names = problem.scene.robot.joint_names
-        for what, unit, part in (("position", "rad or m", beyond.position), ("velocity", "1/s", beyond.velocity)):
+        robot = problem.scene.robot
+        units = joint_unit(robot), joint_unit(robot, speed=True)
+        for what, unit, part in zip(("position", "velocity"), units, (beyond.position, beyond.velocity), strict=True):
             over = [f"{name} {value:.3g}" for name, value in zip(names, part, strict=True) if value]
             if over:
                 rows.append((f"{what} beyond limits [{unit}]", listed(over)))

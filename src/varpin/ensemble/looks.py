@@ -68,4 +68,5 @@ def _examine(task: Task) -> tuple[Finding, ...]:
     # The loop's check is for held controls.
     held = len(shared.commands.gains) and not len(shared.commands.stage_times)
     hold = shared.commands.hold if held else None
-    return examined_in_loop(shared.scene, shared.integrator, motion, hold)[1]
+    fed = shared.commands if held else None
+    return examined_in_loop(shared.scene, shared.integrator, motion, hold, commands=fed)[1]

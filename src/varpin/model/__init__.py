@@ -23,3 +23,4 @@ from varpin.model.sources import bundled_robots as bundled_robots
 from varpin.model.sources import models_dir as models_dir
 from varpin.model.sources import robot_names as robot_names
 from varpin.model.tree import require_sound as require_sound
+from varpin.model.units import joint_unit as joint_unit

@@ -8,6 +8,10 @@ from pathlib import Path
 from varpin.errors import MissingDependency, RobotError
 
 SUFFIX = "_description"
+INSTALL = (
+    f'more robots, by names such as "iiwa14{SUFFIX}", are those of robot_descriptions: '
+    'pip install "varpin[descriptions]"'
+)
 
 # Tags of robots with a floating base, and tags that override them.
 _FLOATING, _FIXED = {"biped", "drone", "humanoid", "quadruped"}, {"arm", "dual_arm", "end_effector"}

@@ -140,7 +140,9 @@ def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, ob
     if is_path and path.is_dir():
         raise RobotError(f"{path} is a folder, not a URDF file; it contains {_urdf_files(path)}")
     note = "" if path.suffix not in (".urdf", ".xacro") else f" (looked in {path.absolute().parent})"
-    raise RobotNotFound(text, [*bundled, *example_robot_data.installed(), *downloadable], note)
+    # Without the package its names are unknown.
+    more = "" if downloadable or is_path else robot_descriptions.INSTALL
+    raise RobotNotFound(text, [*bundled, *example_robot_data.installed(), *downloadable], note, more)
 
 
 def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[str] | None) -> tuple[str, ...]:

@@ -13,8 +13,9 @@ from varpin.core import longest_alternation
 # Least second difference of a velocity that counts, as a share of the joint's largest velocity: it is four times the
 # alternating part.
 _COUNTS = 2e-3
-# The same as a share of the largest velocity of all joints: couplings and rounding in joints at rest.
-_IDLE = 1e-6
+# The same as a share of the largest velocity of all joints: swings of slow joints that hardly move the robot or change
+# its cost, and couplings and rounding in joints at rest.
+_IDLE = 5e-4
 # Changes of sign in a row from which on a warning is given. An oscillation that the steps resolve has none in a row.
 RUN = 8
 # Largest factor between second differences in a row. Those after a jump at an end of an optimal motion do not count:
@@ -22,8 +23,8 @@ RUN = 8
 _EVEN = 2.0
 
 # Least difference of a velocity from node to node that counts as restlessness, as a share of the joint's largest
-# velocity.
-_RESTLESS_CHANGE = 1e-3
+# velocity, and of the largest velocity of all joints.
+_RESTLESS_CHANGE, _RESTLESS_IDLE = 1e-3, 1e-6
 # Changes of sign from which on a warning is given: more than the first number in a hundred steps, and at least the
 # second, for each end of a motion under held controls has five or six, whatever the number of steps.
 RESTLESS, _FEWEST = 12, 13
@@ -92,7 +93,7 @@ def restlessness(v: Floats) -> Restlessness | None:
     """
     fastest = np.abs(v).max(axis=0, initial=0.0)
     change = np.diff(v, axis=0)
-    counts = np.abs(change) > np.maximum(_RESTLESS_CHANGE * fastest, _IDLE * fastest.max(initial=0.0))
+    counts = np.abs(change) > np.maximum(_RESTLESS_CHANGE * fastest, _RESTLESS_IDLE * fastest.max(initial=0.0))
     changes = ((change[1:] * change[:-1] < 0.0) & counts[1:] & counts[:-1]).sum(axis=0)
     if not changes.size:
         return None

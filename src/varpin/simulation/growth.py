@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
+from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.integrators import Gauss, Integrator, Radau, Reference
 from varpin.integrators.base import open_loop
@@ -24,6 +25,7 @@ from varpin.mechanics.scene import Scene
 from varpin.simulation.accuracy import ROUNDING, travel_scales
 from varpin.simulation.kinks import kinks
 from varpin.simulation.modes import first_order, linearized, of_inputs, rate_bounds
+from varpin.simulation.record import Motions
 from varpin.simulation.retaking import Finer, finer, impulses_of_parts, noise_left_out, shortest_parts, taken_again
 from varpin.trajectory import Trajectory
 
@@ -179,6 +181,25 @@ def whole_error(scene: Scene, trajectory: Trajectory, other: Finer, times: Times
     shares = most / _travel(scene, trajectory)
     joint = int(shares.argmax())
     return joint, float(most[joint]), float(shares[joint])
+
+
+def corrected(scene: Scene, integrator: Integrator, trajectory: Trajectory, commands: Commands) -> bool:
+    """Whether feedback corrects the errors of a motion's steps, so that they neither add up nor grow.
+
+    The motion is integrated again by a method of far more stages under the same ``commands``, whose feedback acts on
+    its own state, and the same noise; the two then agree. False where that is not known.
+    """
+    other = better(integrator, trajectory)
+    method, linear = other.method, len(commands.stage_times) > 0
+    if other.parts > 1 or linear or method.variational != integrator.variational or _in_python(scene, trajectory):
+        return False
+    drawn = trajectory.dw if trajectory.dw.any() else None
+    again, failure = Motions(scene, method, trajectory.q[0], trajectory.v[0], trajectory.dt).under(
+        commands, increments=drawn
+    )
+    if failure is not None or again.steps != trajectory.steps:
+        return False
+    return bool((np.abs(again.q - trajectory.q) <= WARNED * _travel(scene, trajectory)).all())
 
 
 def _whole_off(scene: Scene, trajectory: Trajectory, other: Finer, times: Times, kinked: Integers) -> Floats | None:

@@ -17,6 +17,7 @@ import scipy
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
+from varpin.core.arrays import Commands
 from varpin.errors import AssemblyError, LinearizationError, SingularMassMatrix
 from varpin.integrators import Integrator
 from varpin.integrators.explicit import accelerations
@@ -24,9 +25,10 @@ from varpin.mechanics.assembly import nearest
 from varpin.mechanics.forces import drive_forces
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
+from varpin.simulation import growth
 from varpin.simulation.chatter import RUN, alternation
 from varpin.simulation.modes import first_order, linearized
-from varpin.simulation.soundness import Finding, examined, with_warnings
+from varpin.simulation.soundness import GROWING, Finding, examined, with_warnings
 from varpin.trajectory import Trajectory
 
 _ADVICE = "take a shorter period or lower gains; where neither helps, look at the signs of the law"
@@ -165,13 +167,23 @@ def examined_in_loop(
     error: float | None = None,
     *,
     corrected: bool = False,
+    commands: Commands | None = None,
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
     """:func:`varpin.simulation.soundness.examined`, and the check of the control loop.
 
     ``hold`` is the period of the loop in steps, None without feedback; ``error`` the largest of q [rad or m], if known.
-    ``corrected``: the controller brings the motion back, so that errors of steps do not add up.
+    ``corrected``: the controller brings the motion back, so that errors of steps do not add up. ``commands`` are those
+    of all steps, where they have linear feedback: whether it does so is then tried out.
     """
     trajectory, found = examined(scene, integrator, trajectory, error, corrected=corrected)
+    if (
+        commands is not None
+        and any(finding.kind == GROWING for finding in found)
+        and growth.corrected(scene, integrator, trajectory, commands)
+    ):
+        # The repetition that found them had the recorded controls, without feedback.
+        found = tuple(finding for finding in found if finding.kind != GROWING)
+        trajectory = trajectory.changed(warnings=())
     if hold is not None:
         loop = unstable_loop(scene, trajectory, hold) or _flipping(scene, trajectory, hold)
         found = (*(loop or _cycling(scene, trajectory, hold)), *found)

@@ -214,7 +214,10 @@ def simulated(
         integrator = other
     try:
         try:
-            trajectory, found = _checked(scene, integrator, record.trajectory(), hold, accuracy, check=check)
+            fed = None
+            if isinstance(controls, LinearPolicy) and hold is not None and record.steps == steps:
+                fed = commands_of(scene, integrator, controls, steps, dt)
+            trajectory, found = _checked(scene, integrator, record.trajectory(), hold, accuracy, fed, check=check)
         except (CustomForceError, CustomConstraintError) as error:
             # Steps that the check repeats may go where the function is not defined. The motion itself is valid.
             sentence = f"the motion was not checked: {error}"
@@ -356,12 +359,17 @@ def _checked(
     trajectory: Trajectory,
     hold: int | None,
     accuracy: Accuracy | None,
+    commands: Commands | None,
     *,
     check: bool,
 ) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """A motion with its warnings; ``hold`` is the period of its feedback in steps, None for none."""
+    """A motion with its warnings.
+
+    ``hold`` is the period of its feedback in steps, None for none, and ``commands`` those of a linear feedback.
+    """
     if check:
-        return examined_in_loop(scene, integrator, trajectory, hold, None if accuracy is None else accuracy.error)
+        error = None if accuracy is None else accuracy.error
+        return examined_in_loop(scene, integrator, trajectory, hold, error, commands=commands)
     found = findings_from_record(scene, integrator, trajectory)
     return with_warnings(trajectory, found), found
 

@@ -23,6 +23,7 @@ from varpin.integrators.explicit import accelerations
 from varpin.integrators.within import changing, in_pairs, in_parts, shares
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
+from varpin.model import joint_unit
 from varpin.simulation.accuracy import (
     EVEN,
     FIRST,
@@ -98,6 +99,8 @@ _MEDIAN_OFF, _MOST_OFF = 0.1, 1e-3
 _NODES = 16
 # First nodes of the windows of a motion that has one.
 _FROM_START = np.zeros(1, dtype=np.int64)
+# Kind of the finding about errors that add up or grow.
+GROWING = "growing errors"
 # Velocities below this count as zero [rad/s or m/s]: rounding in a robot in equilibrium.
 _STILL = 1e-9
 
@@ -344,10 +347,10 @@ def _growing(
         return (Finding("kinks of forces", sentence, found.joint),)
     sentence = (
         f"{GROWTH_WORDS if found.grows else ADDED_WORDS}: single steps of dt = {trajectory.dt:g} s by {integrator} are "
-        f"off by about {found.step:.1g} rad or m, and a method of more stages moves {off}; "
+        f"off by about {found.step:.1g} {joint_unit(scene.robot)}, and a method of more stages moves {off}; "
         "smaller steps or more stages keep the motion right for longer"
     )
-    return (Finding("growing errors", sentence, found.joint),)
+    return (Finding(GROWING, sentence, found.joint),)
 
 
 def share_in_words(scene: Scene, joint: int, off: float, share: float) -> str:

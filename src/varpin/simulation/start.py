@@ -10,7 +10,7 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.scene import CORRECTED, EARTH, Scene
-from varpin.model import degrees_hint, degrees_per_second_hint, millimetres_hint
+from varpin.model import degrees_hint, degrees_per_second_hint, joint_unit, millimetres_hint
 from varpin.simulation.soundness import Finding
 
 # Shift of a start onto its constraints up to which no warning is given [rad or m]: rounding.
@@ -89,8 +89,10 @@ def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats
     changes = []
     if shift > _ROUNDING:
         changes.append(
-            f"q0 was moved by up to {shift:.3g} rad or m onto the constraints (it missed {label} by {miss:.3g})"
+            f"q0 was moved by up to {shift:.3g} {joint_unit(scene.robot)} onto the constraints (it missed {label} by "
+            f"{miss:.3g})"
         )
     if turned > _ROUNDING * max(1.0, float(np.abs(v0).max())):
-        changes.append(f"v0 was changed by up to {turned:.3g} rad/s or m/s, to what the constraints allow")
+        unit = joint_unit(scene.robot, speed=True)
+        changes.append(f"v0 was changed by up to {turned:.3g} {unit}, to what the constraints allow")
     return q, v, (Finding("start off the constraints", "; ".join(changes)),) if changes else ()

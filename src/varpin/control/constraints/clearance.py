@@ -76,7 +76,7 @@ class KeepClear(PlanConstraint):
             links: Names of the links; by default all moving links with shapes or a given capsule.
             itself: Keep links clear of each other, too, except for pairs on one joint or on two consecutive joints, and
                 pairs that overlap at q = 0; ``pairs`` lists the rest.
-            srdf: An SRDF file, whose ``disable_collisions`` leave out more pairs of links;
+            srdf: With ``itself``, an SRDF file, whose ``disable_collisions`` leave out more pairs of links;
                 a warning tells if the robot lacks most of the links that they name.
             capsules: By the name of a link, or of another frame, (begin (3,), end (3,), radius) in its own axes [m], in
                 place of the fitted one.
@@ -102,6 +102,8 @@ class KeepClear(PlanConstraint):
         if not (capsules is None or isinstance(capsules, Mapping)):
             raise InputError(f"KeepClear capsules must map names of links to (begin, end, radius), got {capsules!r}")
         file = None if srdf is None else path_like("KeepClear srdf", srdf)
+        if file is not None and not itself:
+            raise InputError("KeepClear srdf leaves out pairs of links, and there are none without itself=True")
         self._of = clearance(robot, self.obstacles, links=links, itself=itself, srdf=file, capsules=capsules)
         self.pairs = self._of.names
         self.capsules = {

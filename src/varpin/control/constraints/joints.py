@@ -18,7 +18,7 @@ from varpin.control.constraints.base import (
     require_same,
 )
 from varpin.errors import InputError
-from varpin.model import Robot, require_robot
+from varpin.model import Robot, joint_unit, require_robot
 from varpin.support.checks import JointValues, as_floats, control_array, finite, finite_array, real, some_limits
 
 # Scales of joints without a finite range [rad or m; rad/s or m/s].
@@ -91,7 +91,7 @@ class _WithinLimits(PlanConstraint):
             self,
             *nodes_after(horizon),
             tuple(rows),
-            "rad/s or m/s" if self.in_velocity else "rad or m",
+            joint_unit(self.robot, sorted(set(columns)), speed=self.in_velocity),
             scale,
             self.in_velocity,
             np.array(columns),

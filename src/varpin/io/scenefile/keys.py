@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -21,7 +22,8 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 
-from varpin.io.scenefile.table import SceneFileError, shown, suggestion
+from varpin.io.scenefile.table import SceneFileError, inside, shown, suggestion
+from varpin.support.checks import is_file
 
 
 class Keys(BaseModel):
@@ -127,6 +129,30 @@ def either(what: str, shape: Callable[[Any], str] | None = None, **kinds: Any) -
         return readers[found].validate_python(value, context=info.context)
 
     return Rule(Annotated[Any, PlainValidator(chosen)], what, parts=True)
+
+
+def checked(kind: Any, check: Callable[..., Any]) -> Rule:
+    """A value of a kind, converted by ``check``, which raises a ValueError for wrong ones."""
+    plain, what = (Annotated[Any, kind], kind.what) if isinstance(kind, Rule) else (kind, "")
+    return Rule(Annotated[plain, AfterValidator(check)], what, parts=True)
+
+
+def beside(text: str, info: ValidationInfo) -> Path:
+    """A path in a scene file; a relative one must be below the folder of the file."""
+    context: Any = info.context
+    return inside(text, context["folder"], "the scene's folder")
+
+
+def existing(path: Path) -> Path:
+    """The path of a file, which must exist."""
+    if not is_file(path):
+        raise ValueError(f"there is no file {path}")
+    return path
+
+
+def existing_file(text: str, info: ValidationInfo) -> Path:
+    """The path of an existing file, by :func:`beside`."""
+    return existing(beside(text, info))
 
 
 def typed(kinds: Mapping[str, type[Keys]], default: str | None = None) -> Rule:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from varpin.control.constraints import (
     WithinJointLimits,
     WithinVelocityLimits,
 )
-from varpin.io.scenefile.keys import FLAG, TEXT, Rule, number, numbers, values
+from varpin.io.scenefile.keys import FLAG, TEXT, Rule, checked, either, existing_file, number, numbers, values
 from varpin.model import Robot
 from varpin.model.clearance import Obstacle
 
@@ -64,9 +65,19 @@ def _clear(robot: Robot, given: Given) -> PlanConstraint:
     obstacles = [Obstacle.sphere(x[:3], x[3], f"sphere[{k}]") for k, x in enumerate(given["spheres"])]
     obstacles += [Obstacle.capsule(x[:3], x[3:6], x[6], f"capsule[{k}]") for k, x in enumerate(given["capsules"])]
     obstacles += [Obstacle.box(x[:3], x[3:], name=f"box[{k}]") for k, x in enumerate(given["boxes"])]
-    obstacles += [Obstacle.convex(x, name=f"hull[{k}]") for k, x in enumerate(given["hulls"])]
+    for k, x in enumerate(given["hulls"]):
+        of = Obstacle.mesh if isinstance(x, Path) else Obstacle.convex
+        obstacles.append(of(x, name=f"hull[{k}]"))
     links = None if given["links"] is None else list(given["links"])
-    return KeepClear(robot, obstacles, given["distance"], links=links, itself=given["itself"], margin=given["margin"])
+    return KeepClear(
+        robot,
+        obstacles,
+        given["distance"],
+        links=links,
+        itself=given["itself"],
+        srdf=given["srdf"],
+        margin=given["margin"],
+    )
 
 
 def _rows(length: int) -> Rule:
@@ -74,11 +85,12 @@ def _rows(length: int) -> Rule:
     return Rule(tuple[one, ...], f"a list of lists of {length} numbers [m]", parts=True)
 
 
-_POINTS = Rule(
-    tuple[Annotated[tuple[Annotated[tuple[float, ...], numbers(3, "m")], ...], _rows(3)], ...],
-    "a list of lists of points, each of 3 numbers [m]",
-    parts=True,
+_HULL = either(
+    "a list of points, each of 3 numbers [m], or the path of a mesh file in metres",
+    list=Annotated[tuple[float, ...], _rows(3)],
+    text=Annotated[Path, checked(TEXT, existing_file)],
 )
+_HULLS = Rule(tuple[Annotated[Any, _HULL], ...], "a list of hulls", parts=True)
 _MARGIN = {"margin": (number(least=0.0), 0.0)}
 _FRAME = {"frame": (TEXT, ...)}
 _SPHERE = _FRAME | {"center": (numbers(3, "m"), ...), "radius": (number("m", above=0.0), ...)} | _MARGIN
@@ -121,9 +133,10 @@ PLAN_CONSTRAINTS: dict[str, Kind] = {
             "spheres": (_rows(4), ()),
             "capsules": (_rows(7), ()),
             "boxes": (_rows(6), ()),
-            "hulls": (_POINTS, ()),
+            "hulls": (_HULLS, ()),
             "links": (Rule(tuple[Annotated[str, TEXT], ...], "a list of texts", parts=True), None),
             "itself": (FLAG, False),
+            "srdf": (checked(TEXT, existing_file), None),
         }
         | _MARGIN,
     ),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationInfo, create_model, model_validator
+from pydantic import Field, ValidationInfo, create_model, model_validator
 from scipy.spatial.transform import Rotation
 
 from varpin.control.problem import default_integrator
@@ -20,7 +20,11 @@ from varpin.io.scenefile.keys import (
     TEXT,
     Keys,
     Rule,
+    beside,
+    checked,
     either,
+    existing,
+    existing_file,
     mistake,
     number,
     numbers,
@@ -52,17 +56,10 @@ from varpin.io.scenefile.terms import TERMS, Term
 from varpin.mechanics.constraints import FrameOnFrame
 from varpin.mechanics.forces import CoulombFriction
 from varpin.model import Payload
-from varpin.support.checks import is_file
 
 _THREE = tuple[float, float, float]
 # The value of the robot's description.
 _ROBOT = Annotated[str, word("robot")]
-
-
-def _checked(kind: Any, check: Callable[..., Any]) -> Rule:
-    """A value of a kind, converted by ``check``, which raises a ValueError for wrong ones."""
-    plain, what = (Annotated[Any, kind], kind.what) if isinstance(kind, Rule) else (kind, "")
-    return Rule(Annotated[plain, AfterValidator(check)], what, parts=True)
 
 
 def _distinct(rule: Rule) -> Rule:
@@ -74,33 +71,17 @@ def _distinct(rule: Rule) -> Rule:
                 raise mistake(index, f"{entry!r} is a duplicate")
         return entries
 
-    return _checked(tuple[Annotated[str, rule], ...], once)
-
-
-def _beside(text: str, info: ValidationInfo) -> Path:
-    """A path in a scene file; a relative one must be below the folder of the file."""
-    context: Any = info.context
-    return inside(text, context["folder"], "the scene's folder")
+    return checked(tuple[Annotated[str, rule], ...], once)
 
 
 def _folder(text: str, info: ValidationInfo) -> str:
-    return str(_beside(text, info))
-
-
-def _existing(path: Path) -> Path:
-    if not is_file(path):
-        raise ValueError(f"there is no file {path}")
-    return path
-
-
-def _file(text: str, info: ValidationInfo) -> Path:
-    return _existing(_beside(text, info))
+    return str(beside(text, info))
 
 
 def _robot_source(text: str, info: ValidationInfo) -> str | Path:
     """The name of a robot, or the path of an existing file."""
     named = not Path(text).suffix and "/" not in text and "\\" not in text
-    return text if named else _existing(_beside(text, info))
+    return text if named else existing(beside(text, info))
 
 
 # The position of a locked joint. A joint with several axes, or a continuous one, has several numbers.
@@ -159,16 +140,16 @@ def _base_of(base: Any) -> Any:
 class RobotKeys(Keys):
     """[robot]."""
 
-    source: Annotated[str | Path, _checked(TEXT, _robot_source)]
+    source: Annotated[str | Path, checked(TEXT, _robot_source)]
     lock: dict[str, Annotated[Any, _LOCK]] = Field(default_factory=dict)
     mimic: Annotated[str, word("tied", "free")] = "tied"
-    package_dirs: Annotated[tuple[str, ...], _distinct(_checked(TEXT, _folder))] = ()
+    package_dirs: Annotated[tuple[str, ...], _distinct(checked(TEXT, _folder))] = ()
     xacro_args: dict[str, Annotated[Any, _ARGUMENT]] = Field(default_factory=dict)
-    srdf: Annotated[Path | None, _checked(TEXT, _file)] = None
-    payload: tuple[Annotated[Payload, _checked(PayloadKeys, PayloadKeys.payload)], ...] = ()
+    srdf: Annotated[Path | None, checked(TEXT, existing_file)] = None
+    payload: tuple[Annotated[Payload, checked(PayloadKeys, PayloadKeys.payload)], ...] = ()
     base: Annotated[
         Any,
-        _checked(either('"planar", or { xyz, rpy }', text=Annotated[str, word("planar")], table=BaseKeys), _base_of),
+        checked(either('"planar", or { xyz, rpy }', text=Annotated[str, word("planar")], table=BaseKeys), _base_of),
     ] = None
     armature: Annotated[ByName | None, values("kg m^2 or kg", least=0.0)] = None
     inertia: Annotated[Literal["file", "meshes"], word("file", "meshes")] = "file"
@@ -297,16 +278,16 @@ class WaypointKeys(Keys):
 
 
 def _values_file(text: str, info: ValidationInfo) -> Path:
-    path = _beside(text, info)
+    path = beside(text, info)
     if path.suffix not in (".csv", ".npz"):
         raise ValueError(f"must be a .csv or .npz file, got {path.name!r}")
-    return _existing(path)
+    return existing(path)
 
 
 class FileKeys(Keys):
     """A reference in a file."""
 
-    file: Annotated[Path, _checked(TEXT, _values_file)]
+    file: Annotated[Path, checked(TEXT, _values_file)]
 
 
 REFERENCE_KEYS: Mapping[str, type[Keys]] = {"file": FileKeys, "waypoints": WaypointKeys, "sines": SinesKeys}
@@ -352,7 +333,7 @@ def _output(*endings: str) -> Rule:
             raise ValueError(f"must end in {', '.join(endings)}, got {path.name!r}")
         return path
 
-    return _checked(TEXT, written)
+    return checked(TEXT, written)
 
 
 class OutputKeys(Keys):
@@ -505,7 +486,7 @@ class SceneKeys(Keys):
     friction: Annotated[Any, values("N m or N", least=0.0, text=_ROBOT)] = None
     robot: Annotated[
         tuple[RobotKeys, ...],
-        _checked(
+        checked(
             either("a table [robot], or several of [[robot]]", table=RobotKeys, list=tuple[MemberKeys, ...]), _several
         ),
     ]

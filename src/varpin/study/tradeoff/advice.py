@@ -272,7 +272,8 @@ def _reason(
     else:
         lines = [f"{best}, the most accurate after {duration:g} s within {wish}"]
     if others and tolerance is not None and reached:
-        lines.append(f"next: {others[0]}, {others[0].seconds / best.seconds:.2g} times as long")
+        longer = f"{others[0].seconds / best.seconds:.2g}"
+        lines.append(f"next: {others[0]}, {'as long' if longer == '1' else f'{longer} times as long'}")
     elif others:
         lines.append(f"next: {others[0]}")
     if not best.measured:
