@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene
 from varpin.simulation.record import rollout
 from varpin.support.frozen import Frozen
-from varpin.trajectory import Trajectory
+from varpin.trajectory import Trajectory, joined
 
 # Differences of states and controls, where the derivatives of a step's parts do not follow from each other.
 _SHIFT = 1e-5
@@ -78,38 +79,43 @@ class Parts(Frozen):
         Raises:
             LinearizationError: A part has no derivative.
         """
-        own, n = self._by_differences if self.scene.inputs else self._chained, self.scene.robot.dof
-        states = np.empty((2, len(q), self.count - 1, n))
-        found = np.empty((len(q), self.count - 1, 2 * n, 2 * n + u.shape[1]))
+        motions = []
         for k in range(len(q)):
             motion, failure = self._motion(q[k], v[k], u[k])
             if failure is not None:
                 raise LinearizationError(motion.steps, float(motion.t[-1]), "a step fails in parts")
-            states[:, k] = motion.q[1:-1], motion.v[1:-1]
-            found[k] = own(motion.part(0, self.count - 1), u[k])
-        return (states[0], states[1]), found
+            motions.append(motion)
+        states = np.array([motion.q[1:-1] for motion in motions]), np.array([motion.v[1:-1] for motion in motions])
+        if self.scene.inputs:
+            found = np.array([self._by_differences(*step) for step in zip(motions, u, strict=True)])
+        else:
+            found = self._chained(_one_after_another(motions), u)
+        return states, found
 
     def _chained(self, motion: Trajectory, u: Floats) -> Floats:
-        """The derivatives in one step, those of its parts one after another."""
-        scene, n = self.scene, self.scene.robot.dof
+        """The derivatives in each step of :func:`_one_after_another`, those of its parts one after another."""
+        scene, n, K = self.scene, self.scene.robot.dof, len(u)
         lin = linearize_steps(scene, motion, self.integrator, motion.q[0], ramps=self.linear)
-        slopes = np.tile(np.eye(2 * n), (self.count, 1, 1))
+        A, B = (array.reshape(K, self.count, *array.shape[1:]) for array in (lin.A, lin.B))
+        ramp = None if lin.ramp is None else lin.ramp.reshape(B.shape)
+        slopes = np.tile(np.eye(2 * n), (K, self.count, 1, 1))
         if self.integrator.variational:
-            slopes[:, n:] = velocity_at_nodes(scene, motion.q, motion.v)
-        found = np.empty((self.count - 1, 2 * n, 2 * n + len(u)))
+            at = velocity_at_nodes(scene, motion.q[:-1], motion.v[:-1])
+            slopes[:, :, n:] = at.reshape(K, self.count, n, 2 * n)
+        found = np.empty((K, self.count - 1, 2 * n, 2 * n + u.shape[1]))
         # In (x, controls).
-        after = np.eye(2 * n, 2 * n + len(u))
-        after[:, : 2 * n] = np.linalg.inv(slopes[0])
-        for j, (A, B) in enumerate(zip(lin.A, lin.B, strict=True)):
-            after = A @ after
-            if lin.ramp is None:
-                after[:, 2 * n :] += B
+        after = np.tile(np.eye(2 * n, 2 * n + u.shape[1]), (K, 1, 1))
+        after[:, :, : 2 * n] = np.linalg.inv(slopes[:, 0])
+        for j in range(self.count - 1):
+            after = A[:, j] @ after
+            if ramp is None:
+                after[:, :, 2 * n :] += B[:, j]
             else:
                 share, m = j / self.count, scene.controls
-                rise = lin.ramp[j] / self.count
-                after[:, 2 * n : 2 * n + m] += (1.0 - share) * B - rise
-                after[:, 2 * n + m :] += share * B + rise
-            found[j] = slopes[j + 1] @ after
+                rise = ramp[:, j] / self.count
+                after[:, :, 2 * n : 2 * n + m] += (1.0 - share) * B[:, j] - rise
+                after[:, :, 2 * n + m :] += share * B[:, j] + rise
+            found[:, j] = slopes[:, j + 1] @ after
         return found
 
     def _by_differences(self, motion: Trajectory, u: Floats) -> Floats:
@@ -122,3 +128,18 @@ class Parts(Frozen):
         after, before = np.split(np.concatenate(parted, axis=2), 2)
         found: Floats = np.moveaxis((after - before) / (2.0 * _SHIFT), 0, -1)
         return found
+
+
+def _one_after_another(motions: list[Trajectory]) -> Trajectory:
+    """Motions as one, for its linearization: each without its last node, in whose place the next one begins.
+
+    The linearization takes every step again from the node at its begin; that at its end is a first guess only.
+    """
+    first, last = motions[0], motions[-1]
+    of_nodes, of_steps = ("q", "v", "p", "energy", "u_nodes"), ("u", "u_stages", "dw", "constraint_forces")
+    arrays: dict[str, Any]
+    arrays = {name: np.concatenate([*(getattr(x, name)[:-1] for x in motions), getattr(last, name)[-1:]])
+              for name in of_nodes}  # fmt: skip
+    arrays |= {name: np.concatenate([getattr(x, name) for x in motions]) for name in of_steps}
+    times = first.dt * np.arange(len(arrays["q"]), dtype=np.float64)
+    return replace(first, t=times, **arrays, statistics=joined([x.statistics for x in motions]))
