@@ -73,9 +73,3 @@ def browser(chromium_session):
     """The session's browser. A page left open would go on drawing, at the cost of the tests after it."""
     yield chromium_session
     chromium_session.get("about:blank")
-
-
-@pytest.fixture
-def nodes_alone(monkeypatch):
-    """Constraints hold at the nodes alone, where their derivatives are exact."""
-    monkeypatch.setattr("varpin.control.augmented.seen", lambda *_: None)

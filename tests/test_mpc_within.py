@@ -47,7 +47,7 @@ FAMILIES = {
 
 
 @pytest.mark.parametrize("name", FAMILIES)
-def test_ticks_are_those_of_plans_from_scratch(name, nodes_alone):
+def test_ticks_are_those_of_plans_from_scratch(name):
     """Each against S-DDP with all rounds, from the same state, time and control before."""
     problem = tracking(FAMILIES[name])
     run = vp.Mpc(problem, iterations=4).run(duration=0.9)

@@ -67,7 +67,7 @@ def reference(problem, plan):
     return minimize(lambda x: problem.cost_of(motion(x)), start, method="SLSQP", constraints=rules, options=options)
 
 
-def test_the_last_step_onto_constraints_costs_next_to_nothing(nodes_alone):
+def test_the_last_step_onto_constraints_costs_next_to_nothing():
     """The wrist of an arm that falls over without feedback: brought to its bound, it comes back to its way."""
     robot = vp.load_robot("kinova")
     begin = np.array([0.3, 2.6, 1.6, 0.5, 1.0, 0.5])
@@ -102,7 +102,7 @@ QUICK = ("velocities", "plane", "out of a sphere")
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in FAMILIES]
 )
-def test_scipy_finds_no_less(name, nodes_alone):
+def test_scipy_finds_no_less(name):
     """Violations of 1e-9, and the cost of SciPy's optimum on the same grid."""
     problem = two_links(FAMILIES[name], steps=12, dt=0.06)
     plan = vp.solve(problem, check=False)
@@ -154,7 +154,7 @@ def kkt_residual(problem, plan, change=1e-5):
 
 
 @pytest.mark.parametrize("name", ["velocities", "goal", "two", "out of a sphere"])
-def test_karush_kuhn_tucker(name, nodes_alone):
+def test_karush_kuhn_tucker(name):
     problem = two_links(FAMILIES[name])
     plan = vp.solve(problem, check=False)
     assert plan.status.converged
@@ -216,7 +216,7 @@ def test_multipliers_of_more_rows_than_controls():
     assert 0 < (x[~equal] > 0.0).sum() < 30
 
 
-def test_conditions_of_an_optimum_hold_after_the_last_step(nodes_alone):
+def test_conditions_of_an_optimum_hold_after_the_last_step():
     """A goal, and speeds at their limits: a last step with the least change of the controls would spoil the optimum."""
     robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.0})
     cost = vp.ControlCost(0.1 / robot.effort_limit**2) + vp.VelocityCost(0.1) + vp.Terminal(vp.VelocityCost(10.0))
@@ -307,7 +307,7 @@ def test_first_penalties_on_given_states_are_light():
     assert told < 1e-2 * plan.cost
 
 
-def test_servos_within_velocity_limits(nodes_alone):
+def test_servos_within_velocity_limits():
     """A stiff servo: in steps that the guard divides the search would find no plan, and call the limits infeasible."""
     robot = vp.load_robot("ur5")
     begin = np.array([0.0, -1.2, 1.2, -1.0, -1.5, 0.0])
@@ -350,7 +350,7 @@ def test_given_limits_that_are_all_infinite():
             made(robot, (-np.inf, np.inf))
 
 
-def test_control_limits_and_hold(nodes_alone):
+def test_control_limits_and_hold():
     """Within the box of the controls, each held over two steps, other integrators and samplings included."""
     limits = (-30.0, 30.0)
     for options in (
@@ -608,7 +608,7 @@ def test_capsule_distances_are_coals():
         assert own[0, 0] == pytest.approx(known, abs=1e-6)
 
 
-def test_arm_goes_around_a_post(nodes_alone):
+def test_arm_goes_around_a_post():
     """A tool behind a post: every link stays clear of it, which without the constraint it does not."""
     robot = vp.load_robot("ur5")
     begin = np.array([0.0, -1.2, 1.4, -1.8, -1.57, 0.0])
@@ -662,7 +662,7 @@ def test_margins_against_monte_carlo(constraint):
     assert 0.005 < share <= 0.0228 + 3.0 * np.sqrt(0.0228 * 0.9772 / 10_000)
 
 
-def test_between_nodes_is_told(nodes_alone):
+def test_between_nodes_is_told():
     plan = vp.solve(two_links(FAMILIES["velocities"], steps=12, dt=0.08))
     assert about(plan.warnings, "between nodes")
 
@@ -968,7 +968,7 @@ def test_targets_out_of_reach():
     assert not told(mobile, [30.0, 5.0, 0.0])
 
 
-def test_references_of_rows_go_with_constraints(nodes_alone):
+def test_references_of_rows_go_with_constraints():
     """Looking at a plan between its nodes takes no reference there."""
     reference = np.linspace(0.0, 1.0, 9)[:, None] * np.array([1.0, 0.5])
     cost = vp.ControlCost(1e-2) + vp.TrackingCost(reference, 10.0)
@@ -991,7 +991,7 @@ def test_options_are_checked_with_constraints_as_without(option, value):
     assert told[0] == told[1]
 
 
-def test_verification_tells_what_the_continuous_robot_violates(nodes_alone):
+def test_verification_tells_what_the_continuous_robot_violates():
     """Between nodes, and where coarse steps mislead; against an integration by SciPy."""
     problem = two_links(
         [*FAMILIES["velocities"], *FAMILIES["goal"]], steps=14, dt=0.1, integrator=vp.Midpoint(), sampling="midpoint"

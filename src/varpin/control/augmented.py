@@ -32,7 +32,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import refine
 from varpin.control.search import NOTHING, PATIENCE, checked_time, closing_of, require_reports
 from varpin.control.solution import Solution
-from varpin.errors import InputError, LinearizationError, VarpinError
+from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.soundness import announce
@@ -68,13 +68,9 @@ _STUCK, _LOWERED = 3, 0.9
 # Expected decrease, relative to the cost with penalties, with which a stalled search has not shown infeasibility.
 _MUCH = 1e-2
 # Greatest number of last steps, each with the rows between nodes of the motion before.
-_LOOKS = 6
-# A further one follows if one has left at most _LESS of the violation before.
-_LESS = 0.5
+_LOOKS = 4
 # Number of rounds from which on none is added for the sake of what is between nodes.
 _BETWEEN = 25
-# Greatest number of further iterations for the sake of what is between nodes, where controls are held.
-_FURTHER = 60
 # Violation between nodes that is left to the last steps.
 _CLOSE = 1e-5
 # Violation at which penalties stop growing; the last step removes the rest.
@@ -160,8 +156,6 @@ class _Rounds:
         self.label = f"{problem.scene.robot.name}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
         self.history: list[Iteration] = []
         self.noisy = bool(problem.scene.processes) and any(item.margin > 0.0 for item in problem.constraints)
-        # The plan whose constraints hold at the nodes, where controls are held and its motion goes beyond between them.
-        self.at_nodes: Solution | None = None
         self.state: _State
 
     @property
@@ -195,53 +189,29 @@ class _Rounds:
                 self.history = self.history[:known]
             if np.isfinite(self.limit):
                 options["time_limit"] = max(self.limit - (time.perf_counter() - began), 1e-9)
-            try:
-                found = self.search(
-                    problem,
-                    tolerance=begun.tolerance,
-                    max_iterations=max(left, 0),
-                    callback=functools.partial(self._report, known, last),
-                    check=False,
-                    **options,
-                )
-            except VarpinError:
-                if self.at_nodes is None:
-                    raise
-                plan = self._back(self.at_nodes)
-                break
+            found = self.search(
+                problem,
+                tolerance=begun.tolerance,
+                max_iterations=max(left, 0),
+                callback=functools.partial(self._report, known, last),
+                check=False,
+                **options,
+            )
             resume = None
             self.history += [replace(item, index=item.index + known) for item in found.history]
             kept = self._steady(self._kept(found, problem, begun, known))
             try:
                 status, reason = self._ended_or_next(kept, begun, found, last)
-                alone = not (self.problem.linear or len(begun.between.rows))
-                if (not alone and self._goes_between(kept, begun, status)) or status is None:
+                if self._goes_between(kept, begun, status) or status is None:
                     continue
-                plan = replace(kept, status=status, reason=reason)
                 if kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
-                    plan = self._polished(plan)
-                if alone and plan.status is Status.CONVERGED and time.perf_counter() - began < self.limit:
-                    self.at_nodes, plan = plan, self._polished(plan, within=True)
-                    self.whole = self.problem
-                    if not self._holds(plan) and self._goes_between(kept, begun, status):
-                        last = min(last, len(self.history) + _FURTHER)
-                        continue
-                if self.at_nodes is not None and not self._holds(plan) and status is not Status.INTERRUPTED:
-                    plan = self._back(self.at_nodes)
+                    kept, closing = self._polished(replace(kept, status=status))
+                    status, reason = kept.status, f"{reason}; {closing}"
             except KeyboardInterrupt:
-                plan = replace(kept, status=Status.INTERRUPTED, reason=found.reason)
+                status, reason = Status.INTERRUPTED, found.reason
             break
+        plan = replace(kept, status=status, reason=reason)
         return looked_at(plan)[0] if self.check else plan
-
-    def _back(self, plan: Solution) -> Solution:
-        """The plan whose constraints hold at the nodes, after a search for one that holds between them, too."""
-        further = len(self.history) - len(plan.history)
-        reason = f"{plan.reason}; {further} further iterations led to no plan within the constraints between nodes"
-        return replace(plan, reason=reason, history=tuple(self.history))
-
-    def _holds(self, plan: Solution) -> bool:
-        """Whether a plan is done, and its constraints hold between nodes."""
-        return plan.status is Status.CONVERGED and plan.violation <= _CLOSE
 
     def _first(self) -> Solution:
         """The first motion, and the state of the first round."""
@@ -340,9 +310,6 @@ class _Rounds:
         """The resumed solution, with the history of its last round only."""
         resumed = self.resumed
         if resumed is None or resumed.search is None or resumed.multipliers is None:
-            return None
-        if len(resumed.multipliers.between.rows) and resumed.status in (Status.CONVERGED, Status.STALLED):
-            # After the last steps the rows between nodes are not those of the search.
             return None
         begun = resumed.multipliers.iterations
         history = [replace(item, index=item.index - begun) for item in resumed.search.history[begun:]]
@@ -446,26 +413,27 @@ class _Rounds:
         )
         return None, ""
 
-    def _looked_between(self, motion: Trajectory, between: Instants, backoff: list[Floats], *, calm: bool) -> Instants:
-        """Rows between nodes with the offsets of a motion, and those that it violates, see :func:`updated`."""
+    def _looked_between(self, motion: Trajectory, between: Instants, backoff: list[Floats], least: float) -> Instants:
+        """Rows between nodes with the offsets of a motion, and those that it violates by more than ``least``."""
         values = seen(self.problem, motion)
         if values is None:
             return between
         margins = backoff[: len(self.problem.bound_constraints)]
-        return updated(self.problem, between, motion, values, margins, FEASIBLE, calm=calm)
+        return updated(self.problem, between, motion, values, margins, least)
 
     def _goes_between(self, kept: Solution, begun: _State, ended: Status | None) -> bool:
         """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
 
-        There are no such rows until the rounds have ended with a motion that violates a constraint, with linear
-        controls by more than a thousandth of its range. From then on each round has the offsets of the motion before,
-        and the rows that it violates. The weights of penalties are the first ones again when there are rows for the
-        first time.
+        Only linear controls lead around the nodes. There are no such rows until the rounds have ended with a motion
+        that violates a constraint by more than a thousandth of its range. From then on each round has the offsets of
+        the motion before, and the rows that it violates. The weights of penalties are the first ones again when there
+        are rows for the first time.
         """
         before, base, known = begun.between, self.state, kept.multipliers
         assert known is not None
         values = split(self.bound, known.values)
-        if ended is None and not len(before.rows):
+        if not self.problem.linear or (ended is None and not len(before.rows)):
+            # Motions under held controls stay closer to their nodes.
             return False
         if ended is not None:
             if begun.round + 1 >= _BETWEEN or ended not in (Status.CONVERGED, Status.STALLED):
@@ -473,7 +441,7 @@ class _Rounds:
             if kept.violation > FEASIBLE:
                 return False
             base = replace(begun, multipliers=values, round=begun.round + 1, stuck=0)
-        between = self._looked_between(kept.trajectory, before, begun.backoff, calm=True)
+        between = self._looked_between(kept.trajectory, before, begun.backoff, FEASIBLE)
         if not len(between.rows):
             return False
         parts = (carried(self.problem, before, between, array) for array in (base.multipliers, base.backoff))
@@ -483,8 +451,7 @@ class _Rounds:
         whole = enforced(self.problem, between)
         told = reports_of(whole, kept.trajectory, multipliers, backoff)
         if ended is not None:
-            first = (REPORTED * item.scale if self.problem.linear else FEASIBLE for item in whole.bound_constraints)
-            bounds = [_CLOSE if len(before.rows) else most for most in first]
+            bounds = [_CLOSE if len(before.rows) else REPORTED * item.scale for item in whole.bound_constraints]
             if all(item.violation <= most for item, most in zip(told, bounds, strict=True)):
                 return False
         most = max(told, key=lambda item: item.violation)
@@ -505,87 +472,63 @@ class _Rounds:
             self.state = replace(self.state, weights=first_weights, worst=np.full(len(worst), np.inf), tolerance=_LOOSE)
         return True
 
+    def _left(self, motion: Trajectory, between: Instants, backoff: list[Floats]) -> float:
+        """The largest violation of a motion, with rows between nodes."""
+        whole = enforced(self.problem, between)
+        return max(told.violation for told in reports_of(whole, motion, backoff, backoff))
+
     def _margins(self, backoff: list[Floats], between: Instants) -> list[Floats]:
         """The margins of all rows, those between nodes as at the end of their step."""
         count = len(self.problem.bound_constraints)
         of_instants = [backoff[i][between.of(i)[:, 0]] for i in between.constraints]
         return [*backoff[:count], *of_instants]
 
-    def _at_instants(self, known: Multipliers, new: Instants) -> Multipliers:
-        """Multipliers and the state of the rounds for rows at other instants between nodes."""
-        problem, old = self.problem, known.between
-        bound = enforced(problem, old).bound_constraints
-
-        def of_rows(values: Floats) -> Floats:
-            return flat(carried(problem, old, new, split(bound, values)))
-
-        return replace(
-            known,
-            values=of_rows(known.values),
-            begun=of_rows(known.begun),
-            backoff=flat(self._margins(split(bound, known.backoff), new)),
-            weights=_of_all(known.weights, old, new),
-            first_weights=_of_all(known.first_weights, old, new),
-            worst=_of_all(known.worst, old, new),
-            **_of_instants(new),
-        )
-
-    def _polished(self, kept: Solution, *, within: bool = False) -> Solution:
+    def _polished(self, kept: Solution) -> tuple[Solution, str]:
         """The plan moved onto its constraints and to its optimum, with matching gains, and its residuals in words.
 
-        The motion then has other offsets of its rows between nodes, and other rows, so that the last step is made
-        again. With such rows the plan stays where it is if that does not lead closer. ``within`` is for a plan whose
-        constraints hold at the nodes: it stays as it is if they hold between nodes, too.
+        The motion then has other offsets of its rows between nodes, so that the last step is made again. With such
+        rows, the plan stays where it is if that does not lead closer.
         """
         known = kept.multipliers
         assert known is not None
-        motion, found, dense = kept.trajectory, None, within or len(known.between.rows) > 0
+        values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
+        motion, between, found, dense = kept.trajectory, known.between, None, len(known.between.rows) > 0
         least, bound = np.inf, np.inf
         if dense:
-            known, least = self._with_rows(known, motion)
-            if within and least <= FEASIBLE:
-                return kept
-            kept = replace(kept, multipliers=known)
-        own = known
+            between = self._looked_between(motion, between, backoff, np.inf)
+            least = self._left(motion, between, backoff)
+            kept = replace(kept, multipliers=replace(known, **_of_instants(between)))
         try:
             for _ in range(_LOOKS):
-                self.whole = enforced(self.problem, own.between)
-                values, backoff = split(self.bound, own.values), split(self.bound, own.backoff)
-                after = polished(self.whole, motion, values, own.weights, backoff)
+                self.whole = enforced(self.problem, between)
+                after = polished(self.whole, motion, values, known.weights, backoff)
                 bound = self.tolerance * (after.stake + NOTHING * (0.0 if kept.search is None else kept.search.first))
-                own, motion = replace(own, values=flat(after.multipliers)), after.motion
+                told = between
                 if dense:
-                    own, left = self._with_rows(own, motion)
-                if not dense or (left <= max(least, FEASIBLE) and after.decrease <= bound):
-                    found, known = after, own
-                if not dense or left > _LESS * least or (found is after and left <= FEASIBLE):
+                    told = self._looked_between(after.motion, between, backoff, np.inf)
+                    left = self._left(after.motion, told, backoff)
+                    if left > max(least, FEASIBLE) or after.decrease > bound:
+                        break
+                    least = left
+                found, between = after, told
+                motion, values = found.motion, found.multipliers
+                if not dense or least <= FEASIBLE:
                     break
-                least = left
         except (CostError, NoiseFieldError, LinearizationError):
             pass
-        self.whole = enforced(self.problem, known.between)
+        self.whole = enforced(self.problem, between)
         if found is None:
-            closing = f"{kept.reason}; constraints hold to {kept.violation:.1e}"
-            return replace(kept, status=Status.STALLED if self._clearly_beyond(kept) else kept.status, reason=closing)
-        plan = self._along(kept, found.motion, known)
+            closing = f"constraints hold to {kept.violation:.1e}"
+            return replace(kept, status=Status.STALLED) if self._clearly_beyond(kept) else kept, closing
+        plan = self._along(kept, found.motion, replace(known, values=flat(values), **_of_instants(between)))
         closing = (
             f"constraints hold to {plan.violation:.1e}, and within them the cost would fall by {found.decrease:.1e}"
         )
-        plan = replace(plan, reason=f"{kept.reason}; {closing}")
         if kept.status in (Status.CONVERGED, Status.STALLED):
             # The decrease is a bound, whatever the multipliers, and the search may have stalled at a finer tolerance.
             there = found.decrease <= bound and not self._clearly_beyond(plan)
             plan = replace(plan, status=Status.CONVERGED if there else Status.STALLED)
-        return plan
-
-    def _with_rows(self, known: Multipliers, motion: Trajectory) -> tuple[Multipliers, float]:
-        """Multipliers with the rows between nodes that a motion violates, and its largest violation."""
-        margins = split(enforced(self.problem, known.between).bound_constraints, known.backoff)
-        between = self._looked_between(motion, known.between, margins, calm=False)
-        known = self._at_instants(known, between)
-        whole = enforced(self.problem, between)
-        backoff = split(whole.bound_constraints, known.backoff)
-        return known, max(told.violation for told in reports_of(whole, motion, backoff, backoff))
+        return plan, closing
 
     def _clearly_beyond(self, plan: Solution) -> bool:
         """Whether the motion violates a constraint between nodes by more than a thousandth of its range."""

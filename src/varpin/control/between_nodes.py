@@ -149,13 +149,11 @@ def updated(
     values: list[Floats | None],
     backoff: list[Floats],
     least: float,
-    *,
-    calm: bool,
 ) -> Instants:
     """The instants, with the offsets of a motion, and further ones where it violates a constraint by > ``least``.
 
-    These are where a row is greatest between its neighbours in the step. With ``calm`` small changes of offsets are
-    halved: else rounds may go to and fro between two motions whose peaks are on either side of an instant.
+    These are where a row is greatest between its neighbours in the step. Small changes of offsets are halved:
+    else rounds may go to and fro between two motions whose peaks are on either side of an instant.
 
     Args:
         problem: The problem, without rows between nodes.
@@ -164,7 +162,6 @@ def updated(
         values: Its values of :func:`seen`.
         backoff: Margins of all constraints at the nodes (K, rows).
         least: In the unit of each constraint.
-        calm: Whether small changes are halved.
     """
     rows, offsets, u = [], [], problem.control_rows(motion)
     former = _offsets(problem, instants)
@@ -182,7 +179,7 @@ def updated(
         # Rows without a value are made to hold.
         offset = np.where(np.isfinite(true), true, -bound.scale) - row
         before = former.get(i)
-        if calm and before is not None:
+        if before is not None:
             own = np.isin(_numbers(places), _numbers(instants.of(i)))
             change = offset[own] - before
             offset[own] = before + np.where(np.abs(change) <= _SAME * bound.scale, 0.5, 1.0) * change
