@@ -72,6 +72,7 @@ class Collocation {
           V(stages * n),
           Q(stages * n),
           slope(stages * n),
+          slope_rest(stages * n),
           acting(stages * n),
           weight(stages, 1.0),
           residual(stages * n),
@@ -110,6 +111,7 @@ class Collocation {
     std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
     std::vector<double> Q;                   // (s, n)
     std::vector<double> slope;               // (s, n) L_q + F
+    std::vector<double> slope_rest;          // (s, n) of correct_slopes; less than the last digit of `slope`
     std::vector<JointForce<double>> acting;  // (s, n) of elements and couplings; derivatives of elements only
     std::vector<double> coupled_q;           // (s, n, n) dF/dq of couplings, if there are such forces
     std::vector<double> coupled_v;           // (s, n, n) dF/dv
@@ -129,10 +131,10 @@ class Collocation {
     // The first factorization is kept until a second correction shows its contraction, and for as long as three more
     // corrections would suffice. The iteration fails when a correction exceeds half of the one before (natural
     // monotonicity, Deuflhard 2004), unless the residual is at its rounding floor. The residual after the last
-    // correction is not evaluated if its estimate is below a tenth of the tolerance; `slope` is then corrected to first
-    // order. The estimate follows from the contraction, or after a first correction from the nonlinearity of the
-    // equation. A guess within the tolerance is corrected too: extrapolated guesses have a similar error in every step,
-    // and energy would drift. With `jets_wanted`, the iteration ends with the jets at the root.
+    // correction is not evaluated if its estimate is below a tenth of the tolerance; `slope_rest` then corrects `slope`
+    // to first order. The estimate follows from the contraction, or after a first correction from the nonlinearity of
+    // the equation. A guess within the tolerance is corrected too: extrapolated guesses have a similar error in every
+    // step, and energy would drift. With `jets_wanted`, the iteration ends with the jets at the root.
     Outcome solve(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
         double before = infinity, worst = infinity;
         bool fresh = true;
@@ -483,7 +485,10 @@ class Collocation {
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
             const double* force = start.force_at(i);
-            for (int c = 0; c < n; ++c) slope[i * n + c] = stage[i].Lq[c] + (force[c] + acting[i * n + c].value);
+            for (int c = 0; c < n; ++c) {
+                slope[i * n + c] = stage[i].Lq[c] + (force[c] + acting[i * n + c].value);
+                slope_rest[i * n + c] = 0.0;
+            }
         }
         for (int i = 0; i < stages; ++i) {
             const double* abar = &tableau.gradient[i * stages];
@@ -674,7 +679,8 @@ class Collocation {
         return total;
     }
 
-    // Correct L_q + F of the stages for the step `delta`, to first order.
+    // Correct L_q + F of the stages for the step `delta`, to first order, in `slope_rest`. Rounding would take the
+    // correction from a sum with `slope`; the errors of guesses have a similar sign in every step, and energy drifts.
     void correct_slopes(double h) {
         std::vector<double>& moved = residual;
         for (int i = 0; i < stages; ++i) {
@@ -694,11 +700,11 @@ class Collocation {
             double total = 0.0;
             for (int c = 0; c < n; ++c) total += own_v[c] * delta[first + c] + own_q[c] * moved[first + c];
             acting[k].value += total;
-            slope[k] += total;
+            slope_rest[k] += total;
         }
         if (eliminated()) {
             change_of_slope(h, moved);
-            for (int k = 0; k < stages * n; ++k) slope[k] += moved[k];
+            for (int k = 0; k < stages * n; ++k) slope_rest[k] += moved[k];
             return;
         }
         for (int i = 0; i < stages; ++i) {
@@ -708,7 +714,7 @@ class Collocation {
                     double total = element.by_v * delta[i * n + r] + element.by_q * moved[i * n + r];
                     for (int c = block.begin; c < block.end; ++c)
                         total += stage[i].Lqq[r * n + c] * moved[i * n + c] + stage[i].A[c * n + r] * delta[i * n + c];
-                    slope[i * n + r] += total;
+                    slope_rest[i * n + r] += total;
                 }
             }
         }

@@ -14,9 +14,9 @@ struct Compensated {
     double high = 0.0;
     double low = 0.0;
 
-    // Knuth's two-sum.
-    [[nodiscard]] Compensated plus(double increment) const {
-        increment += low;
+    // Knuth's two-sum; `rest` is what the increment's last digits leave of it.
+    [[nodiscard]] Compensated plus(double increment, double rest = 0.0) const {
+        increment += low + rest;
         const double total = high + increment;
         const double part = total - high;
         return {total, (high - (total - part)) + (increment - part)};

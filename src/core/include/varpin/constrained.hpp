@@ -1093,6 +1093,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
             for (int c = 0; c < n; ++c) {
                 const int k = i * n + c;
                 equation.slope[k] = equation.stage[i].Lq[c] + (start.force_at(i)[c] + equation.acting[k].value);
+                equation.slope_rest[k] = 0.0;
             }
         }
         for (int i = 0; i < stages; ++i) {
@@ -1329,7 +1330,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     // Write the end of the substep to `trial`, with its last impulse separate, and the work in the substep.
     void advance(double h, const PathState& path) {
         for (int c = 0; c < n; ++c) {
-            double move = 0.0, sum = 0.0, across_rows = 0.0;
+            double move = 0.0, sum = 0.0, rest = 0.0, across_rows = 0.0;
             trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
             const double distance =
                 std::min(std::abs(path.position[c].value.high), unwinds(c) ? Coordinate::turn : infinity);
@@ -1338,6 +1339,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
                 const JointForce<double>& element = equation.acting[i * n + c];
                 move += tableau.b[i] * velocity;
                 sum += tableau.b[i] * equation.slope[i * n + c];
+                rest += tableau.b[i] * equation.slope_rest[i * n + c];
                 across_rows += pushed[i * n + c];
                 const double given_force = force[i * stride + c];
                 trial.work[c] += share * (given_force + element.value) * velocity;
@@ -1348,7 +1350,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
                                       push_size[i * n + c] * std::abs(velocity);
             }
             trial.position[c] = {path.position[c].value.plus(h * move), path.position[c].turns};
-            trial.p[c] = path.p[c].plus(h * sum - across_rows);
+            trial.p[c] = path.p[c].plus(h * sum - across_rows, h * rest);
         }
     }
 };

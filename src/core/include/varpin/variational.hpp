@@ -341,7 +341,7 @@ class VariationalStepper final : public Stepper {
     [[gnu::always_inline]] inline void advance(const int stages, double h, const PathState& state) {
         const auto& equation = step_equation;
         for (int c = 0; c < n; ++c) {
-            double move = 0.0, impulse = 0.0;
+            double move = 0.0, impulse = 0.0, rest = 0.0;
             trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
             // The rounding of q is proportional to its distance from 0, without whole turns.
             const double distance =
@@ -351,6 +351,7 @@ class VariationalStepper final : public Stepper {
                 const JointForce<double>& element = equation.acting[i * n + c];
                 move += tableau.b[i] * velocity;
                 impulse += tableau.b[i] * equation.slope[i * n + c];
+                rest += tableau.b[i] * equation.slope_rest[i * n + c];
                 const double given_force = force[i * stride + c];
                 trial.work[c] += share * (given_force + element.value) * velocity;
                 trial.dissipated[c] += share * element.lost;
@@ -360,7 +361,7 @@ class VariationalStepper final : public Stepper {
                     share * scale * std::abs(velocity) + tableau.b[i] * std::abs(equation.stage[i].Lq[c]) * distance;
             }
             trial.position[c] = {state.position[c].value.plus(h * move), state.position[c].turns};
-            trial.p[c] = state.p[c].plus(h * impulse);
+            trial.p[c] = state.p[c].plus(h * impulse, h * rest);
         }
     }
 
