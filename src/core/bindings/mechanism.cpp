@@ -19,8 +19,10 @@
 #include "arrays.hpp"
 #include "bodies.hpp"
 #include "registrations.hpp"
+#include "small_arms.hpp"
 #include "varpin/dense.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/velocity_slopes.hpp"
 
 namespace varpin::border {
 
@@ -353,34 +355,16 @@ std::tuple<Out, Out> jets(const Mechanism& mechanism, In<2> q, In<2> v) {
     return {Ms, As};
 }
 
-// The derivative of v in (q, p) (N, n, 2n) at each row of q and v (N, n): at fixed q dv = M^-1 dp, at fixed p
-// dv = -M^-1 L_vq dq. NaN where M is not positive definite.
-Out velocity_slopes(const Mechanism& mechanism, In<2> q, In<2> v) {
+// The derivative of v in (q, p) (N, n, 2n) at each row of q and v (N, n). NaN where M is not positive definite.
+Out velocity_slopes_at(const Mechanism& mechanism, In<2> q, In<2> v) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
     require(q, "q", {rows, n});
     require(v, "v", {rows, n});
     double* slopes = nullptr;
     const Out out = array_for(slopes, {rows, n, 2 * n});
     nb::gil_scoped_release release;
-    Jet<double> w(mechanism.tree);
-    const int size = mechanism.dof();
-    for (std::size_t s = 0; s < rows; ++s) {
-        momentum_slopes(mechanism, q.data() + s * n, v.data() + s * n, w);
-        double* slope = slopes + s * 2 * n * n;
-        for (std::size_t i = 0; i < n; ++i) {
-            for (std::size_t j = 0; j < n; ++j) slope[i * 2 * n + j] = -w.A[i * n + j];
-            slope[i * 2 * n + n + i] = 1.0;
-        }
-        for (const Block& block : mechanism.tree.blocks) {
-            double* first = slope + static_cast<std::size_t>(block.begin) * 2 * n;
-            if (factor_ldl(w.M.data(), size, block)) {
-                solve_ldl_rows(w.M.data(), size, block, first, 2 * size, 2 * size);
-            } else {
-                std::fill_n(first, static_cast<std::size_t>(block.end - block.begin) * 2 * n,
-                            std::numeric_limits<double>::quiet_NaN());
-            }
-        }
-    }
+    if (!small_velocity_slopes(mechanism, rows, q.data(), v.data(), slopes))
+        velocity_slopes<int>(mechanism, rows, q.data(), v.data(), slopes);
     return out;
 }
 
@@ -500,7 +484,7 @@ void register_mechanism(nb::module_& m) {
                     "quadratic"_a, "centers"_a)
         .def("jet", &jet, "q"_a, "v"_a)
         .def("jets", &jets, "q"_a, "v"_a)
-        .def("velocity_slopes", &velocity_slopes, "q"_a, "v"_a)
+        .def("velocity_slopes", &velocity_slopes_at, "q"_a, "v"_a)
         .def("forces", &forces, "q"_a, "v"_a, "f"_a)
         .def("coupled_forces", &coupled_forces, "q"_a, "v"_a)
         .def("constraints", &constraints, "q"_a)

@@ -1,17 +1,19 @@
 // Steps of arms with up to seven joints, whose number is known at compile time.
 #include "small_arms.hpp"
 
+#include "varpin/velocity_slopes.hpp"
+
 namespace varpin::border {
 
 namespace {
 
-// The result of `make(Size)` for the number of joints of a mechanism, if its steps are solved with one matrix.
-template <class Made, class Make>
-std::unique_ptr<Made> of_size(const Mechanism& mechanism, const Tableau& tableau, Solver solver, const Make& make) {
+// The result of `make(Size)` for the number of joints of a mechanism whose bodies each have their own in a single
+// block, else a default one.
+template <class Make>
+auto of_arm(const Mechanism& mechanism, const Make& make) -> decltype(make(Known<3>(3))) {
     const Tree& tree = mechanism.tree;
     const int n = mechanism.dof();
-    if (tableau.stages != 1 || tree.size() != n || tree.blocks.size() != 1) return nullptr;
-    if (eliminates(mechanism, solver) || eliminates(tree, solver)) return nullptr;
+    if (tree.size() != n || tree.blocks.size() != 1) return {};
     switch (n) {
         case 3:
             return make(Known<3>(n));
@@ -26,8 +28,15 @@ std::unique_ptr<Made> of_size(const Mechanism& mechanism, const Tableau& tableau
             return make(Known<7>(n));
 #endif
         default:
-            return nullptr;
+            return {};
     }
+}
+
+// The same if its steps are solved with one matrix.
+template <class Made, class Make>
+std::unique_ptr<Made> of_size(const Mechanism& mechanism, const Tableau& tableau, Solver solver, const Make& make) {
+    if (tableau.stages != 1 || eliminates(mechanism, solver) || eliminates(mechanism.tree, solver)) return nullptr;
+    return of_arm(mechanism, make);
 }
 
 }  // namespace
@@ -56,6 +65,14 @@ std::unique_ptr<AnyConstrainedStepper> small_constrained_stepper(const Mechanism
         mechanism, tableau, Solver::dense, [&]<class Size>(Size) -> std::unique_ptr<AnyConstrainedStepper> {
             return std::make_unique<ConstrainedStepper<Size, Known<1>>>(mechanism, tableau, places, tolerance, guards);
         });
+}
+
+bool small_velocity_slopes(const Mechanism& mechanism, std::size_t rows, const double* q, const double* v,
+                           double* slopes) {
+    return of_arm(mechanism, [&]<class Size>(Size) {
+        velocity_slopes<Size>(mechanism, rows, q, v, slopes);
+        return true;
+    });
 }
 
 }  // namespace varpin::border

@@ -1,7 +1,9 @@
-// Steppers, and derivatives of steps, for arms and methods with one stage whose sizes are known at compile time.
+// Steppers and derivatives of steps, for arms and methods with one stage whose sizes are known at compile time, and
+// derivatives of velocities at nodes.
 // docs/core.md, "Processors".
 #pragma once
 
+#include <cstddef>
 #include <memory>
 #include <vector>
 
@@ -19,5 +21,8 @@ std::unique_ptr<StepDerivatives> small_derivatives(const Mechanism& mechanism, c
 std::unique_ptr<AnyConstrainedStepper> small_constrained_stepper(const Mechanism& mechanism, const Tableau& tableau,
                                                                  const std::vector<double>& places, double tolerance,
                                                                  const Guards& guards);
+// velocity_slopes; false, and nothing done, where the size of the mechanism is none of those that are compiled.
+bool small_velocity_slopes(const Mechanism& mechanism, std::size_t rows, const double* q, const double* v,
+                           double* slopes);
 
 }  // namespace varpin::border

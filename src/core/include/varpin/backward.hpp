@@ -89,13 +89,15 @@ class BackwardPass {
 
     [[gnu::always_inline]] inline std::ptrdiff_t run_steps(double h, int hold, double regularization,
                                                            const ExpandedSteps& steps, const Gains& gains) {
+        if (steps.one_hessian) common = shape_of(steps.hessian);
         for (std::ptrdiff_t s = steps.steps - 1; s >= 0; --s) {
             if (gains.costate) std::copy_n(costate.data(), x, gains.costate + s * x);
             carry(steps, s, steps.rate || (s + 1) % hold != 0);
             if (steps.processes > 0) add_noise(h, steps, s, gains.spread + s * x * x);
             add_running_cost(h, steps, s);
-            mirror(Q, size);
-            if (s % hold != 0) {
+            const bool decides = s % hold == 0;
+            mirror(Q, {decides ? x : 0, size});
+            if (!decides) {
                 keep();
             } else if (!decide(regularization, steps, s / hold, gains)) {
                 return s / hold;
@@ -135,28 +137,42 @@ class BackwardPass {
         }
     }
 
-    // The rows of (q, v) on which the running cost at a sample depends.
-    Range rows_of(const double* g, const double* H) const {
-        const auto counts = [&](int i) {
-            return g[i] != 0.0 ||
-                   std::any_of(H + i * size, H + (i + 1) * size, [](double entry) { return entry != 0.0; });
+    // What a Hessian H of the running cost depends on.
+    struct Shape {
+        int begin, end;  // rows of (q, v); begin >= end for none
+        bool crossed;    // whether there are entries in (u, q) or (u, v)
+    };
+    Shape shape_of(const double* H) const {
+        const auto empty = [](const double* row, int count) {
+            return std::all_of(row, row + count, [](double entry) { return entry == 0.0; });
         };
-        Range rows{0, x};
-        while (rows.end > 0 && !counts(rows.end - 1)) --rows.end;
-        while (rows.begin < rows.end && !counts(rows.begin)) ++rows.begin;
-        return rows;
+        Shape shape{0, x, false};
+        while (shape.end > 0 && empty(H + (shape.end - 1) * size, size)) --shape.end;
+        while (shape.begin < shape.end && empty(H + shape.begin * size, size)) ++shape.begin;
+        for (int r = x; r < size; ++r) shape.crossed = shape.crossed || !empty(H + r * size, x);
+        return shape;
+    }
+
+    // The rows of (q, v) on which the running cost at a sample depends.
+    Range rows_of(const double* g, const Shape& shape) const {
+        const bool none = shape.begin >= shape.end;
+        int begin = none ? x : shape.begin, end = none ? 0 : shape.end;
+        for (int i = x; i > end; --i) {
+            if (g[i - 1] != 0.0) end = i;
+        }
+        for (int i = 0; i < begin; ++i) {
+            if (g[i] != 0.0) begin = i;
+        }
+        return {std::min(begin, end), end};
     }
 
     // T = factor H D in these rows of the running cost's Hessian.
     void weigh(double factor, const double* H, const TiledMatrix& of, Range rows) {
         for (int i = rows.begin; i < rows.end; ++i) {
-            double* __restrict out = T[i];
-            std::fill_n(out, T.stride(), 0.0);
+            std::fill_n(T[i], T.stride(), 0.0);
             for (int j = rows.begin; j < rows.end; ++j) {
                 const double entry = factor * H[i * size + j];
-                if (entry == 0.0) continue;
-                const double* __restrict other = of[j];
-                for (int c = 0; c < of.stride(); ++c) out[c] += entry * other[c];
+                if (entry != 0.0) add_scaled_row(entry, of[j], of.stride(), T[i]);
             }
         }
     }
@@ -169,7 +185,8 @@ class BackwardPass {
             const double* g = steps.gradient_at(point);
             const double* H = steps.hessian_at(point);
             const double weight = h * steps.rule[sample].weight;
-            const Range rows = rows_of(g, H);
+            const Shape shape = steps.one_hessian ? common : shape_of(H);
+            const Range rows = rows_of(g, shape);
             step.expand(steps.rule[sample], rows);
             std::fill_n(row.begin(), x, 0.0);
             std::copy_n(g + x, m, row.begin() + x);
@@ -179,7 +196,7 @@ class BackwardPass {
             weigh(weight, H, step.D, rows);
             add_transposed_product(step.D, T, rows, Q, size, Part::upper);
             for (int r = x; r < size; ++r) {
-                for (int i = rows.begin; i < rows.end; ++i) {
+                for (int i = rows.begin; shape.crossed && i < rows.end; ++i) {
                     const double entry = weight * H[r * size + i];
                     if (entry == 0.0) continue;
                     for (int c = 0; c < size; ++c) Q[c][r] += entry * step.D[i][c];
@@ -205,7 +222,7 @@ class BackwardPass {
         for (std::ptrdiff_t k = 0; k < samples; ++k) {
             if (!step.expand_after(steps.rule[k])) continue;
             const double* H = steps.hessian_at(s * samples + k);
-            const Range rows = rows_of(steps.gradient_at(s * samples + k), H);
+            const Range rows = rows_of(steps.gradient_at(s * samples + k), steps.one_hessian ? common : shape_of(H));
             weigh(h * h * steps.rule[k].weight, H, step.P, rows);
             add_transposed_product(step.P, T, rows, S, x, Part::upper);
         }
@@ -342,9 +359,11 @@ class BackwardPass {
     // K, with zero feedback for controls at a limit.
     void find_feedback() {
         for (int i = 0; i < m; ++i) {
-            for (int c = 0; c < x; ++c) {
-                Qux[i][c] = Q[x + i][c];
-                K[i][c] = box.held[i] ? 0.0 : -Qux[i][c];
+            std::copy_n(Q[x + i], x, Qux[i]);
+            if (box.held[i]) {
+                std::fill_n(K[i], x, 0.0);
+            } else {
+                std::transform(Qux[i], Qux[i] + x, K[i], [](double entry) { return -entry; });
             }
         }
         solve_ldl_rows(factors.data(), m, K[0], K.stride());
@@ -409,9 +428,8 @@ class BackwardPass {
         }
     }
 
-    static void add_row(double factor, const double* __restrict from, std::vector<double>& to, int count) {
-        double* __restrict out = to.data();
-        for (int c = 0; c < count; ++c) out[c] += factor * from[c];
+    static void add_row(double factor, const double* from, std::vector<double>& to, int count) {
+        detail::subtract_scaled(to.data(), -factor, from, 0, count);
     }
     void add_row(double factor, const double* from, std::vector<double>& to) const { add_row(factor, from, to, size); }
 
@@ -429,7 +447,8 @@ class BackwardPass {
     LinearStep step;
     TiledMatrix S;              // (x, x)
     TiledMatrix T;              // (size, size) a product
-    TiledMatrix Q;              // (size, size); upper triangle alone until the decision
+    TiledMatrix Q;              // (size, size); upper triangle alone until the decision, which has its rows in u
+    Shape common{};             // of the one Hessian of all samples
     std::vector<double> Qz;     // (size) gradient, in whole tiles
     std::vector<double> Cz;     // (size) gradient of the cost itself, in whole tiles
     std::vector<double> terms;  // (size) of Q, as the scale of the value

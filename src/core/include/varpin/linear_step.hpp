@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <vector>
 
+#include "varpin/dense.hpp"
 #include "varpin/steps.hpp"
 #include "varpin/tiles.hpp"
 
@@ -22,7 +23,6 @@ class LinearStep {
           n(dof),
           x(2 * dof),
           size(2 * dof + controls),
-          rates(2 * dof, dof),
           speeds(dof, 2 * dof + controls) {}
 
     // Load step s: J, and the data of the other functions.
@@ -39,9 +39,9 @@ class LinearStep {
             return;
         }
         for (int i = 0; i < n; ++i) {
-            for (int c = 0; c < x; ++c) rates[c][i] = after[i * x + c];
+            std::fill_n(speeds[i], speeds.stride(), 0.0);
+            add_rows(after + i * x, J, x, speeds[i], size);
         }
-        transposed_product(rates, J, x, speeds, n);
     }
 
     // D, the derivative of (q, v) at a sample, in some rows.
@@ -49,11 +49,8 @@ class LinearStep {
         for (int row = rows.begin; row < rows.end; ++row) {
             const Sample::Sum& of = row < n ? sample.q : sample.v;
             const int i = row < n ? row : row - n;
-            double* __restrict out = D[row];
-            const double* __restrict places = J[i];
-            const double* __restrict speed = speeds[i];
-            for (int c = 0; c < size; ++c) out[c] = of.q1 * places[c] + of.v1 * speed[c];
-            add_node(of.q0, of.v0, before, i, out);
+            combine_rows(of.q1, J[i], of.v1, speeds[i], size, D[row]);
+            add_node(of.q0, of.v0, before, i, D[row]);
         }
     }
 
@@ -94,12 +91,11 @@ class LinearStep {
         if (!velocity) {
             out[n + i] += in_v;
         } else if (in_v != 0.0) {
-            for (int c = 0; c < x; ++c) out[c] += in_v * velocity[i * x + c];
+            detail::subtract_scaled(out, -in_v, velocity + i * x, 0, x);
         }
     }
 
     int n, x, size;
-    TiledMatrix rates;   // (2n, n) transposed dv/dx after the step
     TiledMatrix speeds;  // (n, 2n + m) of v after the step
     const double* before = nullptr;
     const double* after = nullptr;

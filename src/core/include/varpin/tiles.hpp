@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <vector>
 
+#include "varpin/pair.hpp"
 #include "varpin/wide.hpp"
 
 namespace varpin {
@@ -101,17 +102,26 @@ inline void transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range
 
 namespace detail {
 
+// Sums of `tiles` tiles from column c on, in registers.
+template <int tiles>
+[[gnu::always_inline]] inline void add_rows_at(int c, const double* __restrict factor, const TiledMatrix& a,
+                                               Range range, double* __restrict out) {
+    Quad sum[tiles];
+    for (int k = 0; k < tiles; ++k) sum[k] = quad_at(out + c + tile * k);
+    const double* row = a[range.begin] + c;
+    for (int i = range.begin; i < range.end; ++i, row += a.stride()) {
+        const Quad all{factor[i], factor[i], factor[i], factor[i]};
+        for (int k = 0; k < tiles; ++k) sum[k] += all * quad_at(row + tile * k);
+    }
+    for (int k = 0; k < tiles; ++k) quad_at(out + c + tile * k) = sum[k];
+}
+
 [[gnu::always_inline]] inline void add_some_rows(const double* __restrict factor, const TiledMatrix& a, Range range,
                                                  double* __restrict out, int columns) {
-    for (int c = 0; c < columns; c += tile) {
-        double sum[tile];
-        for (int k = 0; k < tile; ++k) sum[k] = out[c + k];
-        const double* row = a[range.begin] + c;
-        for (int i = range.begin; i < range.end; ++i, row += a.stride()) {
-            for (int k = 0; k < tile; ++k) sum[k] += factor[i] * row[k];
-        }
-        for (int k = 0; k < tile; ++k) out[c + k] = sum[k];
-    }
+    int c = 0;
+    for (; c + 3 * tile < columns; c += 4 * tile) add_rows_at<4>(c, factor, a, range, out);
+    for (; c + tile < columns; c += 2 * tile) add_rows_at<2>(c, factor, a, range, out);
+    if (c < columns) add_rows_at<1>(c, factor, a, range, out);
 }
 
 #if defined(__x86_64__) && defined(__GNUC__)
@@ -131,10 +141,26 @@ inline void add_rows(const double* factor, const TiledMatrix& a, Range range, do
     detail::add_some_rows(factor, a, range, out, columns);
 }
 
-// Copy the upper triangle to the lower one.
-inline void mirror(TiledMatrix& a, int size) {
-    for (int i = 1; i < size; ++i) {
-        for (int j = 0; j < i; ++j) a[i][j] = a[j][i];
+// out = s a + t b over whole tiles of `columns` columns.
+[[gnu::always_inline]] inline void combine_rows(double s, const double* a, double t, const double* b, int columns,
+                                                double* out) {
+    const Quad first{s, s, s, s}, second{t, t, t, t};
+    for (int c = 0; c < columns; c += tile) quad_at(out + c) = first * quad_at(a + c) + second * quad_at(b + c);
+}
+
+// out += s a over whole tiles of `columns` columns.
+[[gnu::always_inline]] inline void add_scaled_row(double s, const double* a, int columns, double* out) {
+    const Quad factor{s, s, s, s};
+    for (int c = 0; c < columns; c += tile) quad_at(out + c) += factor * quad_at(a + c);
+}
+
+// Copy the upper triangle to the lower one, in these rows.
+inline void mirror(TiledMatrix& a, Range rows) {
+    const int stride = a.stride();
+    for (int i = rows.begin; i < rows.end; ++i) {
+        double* row = a[i];
+        const double* above = a[0] + i;
+        for (int j = 0; j < i; ++j) row[j] = above[j * stride];
     }
 }
 
