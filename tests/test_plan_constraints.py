@@ -662,6 +662,33 @@ def test_margins_against_monte_carlo(constraint):
     assert 0.005 < share <= 0.0228 + 3.0 * np.sqrt(0.0228 * 0.9772 / 10_000)
 
 
+def test_monte_carlo_counts_what_margins_allow():
+    """As an ensemble of the same seed does, of the bound and the node where most paths are outside."""
+    limits = vp.WithinJointLimits(ROBOT, (-0.2, [0.9, 0.6]), margin=2.0)
+    free = vp.WithinVelocityLimits(ROBOT, (-50.0, 50.0), margin=2.0)
+    scene = vp.Scene(ROBOT, damping=0.3, noise=vp.AdditiveNoise(0.3))
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1.0) + vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0))
+    constraints = [vp.WithinVelocityLimits(ROBOT, (-60.0, 60.0)), limits, free]
+    problem = vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.03, steps=40, constraints=constraints)
+    plan, paths = vp.solve(problem, check=False), 1000
+    seen = plan.monte_carlo(paths, rng=1)
+    options = {"controls": plan.policy, "integrator": problem.integrator}
+    found = vp.simulate_ensemble(scene, [0, 0], [0, 0], dt=0.03, steps=40, paths=paths, rng=1, **options)
+    outside = (np.concatenate([found.q - [0.9, 0.6], -0.2 - found.q], axis=2)[:, 1:] > 0.0).sum(axis=0)
+    # Constraints without a margin promise nothing, and are not counted.
+    one, other = seen.broken
+    assert (one.count, one.paths, other.count) == (outside.max(), paths, 0)
+    node, row = np.argwhere(outside == outside.max())[0]
+    names = [f"{side} limit of {joint}" for side in ("upper", "lower") for joint in ROBOT.joint_names]
+    assert (one.label, one.row, one.time) == (limits.label, names[row], pytest.approx(0.03 * (node + 1)))
+    share = outside.max() / paths
+    assert one.standard_error == pytest.approx(np.sqrt(share * (1.0 - share) / paths))
+    assert one.promised == pytest.approx(0.02275, rel=1e-3)
+    assert abs(share - 0.02275) < 5.0 * one.standard_error
+    assert not unnamed(str(seen), one.row, f"{one.count} of {paths}", "2.3 %")
+    assert "WithinJointLimits" in seen._repr_html_()
+
+
 def test_between_nodes_is_told():
     plan = vp.solve(two_links(FAMILIES["velocities"], steps=12, dt=0.08))
     assert about(plan.warnings, "between nodes")

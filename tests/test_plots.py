@@ -265,8 +265,34 @@ def test_what_is_no_motion_record_robot_axes_or_label_is_refused():
         for labels in (3, "ab", [1, 2]):
             with refused(vp.InputError, "labels", "2", repr(labels)):
                 draw(trajectory, labels=labels)
-    with refused(vp.InputError, "Solution", ".trajectory"):
-        plots.plot_joints(type("Solution", (), {"trajectory": trajectory})())
+
+
+def test_plans_and_runs_are_drawn_as_their_motions():
+    """And the limits of the controls are those of the plan, not the robot's."""
+    robot = vp.planar_chain(2)
+    cost = vp.TrackingCost([0.4, 0.2], 1.0) + vp.ControlCost(1e-3)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, gravity=False),
+        cost,
+        np.zeros(2),
+        np.zeros(2),
+        dt=0.02,
+        steps=8,
+        control_limits=([-1, -2], [1, 2]),
+    )
+    plan, run = vp.solve(problem), vp.Mpc(problem).run(duration=0.04)
+    for given, motion in ((plan, plan.trajectory), (run, run.motion)):
+        for draw in (*SINGLE.values(), plots.plot_trajectory):
+            panels = [np.ravel(draw(one)[1]) for one in (given, motion)]
+            for mine, other in zip(*panels, strict=True):
+                for line, same in zip(drawn(mine).values(), drawn(other).values(), strict=True):
+                    np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
+        _, axes = plots.plot_controls(given, robot=robot)
+        places = {path.vertices[0, 1] for lines in axes.collections for path in lines.get_paths()}
+        assert places <= {-1.0, 1.0, -2.0, 2.0}
+        assert places
+    with refused(vp.InputError, "Trajectory", "OptimalControlProblem"):
+        plots.plot_joints(problem)
 
 
 def test_global_state_is_left_alone():

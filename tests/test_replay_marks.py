@@ -14,6 +14,7 @@ import varpin as vp
 from varpin.model import geometry
 from varpin.show.replay import replay
 from varpin.show.replay.annotations import references, torque_shares
+from varpin.show.replay.motion import _shares
 
 TIP = "tool0"
 
@@ -346,6 +347,25 @@ def test_a_joint_without_a_limit_is_held_against_its_own_largest_torque():
     torques = np.array([[1.0, 0.0], [-4.0, 0.0], [2.0, 0.0]])
     shares = torque_shares(chain, np.zeros((4, 2)), torques, None)
     np.testing.assert_array_equal(shares, [[0.25, 0.0], [1.0, 0.0], [0.5, 0.0]])
+
+
+def test_torques_of_a_plan_are_held_against_its_control_limits(ur5):
+    """The limits of its problem, where it has any; a trajectory, and given torques, are held against the robot's."""
+    limits = [20.0, 30.0, 10.0, 5.0, 5.0, np.inf]
+    cost = vp.TrackingCost([0.4, -1.0, 1.0, 0.2, 0.3, 0.1], 100.0) + vp.ControlCost(1e-4)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(ur5, gravity=False), cost, [0.0, -1.0, 1.0, 0.0, 0.0, 0.0], np.zeros(6), dt=0.05, steps=4,
+        control_limits=(-0.5 * np.array(limits), limits),
+    )  # fmt: skip
+    plan, run = vp.solve(problem, check=False), vp.Mpc(problem, iterations=1).run(duration=0.05)
+    for given, motion in ((plan, plan.trajectory), (run, run.motion)):
+        bound = np.minimum(limits, ur5.effort_limit)
+        (shares,) = _shares([(ur5, given)], [True], None)
+        np.testing.assert_allclose(shares, np.abs(motion.u) / bound, rtol=1e-12)
+        own = [_shares([(ur5, one)], [torques], None)[0] for one, torques in ((motion, True), (given, motion.u))]
+        np.testing.assert_allclose(own, 2 * [np.minimum(np.abs(motion.u) / ur5.effort_limit, 1.0)], rtol=1e-12)
+        (half,) = _shares([(ur5, given)], [True], 1e3)
+        np.testing.assert_allclose(half, np.abs(motion.u) / 1e3, rtol=1e-12)
 
 
 def test_torque_colours_are_seen(browser, ur5, tmp_path):

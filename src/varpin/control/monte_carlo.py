@@ -10,8 +10,11 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
+from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostSum
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.verification import excess, percent
@@ -33,6 +36,45 @@ logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+class Broken:
+    """How often paths violated a constraint with a margin, in the row and at the time where they did so most often.
+
+    Attributes:
+        label: The constraint.
+        row: The row.
+        time: The time [s].
+        count: Number of paths that violated it there.
+        paths: Number of paths.
+        promised: The share of paths that the margin allows: beyond it in a normal distribution.
+    """
+
+    label: str
+    row: str
+    time: float
+    count: int
+    paths: int
+    promised: float
+
+    @property
+    def share(self) -> float:
+        """Share of the paths."""
+        return self.count / self.paths
+
+    @property
+    def standard_error(self) -> float:
+        """Standard error of the share; of one path where none or all violated it."""
+        p = min(max(self.share, 1.0 / self.paths), 1.0 - 1.0 / self.paths)
+        return float(np.sqrt(p * (1.0 - p) / self.paths))
+
+    def __str__(self) -> str:
+        where = f" ({self.row} at t = {self.time:.4g} s)" if self.count else ""
+        return (
+            f"{self.label} is violated by {100.0 * self.share:.2g} +- {100.0 * self.standard_error:.1g} % of all paths"
+            f"{where}, {self.count} of {self.paths}; its margin allows {100.0 * self.promised:.2g} %"
+        )
+
+
+@dataclass(frozen=True)
 class MonteCarlo:
     """The expected cost of a policy, by simulation.
 
@@ -43,6 +85,7 @@ class MonteCarlo:
         paths: Number of paths in the mean.
         failures: Number of paths that failed; they are not in the mean.
         warnings: Warnings about the paths, one sentence each, as those of an :class:`Ensemble`.
+        broken: How often paths violated each constraint with a ``margin=``.
     """
 
     cost: float
@@ -51,6 +94,7 @@ class MonteCarlo:
     paths: int
     failures: int
     warnings: tuple[str, ...] = field(default=(), repr=False)
+    broken: tuple[Broken, ...] = ()
 
     def __repr__(self) -> str:
         gap = f"MonteCarlo(cost {self.cost:.6g} +- {self.standard_error:.1e}, predicted {self.predicted:.6g}"
@@ -64,6 +108,7 @@ class MonteCarlo:
             ("paths", self.paths),
             ("ran away", self.failures),
         ]
+        rows += [("constraint", each) for each in self.broken]
         return facts("Expected cost", rows + [("warning", warning) for warning in self.warnings])
 
     def __str__(self) -> str:
@@ -78,6 +123,7 @@ class MonteCarlo:
                 f"{'difference':16}{gap:+14.6e} ({percent(excess(self.cost, self.predicted))}{apart})",
                 "how to read it: within three standard errors (+-) the two agree; beyond, noise is too strong for the "
                 "model",
+                *map(str, self.broken),
                 *(f"warning: {warning}" for warning in self.warnings),
             ]
         )
@@ -98,10 +144,17 @@ class MonteCarloInterrupted(KeyboardInterrupt):
 
 @dataclass(frozen=True, eq=False)
 class _Costs(Frozen):
-    """Results of a chunk: the costs of its paths (C,), NaN where one failed, and the extreme paths to check."""
+    """Results of a chunk.
+
+    Attributes:
+        values: The costs of its paths (C,), NaN where one failed.
+        extremes: The extreme paths to check.
+        broken: Number of paths that violate each constraint with a margin, by its places and rows.
+    """
 
     values: Floats
     extremes: Extremes
+    broken: tuple[Integers, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +194,12 @@ def monte_carlo(
     found: tuple[Finding, ...] = ()
     extremes: Extremes = {}
     done, sent = 0, _sent(problem)
+    broken = [np.zeros((len(bound.places), len(bound.rows)), dtype=np.int64) for bound in _with_margins(problem)]
 
     def add(part: _Costs) -> None:
         nonlocal extremes, done
+        for total, counted in zip(broken, part.broken, strict=True):
+            np.add(total, counted, out=total)
         costs.append(part.values)
         extremes = greater(extremes, part.extremes)
         done += len(part.values)
@@ -172,7 +228,7 @@ def monte_carlo(
             elif np.isfinite(costs[0]).all():
                 found = _look_alone(_Alone(sent, policy, seeds, 0))
         except KeyboardInterrupt:
-            so_far = _mean(costs, predicted, within)
+            so_far = _mean(costs, predicted, within, problem, broken)
             if so_far is None:
                 raise MonteCarloInterrupted(None) from None
             if shared is not None:
@@ -182,7 +238,7 @@ def monte_carlo(
                 with suppress(KeyboardInterrupt):
                     found = _look_alone(_Alone(sent, policy, seeds, 0))
             raise MonteCarloInterrupted(_warned(so_far, (*_lost(so_far), *found))) from None
-    result = _mean(costs, predicted, within)
+    result = _mean(costs, predicted, within, problem, broken)
     if result is None:
         raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
     found = (*_lost(result), *found)
@@ -207,7 +263,8 @@ def _together(chunk: _Chunk) -> _Costs:
     part = simulate_paths(chunk.task)
     stored = part.stored
     u = stored["u_nodes" if chunk.problem.linear else "u"]
-    return _Costs(chunk.problem.costs(stored["q"], stored["v"], u), part.extremes)
+    values = chunk.problem.costs(stored["q"], stored["v"], u)
+    return _Costs(values, part.extremes, _broken(chunk.problem, stored["q"], stored["v"], np.isfinite(values)))
 
 
 def _alone(given: _Alone) -> _Costs:
@@ -215,8 +272,35 @@ def _alone(given: _Alone) -> _Costs:
     try:
         motion = given.problem.simulate(given.policy, rng=child)
     except (StepFailure, NoiseError):
-        return _Costs(np.full(1, np.nan), {})
-    return _Costs(np.array([given.problem.cost_of(motion)]), {})
+        nothing = np.zeros((0, *given.problem.q0.shape))
+        return _Costs(np.full(1, np.nan), {}, _broken(given.problem, nothing, nothing, np.zeros(0, dtype=bool)))
+    value = np.array([given.problem.cost_of(motion)])
+    return _Costs(value, {}, _broken(given.problem, motion.q[None], motion.v[None], np.isfinite(value)))
+
+
+def _with_margins(problem: OptimalControlProblem) -> list[BoundConstraint]:
+    """The constraints with a margin, which are all on the state."""
+    return [bound for bound in problem.bound_constraints if bound.source.margin > 0.0]
+
+
+def _broken(problem: OptimalControlProblem, q: Floats, v: Floats, finished: NDArray[np.bool_]) -> tuple[Integers, ...]:
+    """Number of finished paths (C, N + 1, n) that violate each constraint with a margin, by place and row."""
+    no_controls, found = np.zeros((problem.decisions, problem.scene.controls)), []
+    for bound in _with_margins(problem):
+        count = np.zeros((len(bound.places), len(bound.rows)), dtype=np.int64)
+        for path in np.flatnonzero(finished):
+            count += bound.value(q[path], v[path], no_controls) > 0.0
+        found.append(count)
+    return tuple(found)
+
+
+def _reports(problem: OptimalControlProblem, broken: Sequence[Integers], paths: int) -> tuple[Broken, ...]:
+    found = []
+    for bound, counts in zip(_with_margins(problem), broken, strict=True):
+        place, row = np.unravel_index(int(counts.argmax()), counts.shape)
+        where = bound.rows[row], float(bound.times[place])
+        found.append(Broken(bound.source.label, *where, int(counts.max()), paths, float(ndtr(-bound.source.margin))))
+    return tuple(found)
 
 
 def _look_alone(given: _Alone) -> tuple[Finding, ...]:
@@ -241,7 +325,13 @@ def _warned(result: MonteCarlo, found: Sequence[Finding]) -> MonteCarlo:
     return replace(result, warnings=tuple(finding.sentence for finding in found))
 
 
-def _mean(costs: Sequence[Floats], predicted: float, within: float) -> MonteCarlo | None:
+def _mean(
+    costs: Sequence[Floats],
+    predicted: float,
+    within: float,
+    problem: OptimalControlProblem,
+    broken: Sequence[Integers],
+) -> MonteCarlo | None:
     values = np.concatenate([np.zeros(0), *costs])
     good = values[np.isfinite(values)]
     if len(good) < 2:
@@ -252,4 +342,5 @@ def _mean(costs: Sequence[Floats], predicted: float, within: float) -> MonteCarl
         predicted=predicted,
         paths=len(good),
         failures=len(values) - len(good),
+        broken=_reports(problem, broken, len(good)),
     )

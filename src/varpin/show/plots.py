@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import cycle, islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
+from varpin.show.given import motion_of, problem_of
 from varpin.support.checks import flag
 from varpin.trajectory import Trajectory, kinematic_input_rows, require_trajectory
 
 if TYPE_CHECKING:
     # Imported for types alone: plotting a joint needs no optimizer.
+    from varpin.control import Solution
+    from varpin.control.mpc import MpcRun
     from varpin.study.tradeoff import Advice, OptimalControlTradeoff, WorkPrecision
     from varpin.study.tradeoff.precision import Quantity
-
+Motion: TypeAlias = "Trajectory | Solution | MpcRun"
 
 # Okabe and Ito's palette for colour-blind readers, without its yellow, which is faint on white.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -43,12 +46,12 @@ _POINTS = 8000
 
 
 def plot_joints(
-    trajectory: Trajectory, axes: Axes | None = None, *, robot: Robot | None = None
+    trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None
 ) -> tuple[Figure | SubFigure, Axes]:
     """Joint positions over time.
 
     Args:
-        trajectory: The motion.
+        trajectory: The motion, or a plan or a controller's run that has one.
         axes: Where to draw; a new figure if left out.
         robot: The robot of the motion. With it, labels have the units of the joints, rad or m, and limits near the
             motion are dotted lines.
@@ -60,22 +63,22 @@ def plot_joints(
         InputError: ``trajectory`` is none, ``axes`` are none of matplotlib's, or ``robot`` is none or has other joints
             than the trajectory.
     """
-    _require_motion(trajectory, robot)
+    trajectory = _require_motion(trajectory, robot)
     limits = None if robot is None else robot.position_limits
     return _plot_nodes(trajectory, trajectory.q, "position", ("rad", "m"), axes, robot, limits)
 
 
 def plot_velocities(
-    trajectory: Trajectory, axes: Axes | None = None, *, robot: Robot | None = None
+    trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None
 ) -> tuple[Figure | SubFigure, Axes]:
     """Joint velocities over time; arguments as for :func:`plot_joints`."""
-    _require_motion(trajectory, robot)
+    trajectory = _require_motion(trajectory, robot)
     limits = None if robot is None else (-robot.velocity_limit, robot.velocity_limit)
     return _plot_nodes(trajectory, trajectory.v, "velocity", ("rad/s", "m/s"), axes, robot, limits)
 
 
 def plot_controls(
-    trajectory: Trajectory,
+    trajectory: Motion,
     axes: Axes | None = None,
     *,
     robot: Robot | None = None,
@@ -87,10 +90,10 @@ def plot_controls(
     input is a velocity [rad/s or m/s].
 
     Args:
-        trajectory: The motion.
+        trajectory: The motion, or a plan or a controller's run that has one.
         axes: Where to draw; a new figure if left out.
         robot: The robot of the motion. With it, labels have the units of the controls, N m or N, and limits near the
-            controls are dotted lines: efforts, or positions for servos.
+            controls are dotted lines: efforts, or positions for servos. Those of a plan are its control limits.
         labels: Names of the m controls. If left out, the joints' names where there are as many, which is right if every
             joint is actuated, else u1, u2, ...
 
@@ -100,7 +103,7 @@ def plot_controls(
     Raises:
         InputError: ``labels`` are not m names, or as for :func:`plot_joints`.
     """
-    _require_motion(trajectory, robot)
+    problem, trajectory = problem_of(trajectory), _require_motion(trajectory, robot)
     controls = trajectory.u.shape[1]
     _require_labels(labels, controls)
     slides = _slides(robot)
@@ -133,7 +136,7 @@ def plot_controls(
             axes.plot(*_thin(trajectory.t, row), label=name, **style)
         else:
             axes.step(*_thin_steps(trajectory.t, row), where="post", label=name, **style)
-    limits = _control_limits(robot, joints)
+    limits = _control_limits(robot, joints) if problem is None else tuple(problem.control_limits)
     if limits is not None:
         _draw_limits(axes, drawn, limits)
     _finish(axes, trajectory, f"{what} [{unit}]", controls)
@@ -141,12 +144,12 @@ def plot_controls(
 
 
 def plot_energy_error(
-    trajectory: Trajectory, axes: Axes | None = None, *, relative: bool = False
+    trajectory: Motion, axes: Axes | None = None, *, relative: bool = False
 ) -> tuple[Figure | SubFigure, Axes]:
     """Change of the energy over time, which is an error if no force drives or damps the robot.
 
     Args:
-        trajectory: The motion.
+        trajectory: The motion, or a plan or a controller's run that has one.
         axes: Where to draw; a new figure if left out.
         relative: Divide by the initial energy, instead of plotting joules. The potential energy is zero at the world's
             origin, so the result depends on the placement of the robot.
@@ -157,7 +160,7 @@ def plot_energy_error(
     Raises:
         InputError: ``relative`` is set and the initial energy is 0, or as for :func:`plot_joints`.
     """
-    _require_motion(trajectory, None)
+    trajectory = _require_motion(trajectory, None)
     start = trajectory.energy[0]
     if flag("relative", relative) and start == 0.0:
         raise InputError("the initial energy is 0 J, so nothing is relative to it: plot with relative=False")
@@ -171,7 +174,7 @@ def plot_energy_error(
 
 
 def plot_trajectory(
-    trajectory: Trajectory,
+    trajectory: Motion,
     axes: Sequence[Axes] | NDArray[Any] | None = None,
     *,
     robot: Robot | None = None,
@@ -180,7 +183,7 @@ def plot_trajectory(
     """An overview: positions, velocities, controls and energy, one above the other.
 
     Args:
-        trajectory: The motion.
+        trajectory: The motion, or a plan or a controller's run that has one.
         axes: Four axes to draw on; a new figure if left out, without the panel of controls if there are none or all
             are 0.
         robot: As for :func:`plot_joints`.
@@ -192,7 +195,7 @@ def plot_trajectory(
     Raises:
         InputError: ``axes`` are not four, or as for the single figures.
     """
-    _require_motion(trajectory, robot)
+    given, trajectory = trajectory, _require_motion(trajectory, robot)
     _require_labels(labels, trajectory.u.shape[1])
     driven = axes is not None or bool(np.any(trajectory.u))
     if axes is None:
@@ -207,7 +210,7 @@ def plot_trajectory(
     plot_joints(trajectory, panels[0], robot=robot)
     plot_velocities(trajectory, panels[1], robot=robot)
     if driven:
-        plot_controls(trajectory, panels[2], robot=robot, labels=labels)
+        plot_controls(given, panels[2], robot=robot, labels=labels)
     plot_energy_error(trajectory, panels[-1])
     # Joints have the same colours in all panels and share one legend, which also has the key of limits in any panel.
     entries = [dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True)) for panel in panels[:-1]]
@@ -436,14 +439,15 @@ def _require_axes(axes: object) -> None:
         raise InputError(f"axes must be matplotlib's, such as matplotlib.figure.Figure().subplots(), got {axes!r}")
 
 
-def _require_motion(trajectory: object, robot: Robot | None) -> None:
-    """Refuse anything but a trajectory, and a robot that is not the trajectory's."""
-    motion = require_trajectory(trajectory)
+def _require_motion(given: object, robot: Robot | None) -> Trajectory:
+    """The motion; refuses anything but a trajectory, a plan and a run, and a robot that is not the motion's."""
+    motion = require_trajectory(motion_of(given))
     if robot is not None and require_robot(robot).joint_names != motion.joint_names:
         raise InputError(
             f"robot {robot.name!r} has joints {', '.join(robot.joint_names)}; "
             f"the trajectory has {', '.join(motion.joint_names)}"
         )
+    return motion
 
 
 def _require_labels(labels: object, controls: int) -> None:

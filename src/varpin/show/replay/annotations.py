@@ -19,6 +19,7 @@ from varpin.support.checks import JointValues, as_floats, joint_array, require_f
 from varpin.trajectory import Trajectory, kinematic_input_rows
 
 if TYPE_CHECKING:
+    from varpin.control import OptimalControlProblem
     from varpin.control.mpc import MpcRun
 
 
@@ -211,7 +212,11 @@ def target(name: str, track: tuple[Floats, Floats, Floats | None], times: Floats
 
 
 def torque_shares(
-    robot: Robot, motion: Trajectory | ArrayLike, torques: bool | ArrayLike, limit: JointValues | None
+    robot: Robot,
+    motion: Trajectory | ArrayLike,
+    torques: bool | ArrayLike,
+    limit: JointValues | None,
+    problem: OptimalControlProblem | None = None,
 ) -> Floats | None:
     """Torque of each joint in each step as a share of its limit (N, n), in [0, 1]; None if torques are not shown.
 
@@ -219,8 +224,9 @@ def torque_shares(
         robot: The robot.
         motion: The motion whose controls are the torques, if ``torques`` is True.
         torques: Whether to show torques; or the torques (N, n) themselves [N m or N].
-        limit: One number, (n,) or by name [N m or N]; if left out, the robot's limits, and where it has none the
-            joint's largest torque.
+        limit: One number, (n,) or by name [N m or N]; if left out, those of the plan's controls if ``torques`` is True,
+            else the robot's limits, and where there are none the joint's largest torque.
+        problem: The problem of the motion, if it is a plan's.
 
     Raises:
         InputError: The motion does not have torques of all joints, they are not (N, n), or a limit is not positive.
@@ -257,6 +263,9 @@ def torque_shares(
     largest = size.max(axis=0, initial=0.0)
     effort = robot.effort_limit
     bound = np.where(np.isfinite(effort), effort, largest)
+    if problem is not None and isinstance(torques, bool | np.bool_):
+        own = np.abs(problem.control_limits).max(axis=0)
+        bound = np.where(np.isfinite(own), own, bound)
     if limit is not None:
         given = joint_array("torque_limit", limit, robot.joint_names, uniform=True)
         # Joints that are not named keep the limit of the robot.

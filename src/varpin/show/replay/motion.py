@@ -9,7 +9,7 @@ import reprlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.model import Robot
+from varpin.show.given import motion_of, problem_of
 from varpin.show.replay.annotations import (
     frame_names,
     outlooks,
@@ -103,8 +104,9 @@ def replay(
         torques: Colour each link by the torque of the joint that moves it, grey for none, red at its limit: ``True``
             for the controls of the trajectory, one for each joint; or the torques (N, n) themselves [N m or N], of N
             steps spread evenly over the motion's time. For several robots, True or False for all, or a list.
-        torque_limit: One number, (n,) or by joint name [N m or N]; the robot's effort limits if left out. A joint
-            without a limit is red at its own largest torque.
+        torque_limit: One number, (n,) or by joint name [N m or N]; if left out the control limits of a plan, where
+            ``torques`` is True, and the robot's effort limits where it has none. A joint without a limit is red
+            at its own largest torque.
         constraints: Draw the constraints of the mechanism, and the obstacles, regions and goals of a plan. ``True``
             takes them from a plan or a controller's run, ``False`` draws none. A trajectory or an array does not
             contain them: give its scene or its problem. For several robots, True or False for all, or a list.
@@ -150,7 +152,7 @@ def replay(
             "for a notebook"
         )
     runs = [run if _is_run(run) else None for _, run in shown]
-    pairs = [(arm, _trajectory_of(run)) for arm, run in shown]
+    pairs = [(arm, motion_of(run)) for arm, run in shown]
     steps = [path.dt for _, path in pairs if isinstance(path, Trajectory)]
     if dt is not None and len(steps) == len(pairs):
         raise InputError(f"dt belongs to an array of configurations; this trajectory has its own, {steps[0]:g} s")
@@ -170,7 +172,7 @@ def replay(
     beside = _each("ghost", ghost, len(pairs))
     for arm, run, look, given in zip(arms, runs, looks, beside, strict=True):
         if given is not None:
-            ghosts.append(_ghost(arm, given, end))
+            ghosts.append(_ghost(arm, motion_of(given), end))
         elif run is not None and look > 0.0:
             rows = run.planned(look)
             ghosts.append((run.period * np.arange(len(rows), dtype=np.float64), rows))
@@ -178,7 +180,7 @@ def replay(
             ghosts.append(None)
     traced, triads = frame_names("trace", arms, trace), frame_names("frames", arms, frames)
     paths, tracks = references(reference), target_tracks(targets, end)
-    shares = _shares(pairs, _each("torques", torques, len(pairs)), torque_limit)
+    shares = _shares(shown, _each("torques", torques, len(pairs)), torque_limit)
     held = [
         parts_of(given, run, arm)
         for given, (arm, run) in zip(_each("constraints", constraints, len(shown)), shown, strict=True)
@@ -236,13 +238,6 @@ def _is_run(motion: object) -> TypeGuard[MpcRun]:
     return hasattr(motion, "planned")
 
 
-def _trajectory_of(motion: Motion) -> Trajectory | ArrayLike:
-    """The motion of a controller's run or of a plan; others are returned as they are."""
-    if _is_run(motion):
-        return motion.motion
-    return cast("Trajectory | ArrayLike", getattr(motion, "trajectory", motion))
-
-
 def _ahead(ahead: float | None, run: MpcRun | None) -> float:
     """Time ahead at which a run's plans are shown [s]; 0 to show none."""
     if run is None:
@@ -253,12 +248,13 @@ def _ahead(ahead: float | None, run: MpcRun | None) -> float:
 
 
 def _shares(
-    pairs: Sequence[tuple[Robot, Trajectory | ArrayLike]], torques: Sequence[Any], limit: JointValues | None
+    shown: Sequence[tuple[Robot, Motion]], torques: Sequence[Any], limit: JointValues | None
 ) -> list[Floats | None]:
     """:func:`torque_shares` of each robot; the limit is for those whose torques are shown."""
     hidden = [isinstance(torque, bool | np.bool_) and not torque for torque in torques]
     limits = [None if out and not all(hidden) else limit for out in hidden]
-    return [torque_shares(*pair, torque, bound) for pair, torque, bound in zip(pairs, torques, limits, strict=True)]
+    given = zip(shown, torques, limits, strict=True)
+    return [torque_shares(arm, motion_of(run), torque, bound, problem_of(run)) for (arm, run), torque, bound in given]
 
 
 def _pairs(robot: Robot | Sequence[tuple[Robot, Motion]], motion: Motion | None) -> list[tuple[Robot, Motion]]:
