@@ -261,20 +261,25 @@ class _Rounds:
         return first
 
     def _carried(self, coarse: OptimalControlProblem, known: Multipliers) -> _State:
-        """The state of the first round with the multipliers, weights and margins of a plan with twice the step."""
+        """The state of the first round with the multipliers, weights and margins of a plan with twice the step.
+
+        Rate limits begin anew: the plan's controls on this grid change at every other decision only.
+        """
         begun, bound = self.state, coarse.bound_constraints
-        count = sum(item.size for item in bound)
-        values, backoff = (split(bound, part[:count]) for part in (known.values, known.backoff))
-        shares = [len(a.places) / len(b.places) for a, b in zip(bound, self.bound, strict=True)]
-        return replace(
-            begun,
-            multipliers=[
-                share * in_between(a, b, part)
-                for a, b, part, share in zip(bound, self.bound, values, shares, strict=True)
-            ],
-            weights=np.maximum(begun.weights, shares * known.weights[: len(bound)]),
-            backoff=[in_between(a, b, part) for a, b, part in zip(bound, self.bound, backoff, strict=True)],
-        )
+        size = sum(item.size for item in bound)
+        values, backoff = (split(bound, part[:size]) for part in (known.values, known.backoff))
+        weights = begun.weights.copy()
+        for i, (before, item) in enumerate(zip(bound, self.bound, strict=True)):
+            if item.of_controls:
+                values[i] = begun.multipliers[i]
+                continue
+            share = len(before.places) / len(item.places)
+            values[i] = share * in_between(before, item, values[i])
+            weights[i] = max(weights[i], share * known.weights[i])
+        margins = [
+            in_between(before, item, part) for before, item, part in zip(bound, self.bound, backoff, strict=True)
+        ]
+        return replace(begun, multipliers=values, weights=weights, backoff=margins)
 
     def _heavier(self, plain: OptimalControlProblem, motion: Trajectory, weights: Floats) -> float:
         """Factor of first weights that are light: those of a first motion that costs next to nothing.
