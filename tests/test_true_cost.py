@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from findings import about
+from naive import continuous
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control.refinement import _halved, refine, start_of
+from varpin.control.refinement import halved, refine, start_of
+from varpin.control.refinement_within import Warm, refine_within
 
 
 def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
@@ -227,29 +229,136 @@ def test_the_time_limit_is_for_all_steps() -> None:
     assert time.perf_counter() - began < 20.0
 
 
-def test_within_constraints():
-    robot = vp.planar_chain(2)
+def within(*constraints: vp.PlanConstraint, dt: float = 0.1, steps: int = 12) -> vp.OptimalControlProblem:
     cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
     cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1)
+    return vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=dt, steps=steps, constraints=constraints)
 
-    def problem(*constraints):
-        scene = vp.Scene(robot, damping=0.1)
-        return vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.1, steps=12, constraints=constraints)
 
-    limited = problem(vp.WithinVelocityLimits(robot, (-1.2, 1.2)))
-    plan = vp.solve(limited, true_cost=1e-6, check=False)
-    assert plan.refinement.met
-    assert plan.problem.steps > 12
+def on_robot(plan: vp.Solution) -> tuple[float, np.ndarray]:
+    """The cost of a plan of ``within`` with feedback, and its velocities in eighths of steps, by DOP853."""
+    problem, policy, parts, given = plan.problem, plan.policy_on("velocity"), 8, []
+
+    def running(t: float, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> float:
+        return 1e-2 * (u @ u + v @ v)
+
+    def law(k: int, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+        if k % parts == 0:
+            decision = k // parts
+            state = np.concatenate([q, v]) - policy.reference[decision]
+            given.append(plan.controls[decision] + policy.gains[decision] @ state)
+        return given[-1]
+
+    rows = np.repeat(plan.controls, parts, axis=0)
+    q, v, integral = continuous(
+        problem.scene, problem.q0, problem.v0, rows, problem.dt / parts, running, law, rtol=1e-9
+    )
+    return integral + 100.0 * ((q[-1] - [1.0, 0.5]) ** 2).sum() + 10.0 * v[-1] @ v[-1], v
+
+
+def test_within_constraints():
+    limited = within(vp.WithinVelocityLimits(vp.planar_chain(2), (-4.8, 1.2)))
+    plan = vp.solve(limited, true_cost=0.01, check=False)
+    found = plan.refinement
+    row = found.tried[found.chosen]
+    assert found.met
+    assert plan.problem.steps == row.steps > 12
     assert plan.status.converged
     assert plan.violation <= 1e-9
-    assert abs(plan.verify().closed_loop_loss) <= 1.1e-6
+    # Multipliers and controls of the plan before are near those of half the step.
+    assert all(finer.iterations < found.tried[0].iterations for finer in found.tried[1:])
+    true, v = on_robot(plan)
+    assert row.true_cost == pytest.approx(true, rel=1e-4)
+    assert abs(true / plan.cost - 1.0) <= 0.01
+    # Held controls exceed the limit between nodes: at 0.1 s by a thirtieth of what is allowed to rest.
+    beyond = (v - 1.2).max() / 6.0
+    assert row.violation == pytest.approx(beyond, rel=1e-2)
+    assert 1e-4 < beyond < 1e-3 < found.tried[0].violation
+    fine = vp.solve(limited.at(dt=plan.problem.dt / 2), check=False)
+    assert fine.violation <= 1e-6
+    assert true <= 1.01 * fine.cost
     with refused(vp.InputError, "resume", "true_cost"):
         vp.solve(limited, resume=plan, true_cost=0.1)
-    # No finer grid is tried where there is no plan.
-    far = vp.solve(problem(vp.ReachFrame(robot, "tip", position=[1.0, 0.5, -0.5])), true_cost=0.01, check=False)
+
+
+def test_no_plan_within_constraints() -> None:
+    """A step that has none may be too coarse, so half of it is tried, too."""
+    goal = vp.ReachFrame(vp.planar_chain(2), "tip", position=[1.0, 0.5, -0.5])
+    far = vp.solve(within(goal), true_cost=0.01, check=False)
     assert far.status is vp.Status.INFEASIBLE
-    assert len(far.refinement.tried) == 1
+    assert len(far.refinement.tried) == 2
+    assert not far.refinement.met
     assert about(far.refinement.reason, "no plan within constraints")
+
+
+def test_a_coarse_step_that_is_infeasible() -> None:
+    """One held control accelerates to the end, to twice the mean speed; two of them reach the goal within 1.6 of it."""
+    chain = vp.planar_chain(2)
+    there = np.array([1.0, 0.5])
+    limits = vp.WithinVelocityLimits(chain, (-20.0 * there, 1.6 * there))
+    goal = vp.ReachFrame(chain, "tip", position=chain.frame_positions(there, "tip"))
+    plan = vp.solve(within(limits, goal, dt=1.0, steps=1), true_cost=0.3, check=False)
+    first = plan.refinement.tried[0]
+    assert first.status is vp.Status.INFEASIBLE
+    assert plan.refinement.met
+    assert plan.status.converged
+    _, v = on_robot(plan)
+    assert (v <= 1.6 * there + 1e-3 * 21.6 * there.mean()).all()
+
+
+def goal_problem(steps: int = 3, **options: object) -> vp.OptimalControlProblem:
+    goal = vp.ReachFrame(vp.planar_chain(2), "tip", position=vp.planar_chain(2).frame_positions([1.5, -1.0], "tip"))
+    return reach(steps, constraints=[goal], **options)
+
+
+def test_finer_controls_within_constraints() -> None:
+    """Coarse controls cost more, however well the robot follows."""
+    optimum = vp.solve(goal_problem(48, controls="linear"), check=False).cost
+    found = vp.solve(goal_problem(), true_cost=0.02, check=False).refinement
+    assert found.met
+    above = [row.true_cost / optimum - 1.0 for row in found.tried]
+    assert above[0] > 0.05
+    assert above[-1] <= 0.02
+    known = np.array([row.excess for row in found.tried[1:]])
+    np.testing.assert_allclose(known, above[1:], rtol=0.3, atol=2e-3)
+
+
+def test_an_interrupted_comparison_keeps_the_plan() -> None:
+    first = vp.solve(goal_problem(), tolerance=1e-3, check=False)
+    steps: list[int] = []
+
+    def callback(item: vp.Iteration, motion: vp.Trajectory) -> None:
+        steps.append(motion.steps)
+        if motion.steps > 3:
+            raise KeyboardInterrupt
+
+    plan = vp.solve(goal_problem(), true_cost=0.1, callback=callback, check=False)
+    assert steps[-1] == 6
+    assert plan.status is vp.Status.INTERRUPTED
+    assert not plan.refinement.met
+    assert [row.steps for row in plan.refinement.tried] == [3]
+    assert plan.violation <= 1e-9
+    assert plan.cost == pytest.approx(first.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("status", [vp.Status.STALLED, vp.Status.INFEASIBLE])
+def test_comparisons_that_fail_prove_nothing(status: vp.Status) -> None:
+    """Half the step is not cheaper only if its search has converged within the constraints."""
+    coarse = vp.solve(goal_problem(), check=False)
+
+    def search(problem: vp.OptimalControlProblem, start: Warm | None) -> vp.Solution:
+        if start is None:
+            return coarse
+        plan = vp.solve(problem, start.controls, check=False)
+        return replace(plan, status=status, cost=2.0 * plan.cost)
+
+    plan = refine_within(goal_problem(), search, 0.5, lambda: np.inf)
+    found = plan.refinement
+    assert not found.met
+    assert plan.cost == coarse.cost
+    assert [row.excess for row in found.tried] == [np.inf] * len(found.tried)
+    assert len(found.tried) <= 4
 
 
 def test_interrupted_before_a_motion_is_made() -> None:
@@ -283,7 +392,7 @@ def test_the_default_integrator_is_chosen_on_each_grid() -> None:
         assert problem.integrator == vp.Radau(4)
         assert problem.at(dt=0.05).integrator == finer
         assert problem.at(dt=0.05, integrator=vp.Midpoint()).integrator == vp.Midpoint()
-        assert _halved(problem).integrator == finer
+        assert halved(problem).integrator == finer
 
 
 def test_a_loss_within_the_wish_is_no_warning() -> None:

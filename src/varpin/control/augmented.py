@@ -25,16 +25,24 @@ from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
-from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, reports_of, split
+from varpin.control.multipliers import (
+    FEASIBLE,
+    REPORTED,
+    ConstraintReport,
+    Multipliers,
+    in_between,
+    reports_of,
+    split,
+)
 from varpin.control.penalties import PenalizedProblem, flat, penalized
 from varpin.control.polish import deviations, polished
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.refinement import refine
+from varpin.control.refinement import SUFFICIENT
+from varpin.control.refinement_within import Warm, refine_within
 from varpin.control.search import NOTHING, PATIENCE, checked_time, closing_of, require_reports
 from varpin.control.solution import Solution
 from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
-from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.soundness import announce
 from varpin.support.checks import count, flag, positive
 from varpin.trajectory import Trajectory
@@ -43,6 +51,8 @@ P = ParamSpec("P")
 
 logger = logging.getLogger(__name__)
 
+# Default tolerance.
+_TOLERANCE = 1e-7
 # Default number of iterations over all rounds.
 _MOST_ITERATIONS = 5 * ITERATIONS
 # Greatest number of iterations in a round, and of rounds.
@@ -106,16 +116,17 @@ def _to_true_cost(
     if options.get("resume") is not None:
         raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
     deadline = time.perf_counter() + checked_time(options.get("time_limit", np.inf))
+    sufficient = max(positive("tolerance", options.get("tolerance", _TOLERANCE), "1"), SUFFICIENT * wish)
 
-    def once(finer: OptimalControlProblem, start: LinearPolicy | Solution | None) -> Solution:
-        own = {**options, "check": False}
+    def once(finer: OptimalControlProblem, start: Warm | None) -> Solution:
+        own = {**options, "check": False, "tolerance": sufficient}
         if start is not None:
-            own |= {"controls": start, "states": None}
+            own |= {"controls": start.controls, "states": None}
         if np.isfinite(deadline):
             own["time_limit"] = max(deadline - time.perf_counter(), 1e-9)
-        return _Rounds(finer, search, own).run()
+        return _Rounds(finer, search, own, None if start is None else start.before).run()
 
-    found = refine(problem, once, wish, lambda: deadline - time.perf_counter())
+    found = refine_within(problem, once, wish, lambda: deadline - time.perf_counter())
     return looked_at(found)[0] if options.get("check", True) else found
 
 
@@ -138,9 +149,15 @@ class _Rounds:
     """Searches of the augmented Lagrangian, one after another, until the constraints hold."""
 
     def __init__(
-        self, problem: OptimalControlProblem, search: Callable[..., Solution], options: dict[str, Any]
+        self,
+        problem: OptimalControlProblem,
+        search: Callable[..., Solution],
+        options: dict[str, Any],
+        before: Solution | None = None,
     ) -> None:
         self.problem, self.search = problem, search
+        # A plan with twice the step.
+        self.before = before
         # The problem of a round, with its rows between nodes.
         self.whole = problem
         self.options = dict(options)
@@ -149,7 +166,7 @@ class _Rounds:
         self.controls = self.options.pop("controls", None)
         self.states = self.options.pop("states", None)
         self.resumed: Solution | None = self.options.pop("resume", None)
-        self.tolerance = self.options.pop("tolerance", 1e-7)
+        self.tolerance = self.options.pop("tolerance", _TOLERANCE)
         self.most = count("max_iterations", self.options.pop("max_iterations", _MOST_ITERATIONS))
         self.limit = checked_time(self.options.pop("time_limit", np.inf))
         self.report_all = require_reports(self.options.pop("callback", None), self.progress)
@@ -239,7 +256,30 @@ class _Rounds:
             weights = weights * self._heavier(plain, first.trajectory, weights)
         nothing = np.full(len(self.bound), np.inf)
         self.state = _State(zeros, weights, weights, zeros, nothing, _LOOSE)
+        if self.before is not None and self.before.multipliers is not None:
+            self.state = self._carried(self.before.problem, self.before.multipliers)
         return first
+
+    def _carried(self, coarse: OptimalControlProblem, known: Multipliers) -> _State:
+        """The state of the first round with the multipliers, weights and margins of a plan with twice the step.
+
+        Rate limits begin anew: the plan's controls on this grid change at every other decision only.
+        """
+        begun, bound = self.state, coarse.bound_constraints
+        size = sum(item.size for item in bound)
+        values, backoff = (split(bound, part[:size]) for part in (known.values, known.backoff))
+        weights = begun.weights.copy()
+        for i, (before, item) in enumerate(zip(bound, self.bound, strict=True)):
+            if item.of_controls:
+                values[i] = begun.multipliers[i]
+                continue
+            share = len(before.places) / len(item.places)
+            values[i] = share * in_between(before, item, values[i])
+            weights[i] = max(weights[i], share * known.weights[i])
+        margins = [
+            in_between(before, item, part) for before, item, part in zip(bound, self.bound, backoff, strict=True)
+        ]
+        return replace(begun, multipliers=values, weights=weights, backoff=margins)
 
     def _heavier(self, plain: OptimalControlProblem, motion: Trajectory, weights: Floats) -> float:
         """Factor of first weights that are light: those of a first motion that costs next to nothing.

@@ -130,6 +130,12 @@ def split(bound: tuple[BoundConstraint, ...], flat: Floats) -> list[Floats]:
     return [part.reshape(item.shape) for item, part in zip(bound, np.split(flat, ends[:-1]), strict=True)]
 
 
+def in_between(coarse: BoundConstraint, fine: BoundConstraint, values: Floats) -> Floats:
+    """Values (K, rows) at the places of a constraint, interpolated at its places on a finer grid."""
+    found = [np.interp(fine.times, coarse.times, column) for column in values.T]
+    return np.stack(found, axis=1) if found else np.zeros(fine.shape)
+
+
 def reports_of(
     problem: OptimalControlProblem, motion: Trajectory, values: list[Floats], backoff: list[Floats]
 ) -> tuple[ConstraintReport, ...]:

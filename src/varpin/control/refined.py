@@ -31,7 +31,10 @@ class Refined:
         seconds: Time of the search and the verification [s].
         share: Share in the time of all steps tried.
         excess: Excess of the true cost over the optimum of finer controls, relative to the latter: an estimate from a
-            few iterations with half the step. Infinite where they were not made.
+            few iterations with half the step; with constraints, from the plan with half the step. Infinite where it is
+            not known.
+        violation: Largest violation of a constraint on the continuous system with feedback, relative to the
+            constraint's range (for frames and clearance 1 m or 3 rad); NaN where that motion diverges.
     """
 
     dt: float
@@ -45,13 +48,15 @@ class Refined:
     seconds: float
     share: float = 1.0
     excess: float = np.inf
+    violation: float = 0.0
 
-    HEADER = "      dt  steps         cost    true cost       loss  iterations   time"
+    HEADER = "      dt  steps         cost    true cost       loss     excess  violation  iterations   time"
 
     def __str__(self) -> str:
+        above = part(self.excess) if np.isfinite(self.excess) else ""
         return (
             f"{self.dt:8.3g} {self.steps:6d} {self.cost:12.6e} {self.true_cost:12.6e} {part(self.loss):>10} "
-            f"{self.iterations:11d} {100.0 * self.share:4.0f} %"
+            f"{above:>10} {self.violation:10.1e} {self.iterations:11d} {100.0 * self.share:4.0f} %"
         )
 
 
@@ -61,7 +66,8 @@ class Refinement:
 
     Attributes:
         wish: The greatest allowed loss, relative to the plan's cost, and excess over the optimum of finer controls.
-        met: Whether the loss of the plan is within it, and the excess, where finer controls were compared.
+        met: Whether the loss of the plan is within it, and the excess, where finer controls were compared, and no
+            constraint is violated on the continuous system by more than a thousandth of its range.
         tried: The steps tried, from the coarsest on.
         chosen: Index of the plan's step in ``tried``.
         reason: How the refinement ended.

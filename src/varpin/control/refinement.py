@@ -14,7 +14,7 @@ from varpin.control.history import Status
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refined import Refined, Refinement, part
 from varpin.control.solution import Solution
-from varpin.control.verification import excess, true_costs
+from varpin.control.verification import OnRobot, excess, true_costs
 from varpin.errors import InputError, VarpinError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.friction import rate_at_rest
@@ -30,18 +30,18 @@ SUFFICIENT = 0.01
 # progress. They are finished where half the step does not lower the cost by more than the wish.
 SLOW = 0.3
 # Accuracy of true costs, and changes of the cost that do not count, relative to the allowed loss.
-_KNOWN = 0.1
+KNOWN = 0.1
 # Iterations of a comparison with half the step.
 COMPARISON = 3
 # Bounds on the factor by which half the step lowers the excess of planned costs over the optimum: of smooth motions on
 # coarse grids (on fine ones it is 0.25), and of controls that reach their limits.
 _FALLS = (0.4, 0.5)
 # Greatest number of halvings of the step.
-_HALVINGS = 10
+HALVINGS = 10
 # Number of halvings without a smaller loss, or of searches within it that have not converged, that end the refinement.
-_PATIENCE = 3
+PATIENCE = 3
 # Greatest rate of dampers and dry friction, times the step, from where on halvings must lower the loss.
-_RESOLVED = 2.0
+RESOLVED = 2.0
 
 
 def refine(
@@ -98,9 +98,9 @@ class _Refining:
                 return self._given_up(f"with dt = {problem.dt:g} s there is no plan: {error}")
             if solution is None or costs is None:
                 return self._interrupted(solution, f"interrupted with dt = {problem.dt:g} s")
-            self.tried.append(_row(solution, costs, time.perf_counter() - began))
+            self.tried.append(row_of(solution, costs, time.perf_counter() - began))
             finer, compared, waits = None, self.compare is None, False
-            if _within(self.tried[-1], self.wish) and self.compare is not None and self._may_go_on():
+            if is_within(self.tried[-1], self.wish) and self.compare is not None and self._may_go_on():
                 above = self._foreseen()
                 finer = None if np.isfinite(above) else _in_half(problem, solution, self.compare)
                 compared, waits = True, self.finish is not None and solution.status is Status.MAX_ITERATIONS
@@ -109,22 +109,22 @@ class _Refining:
                     made, costs = self._attempt(self.finish, problem, solution)
                     if made is None or costs is None:
                         return self._interrupted(made or solution, f"interrupted with dt = {problem.dt:g} s")
-                    solution, self.tried[-1] = made, _row(made, costs, 0.0)
-                    if before - solution.cost > _KNOWN * self.wish * abs(solution.cost):
+                    solution, self.tried[-1] = made, row_of(made, costs, 0.0)
+                    if before - solution.cost > KNOWN * self.wish * abs(solution.cost):
                         finer = _in_half(problem, solution, self.compare)
                 if finer is not None and finer.status is Status.INTERRUPTED:
                     ended = f"interrupted while dt = {problem.dt:g} s was compared with half of it"
                     left = replace(solution, status=Status.INTERRUPTED, reason=ended)
-                    return _with(left, self.wish, self.tried, len(self.tried) - 1, ended)
-                above = above if finer is None else _excess(self.tried, finer)
+                    return recorded(left, self.wish, self.tried, len(self.tried) - 1, ended)
+                above = above if finer is None else excess_over(self.tried, finer)
                 self.tried[-1] = replace(self.tried[-1], excess=above, seconds=time.perf_counter() - began)
             row = self.tried[-1]
-            within = _within(row, self.wish)
+            within = is_within(row, self.wish)
             meets = within and solution.status.converged
             if self.best is None or meets or not abs(row.loss) >= abs(self.tried[self.chosen].loss):
                 self.best, self.chosen = solution, len(self.tried) - 1
             if meets and compared and (finer is None or row.excess <= self.wish):
-                return _with(solution, self.wish, self.tried, self.chosen, "", met=True)
+                return recorded(solution, self.wish, self.tried, self.chosen, "", met=True)
             self.unconverged = self.unconverged + 1 if within and not (solution.status.converged or waits) else 0
             ended = self._ended(problem, solution)
             if ended:
@@ -133,7 +133,7 @@ class _Refining:
                 problem, start = finer.problem, finer
                 continue
             try:
-                problem = _halved(problem)
+                problem = halved(problem)
                 start = start_of(problem, solution)
             except VarpinError as error:
                 return self._given_up(f"half the step cannot be taken: {error}")
@@ -144,7 +144,7 @@ class _Refining:
         problem: OptimalControlProblem,
         start: LinearPolicy | Solution | None,
         known: Solution | None = None,
-    ) -> tuple[Solution | None, tuple[float, float, bool] | None]:
+    ) -> tuple[Solution | None, OnRobot | None]:
         """A plan and its true costs; None for what an interrupt prevented."""
         solution = known
         try:
@@ -152,12 +152,12 @@ class _Refining:
                 solution = search(problem, start)
             if solution is None or solution.status is Status.INTERRUPTED:
                 return solution, None
-            return solution, _true_costs(solution, self.wish)
+            return solution, on_robot(solution, self.wish)
         except KeyboardInterrupt:
             return solution, None
 
     def _may_go_on(self) -> bool:
-        return len(self.tried) <= _HALVINGS and self.time_left() > 0.0
+        return len(self.tried) <= HALVINGS and self.time_left() > 0.0
 
     def _foreseen(self) -> float:
         """Excess of the last row, where the halving before has lowered the cost by little; else infinite."""
@@ -165,7 +165,7 @@ class _Refining:
             return np.inf
         before, last = self.tried[-2:]
         gained = before.cost - last.cost
-        if not 0.0 <= gained <= _KNOWN * self.wish * abs(last.cost):
+        if not 0.0 <= gained <= KNOWN * self.wish * abs(last.cost):
             return np.inf
         return excess(last.true_cost, last.cost - gained * _FALLS[0] / (1.0 - _FALLS[0]))
 
@@ -178,7 +178,7 @@ class _Refining:
             # Twice, half the step has hardly lowered the cost, whatever the model expects of it.
             return True
         rest = max(solution.history[-1].expected_decrease, 0.0) if solution.history else 0.0
-        return _excess(self.tried, finer, rest) <= self.wish
+        return excess_over(self.tried, finer, rest) <= self.wish
 
     def _given_up(self, ended: str) -> Solution:
         """The best plan, its search finished."""
@@ -189,9 +189,9 @@ class _Refining:
             if made is None or costs is None:
                 return self._interrupted(None, f"interrupted with dt = {row.dt:g} s")
             seconds = row.seconds + time.perf_counter() - began
-            self.tried[self.chosen] = replace(_row(made, costs, seconds), excess=row.excess)
+            self.tried[self.chosen] = replace(row_of(made, costs, seconds), excess=row.excess)
             self.best = made
-        return _with(self.best, self.wish, self.tried, self.chosen, ended)
+        return recorded(self.best, self.wish, self.tried, self.chosen, ended)
 
     def _interrupted(self, solution: Solution | None, ended: str) -> Solution:
         """The best plan of an interrupted refinement, or the only one."""
@@ -201,7 +201,7 @@ class _Refining:
             best = replace(solution, status=Status.INTERRUPTED)
         else:
             raise KeyboardInterrupt
-        return _with(best, self.wish, self.tried, self.chosen, ended)
+        return recorded(best, self.wish, self.tried, self.chosen, ended)
 
     def _ended(self, problem: OptimalControlProblem, solution: Solution) -> str:
         """Why the refinement ends here; empty if it continues."""
@@ -210,24 +210,24 @@ class _Refining:
             return f"with dt = {problem.dt:g} s there is no plan within the constraints: {solution.reason}"
         if self.time_left() <= 0.0:
             return f"the time limit came after dt = {problem.dt:g} s"
-        if len(tried) > _HALVINGS:
-            return f"the step has been halved {_HALVINGS} times"
-        resolved = problem.dt * rate_at_rest(problem.scene, problem.q0) <= _RESOLVED
-        if resolved and len(tried) - 1 - self.chosen >= _PATIENCE:
-            return f"the last {_PATIENCE} halvings of the step have not lowered the loss"
+        if len(tried) > HALVINGS:
+            return f"the step has been halved {HALVINGS} times"
+        resolved = problem.dt * rate_at_rest(problem.scene, problem.q0) <= RESOLVED
+        if resolved and len(tried) - 1 - self.chosen >= PATIENCE:
+            return f"the last {PATIENCE} halvings of the step have not lowered the loss"
         coarse = self.wish < row.excess < np.inf
         stuck = solution.status in (Status.STALLED, Status.INDEFINITE, Status.NOT_DIFFERENTIABLE)
-        if _within(row, self.wish) and stuck and not coarse:
+        if is_within(row, self.wish) and stuck and not coarse:
             return f"the loss is within the wish, but the search ended {solution.status.name}"
-        if self.unconverged >= _PATIENCE:
-            return f"losses are within the wish for {_PATIENCE} steps, but the searches ended {solution.status.name}"
+        if self.unconverged >= PATIENCE:
+            return f"losses are within the wish for {PATIENCE} steps, but the searches ended {solution.status.name}"
         return ""
 
 
 def _in_half(problem: OptimalControlProblem, solution: Solution, compare: Search) -> Solution | None:
     """The beginning of a search with half the step from a plan; None where there is none. It may be interrupted."""
     try:
-        finer = _halved(problem)
+        finer = halved(problem)
         return compare(finer, start_of(finer, solution))
     except VarpinError:
         return None
@@ -235,7 +235,7 @@ def _in_half(problem: OptimalControlProblem, solution: Solution, compare: Search
         return replace(solution, status=Status.INTERRUPTED)
 
 
-def _excess(tried: list[Refined], finer: Solution, rest: float = 0.0) -> float:
+def excess_over(tried: list[Refined], finer: Solution, rest: float = 0.0) -> float:
     """Excess of the last row's true cost, less ``rest``, over the optimum, by a search with half the step."""
     optimum = finer.cost
     if not finer.status.converged and finer.history:
@@ -244,57 +244,73 @@ def _excess(tried: list[Refined], finer: Solution, rest: float = 0.0) -> float:
     gained, falls = tried[-1].cost - rest - optimum, _FALLS[0]
     if len(tried) > 1 and tried[-2].cost > tried[-1].cost:
         falls = float(np.clip(gained / (tried[-2].cost - tried[-1].cost), *_FALLS))
-    return excess(tried[-1].true_cost - rest, optimum - max(gained, 0.0) * falls / (1.0 - falls))
+    # Where the cost has fallen to a fraction, that says nothing about further falls.
+    further = max(gained, 0.0) * falls / (1.0 - falls) if gained < abs(optimum) else 0.0
+    return excess(tried[-1].true_cost - rest, optimum - further)
 
 
-def _true_costs(solution: Solution, wish: float) -> tuple[float, float, bool]:
-    accuracy = _KNOWN * wish
+def on_robot(solution: Solution, wish: float) -> OnRobot:
+    """The true costs of a plan, as accurate as a wish needs, and its violations on the continuous system."""
+    accuracy = KNOWN * wish
     plan = (solution.problem, solution.trajectory, solution.cost, solution.policy_on)
     return true_costs(*plan, wish=wish, accuracy=accuracy)
 
 
-def _row(solution: Solution, costs: tuple[float, float, bool], seconds: float) -> Refined:
+def row_of(solution: Solution, costs: OnRobot, seconds: float) -> Refined:
+    """The record of a plan's step."""
     problem = solution.problem
-    opened, closed, known = costs
     return Refined(
         dt=problem.dt,
         steps=problem.steps,
         cost=solution.cost,
-        true_cost=closed,
-        open_loop_cost=opened,
-        loss=excess(closed, solution.cost) if known else np.nan,
+        true_cost=costs.closed,
+        open_loop_cost=costs.opened,
+        loss=excess(costs.closed, solution.cost) if costs.known else np.nan,
         iterations=solution.iterations,
         status=solution.status,
         seconds=seconds,
+        violation=costs.violation,
     )
 
 
-def _within(row: Refined, wish: float) -> bool:
+def is_within(row: Refined, wish: float) -> bool:
+    """Whether a step's loss is within the wish."""
     return bool(abs(row.loss) <= wish)
 
 
-def _with(
-    solution: Solution, wish: float, tried: list[Refined], chosen: int, reason: str, *, met: bool = False
+def recorded(
+    solution: Solution,
+    wish: float,
+    tried: list[Refined],
+    chosen: int,
+    reason: str,
+    *,
+    met: bool = False,
+    beyond: str = "",
 ) -> Solution:
-    """The solution with the record of its refinement."""
+    """The solution with the record of its refinement; ``beyond`` is what it violates on the continuous system."""
     total = sum(row.seconds for row in tried) or 1.0
     rows = tuple(replace(row, share=row.seconds / total) for row in tried)
     if met:
         above = rows[chosen].excess
         compared = f"about {part(above)} above the optimum of finer controls" if np.isfinite(above) else ""
+        if above <= 0.0:
+            compared = "half the step is not cheaper"
         reason = f"dt = {rows[chosen].dt:g} s loses {part(rows[chosen].loss)}, within {part(wish)[1:]}; "
         reason += compared or "not compared with finer controls"
     elif rows:
         loss = rows[chosen].loss
         reached = f"the best plan loses {part(loss)}" if np.isfinite(loss) else "no plan's true cost is known"
         reason = f"true_cost = {wish:g} is not met: {reason}; {reached} at dt = {rows[chosen].dt:g} s"
+        if beyond:
+            reason += f", and on the continuous system {beyond}"
         if wish < rows[chosen].excess < np.inf:
             reason += f", and costs about {part(rows[chosen].excess)} more than the optimum of finer controls"
     logger.log(logging.INFO if met else logging.WARNING, "%s: %s", solution.problem.scene.robot.name, reason)
     return replace(solution, refinement=Refinement(wish, met, rows, chosen, reason))
 
 
-def _halved(problem: OptimalControlProblem) -> OptimalControlProblem:
+def halved(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The problem with half the step; controls that are held over several steps keep their period."""
     hold = problem.hold if problem.hold == 1 else 2 * problem.hold
     return problem.at(dt=0.5 * problem.dt, steps=2 * problem.steps, hold=hold)

@@ -183,12 +183,13 @@ def solve(
             search.
         true_cost: Greatest difference between the plan's cost and its cost with feedback on the continuous system,
             relative to the former: 0.01 for a percent; and greatest excess of the latter over the optimum of finer
-            controls, as estimated from a few iterations with half the step (not with constraints). The problem's step
-            is the coarsest; it is halved, each search starting from the plan before, until both are within it.
+            controls, as estimated from a few iterations with half the step, or with constraints from the plan of half
+            the step. Constraints must then hold on the continuous system to a thousandth of their range. The problem's
+            step is the coarsest; it is halved, each search starting from the plan before, until all that is so.
             ``Solution.problem`` has the plan's step. ``Solution.refinement`` lists the steps tried, or why the accuracy
             cannot be reached; a warning reports that, too. Controls that are held over several steps keep their period,
             and their optimum is that of the period. ``max_iterations`` is for each step, ``time_limit`` for all;
-            without constraints, ``tolerance`` is at least a hundredth of ``true_cost``, and a search whose progress is
+            ``tolerance`` is at least a hundredth of ``true_cost``. Without constraints a search whose progress is
             slow leaves the rest to half the step, where that lowers the cost by more than ``true_cost``. Ctrl-C keeps
             the best plan so far. Where dampers are far faster than the step, ``controls="linear"`` in the problem
             reaches the accuracy at much larger steps.

@@ -38,6 +38,8 @@ _READING = (
 )
 # A loss is far above a wish from this multiple of it on.
 _FAR = 2.0
+# Least number of parts of a step in which the constraints of a plan with a wished true cost are looked at.
+_LOOKS = 8
 # Stability limit of the Runge-Kutta method: greatest product of rate and step.
 _STABLE = 2.78
 
@@ -237,6 +239,25 @@ def verify(
     return verified
 
 
+class OnRobot(NamedTuple):
+    """A plan on the continuous system.
+
+    Attributes:
+        opened: True cost under its controls alone; NaN where the motion diverges.
+        closed: The same with feedback.
+        known: Whether the costs decide on a wish. Where the loss with feedback exceeds the wish by far, they are rough.
+        violation: Largest violation of a constraint with feedback, relative to the constraint's range; NaN where the
+            motion diverges.
+        where: The constraint that is violated most, by how much and where, in words; empty where all hold.
+    """
+
+    opened: float
+    closed: float
+    known: bool
+    violation: float = 0.0
+    where: str = ""
+
+
 def true_costs(
     problem: OptimalControlProblem,
     plan: Trajectory,
@@ -246,10 +267,8 @@ def true_costs(
     wish: float,
     accuracy: float,
     max_substeps: int = 1024,
-) -> tuple[float, float, bool]:
-    """The true costs under a plan's controls alone and with feedback, and whether they decide on a wish.
-
-    Where the loss with feedback exceeds the wish by far, they are rough.
+) -> OnRobot:
+    """The true costs under a plan's controls alone and with feedback, whether they decide on a wish, and violations.
 
     Args:
         wish: Greatest allowed loss with feedback, relative to ``planned_cost``.
@@ -257,7 +276,22 @@ def true_costs(
     """
     above = planned_cost + _FAR * wish * abs(planned_cost)
     found = _true_costs(problem, plan, policy, tolerance=accuracy, max_substeps=max_substeps, above=above)
-    return found.opened[0], found.closed[0], found.known
+    told = OnRobot(found.opened[0], found.closed[0], found.known)
+    if not problem.constraints:
+        return told
+    substeps, feedback = found.substeps, found.ways[1]
+    if substeps < _LOOKS:
+        # Motions are seen at the ends of substeps only.
+        substeps, feedback = _LOOKS, _feedback(problem, policy, found.integrator, _LOOKS)
+    bound = problem.bound_constraints
+    beyond = _beyond(problem, feedback, substeps, found.integrator)
+    shares = [by / (10.0 * item.scale) for (by, _), item in zip(beyond, bound, strict=True)]
+    if not np.isfinite(shares).all():
+        return told._replace(violation=np.nan)
+    i = int(np.argmax(shares))
+    (worst, where), item = beyond[i], bound[i]
+    words = f"{item.source.label} is violated by {worst:.2g} {item.unit} ({where})" if where else ""
+    return told._replace(violation=shares[i], where=words)
 
 
 class _TrueCosts(NamedTuple):
@@ -324,7 +358,6 @@ def _costs_by(
     above: float,
 ) -> _TrueCosts:
     """True costs by one integrator, also where the one with feedback is surely greater than ``above``."""
-    state: Literal["momentum", "velocity"] = "momentum" if integrator.variational else "velocity"
     substeps, before, decided = 2, (np.nan, np.nan), False
     times = integrator.stage_times
     blind = open_line(problem.decided(plan), times) if problem.linear else open_loop(problem.decided(plan))
@@ -333,13 +366,7 @@ def _costs_by(
             progress(substeps, max_substeps)
         costs = _fine_costs(problem, substeps)
         opened = accurate_cost(problem, blind._replace(hold=problem.hold * substeps), substeps, costs, integrator)
-        feedback = policy(state, substeps).commands(
-            problem.steps * substeps,
-            problem.scene.controls,
-            problem.scene.robot.dof,
-            variational=integrator.variational,
-            stage_times=times,
-        )
+        feedback = _feedback(problem, policy, integrator, substeps)
         closed = accurate_cost(problem, feedback, substeps, costs, integrator)
         changes = [
             abs(now[0] - then) / max(abs(now[0]), 1e-300)
@@ -356,6 +383,22 @@ def _costs_by(
     return _TrueCosts(opened, closed, (blind, feedback), substeps, accuracy, bool(decided), integrator)
 
 
+def _feedback(
+    problem: OptimalControlProblem,
+    policy: Callable[[Literal["momentum", "velocity"], int], LinearPolicy],
+    integrator: Integrator,
+    substeps: int,
+) -> Commands:
+    """The commands of a plan's policy in ``substeps`` parts of each of its steps."""
+    return policy("momentum" if integrator.variational else "velocity", substeps).commands(
+        problem.steps * substeps,
+        problem.scene.controls,
+        problem.scene.robot.dof,
+        variational=integrator.variational,
+        stage_times=integrator.stage_times,
+    )
+
+
 def _violations(
     problem: OptimalControlProblem,
     plan: Trajectory,
@@ -366,30 +409,38 @@ def _violations(
     """Violations of each constraint on the continuous system, under the controls alone and with feedback."""
     if not problem.constraints:
         return ()
+    opened, closed = (_beyond(problem, law, substeps, integrator) for law in laws)
+    found = []
+    for whole, (alone, _), (fed, where) in zip(problem.bound_constraints, opened, closed, strict=True):
+        planned = _excess(whole, whole.value(plan.q, plan.v, problem.control_rows(plan)))
+        label, unit = whole.source.label, whole.unit
+        found.append(ViolationOnRobot(label, unit, float(planned.max(initial=0.0)), alone, fed, where))
+    return tuple(found)
+
+
+def _beyond(
+    problem: OptimalControlProblem, law: Commands, substeps: int, integrator: Integrator
+) -> list[tuple[float, str]]:
+    """The largest violation of each constraint under given commands, and the row and time in words.
+
+    NaN where the motion diverges.
+    """
     h = problem.dt / substeps
+    motion, failure = rollout(problem.scene, integrator, problem.q0, problem.v0, law, h)
+    if failure is not None:
+        return [(np.nan, "")] * len(problem.bound_constraints)
     fine = problem.constraints_on(h, problem.steps * substeps, problem.hold * substeps)
-    motions = [rollout(problem.scene, integrator, problem.q0, problem.v0, law, h) for law in laws]
     found = []
     for bound, whole in zip(fine, problem.bound_constraints, strict=True):
-        planned = _excess(whole, whole.value(plan.q, plan.v, problem.control_rows(plan)))
-        worst, where = [], ""
-        for motion, failure in motions:
-            if failure is not None:
-                worst.append(np.nan)
-                where = ""
-                continue
-            excess = _excess(bound, bound.value(motion.q, motion.v, problem.control_rows(motion)))
-            outside = at_start(problem, whole)
-            if outside is not None:
-                # A row that is violated at the start cannot hold before the first node.
-                excess[: substeps - 1, outside > 0.0] = 0.0
-            sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
-            worst.append(float(excess[sample, row]))
-            where = f"{bound.rows[row]} at t = {bound.times[sample]:.4g} s" if worst[-1] > 0.0 else ""
-        label, unit = bound.source.label, bound.unit
-        opened, closed = worst
-        found.append(ViolationOnRobot(label, unit, float(planned.max(initial=0.0)), opened, closed, where))
-    return tuple(found)
+        excess = _excess(bound, bound.value(motion.q, motion.v, problem.control_rows(motion)))
+        outside = at_start(problem, whole)
+        if outside is not None:
+            # A row that is violated at the start cannot hold before the first node.
+            excess[: substeps - 1, outside > 0.0] = 0.0
+        sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        worst = float(excess[sample, row])
+        found.append((worst, f"{bound.rows[row]} at t = {bound.times[sample]:.4g} s" if worst > 0.0 else ""))
+    return found
 
 
 def at_start(problem: OptimalControlProblem, bound: BoundConstraint) -> Floats | None:
