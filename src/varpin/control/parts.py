@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -136,6 +137,7 @@ def _one_after_another(motions: list[Trajectory]) -> Trajectory:
     """
     first, last = motions[0], motions[-1]
     of_nodes, of_steps = ("q", "v", "p", "energy", "u_nodes"), ("u", "u_stages", "dw", "constraint_forces")
+    arrays: dict[str, Any]
     arrays = {name: np.concatenate([*(getattr(x, name)[:-1] for x in motions), getattr(last, name)[-1:]])
               for name in of_nodes}  # fmt: skip
     arrays |= {name: np.concatenate([getattr(x, name) for x in motions]) for name in of_steps}
