@@ -3,7 +3,8 @@
 import numpy as np
 
 import varpin as vp
-from varpin.control.backward import Along, backward
+from varpin.control.along import Along
+from varpin.control.backward import backward
 
 
 def expected_cost_slopes(problem: vp.OptimalControlProblem, made, u: np.ndarray):

@@ -8,7 +8,9 @@ from findings import about
 
 import varpin as vp
 from varpin import core
-from varpin.control.backward import TRUSTED, Along, _foreseen, _Limits, _one_pass, backward
+from varpin.control.along import Along, Limits
+from varpin.control.backward import backward
+from varpin.control.passes import TRUSTED, foreseen, one_pass
 from varpin.control.square_root import squares_of
 from varpin.linearization import linearize_steps
 from varpin.simulation.run import simulate
@@ -185,11 +187,11 @@ def test_both_forms_agree_where_digits_are_plenty(name, foresight, regularizatio
     if problem.limited:
         expected = np.zeros((0, 9))
         if foresight:
-            free = _one_pass(along, regularization, False, None, None, roots=False)[0]
-            expected = _foreseen(along, free)[0]
-        limits = _Limits(along.slack, expected)
+            free = one_pass(along, regularization, False, None, None, roots=False)[0]
+            expected = foreseen(along, free)[0]
+        limits = Limits(along.slack, expected)
     (plain, first), (roots, second) = (
-        _one_pass(along, regularization, True, None, limits, roots=roots) for roots in (False, True)
+        one_pass(along, regularization, True, None, limits, roots=roots) for roots in (False, True)
     )
     if problem.limited:
         held = ~plain.feedback.any(axis=2)

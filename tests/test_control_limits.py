@@ -7,7 +7,9 @@ from scipy.optimize import lsq_linear
 from test_sddp import sliders
 
 import varpin as vp
-from varpin.control import backward as passes
+from varpin.control import backward as whole
+from varpin.control import box, passes
+from varpin.control.along import Along, Limits
 from varpin.control.backward import backward
 from varpin.core import box_minimum
 from varpin.model.kinematics import frame_kinematics
@@ -180,13 +182,13 @@ def test_limits_that_the_optimum_does_not_touch(effort, speed):
 
 
 def around_the_nominal_states(problem, motion, second_order):
-    along = passes.Along(problem, motion)
+    along = Along(problem, motion)
     curvature = None
     if second_order:
-        plan, costate = passes._pass(along, 1e-3, costates=True)
-        curvature = passes._curvature(along, plan, costate)
-    limits = passes._Limits(along.slack, np.zeros((0, 18)))
-    return passes._pass(along, 0.0, curvature=curvature, limits=limits)[0]
+        plan, costate = passes.single_pass(along, 1e-3, costates=True)
+        curvature = whole._curvature(along, plan, costate)
+    limits = Limits(along.slack, np.zeros((0, 18)))
+    return passes.single_pass(along, 0.0, curvature=curvature, limits=limits)[0]
 
 
 @pytest.mark.parametrize(("steps", "controls"), [(40, "held"), (25, "linear")])
@@ -283,13 +285,13 @@ def test_model_within_limits_by_interior_points(hold, monkeypatch):
     """Where active sets do not settle, an interior-point method finds the limits that hold: SciPy's solution."""
     lower, upper = np.array([-3.0, -0.8]), np.array([2.0, 5.0])
     problem = pushed((lower, upper), integrator=vp.Midpoint(), hold=hold, dt=0.2 / hold, steps=10 * hold)
-    real, calls = passes._Box._active_sets, []
+    real, calls = box._Box._active_sets, []
 
-    def second_time(box, plan, held):
+    def second_time(within, plan, held):
         calls.append(held)
-        return real(box, plan, held) if len(calls) % 2 == 0 else None
+        return real(within, plan, held) if len(calls) % 2 == 0 else None
 
-    monkeypatch.setattr(passes._Box, "_active_sets", second_time)
+    monkeypatch.setattr(box._Box, "_active_sets", second_time)
     sol = vp.solve(problem, max_iterations=1)
     assert calls
     g, H = transcribed(problem)
@@ -309,9 +311,9 @@ def test_interior_points_where_no_active_set_ends(rate, upper, lower, monkeypatc
             problem.scene, problem.cost + vp.ControlRateCost(rate), problem.q0, problem.v0, dt=problem.dt,
             steps=problem.steps, integrator=vp.Midpoint(), control_limits=(lower, upper),
         )  # fmt: skip
-    real = passes._Box._pushed
-    monkeypatch.setattr(passes._Box, "_active_sets", lambda *_: None)
-    monkeypatch.setattr(passes._Box, "_pushed", lambda *given: steps.append(None) or real(*given))
+    real = box._Box._pushed
+    monkeypatch.setattr(box._Box, "_active_sets", lambda *_: None)
+    monkeypatch.setattr(box._Box, "_pushed", lambda *given: steps.append(None) or real(*given))
     sol = vp.solve(problem, max_iterations=1)
     assert 1 < len(steps) <= 14
     g, H = transcribed(problem)
@@ -337,7 +339,7 @@ def test_interior_points_are_corrected_as_by_whole_passes(controls, monkeypatch)
     problem = vp.OptimalControlProblem(
         scene, cost, [0, 0], [0, 0], dt=0.05, steps=10, control_limits=([-8, -0.5], [np.inf, -0.5]), controls=controls
     )
-    real = passes._Box._pushed
+    real = box._Box._pushed
 
     def both(box, plan, limits, *others):
         whole = real(box, plan, limits._replace(factors=None), *others)
@@ -345,8 +347,8 @@ def test_interior_points_are_corrected_as_by_whole_passes(controls, monkeypatch)
         apart.append(np.abs(quick - whole).max() / np.abs(whole).max())
         return quick
 
-    monkeypatch.setattr(passes._Box, "_active_sets", lambda *_: None)
-    monkeypatch.setattr(passes._Box, "_pushed", both)
+    monkeypatch.setattr(box._Box, "_active_sets", lambda *_: None)
+    monkeypatch.setattr(box._Box, "_pushed", both)
     vp.solve(problem, max_iterations=1, check=False)
     assert 1 < len(apart) < 20
     assert max(apart) < 1e-9

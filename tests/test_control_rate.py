@@ -12,7 +12,8 @@ from test_sddp import SAMPLINGS, Plain, PlainCost, noise_columns, run, sliders, 
 from test_solution_files import same
 
 import varpin as vp
-from varpin.control.backward import Along, _one_pass
+from varpin.control.along import Along
+from varpin.control.passes import one_pass
 
 MATRIX = np.array([[2e-2, 5e-3], [5e-3, 1e-2]])
 BEFORE = np.array([0.7, -0.3])
@@ -142,7 +143,7 @@ def test_riccati_on_the_augmented_state(integrator, sampling, before, hold, root
     noise = vp.AdditiveNoise(0.2) + vp.ControlNoise(0.5) + vp.StateNoise(0.8, center=-0.1)
     problem = linear(vp.ControlRateCost(MATRIX, before), integrator, sampling, noise, hold=hold)
     motion = run(problem, np.random.default_rng(1).normal(size=(problem.decisions, 2)))
-    plan, _ = _one_pass(Along(problem, motion), 0.0, False, None, None, roots=roots)
+    plan, _ = one_pass(Along(problem, motion), 0.0, False, None, None, roots=roots)
     plain = Plain(problem.scene, problem.dt, integrator)
     columns = noise_columns(plain, problem.scene, motion)(0.2, 0.5, 0.8, -0.1)
     laws, value = augmented_riccati(plain, problem, MATRIX, before, columns)
@@ -218,7 +219,7 @@ def test_gradient_far_from_an_optimum(before, roots):
     """Of a nonlinear motion's cost, against differences."""
     problem = finger(vp.ControlRateCost(2e-3, before), steps=6, hold=2)
     u = 1e-3 * np.random.default_rng(3).normal(size=(3, 3))
-    plan, _ = _one_pass(Along(problem, run(problem, u)), 0.0, False, None, None, roots=roots)
+    plan, _ = one_pass(Along(problem, run(problem, u)), 0.0, False, None, None, roots=roots)
     for r in range(3):
         for i in range(3):
             e = np.zeros((3, 3))

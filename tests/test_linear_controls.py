@@ -5,7 +5,9 @@ import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin.control.backward import Along, _one_pass, backward, noise_shares
+from varpin.control.along import Along
+from varpin.control.backward import backward
+from varpin.control.passes import noise_shares, one_pass
 
 N = 8
 RNG = np.random.default_rng(3)
@@ -206,7 +208,7 @@ def test_the_pass_on_square_roots_is_the_plain_one(joints) -> None:
     still = np.zeros(joints)
     problem = vp.OptimalControlProblem(scene, cost, still, still, dt=0.1, steps=N, controls="linear")
     along = Along(problem, problem.simulate(problem.holding_policy()))
-    plain, roots = (_one_pass(along, 0.0, False, None, None, roots=way)[0] for way in (False, True))
+    plain, roots = (one_pass(along, 0.0, False, None, None, roots=way)[0] for way in (False, True))
     for name in ("feedforward", "feedback", "previous", "gradient", "slope", "curvature"):
         one, other = getattr(plain, name), getattr(roots, name)
         np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9 * np.abs(one).max(), err_msg=name)

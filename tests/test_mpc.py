@@ -10,7 +10,7 @@ from refusals import refused, unnamed
 
 import varpin as vp
 import varpin.control.mpc
-from varpin.control import backward
+from varpin.control import passes
 from varpin.control.mpc import _decision
 from varpin.simulation.soundness import examined
 
@@ -213,18 +213,18 @@ def test_a_tick_takes_a_backward_pass_for_each_iteration(iterations, monkeypatch
     """And no more: its gains are those that its last step followed, and near those made anew for its motion."""
     mpc = vp.Mpc(tracking(), iterations=iterations, tolerance=1e-15)
     first = mpc.plan(0.0, mpc.problem.q0, mpc.problem.v0)
-    passes, real = [], backward._one_pass
+    calls, real = [], passes.one_pass
 
     def counted(*given, **options):
-        passes.append(given)
+        calls.append(given)
         return real(*given, **options)
 
     q, v = first.trajectory.q[1] + 1e-3, first.trajectory.v[1]
-    monkeypatch.setattr(backward, "_one_pass", counted)
+    monkeypatch.setattr(passes, "one_pass", counted)
     plan = mpc.plan(mpc.period, q, v, first)
-    assert len(passes) == plan.iterations == iterations
+    assert len(calls) == plan.iterations == iterations
     whole = vp.solve(plan.problem, first.shifted(1), tolerance=1e-15, max_iterations=iterations, check=False)
-    assert len(passes) == 2 * iterations + 1
+    assert len(calls) == 2 * iterations + 1
     np.testing.assert_array_equal(plan.trajectory.u, whole.trajectory.u)
     assert plan.cost == whole.cost
     assert 0.0 < np.abs(plan.gains - whole.gains).max() < 0.05 * np.abs(whole.gains).max()

@@ -5,7 +5,8 @@ import pytest
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control import backward
+from varpin.control import box
+from varpin.control.backward import backward
 from varpin.control.penalties import penalized
 
 ROBOT = vp.planar_chain(2)
@@ -154,8 +155,8 @@ def test_passes_that_look_for_active_bounds_end_with_the_time(monkeypatch):
         made.append(None)
         return plain(*args, **options)
 
-    plain = backward._pass
-    monkeypatch.setattr(backward, "_pass", counted)
+    plain = box.single_pass
+    monkeypatch.setattr(box, "single_pass", counted)
     moved = problem.at(t0=0.1, q0=first.trajectory.q[5], v0=first.trajectory.v[5])
     zeros = [np.zeros(item.shape) for item in moved.bound_constraints]
     weights = np.full(len(zeros), 100.0)
@@ -164,7 +165,7 @@ def test_passes_that_look_for_active_bounds_end_with_the_time(monkeypatch):
     for until in (0.0, np.inf):
         made.clear()
         goal = penalized(moved, zeros, weights, zeros, until=until)
-        plan = backward.backward(goal, motion, 0.0)
+        plan = backward(goal, motion, 0.0)
         passes.append(len(made))
         changes.append(plan.expected_decrease)
     assert passes[0] <= 2 < passes[1]

@@ -5,7 +5,8 @@ import pytest
 
 import varpin as vp
 from varpin.control import search
-from varpin.control.backward import Along, backward
+from varpin.control.along import Along
+from varpin.control.backward import backward
 from varpin.errors import LinearizationError
 from varpin.simulation.friction import rate_at_rest
 

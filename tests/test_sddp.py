@@ -14,7 +14,8 @@ from refusals import refused
 from scipy.interpolate import CubicHermiteSpline
 
 import varpin as vp
-from varpin.control.backward import backward, noise_shares
+from varpin.control.backward import backward
+from varpin.control.passes import noise_shares
 
 WEIGHTS = {1: 2 / 3, 2: -1 / 12}
 SAMPLINGS = ["midpoint", "gauss", "start"]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.backward import states
+from varpin.control.along import states
 from varpin.control.problem import OptimalControlProblem, bind_cost
 from varpin.errors import InputError, VarpinError
 from varpin.integrators.base import open_loop

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
-from varpin.control.backward import Along
+from varpin.control.along import Along
 from varpin.control.constraints import BoundConstraint, BoundRate, Slopes
 from varpin.control.descent import Model, Stake, at_stake
 from varpin.control.linear_controls import at_samples, linear_steps

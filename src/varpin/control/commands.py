@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.backward import Plan, states
+from varpin.control.along import states
+from varpin.control.passes import Plan
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.core.arrays import Commands

@@ -19,9 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.backward import Along, Plan, backward, states
+from varpin.control.along import Along, states
+from varpin.control.backward import backward
 from varpin.control.costs import CostError, Expansion
 from varpin.control.history import Iteration
+from varpin.control.passes import Plan
 from varpin.control.penalties import PenalizedProblem, PenalizedRate
 from varpin.control.problem import OptimalControlProblem
 from varpin.core.arrays import Commands

@@ -14,7 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
-from varpin.control.backward import states
+from varpin.control.along import states
 from varpin.control.closed_loop import ClosedLoop
 from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.problem import OptimalControlProblem

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.control.backward import Along, Plan, backward, feedforward_beside, noise_shares
+from varpin.control.along import Along
+from varpin.control.backward import backward
 from varpin.control.commands import controls_along, first_commands, shifted_commands, with_feedback
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
@@ -27,9 +28,11 @@ from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.control.multiple_shooting import GapClosing, Path, path_of
 from varpin.control.noise_adjoint import is_exact
+from varpin.control.passes import Plan, feedforward_beside, noise_shares
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import COMPARISON, SLOW, SUFFICIENT, refine
 from varpin.control.solution import Solution
+from varpin.control.spread import Feedback
 from varpin.control.trials import Attempt, Trials
 from varpin.core import Watch
 from varpin.core.arrays import Commands
@@ -723,12 +726,15 @@ class _Search:
             return 0
         rated, self.rated = self.rated, None
         if rated is not None and rated.along is self.along:
-            self.along.differentiate_noise(rated.plan, self.steered)
+            self._along_noise(rated.plan)
             return 0
         plan = backward(self.problem, self.trajectory, regularization, along=self.along)
         if plan is not None:
-            self.along.differentiate_noise(plan, self.steered)
+            self._along_noise(plan)
         return 1
+
+    def _along_noise(self, plan: Plan) -> None:
+        self.along.differentiate_noise(Feedback(plan.feedback, plan.previous), plan.spread, self.steered)
 
     def _compare_with_best(self, plan: Plan) -> None:
         noise = self._noise(plan)

@@ -1,0 +1,305 @@
+"""The minimum of a motion's quadratic model with controls within their limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin import core
+from varpin.arrays import Floats
+from varpin.control.along import Along, Limits, around_nominal, without_limits
+from varpin.control.passes import Plan, foreseen, gains_on_states, single_pass
+
+Mask = NDArray[np.bool_]
+
+
+# Greatest numbers of active sets and of interior-point steps to the model's minimum within limits, its gap relative to
+# the model's change, and rounding errors of changes and slopes relative to the largest ones.
+_ACTIVE_SETS, _INTERIOR_STEPS, _GAP, _ROUNDED = 8, 40, 1e-5, 1e-11
+
+
+# Active sets end where, after the first ones, a change is not smaller than this share of the one before.
+_SETTLING, _SHRINKING = 1, 0.75
+
+
+# Pivot of a control that cannot move.
+_FIRM = 1e300
+
+
+def within_limits(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
+    """The pass to the model's minimum with controls within their limits.
+
+    Around the nominal states, late decisions seem to reach their limits because each would have to make up for the
+    earlier ones. So the first pass has no limits, and where its linearized motion reaches some, further passes lead to
+    the minimum.
+    """
+    problem = along.problem
+    if not problem.limited or along.clipped:
+        return single_pass(along, regularization, curvature=curvature)[0]
+    stiffness = np.zeros((problem.decisions, problem.scene.controls))
+    free = around_nominal(along.slack[:0], along.states)._replace(stiffness=stiffness)
+    plan = single_pass(along, regularization, curvature=curvature, limits=free)[0]
+    if plan is not None:
+        moves = foreseen(along, plan)[1]
+        lower, upper = along.slack[:, 0], along.slack[:, 1]
+        if not ((moves <= lower) | (moves >= upper)).any():
+            return _sloped(plan, moves)
+        if problem.processes:
+            plan = _matching(along, regularization, curvature, plan)
+        else:
+            plan = _Box(along, regularization * np.abs(stiffness), curvature).minimum(plan, moves)
+        if plan is not None:
+            return plan
+    return single_pass(along, regularization, curvature=curvature, limits=around_nominal(along.slack, along.states))[0]
+
+
+def _sloped(plan: Plan, moves: Floats) -> Plan:
+    """A plan with the slope of the controls' changes (R, m) on its linearized motion.
+
+    The feed-forward parts belong together with the feedback, so the slope is that of both.
+    """
+    slope = float((plan.gradient * moves).sum())
+    if not (plan.expected_decrease > 0.0 and slope < 0.0):
+        return plan
+    return replace(plan, slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
+
+
+def _matching(along: Along, regularization: float, curvature: Floats | None, plan: Plan) -> Plan | None:
+    """Under noise: passes within the limits that the linearized motion reaches, until these do not change.
+
+    None if ever more of them change. The noise cost depends on the gains, so passes have no common model.
+    """
+    held: NDArray[np.bool_] = np.zeros(plan.feedforward.shape, dtype=np.bool_)
+    others, found, (expected, moves) = held.size + 1, plan, foreseen(along, plan)
+    while others > 0:
+        limits = Limits(along.slack, expected)
+        passed = single_pass(along, regularization, curvature=curvature, limits=limits)[0]
+        if passed is None:
+            return None
+        found = passed
+        now = np.logical_not(found.feedback.any(axis=2))
+        # Where motions stay at limits for long, these passes may not converge.
+        changed = int((now != held).sum())
+        if changed >= others:
+            return None
+        held, others = now, changed
+        expected, moves = foreseen(along, found)
+    made = _sloped(found, moves)
+    return made if made is not found else None
+
+
+class _Box:
+    """The model of a motion in the changes of its controls (R, m), which have to stay within their limits.
+
+    Its minimum is found by passes with the controls at limits fixed, whose set changes until no other control exceeds a
+    limit and no fixed one would leave its own; where these do not end, after a primal-dual interior-point method, whose
+    steps are passes, too. ``proximal`` (R, m) regularizes: the Hessian of a further cost of the changes.
+    """
+
+    def __init__(self, along: Along, proximal: Floats, curvature: Floats | None) -> None:
+        self.along, self.proximal, self.curvature = along, proximal, curvature
+        self.lower, self.upper = along.slack[:, 0], along.slack[:, 1]
+
+    def minimum(self, plan: Plan, moves: Floats) -> Plan | None:
+        """The plan to the minimum, from the plan without limits and the controls' changes of its linearized motion."""
+        found = self._active_sets(plan, (moves <= self.lower, moves >= self.upper))
+        if found is None:
+            inner = self._interior(plan, np.clip(moves, self.lower, self.upper))
+            if inner is None:
+                return None
+            at, held = inner
+            found = self._active_sets(plan, held) or self._with_gains(at, held)
+        if found is None or not found[1].value < 0.0:
+            return None
+        return self._leading(*found)
+
+    def _active_sets(self, plan: Plan, held: tuple[Mask, Mask]) -> tuple[Plan, _Point] | None:
+        """The last pass and the minimum by a primal-dual active set; None if it takes too many passes.
+
+        It begins with the controls ``held`` at a lower and at an upper limit (Hintermueller, Ito and Kunisch 2002).
+        """
+        low, high, changed = self.lower, self.upper, math.inf
+        for done in range(_ACTIVE_SETS):
+            found = self._fixed(held)
+            if found is None:
+                return None
+            at = self._at(plan, foreseen(self.along, found, self._slack(held))[1])
+            if at is None:
+                return None
+            size, force = _ROUNDED * np.abs(at.moves).max(axis=0), _ROUNDED * np.abs(at.pressure).max(axis=0)
+            now = (
+                np.where(held[0], at.pressure >= -force, at.moves < low - size),
+                np.where(held[1], at.pressure <= force, at.moves > high + size),
+            )
+            fixed = low >= high
+            now = now[0] | fixed, now[1] & ~fixed
+            if np.array_equal(now[0], held[0]) and np.array_equal(now[1], held[1]):
+                return found, at._replace(moves=np.clip(at.moves, low, high))
+            before, changed = changed, int((now[0] != held[0]).sum() + (now[1] != held[1]).sum())
+            if done >= _SETTLING and changed > _SHRINKING * before:
+                return None
+            held = now
+        return None
+
+    def _slack(self, held: tuple[Mask, Mask]) -> Floats:
+        """Limits (R, 2, m) that fix the held controls only."""
+        at = np.where(held[0], self.lower, np.where(held[1], self.upper, 0.0))
+        either = held[0] | held[1]
+        return np.stack([np.where(either, at, -np.inf), np.where(either, at, np.inf)], axis=1)
+
+    def _fixed(self, held: tuple[Mask, Mask]) -> Plan | None:
+        slack = self._slack(held)
+        return self._passed(around_nominal(slack, self.along.states))
+
+    def _with_gains(self, moves: Floats, held: tuple[Mask, Mask]) -> tuple[Plan, _Point] | None:
+        """The pass with held controls, whose gains go with the given changes, and the model there."""
+        found = self._fixed(held)
+        at = None if found is None else self._at(found, moves)
+        return None if found is None or at is None else (found, at)
+
+    def _interior(self, plan: Plan, begin: Floats) -> tuple[Floats, tuple[Mask, Mask]] | None:
+        """Changes near the minimum by a primal-dual interior-point method, and which controls are at each limit."""
+        low, high = self.lower, self.upper
+        fixed = low >= high
+        bounded = [np.isfinite(low) & ~fixed, np.isfinite(high) & ~fixed]
+        count = int(bounded[0].sum() + bounded[1].sum())
+        if count == 0 or not plan.expected_decrease > 0.0:
+            return None
+        # The size of changes of each control.
+        moved = np.abs(plan.feedforward).max(axis=0) + np.abs(begin).max(axis=0)
+        both = bounded[0] & bounded[1]
+        size = np.where(both, np.where(both, high, 0.0) - np.where(both, low, 0.0), np.where(moved > 0.0, moved, 1.0))
+        z = np.where(fixed, low, np.clip(0.0, low + 0.1 * size, high - 0.1 * size))
+        slack = self._slack((fixed, np.zeros_like(fixed)))
+        gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+        mu = plan.expected_decrease / count
+        duals = [mu / gap for gap in gaps]
+        for _ in range(_INTERIOR_STEPS):
+            # A step without centring, and one corrected by what that foresees (Mehrotra 1992).
+            stiff = duals[0] / gaps[0] + duals[1] / gaps[1]
+            limits = around_nominal(slack, self.along.states)._replace(factors=np.empty((*z.shape, z.shape[1])))
+            found = self._passed(limits, stiff, -stiff * z)
+            if found is None:
+                return None
+            to = foreseen(self.along, found, slack)[1]
+            d = np.where(fixed, 0.0, to - z)
+            opening, turning = (d, -d), (-duals[0] * (1.0 + d / gaps[0]), -duals[1] * (1.0 - d / gaps[1]))
+            length = min(1.0, _free_length((*gaps, *duals), (*opening, *turning)))
+            mu = _complementarity(gaps, duals, bounded) / count
+            ahead = [gap + length * more for gap, more in zip(gaps, opening, strict=True)]
+            aims = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
+            mu *= (_complementarity(ahead, aims, bounded) / (count * mu)) ** 3
+            aims = [np.where(rows, mu - a * b, 0.0) for rows, a, b in zip(bounded, opening, turning, strict=True)]
+            push = aims[1] / gaps[1] - aims[0] / gaps[0]
+            corrected = self._pushed(found, limits, to, stiff, push - stiff * z, push)
+            if corrected is None:
+                return None
+            to = corrected
+            d = np.where(fixed, 0.0, to - z)
+            after = [(aims[0] - duals[0] * d) / gaps[0], (aims[1] + duals[1] * d) / gaps[1]]
+            turning = after[0] - duals[0], after[1] - duals[1]
+            length = min(1.0, 0.995 * _free_length((*gaps, *duals), (d, -d, *turning)))
+            z = z + length * d
+            gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+            duals = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
+            value = 0.5 * float(((plan.gradient - stiff * (to - z) - push) * to).sum())
+            if length > 0.9 and _complementarity(gaps, duals, bounded) <= _GAP * abs(value):
+                break
+        # A limit binds where its multiplier exceeds its gap, each relative to its size.
+        scale = np.maximum(duals[0] + duals[1], 1e-300).max(axis=0)
+        held = gaps[0] / size < duals[0] / scale, gaps[1] / size < duals[1] / scale
+        return z, (held[0] | fixed, held[1] & ~held[0] & ~fixed)
+
+    def _pushed(
+        self, plan: Plan, limits: Limits, to: Floats, stiff: Floats, pull: Floats, push: Floats
+    ) -> Floats | None:
+        """Changes of the controls to the minimum with a further gradient ``push``, which brings its sum to ``pull``.
+
+        ``to`` are those without it, of a pass with the factors of ``limits``.
+        """
+        along, factors, (_, m), x = self.along, limits.factors, to.shape, self.along.states
+        if factors is None or len(along.blocks) > 1:
+            passed = self._passed(limits, stiff, pull)
+            return None if passed is None else foreseen(along, passed, limits.slack)[1]
+        problem, alone = along.problem, along.with_gradient_alone(push)
+        decision, control = np.nonzero(self.lower >= self.upper)
+        factors[decision, control, control] = _FIRM
+        feedforward, (feedback, previous) = np.empty(to.shape), gains_on_states(along, plan)
+        gains = core.Gains(
+            feedforward=feedforward,
+            feedback=feedback,
+            previous=previous,
+            control_gradient=plan.gradient,
+            costate=np.zeros((0, x)),
+            spread=np.zeros((0, x, x)),
+            factors=factors,
+        )
+        steps = alone.steps(0, problem.decisions * problem.hold, None, without_limits(m, x))
+        core.run_gradients(problem.dt, problem.hold, 0.0, steps, gains, np.zeros(x))
+        more: Floats = foreseen(alone, replace(plan, feedforward=feedforward), np.zeros((0, 2, m)))[1]
+        return to + more
+
+    def _passed(self, limits: Limits, stiff: Floats | None = None, pull: Floats | None = None) -> Plan | None:
+        """A pass with a further cost of the controls' changes: its Hessian's diagonal and its gradient (R, m)."""
+        along = self.along
+        if stiff is not None and pull is not None:
+            along = along.with_cost_of_controls(self.proximal + stiff, pull)
+        elif self.proximal.any():
+            along = along.with_cost_of_controls(self.proximal)
+        return single_pass(along, 0.0, curvature=self.curvature, limits=limits)[0]
+
+    def _at(self, plan: Plan, moves: Floats) -> _Point | None:
+        """The model and its gradient at changes of the controls."""
+        still = replace(plan, feedforward=moves, feedback=np.zeros(plan.feedback.shape))
+        if plan.previous is not None:
+            still = replace(still, previous=np.zeros(plan.previous.shape))
+        slack, pressure = np.stack([moves, moves], axis=1), np.zeros(moves.shape)
+        expected = foreseen(self.along, still, slack)[0]
+        found = self._passed(Limits(slack, expected, pressure=pressure))
+        return None if found is None else _Point(moves, expected, -found.expected_decrease, pressure)
+
+    def _leading(self, plan: Plan, at: _Point) -> Plan:
+        """The plan to a point of the model, with the feedback of ``plan``."""
+        x = 2 * self.along.problem.scene.robot.dof
+        ahead = at.moves - np.einsum("kmx,kx->km", plan.feedback, at.expected[:, :x])
+        if plan.previous is not None:
+            ahead -= np.einsum("kmi,ki->km", plan.previous, at.expected[:, x : x + at.moves.shape[1]])
+        slope = float((plan.gradient * at.moves).sum())
+        value = at.value - 0.5 * float((self.proximal * at.moves**2).sum())
+        curvature, left = 2.0 * (value - slope), at.pressure - self.proximal * at.moves
+        return replace(plan, feedforward=ahead, slope=slope, curvature=curvature, limited=True, left=left)
+
+
+class _Point(NamedTuple):
+    """A point of a model within limits.
+
+    Attributes:
+        moves: Changes of the controls (R, m).
+        expected: States and previous controls before each decision (R, 2n + m).
+        value: The model's change.
+        pressure: Its gradient in the controls (R, m).
+    """
+
+    moves: Floats
+    expected: Floats
+    value: float
+    pressure: Floats
+
+
+def _free_length(values: Sequence[Floats], changes: Sequence[Floats]) -> float:
+    """The greatest length of a step at which positive values do not become negative."""
+    length = math.inf
+    for value, change in zip(values, changes, strict=True):
+        closing = change < 0.0
+        if closing.any():
+            length = min(length, float((value[closing] / -change[closing]).min()))
+    return length
+
+
+def _complementarity(gaps: Sequence[Floats], duals: Sequence[Floats], bounded: Sequence[Mask]) -> float:
+    return sum(float((dual[rows] * gap[rows]).sum()) for gap, dual, rows in zip(gaps, duals, bounded, strict=True))

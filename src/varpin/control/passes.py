@@ -1,0 +1,336 @@
+"""One backward pass along a motion: a quadratic model of the cost to go, and the change of the controls it gives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from varpin import core
+from varpin.arrays import Floats
+from varpin.control.along import Along, Limits, around_nominal, without_limits
+from varpin.control.descent import Model
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.square_root import Squares, squares_of
+from varpin.integrators.base import noise_fields
+from varpin.linearization import (
+    velocity_at_nodes,
+    velocity_curvature,
+)
+from varpin.trajectory import Trajectory
+
+# Greatest relative rounding error of Quu; above, the pass is repeated on square roots.
+TRUSTED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The result of a backward pass: gains, feed-forward changes of the controls, and the expected decrease."""
+
+    feedforward: Floats  # (R, m)
+    feedback: Floats  # (R, m, 2n)
+    previous: Floats | None  # (R, m, m) gains on the previous control, with a rate cost or linear controls
+    gradient: Floats  # (R, m)
+    slope: float
+    curvature: float
+    noise: float  # cost of the noise along the motion
+    jumps: Floats  # (N, 2n, n), empty without noise
+    spread: Floats  # (N, 2n, 2n)
+    limited: bool
+    loss: float  # estimated relative rounding error of Quu, or of its root
+    model: Model  # of the cost along the motion
+    factors: Floats | None  # (R, m, m) L D L' of the regularized Quu, without limits and along motions of one block
+    left: Floats | None = None  # (R, m) the model's gradient after a full step, which presses controls against limits
+
+    @property
+    def expected_decrease(self) -> float:
+        """Decrease of the expected cost with a full step, by the model."""
+        # Without limits the step is the model's minimum, where curvature = -slope.
+        return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
+
+    def followed(self, length: float) -> Plan:
+        """The plan after a step of the given length, by the model: the same gains and the rest of the step."""
+        left = 1.0 - length
+        return replace(self, feedforward=left * self.feedforward, gradient=left * self.gradient)
+
+    def free_gradient(self, problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
+        """The gradient (R, m), zero where it pushes a control against its active limit; zero at an optimum."""
+        if not problem.limited:
+            return self.gradient
+        u, (lower, upper) = problem.decided(trajectory), problem.control_limits
+        held = ((u <= lower) & (self.gradient > 0.0)) | ((u >= upper) & (self.gradient < 0.0))
+        return np.where(held, 0.0, self.gradient)
+
+
+def noise_shares(
+    problem: OptimalControlProblem, trajectory: Trajectory, plan: Plan, processes: NDArray[np.bool_] | None = None
+) -> Floats:
+    """Noise cost of each step of a motion (N,), with the noise's effect and value function of the plan's own motion.
+
+    ``processes`` (K,) selects increments, by default all. Empty where there is no noise.
+    """
+    if problem.processes == 0:
+        return np.zeros(0)
+    g = impulses(problem, trajectory, plan.jumps)
+    if processes is not None:
+        g = g[:, :, processes]
+    added: Floats = 0.5 * np.einsum("Nai,Nai->N", g, plan.spread @ g)
+    return added
+
+
+def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floats) -> Floats:
+    """Effect of each increment on the state after each step of a motion (N, 2n, K), for given ``jumps``."""
+    scene, n, left = problem.scene, problem.scene.robot.dof, problem.integrator.left
+    q, v = trajectory.q, trajectory.v
+    jump = noise_fields(scene, trajectory, q[:-1], v[:-1], problem.q0).F
+    if not problem.integrator.variational:
+        jump = velocity_at_nodes(scene, q[:-1], v[:-1])[:, :, n:] @ jump
+    g: Floats = left * (jumps @ jump)
+    if left < 1.0:
+        g[:, n:] += (1.0 - left) * noise_fields(scene, trajectory, q[1:], v[1:], problem.q0).F
+    return g
+
+
+def feedforward_beside(along: Along, plan: Plan, regularization: float, trajectory: Trajectory) -> Floats:
+    """The feed-forward part (R, m) of a plan around a motion close to its own, of which it has ``factors``.
+
+    The cost's gradients are those along the motion close by; its Hessians, those of the dynamics and the gains are the
+    plan's.
+    """
+    problem, m = along.problem, along.problem.scene.controls
+    terminal, x = along.terminal, along.states
+    end = problem.expand_terminal(trajectory).gradient[0, :x]
+    feedforward = np.empty_like(plan.feedforward)
+    gains = core.Gains(
+        feedforward=feedforward,
+        feedback=plan.feedback,
+        previous=np.zeros((0, m, m)) if plan.previous is None else plan.previous,
+        control_gradient=plan.gradient,
+        costate=np.zeros((0, x)),
+        spread=plan.spread,
+        factors=plan.factors,
+    )
+    steps = along.beside(trajectory).steps(0, problem.steps, None, without_limits(m, x))
+    core.run_gradients(problem.dt, problem.hold, regularization, steps, gains, terminal.slopes.T @ end)
+    return feedforward
+
+
+def foreseen(along: Along, plan: Plan, slack: Floats | None = None) -> tuple[Floats, Floats]:
+    """The linearized motion under a plan whose controls are clipped to their limits, or to ``slack`` (R, 2, m).
+
+    Returns the state and the change of the previous control before each decision (R, 2n + m), and the controls' changes
+    (R, m). Where controls are linear between nodes the state is X of :mod:`varpin.control.linear_controls`.
+    """
+    problem, (R, m, _), x = along.problem, plan.feedback.shape, along.states
+    feedback, previous = gains_on_states(along, plan)
+    expected, moves, state = np.empty((R, x + m)), np.empty((R, m)), np.zeros(x + m)
+    spread = np.zeros((R if plan.spread.size else 0, x, x)) if problem.linear else plan.spread
+    for begin, end in along.blocks:
+        rows = slice(begin // problem.hold, end // problem.hold)
+        gains = core.Gains(
+            feedforward=plan.feedforward[rows],
+            feedback=feedback[rows],
+            previous=previous[rows],
+            control_gradient=plan.gradient[rows],
+            costate=np.zeros((0, x)),
+            spread=spread[begin:end],
+        )
+        within = around_nominal(along.slack if slack is None else slack, x)
+        steps = along.steps(begin, end, None, within)
+        core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows])
+    return expected, moves
+
+
+def gains_on_states(along: Along, plan: Plan) -> tuple[Floats, Floats]:
+    """A plan's feedback on the states of its pass, and on previous controls where these are no part of the state."""
+    (R, m, n), x = plan.feedback.shape, along.states
+    if plan.previous is None or not along.problem.linear:
+        return plan.feedback, np.zeros((0, m, m)) if plan.previous is None else plan.previous
+    feedback = np.zeros((R, m, x))
+    feedback[:, :, :n] = plan.feedback
+    feedback[:, :, n : n + m] = plan.previous
+    return feedback, np.zeros((0, m, m))
+
+
+def single_pass(
+    along: Along,
+    regularization: float,
+    *,
+    costates: bool = False,
+    curvature: Floats | None = None,
+    limits: Limits | None = None,
+) -> tuple[Plan | None, Floats]:
+    """The plain recursion, or, where its rounding errors are large and the model is convex, that on square roots."""
+    plain = one_pass(along, regularization, costates, curvature, limits, roots=False)
+    curved = curvature is not None or along.firm is not None
+    if curved or (plain[0] is not None and plain[0].loss <= TRUSTED):
+        return plain
+    by_roots = one_pass(along, regularization, costates, None, limits, roots=True)
+    return plain if by_roots[0] is None else by_roots
+
+
+class _ByRoots(NamedTuple):
+    """A pass on square roots, with the costs of samples, of control changes and within steps as squares."""
+
+    run: core.RootPass
+    running: Squares
+    change: Squares
+    within: Squares | None
+
+
+def one_pass(
+    along: Along,
+    regularization: float,
+    costates: bool,
+    curvature: Floats | None,
+    limits: Limits | None,
+    *,
+    roots: bool,
+) -> tuple[Plan | None, Floats]:
+    """The plan of one recursion, plain or on square ``roots``, and with ``costates`` those after each step (N, 2n)."""
+    problem, running = along.problem, along.running
+    scene = problem.scene
+    n, m, k, N, R = scene.robot.dof, scene.controls, problem.processes, problem.steps, problem.decisions
+    _, D, by_state, by_states = along.terminal
+    if curvature is not None and problem.integrator.variational:
+        pull = along.terminal.cost.gradient[:, n:]
+        by_states = by_states + velocity_curvature(scene, along.trajectory.q[-1:], along.trajectory.v[-1:], pull)[0]
+    if problem.linear:
+        return _one_pass_on_lines(along, regularization, costates, curvature, by_states, limits, roots=roots)
+    noisy = N if k else 0
+    jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
+    feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
+    previous = np.empty(along.rate.shape)
+    costate = np.empty((N if costates else 0, 2 * n))
+    plain, by_roots = core.BackwardPass(m, by_state, by_states), None
+    if roots:
+        final, squares = (
+            squares_of(along.terminal.cost.gradient, along.terminal.cost.hessian),
+            squares_of(along.slopes, running.hessian),
+        )
+        change = squares_of(along.pull, along.rate)
+        within = None if along.within is None else squares_of(np.zeros((N, 2 * n)), along.within)
+        if final is None or squares is None or change is None or (within is None and along.within is not None):
+            return None, costate
+        by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change, within)
+    factors = None
+    if limits is None:
+        factors = np.empty((R, m, m)) if len(along.blocks) == 1 else None
+        limits = without_limits(m, 2 * n)._replace(factors=factors)
+    samples = len(problem.model_rule)
+    for begin, end in reversed(along.blocks):
+        steps, points = slice(begin, end), slice(begin * samples, end * samples)
+        rows = slice(begin // problem.hold, end // problem.hold)
+        if k:
+            jumps[steps] = along.linearized(begin, end)[0].J
+        given = along.steps(begin, end, curvature, limits)
+        gains = core.Gains(
+            feedforward=feedforward[rows],
+            feedback=feedback[rows],
+            previous=previous[rows],
+            control_gradient=gradient[rows],
+            costate=costate[steps] if costates else costate,
+            spread=spread[steps],
+            **limits.part(rows),
+        )
+        how = (problem.dt, problem.hold, float(regularization))
+        if by_roots is None:
+            failed = plain.run(*how, given, gains)
+        else:
+            running_squares, change_squares = by_roots.running[points].core, by_roots.change[rows].core
+            within_squares = None if by_roots.within is None else by_roots.within[steps].core
+            failed = by_roots.run.run(*how, given, gains, running_squares, change_squares, within_squares)
+        if failed >= 0:
+            return None, costate
+    found = plain if by_roots is None else by_roots.run
+    if not (math.isfinite(found.slope) and math.isfinite(found.curvature)):
+        return None, costate
+    plan = Plan(
+        feedforward,
+        feedback,
+        None if problem.rate is None else previous,
+        gradient,
+        found.slope,
+        found.curvature,
+        found.noise,
+        jumps,
+        spread,
+        limits.slack.size > 0,
+        found.loss,
+        along.model,
+        factors,
+    )
+    return plan, costate
+
+
+def _one_pass_on_lines(
+    along: Along,
+    regularization: float,
+    costates: bool,
+    curvature: Floats | None,
+    by_states: Floats,
+    limits: Limits | None,
+    *,
+    roots: bool,
+) -> tuple[Plan | None, Floats]:
+    """The pass of a plan whose controls are linear between nodes; ``by_states`` is the terminal Hessian (2n, 2n)."""
+    problem, X, x = along.problem, along.states, 2 * along.problem.scene.robot.dof
+    R, m = problem.decisions, problem.scene.controls
+    cost, D, by_state, _ = along.terminal
+    end_gradient, end_hessian = np.zeros(X), np.zeros((X, X))
+    end_gradient[:x], end_hessian[:x, :x] = by_state, by_states
+    feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
+    line, k = along.line, problem.processes
+    spread, costate = np.empty((R if k else 0, X, X)), np.empty((R if costates else 0, X))
+    of_states = costate[1:, :x]
+    limits = without_limits(m, X) if limits is None else limits
+    gains = core.Gains(
+        feedforward=feedforward,
+        feedback=feedback,
+        previous=np.empty((0, m, m)),
+        control_gradient=gradient,
+        costate=costate,
+        spread=spread,
+        **limits.part(slice(0, R)),
+    )
+    steps = along.steps(0, R, curvature, limits)
+    how = (problem.dt, 1, float(regularization))
+    found: core.BackwardPass | core.RootPass
+    if roots:
+        final = squares_of(cost.gradient, cost.hessian)
+        squares = squares_of(line.gradient, line.hessian)
+        change = squares_of(np.zeros((0, m)), np.zeros((0, m, m)))
+        if final is None or squares is None or change is None:
+            return None, of_states
+        wide = np.concatenate([D, np.zeros((x, X - x))], axis=1)
+        found = core.RootPass(m, final.after(wide).padded(X).core, end_gradient)
+        failed = found.run(*how, steps, gains, squares.core, change.core)
+    else:
+        found = core.BackwardPass(m, end_gradient, end_hessian)
+        failed = found.run(*how, steps, gains)
+    if failed >= 0 or not (math.isfinite(found.slope) and math.isfinite(found.curvature)):
+        return None, of_states
+    jumps, noise = np.empty((0, x, x // 2)), found.noise
+    after = spread[1:, :x, :x] + problem.dt * line.kicked
+    if k:
+        jumps, G = along.linearized(0, problem.steps)[0].J, line.G[1:, :x]
+        noise += 0.5 * problem.dt * float((G * (line.kicked @ G)).sum())
+    plan = Plan(
+        feedforward,
+        feedback[:, :, :x].copy(),
+        feedback[:, :, x : x + m].copy(),
+        gradient,
+        found.slope,
+        found.curvature,
+        noise,
+        jumps,
+        after,
+        limits.slack.size > 0,
+        found.loss,
+        along.model,
+        None,
+    )
+    return plan, of_states
