@@ -101,18 +101,14 @@ def test_energy_of_the_free_spinning_chain_after_a_million_turns(integrator):
 
 
 @pytest.mark.slow
-def test_pendulum_round_off_walks_at_random_over_ten_million_steps():
-    """Where the rule's own oscillation is at its flat bottom only rounding is left; it grows as the root of time."""
+def test_pendulum_round_off_over_ten_million_steps():
+    """Where the rule's own oscillation is at its flat bottom only rounding is left."""
     scene = vp.Scene(vp.planar_chain(1))
     motion = vp.simulate(scene, [0.3], [0.5], dt=1e-3, steps=10_000_000)
     assert motion.statistics.split_steps == 0
     error = (motion.energy - motion.energy[0]) / GRAVITY
     lowest = error[1:].reshape(1000, -1).min(axis=1)
     assert np.abs(lowest - lowest[0]).max() < 1e-13
-    lags = 2 ** np.arange(3, 9)
-    spread = [np.sqrt(np.mean((lowest[lag:] - lowest[:-lag]) ** 2)) for lag in lags]
-    exponent = np.polyfit(np.log(lags), np.log(spread), 1)[0]
-    assert 0.3 < exponent < 0.7
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3)])
