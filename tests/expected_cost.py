@@ -5,6 +5,7 @@ import numpy as np
 import varpin as vp
 from varpin.control.along import Along
 from varpin.control.backward import backward
+from varpin.control.spread import Feedback
 
 
 def expected_cost_slopes(problem: vp.OptimalControlProblem, made, u: np.ndarray):
@@ -21,7 +22,7 @@ def expected_cost_slopes(problem: vp.OptimalControlProblem, made, u: np.ndarray)
     motion = made(u)
     plan = backward(problem, motion, 0.0)
     along = Along(problem, motion)
-    along.differentiate_noise(plan, np.ones_like(problem.steered))
+    along.differentiate_noise(Feedback(plan.feedback, plan.previous), plan.spread, np.ones_like(problem.steered))
     whole, step, found = backward(problem, motion, 0.0, along=along).gradient, 1e-4, np.empty_like(u)
     for index in np.ndindex(u.shape):
         away = np.zeros_like(u)

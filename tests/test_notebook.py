@@ -173,7 +173,7 @@ def test_plans_show_what_is_beyond_limits(objects):
     problem = objects["problem"]
     far = vp.OptimalControlProblem(problem.scene, problem.cost, [2.5, 0.0, 0.0], np.zeros(3), dt=5e-3, steps=40)
     plan = vp.solve(far, max_iterations=1)
-    assert row(plan._repr_html_(), "position beyond limits [rad or m]")[0].startswith(f"{NAMES[0]} 1")
+    assert row(plan._repr_html_(), "position beyond limits [rad]")[0].startswith(f"{NAMES[0]} 1")
     assert repr(plan.violations).startswith("Violations(position by up to 1")
 
 

@@ -739,7 +739,7 @@ def test_parts_of_unequal_length_are_repeated_as_short_as_the_shortest():
     assert np.mean(parts[split] == 1 << deepest) > 0.9
     assert motion.warnings
     # As many equal parts are further off than the motion itself.
-    at, times = 152, vp.Gauss(4).stage_times
+    at, times = 138, vp.Gauss(4).stage_times
     mean = int(2 ** np.ceil(np.log2(numbers.substeps[at : at + 24].mean())))
     fine, right, coarse = (
         taken_again(scene, vp.Gauss(5), motion, times, at, 3, own)[0] for own in (parts[at : at + 3], 1024, mean)
