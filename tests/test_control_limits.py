@@ -11,6 +11,7 @@ from varpin.control import backward as whole
 from varpin.control import box, passes
 from varpin.control.along import Along, Limits
 from varpin.control.backward import backward
+from varpin.control.penalties import penalized
 from varpin.core import box_minimum
 from varpin.model.kinematics import frame_kinematics
 
@@ -285,13 +286,13 @@ def test_model_within_limits_by_interior_points(hold, monkeypatch):
     """Where active sets do not settle, an interior-point method finds the limits that hold: SciPy's solution."""
     lower, upper = np.array([-3.0, -0.8]), np.array([2.0, 5.0])
     problem = pushed((lower, upper), integrator=vp.Midpoint(), hold=hold, dt=0.2 / hold, steps=10 * hold)
-    real, calls = box._Box._active_sets, []
+    real, calls = box.Box._active_sets, []
 
     def second_time(within, plan, held):
         calls.append(held)
         return real(within, plan, held) if len(calls) % 2 == 0 else None
 
-    monkeypatch.setattr(box._Box, "_active_sets", second_time)
+    monkeypatch.setattr(box.Box, "_active_sets", second_time)
     sol = vp.solve(problem, max_iterations=1)
     assert calls
     g, H = transcribed(problem)
@@ -311,9 +312,9 @@ def test_interior_points_where_no_active_set_ends(rate, upper, lower, monkeypatc
             problem.scene, problem.cost + vp.ControlRateCost(rate), problem.q0, problem.v0, dt=problem.dt,
             steps=problem.steps, integrator=vp.Midpoint(), control_limits=(lower, upper),
         )  # fmt: skip
-    real = box._Box._pushed
-    monkeypatch.setattr(box._Box, "_active_sets", lambda *_: None)
-    monkeypatch.setattr(box._Box, "_pushed", lambda *given: steps.append(None) or real(*given))
+    real = box.Box._pushed
+    monkeypatch.setattr(box.Box, "_active_sets", lambda *_: None)
+    monkeypatch.setattr(box.Box, "_pushed", lambda *given: steps.append(None) or real(*given))
     sol = vp.solve(problem, max_iterations=1)
     assert 1 < len(steps) <= 14
     g, H = transcribed(problem)
@@ -339,19 +340,60 @@ def test_interior_points_are_corrected_as_by_whole_passes(controls, monkeypatch)
     problem = vp.OptimalControlProblem(
         scene, cost, [0, 0], [0, 0], dt=0.05, steps=10, control_limits=([-8, -0.5], [np.inf, -0.5]), controls=controls
     )
-    real = box._Box._pushed
+    real = box.Box._pushed
 
-    def both(box, plan, limits, *others):
-        whole = real(box, plan, limits._replace(factors=None), *others)
-        quick = real(box, plan, limits, *others)
+    def both(within, plan, limits, *others):
+        whole = real(within, plan, limits._replace(factors=None), *others)
+        quick = real(within, plan, limits, *others)
         apart.append(np.abs(quick - whole).max() / np.abs(whole).max())
         return quick
 
-    monkeypatch.setattr(box._Box, "_active_sets", lambda *_: None)
-    monkeypatch.setattr(box._Box, "_pushed", both)
+    monkeypatch.setattr(box.Box, "_active_sets", lambda *_: None)
+    monkeypatch.setattr(box.Box, "_pushed", both)
     vp.solve(problem, max_iterations=1, check=False)
     assert 1 < len(apart) < 20
     assert max(apart) < 1e-9
+
+
+@pytest.mark.parametrize("way", ["active sets", "interior points"])
+@pytest.mark.parametrize("hold", [1, 5])
+def test_penalties_and_limits_are_minimized_together(hold, way, monkeypatch):
+    """Each penalty is the least square with a slack: SciPy's solution, with active rows and limits, after one step."""
+    lower, upper, robot = np.array([-3.0, -0.8]), np.array([2.0, 5.0]), sliders(2)
+    problem = pushed(
+        (lower, upper), scene=vp.Scene(robot, gravity=False), integrator=vp.Midpoint(), hold=hold, dt=0.2 / hold,
+        steps=10 * hold, constraints=[vp.WithinVelocityLimits(robot, (-0.6, 0.6)), vp.WithinControlRate(8.0)],
+    )  # fmt: skip
+    bound, weights = problem.bound_constraints, np.array([30.0, 0.02])
+    zeros = [np.zeros(item.shape) for item in bound]
+    real, calls = box.Box._active_sets, []
+
+    def second_time(within, plan, held):
+        calls.append(held)
+        return real(within, plan, held) if len(calls) % 2 == 0 else None
+
+    if way == "interior points":
+        monkeypatch.setattr(box.Box, "_active_sets", second_time)
+    sol = vp.solve(penalized(problem, zeros, weights, zeros), max_iterations=1)
+    g, H = transcribed(problem)
+    L, R = np.linalg.cholesky(H), problem.decisions
+
+    def rows(u):
+        motion = problem.simulate(np.repeat(u.reshape(R, 2), hold, axis=0))
+        values = [item.value(motion.q, motion.v, motion.u) for item in bound]
+        return np.concatenate([np.sqrt(w) * c.ravel() for w, c in zip(weights, values, strict=True)])
+
+    begin = rows(np.zeros(2 * R))
+    G = np.stack([rows(e) - begin for e in np.eye(2 * R)], axis=1)
+    whole = np.block([[L.T, np.zeros((2 * R, len(begin)))], [G, np.eye(len(begin))]])
+    low = np.concatenate([np.tile(lower, R), np.zeros(len(begin))])
+    high = np.concatenate([np.tile(upper, R), np.full(len(begin), np.inf)])
+    goal = -np.concatenate([np.linalg.solve(L, g), begin])
+    found = lsq_linear(whole, goal, (low, high), method="bvls", tol=1e-15, max_iter=2000).x
+    assert ((G @ found[: 2 * R] + begin) > 1e-6).sum() >= 2
+    np.testing.assert_allclose(sol.controls.ravel(), found[: 2 * R], atol=2e-5)
+    assert ((sol.controls == lower) | (sol.controls == upper)).sum() >= 2
+    assert bool(calls) == (way == "interior points")
 
 
 def test_swing_with_most_torques_at_limits_converges():

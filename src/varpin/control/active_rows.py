@@ -1,8 +1,8 @@
-"""The minimum of a motion's model with the penalties that are active on its linearized motion."""
+"""The rows of penalties around a motion, and which of them are active on a linearized motion."""
 
 from __future__ import annotations
 
-import time
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control.along import Along
-from varpin.control.box import within_limits
 from varpin.control.passes import Plan
 from varpin.control.penalties import PenalizedProblem, PenalizedRate, controls_of_steps, flat, rate_columns
 
@@ -22,43 +21,7 @@ Mask = NDArray[np.bool_]
 _BISECTIONS = 40
 
 
-def foreseeing(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
-    """The pass with the penalties that are active on the linearized motion.
-
-    A penalty is zero up to its bound and a parabola beyond. A model around the nominal motion has only the rows active
-    there, not those that the step activates. So passes are repeated until their active rows are those of their
-    linearized motion: Newton steps with exact line search to the minimum of the piecewise quadratic model. If these do
-    not converge, the result is the best pass or the last point of the steps.
-    """
-    problem = along.problem
-    if not (isinstance(problem, PenalizedProblem) and problem.passes) or len(along.blocks) > 1:
-        return within_limits(along, regularization, curvature)
-    rows = _Rows(along, problem)
-    held, best, least = rows.begun, None, 0.0
-    for done in range(1, problem.passes + 1):
-        passing = rows.along(held)
-        plan = within_limits(passing, regularization, curvature)
-        if plan is None:
-            break
-        ahead = rows.ahead(passing, plan)
-        change, slope = rows.change(plan, held, ahead)
-        if slope < 0.0 and change < least:
-            best, least = replace(plan, slope=slope, curvature=2.0 * (change - slope), limited=True), change
-        met = [penalty.held(s) for penalty, s in zip(rows.penalties, ahead, strict=True)]
-        if all(np.array_equal(a, b) for a, b in zip(met, held, strict=True)):
-            break
-        rows.move(plan, held, ahead, slope)
-        held = [penalty.held(s) for penalty, s in zip(rows.penalties, rows.at, strict=True)]
-        if done == problem.passes or time.perf_counter() > problem.until:
-            if rows.slope < 0.0 and rows.lowered < least:
-                best = rows.there(plan)
-            break
-    if best is None:
-        return within_limits(along, regularization, curvature)
-    return replace(best, model=along.model, factors=None)
-
-
-class _Rows:
+class Rows:
     """The rows of all penalties around a motion; passes along it differ in their active rows."""
 
     def __init__(self, along: Along, problem: PenalizedProblem) -> None:
@@ -73,6 +36,13 @@ class _Rows:
         self.signed = [item.signed(item.bound.value(q, v, u)) for item in self.penalties]
         self.begun = [item.held(s) for item, s in zip(self.penalties, self.signed, strict=True)]
         self.slopes = [item.bound.slopes(q, v, u) for item in self.of_nodes]
+        # Of all rows.
+        self.weights = flat(
+            [np.full(s.shape, item.weight) for item, s in zip(self.penalties, self.signed, strict=True)]
+        )
+        self.equal = (
+            flat([np.full(s.shape, item.equality) for item, s in zip(self.penalties, self.signed, strict=True)]) > 0
+        )
         # The present point of the steps to the model's minimum: its rows, and the change of the cost without penalties.
         self.at, self.cost = self.signed, 0.0
         # Changes of controls and states at this point, and the model's slope from its start in that direction.
@@ -85,24 +55,39 @@ class _Rows:
             slopes[:, n:] = velocity
         self.by_state = [found.by_state @ slopes[found.nodes] for found in self.slopes]
 
-    def along(self, held: list[Mask]) -> Along:
-        """Expansions for a pass with the active rows ``held``."""
+    def held(self, ahead: list[Floats]) -> list[Mask]:
+        """The rows that are active where the shifted values are ``ahead``."""
+        return [item.held(s) for item, s in zip(self.penalties, ahead, strict=True)]
+
+    def split(self, values: Floats) -> list[Floats]:
+        """Values of all rows, in the shapes of the penalties."""
+        ends = np.cumsum([s.size for s in self.signed])
+        return [part.reshape(s.shape) for part, s in zip(np.split(values, ends[:-1]), self.signed, strict=True)]
+
+    def along(self, held: Sequence[Mask | Floats], shifted: list[Floats] | None = None) -> Along:
+        """Expansions for a pass with the active rows ``held``, or with these shares of the rows' weights.
+
+        ``shifted`` are the rows' shifted values at the nominal motion, by default those of the penalties.
+        """
         passing = copy(self.whole)
         for name in ("model", "line"):
             vars(passing).pop(name, None)
-        count = len(self.of_nodes)
-        passing.running = self.problem.with_held(self.unpenalized, self.signed[:count], self.slopes, held[:count])
+        count, signed = len(self.of_nodes), self.signed if shifted is None else shifted
+        passing.running = self.problem.with_held(self.unpenalized, signed[:count], self.slopes, held[:count])
         rate = self.problem.rate
         if isinstance(rate, PenalizedRate):
             u = self.problem.decided(self.whole.trajectory)
-            passing.pull, passing.rate = rate.expand(u, self.problem.period, held[count:])
+            passing.pull, passing.rate = rate.expand(u, self.problem.period, held[count:], signed[count:])
         return passing
 
-    def ahead(self, passing: Along, plan: Plan) -> list[Floats]:
-        """The penalties' shifted values on the linearized motion under a plan."""
+    def ahead(self, passing: Along, plan: Plan, slack: Floats | None = None) -> list[Floats]:
+        """The penalties' shifted values on the linearized motion under a plan, with its controls clipped to ``slack``.
+
+        By default ``slack`` (R, 2, m) is that of the control limits.
+        """
         problem, hold = self.problem, self.problem.hold
         (A, B), x = passing.maps, self.states.shape[1]
-        slack = passing.slack
+        slack = passing.slack if slack is None else slack
         states, moves = np.zeros((len(A) + 1, A.shape[1])), np.zeros(plan.feedforward.shape)
         for j in range(len(A)):
             k = j // hold
@@ -135,12 +120,7 @@ class _Rows:
         """
         at, to = flat(self.at), flat(ahead)
         counts = np.concatenate([rows.ravel() for rows in held])
-        weights = np.concatenate(
-            [np.full(s.size, item.weight) for item, s in zip(self.penalties, self.at, strict=True)]
-        )
-        equal = np.concatenate(
-            [np.full(s.size, item.equality) for item, s in zip(self.penalties, self.at, strict=True)]
-        )
+        weights, equal = self.weights, self.equal
         way, of_held = to - at, np.where(counts, weights, 0.0)
         least = 0.5 * float(of_held @ flat(self.signed) ** 2) - plan.expected_decrease
         gap = self.cost + 0.5 * float(of_held @ at**2) - least
@@ -197,3 +177,75 @@ class _Rows:
             pull = item.weight * s * (t - s)
             slope += float(pull[now].sum() - pull[rows].sum())
         return change, slope
+
+
+class Pushes:
+    """Multipliers of penalties' rows in an interior-point method, and how far the rows are inside.
+
+    The penalty (w / 2) max(s, 0)^2 of a row is the least of (w / 2) (s + p)^2 over p >= 0. Its multiplier is
+    y = w (s + p), and the method has y p = mu. Rows of equality constraints have their quadratic penalty.
+    """
+
+    def __init__(self, rows: Rows, at: Floats, mu: float) -> None:
+        self.rows, self.free, w = rows, ~rows.equal, rows.weights
+        self.s = at
+        root = np.sqrt(at**2 + 4.0 * mu / w)
+        self.y = np.where(at > 0.0, 0.5 * w * (at + root), 2.0 * mu / np.maximum(root - at, 1e-300))
+        self.p = mu / self.y
+        self.to, self.to_y, self.to_p = self.s, self.y, self.p
+
+    @property
+    def products(self) -> Floats:
+        """The products y p."""
+        return (self.y * self.p)[self.free]
+
+    @property
+    def bent(self) -> Floats:
+        """Second-order terms of the products over the whole step."""
+        return (self.to_y - self.y) * (self.to_p - self.p)
+
+    def left(self, length: float) -> float:
+        """Sum of the products after a share of the step."""
+        y, p = (a + length * (b - a) for a, b in ((self.y, self.to_y), (self.p, self.to_p)))
+        return float((y * p)[self.free].sum())
+
+    @property
+    def active(self) -> list[Mask]:
+        """The active rows at the present point."""
+        return self.rows.held(self.rows.split(self.s))
+
+    def _linear(self, aim: Floats) -> tuple[Floats, Floats]:
+        """Shares of the weights, and the shifts, of the quadratic penalties of a step."""
+        share = np.where(self.free, 1.0 / (1.0 + self.rows.weights * self.p / self.y), 1.0)
+        return share, np.where(self.free, aim / self.y + self.p, 0.0)
+
+    def along(self, aim: Floats) -> Along:
+        """Expansions for the pass of a step towards the products ``aim``."""
+        share, shift = self._linear(aim)
+        return self.rows.along(self.rows.split(share), self.rows.split(flat(self.rows.signed) + shift))
+
+    def towards(self, ahead: list[Floats], aim: Floats) -> float:
+        """Take a step's end from the rows ``ahead``; returns the model's change there less that of the step's model."""
+        share, shift = self._linear(aim)
+        w, begin = self.rows.weights, flat(self.rows.signed)
+        self.to = flat(ahead)
+        self.to_y = w * share * (self.to + shift)
+        self.to_p = self.to_y / w - self.to
+
+        def piecewise(s: Floats) -> Floats:
+            return np.where(self.free, np.maximum(s, 0.0), s) ** 2
+
+        of_step = share * ((self.to + shift) ** 2 - (begin + shift) ** 2)
+        return 0.5 * float((w * (piecewise(self.to) - piecewise(begin) - of_step)).sum())
+
+    @property
+    def signs(self) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+        """Multipliers and distances, which stay positive, and their changes over the whole step."""
+        free = self.free
+        return (self.y[free], self.p[free]), ((self.to_y - self.y)[free], (self.to_p - self.p)[free])
+
+    def move(self, length: float) -> None:
+        """Go a share of the step."""
+        self.s = self.s + length * (self.to - self.s)
+        self.y = self.y + length * (self.to_y - self.y)
+        self.p = self.p + length * (self.to_p - self.p)

@@ -1,20 +1,24 @@
-"""The backward pass of a search, with second derivatives of the dynamics where they are asked for."""
+"""The backward pass of a search: with penalties that become active, and second derivatives where they are asked for."""
 
 from __future__ import annotations
 
+import time
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.active_rows import foreseeing
+from varpin.control.active_rows import Rows
 from varpin.control.along import Along, linearize
+from varpin.control.box import Box, to_minimum, within_limits
 from varpin.control.linear_controls import (
     curvature_on_lines,
     in_step,
     widened,
 )
 from varpin.control.passes import Plan, impulses, single_pass
+from varpin.control.penalties import PenalizedProblem
 from varpin.control.problem import OptimalControlProblem
 from varpin.linearization import (
     second_order_steps,
@@ -87,10 +91,57 @@ def backward(
         along.clipped = True
     damping = regularization * along.stake.moved * along.demands if demands and regularization > 0.0 else None
     if not second_order:
-        return foreseeing(along, regularization, damping)
+        return _foreseeing(along, regularization, damping)
     # First derivatives of the cost to go, then with them second derivatives of the dynamics (stagewise Newton).
     plan, costate = single_pass(along, max(regularization, 1e-3), costates=True)
     if plan is None:
         return None
     curvature = _curvature(along, plan, costate)
-    return foreseeing(along, regularization, curvature if damping is None else curvature + damping)
+    return _foreseeing(along, regularization, curvature if damping is None else curvature + damping)
+
+
+def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
+    """The pass with the penalties that are active on the linearized motion.
+
+    A penalty is zero up to its bound and a parabola beyond. A model around the nominal motion has only the rows active
+    there, not those that the step activates. So passes are repeated until their active rows are those of their
+    linearized motion: Newton steps with exact line search to the minimum of the piecewise quadratic model. If these do
+    not converge, the result is the best pass or the last point of the steps.
+    """
+    problem = along.problem
+    if (
+        not (isinstance(problem, PenalizedProblem) and problem.all_penalties and problem.passes)
+        or len(along.blocks) > 1
+    ):
+        return within_limits(along, regularization, curvature)
+    rows = Rows(along, problem)
+    held, best, least, together = rows.begun, None, 0.0, True
+    for done in range(1, problem.passes + 1):
+        passing = rows.along(held)
+        box = Box(passing, curvature, rows, held) if together else Box(passing, curvature)
+        plan, active = to_minimum(box, regularization)
+        if plan is None:
+            break
+        held = held if active is None else active
+        ahead = rows.ahead(passing, plan)
+        change, slope = rows.change(plan, held, ahead)
+        if slope < 0.0 and change < least:
+            best, least = replace(plan, slope=slope, curvature=2.0 * (change - slope), limited=True), change
+        met = rows.held(ahead)
+        if all(np.array_equal(a, b) for a, b in zip(met, held, strict=True)):
+            break
+        if active is not None:
+            # The minimum to rounding errors, or nothing.
+            if best is not None:
+                break
+            held, together = rows.begun, False
+            continue
+        rows.move(plan, held, ahead, slope)
+        held = rows.held(rows.at)
+        if done == problem.passes or time.perf_counter() > problem.until:
+            if rows.slope < 0.0 and rows.lowered < least:
+                best = rows.there(plan)
+            break
+    if best is None:
+        return within_limits(along, regularization, curvature)
+    return replace(best, model=along.model, factors=None)

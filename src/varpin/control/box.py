@@ -1,9 +1,10 @@
-"""The minimum of a motion's quadratic model with controls within their limits."""
+"""The minimum of a model with controls within their limits, and the rows of penalties that are active there."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 
 from varpin import core
 from varpin.arrays import Floats
+from varpin.control.active_rows import Pushes, Rows
 from varpin.control.along import Along, Limits, around_nominal, without_limits
-from varpin.control.passes import Plan, foreseen, gains_on_states, single_pass
+from varpin.control.passes import Plan, foreseen, gains_on_states, single_pass, without_feedback
+from varpin.control.penalties import flat
 
 Mask = NDArray[np.bool_]
 
@@ -31,16 +34,31 @@ _SETTLING, _SHRINKING = 1, 0.75
 _FIRM = 1e300
 
 
+# With rows of penalties: the greatest number of interior-point steps, the gap, relative to the model's change and to
+# the cost at stake, and the first gap, relative to the latter.
+_STEPS_WITH_ROWS, _CLOSE, _NOTHING, _LARGE = 60, 1e-9, 1e-12, 1e3
+
+
+# Greatest share of the way to a limit in an interior-point step.
+_INSIDE = 0.995
+
+
 def within_limits(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
-    """The pass to the model's minimum with controls within their limits.
+    """The pass to the model's minimum with controls within their limits."""
+    return to_minimum(Box(along, curvature), regularization)[0]
+
+
+def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask] | None]:
+    """The pass to the minimum of a model with controls within their limits, and its active rows if limits are reached.
 
     Around the nominal states, late decisions seem to reach their limits because each would have to make up for the
     earlier ones. So the first pass has no limits, and where its linearized motion reaches some, further passes lead to
-    the minimum.
+    the minimum. Where no limits are reached, the model is that with the rows of ``box``.
     """
+    along, curvature = box.along, box.curvature
     problem = along.problem
     if not problem.limited or along.clipped:
-        return single_pass(along, regularization, curvature=curvature)[0]
+        return single_pass(along, regularization, curvature=curvature)[0], None
     stiffness = np.zeros((problem.decisions, problem.scene.controls))
     free = around_nominal(along.slack[:0], along.states)._replace(stiffness=stiffness)
     plan = single_pass(along, regularization, curvature=curvature, limits=free)[0]
@@ -48,14 +66,16 @@ def within_limits(along: Along, regularization: float, curvature: Floats | None)
         moves = foreseen(along, plan)[1]
         lower, upper = along.slack[:, 0], along.slack[:, 1]
         if not ((moves <= lower) | (moves >= upper)).any():
-            return _sloped(plan, moves)
+            return _sloped(plan, moves), None
         if problem.processes:
-            plan = _matching(along, regularization, curvature, plan)
+            plan, active = _matching(along, regularization, curvature, plan), None
         else:
-            plan = _Box(along, regularization * np.abs(stiffness), curvature).minimum(plan, moves)
+            plan, active = box.with_proximal(regularization * np.abs(stiffness)).minimum(plan, moves)
         if plan is not None:
-            return plan
-    return single_pass(along, regularization, curvature=curvature, limits=around_nominal(along.slack, along.states))[0]
+            return plan, active
+    return single_pass(along, regularization, curvature=curvature, limits=around_nominal(along.slack, along.states))[
+        0
+    ], None
 
 
 def _sloped(plan: Plan, moves: Floats) -> Plan:
@@ -93,42 +113,60 @@ def _matching(along: Along, regularization: float, curvature: Floats | None, pla
     return made if made is not found else None
 
 
-class _Box:
+class Box:
     """The model of a motion in the changes of its controls (R, m), which have to stay within their limits.
 
     Its minimum is found by passes with the controls at limits fixed, whose set changes until no other control exceeds a
     limit and no fixed one would leave its own; where these do not end, after a primal-dual interior-point method, whose
     steps are passes, too. ``proximal`` (R, m) regularizes: the Hessian of a further cost of the changes.
+
+    With ``rows`` the model is piecewise quadratic: the rows of the penalties that are active at its minimum are found
+    together with the controls at limits. Around a point it has the rows ``active``.
     """
 
-    def __init__(self, along: Along, proximal: Floats, curvature: Floats | None) -> None:
-        self.along, self.proximal, self.curvature = along, proximal, curvature
+    def __init__(
+        self, along: Along, curvature: Floats | None, rows: Rows | None = None, active: list[Mask] | None = None
+    ) -> None:
+        self.along, self.curvature, self.rows, self.active = along, curvature, rows, active
+        self.proximal = np.zeros((along.problem.decisions, along.problem.scene.controls))
         self.lower, self.upper = along.slack[:, 0], along.slack[:, 1]
 
-    def minimum(self, plan: Plan, moves: Floats) -> Plan | None:
-        """The plan to the minimum, from the plan without limits and the controls' changes of its linearized motion."""
-        found = self._active_sets(plan, (moves <= self.lower, moves >= self.upper))
-        if found is None:
-            inner = self._interior(plan, np.clip(moves, self.lower, self.upper))
-            if inner is None:
-                return None
-            at, held = inner
-            found = self._active_sets(plan, held) or self._with_gains(at, held)
-        if found is None or not found[1].value < 0.0:
-            return None
-        return self._leading(*found)
+    def with_proximal(self, proximal: Floats) -> Box:
+        """The model with a further cost of the changes."""
+        made = copy(self)
+        made.proximal = proximal
+        return made
 
-    def _active_sets(self, plan: Plan, held: tuple[Mask, Mask]) -> tuple[Plan, _Point] | None:
+    def minimum(self, plan: Plan, moves: Floats) -> tuple[Plan | None, list[Mask] | None]:
+        """The plan to the minimum, from the plan without limits and the controls' changes of its linearized motion.
+
+        Also the rows that are active at the minimum, if these were to be found.
+        """
+        found = self._active_sets(plan, (moves <= self.lower, moves >= self.upper))
+        found = self._inside(plan) if found is None else found
+        if found is None or not (found.at.value < 0.0 or found.box.rows is not None):
+            return None, None
+        return found.box.leading(found), found.box.active
+
+    def _inside(self, plan: Plan) -> _Least | None:
+        """The minimum by the interior-point method; see :meth:`minimum`."""
+        inner = self._interior(plan)
+        if inner is None:
+            return None
+        at, held, box = inner
+        return box._active_sets(plan, held) or box._with_gains(at, held)
+
+    def _active_sets(self, plan: Plan, held: tuple[Mask, Mask]) -> _Least | None:
         """The last pass and the minimum by a primal-dual active set; None if it takes too many passes.
 
         It begins with the controls ``held`` at a lower and at an upper limit (Hintermueller, Ito and Kunisch 2002).
         """
-        low, high, changed = self.lower, self.upper, math.inf
+        low, high, box, changed = self.lower, self.upper, self, math.inf
         for done in range(_ACTIVE_SETS):
-            found = self._fixed(held)
+            found = box._fixed(held)
             if found is None:
                 return None
-            at = self._at(plan, foreseen(self.along, found, self._slack(held))[1])
+            at = box._at(plan, foreseen(box.along, found, box._slack(held))[1])
             if at is None:
                 return None
             size, force = _ROUNDED * np.abs(at.moves).max(axis=0), _ROUNDED * np.abs(at.pressure).max(axis=0)
@@ -138,13 +176,29 @@ class _Box:
             )
             fixed = low >= high
             now = now[0] | fixed, now[1] & ~fixed
-            if np.array_equal(now[0], held[0]) and np.array_equal(now[1], held[1]):
-                return found, at._replace(moves=np.clip(at.moves, low, high))
+            active = box._met(found, held)
+            if np.array_equal(now[0], held[0]) and np.array_equal(now[1], held[1]) and active is None:
+                return _Least(box, found, at._replace(moves=np.clip(at.moves, low, high)))
             before, changed = changed, int((now[0] != held[0]).sum() + (now[1] != held[1]).sum())
-            if done >= _SETTLING and changed > _SHRINKING * before:
+            if self.rows is None and done >= _SETTLING and changed > _SHRINKING * before:
                 return None
-            held = now
+            held, box = now, box if active is None else box._with_active(active)
         return None
+
+    def _met(self, plan: Plan, held: tuple[Mask, Mask]) -> list[Mask] | None:
+        """The active rows of the linearized motion under a plan, or None if they are those of the model."""
+        rows, active = self.rows, self.active
+        if rows is None or active is None:
+            return None
+        met = rows.held(rows.ahead(self.along, plan, self._slack(held)))
+        return None if all(np.array_equal(a, b) for a, b in zip(met, active, strict=True)) else met
+
+    def _with_active(self, active: list[Mask]) -> Box:
+        """The model around points with other active rows."""
+        assert self.rows is not None
+        made = copy(self)
+        made.along, made.active = self.rows.along(active), active
+        return made
 
     def _slack(self, held: tuple[Mask, Mask]) -> Floats:
         """Limits (R, 2, m) that fix the held controls only."""
@@ -156,14 +210,19 @@ class _Box:
         slack = self._slack(held)
         return self._passed(around_nominal(slack, self.along.states))
 
-    def _with_gains(self, moves: Floats, held: tuple[Mask, Mask]) -> tuple[Plan, _Point] | None:
+    def _with_gains(self, moves: Floats, held: tuple[Mask, Mask]) -> _Least | None:
         """The pass with held controls, whose gains go with the given changes, and the model there."""
         found = self._fixed(held)
         at = None if found is None else self._at(found, moves)
-        return None if found is None or at is None else (found, at)
+        return None if found is None or at is None else _Least(self, found, at)
 
-    def _interior(self, plan: Plan, begin: Floats) -> tuple[Floats, tuple[Mask, Mask]] | None:
-        """Changes near the minimum by a primal-dual interior-point method, and which controls are at each limit."""
+    def _interior(self, plan: Plan) -> tuple[Floats, tuple[Mask, Mask], Box] | None:
+        """Changes near the minimum by a primal-dual interior-point method.
+
+        Also which controls are at each limit, and the model with the rows that are active there.
+        """
+        if self.rows is not None:
+            return self._interior_with_rows(plan, self.rows)
         low, high = self.lower, self.upper
         fixed = low >= high
         bounded = [np.isfinite(low) & ~fixed, np.isfinite(high) & ~fixed]
@@ -171,13 +230,13 @@ class _Box:
         if count == 0 or not plan.expected_decrease > 0.0:
             return None
         # The size of changes of each control.
-        moved = np.abs(plan.feedforward).max(axis=0) + np.abs(begin).max(axis=0)
+        moved = np.abs(plan.feedforward).max(axis=0)
         both = bounded[0] & bounded[1]
         size = np.where(both, np.where(both, high, 0.0) - np.where(both, low, 0.0), np.where(moved > 0.0, moved, 1.0))
         z = np.where(fixed, low, np.clip(0.0, low + 0.1 * size, high - 0.1 * size))
         slack = self._slack((fixed, np.zeros_like(fixed)))
-        gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
         mu = plan.expected_decrease / count
+        gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
         duals = [mu / gap for gap in gaps]
         for _ in range(_INTERIOR_STEPS):
             # A step without centring, and one corrected by what that foresees (Mehrotra 1992).
@@ -203,7 +262,7 @@ class _Box:
             d = np.where(fixed, 0.0, to - z)
             after = [(aims[0] - duals[0] * d) / gaps[0], (aims[1] + duals[1] * d) / gaps[1]]
             turning = after[0] - duals[0], after[1] - duals[1]
-            length = min(1.0, 0.995 * _free_length((*gaps, *duals), (d, -d, *turning)))
+            length = min(1.0, _INSIDE * _free_length((*gaps, *duals), (d, -d, *turning)))
             z = z + length * d
             gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
             duals = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
@@ -213,7 +272,7 @@ class _Box:
         # A limit binds where its multiplier exceeds its gap, each relative to its size.
         scale = np.maximum(duals[0] + duals[1], 1e-300).max(axis=0)
         held = gaps[0] / size < duals[0] / scale, gaps[1] / size < duals[1] / scale
-        return z, (held[0] | fixed, held[1] & ~held[0] & ~fixed)
+        return z, (held[0] | fixed, held[1] & ~held[0] & ~fixed), self
 
     def _pushed(
         self, plan: Plan, limits: Limits, to: Floats, stiff: Floats, pull: Floats, push: Floats
@@ -244,6 +303,78 @@ class _Box:
         more: Floats = foreseen(alone, replace(plan, feedforward=feedforward), np.zeros((0, 2, m)))[1]
         return to + more
 
+    def _interior_with_rows(self, plan: Plan, rows: Rows) -> tuple[Floats, tuple[Mask, Mask], Box] | None:
+        """The same with the rows of penalties; it begins at the motion, as those far away would be far from bounds."""
+        low, high = self.lower, self.upper
+        fixed = low >= high
+        bounded = [np.isfinite(low) & ~fixed, np.isfinite(high) & ~fixed]
+        count = int(bounded[0].sum() + bounded[1].sum()) + int((~rows.equal).sum())
+        if count == 0:
+            return None
+        # The size of changes of each control.
+        moved = np.abs(plan.feedforward).max(axis=0)
+        both = bounded[0] & bounded[1]
+        size = np.where(both, np.where(both, high, 0.0) - np.where(both, low, 0.0), np.where(moved > 0.0, moved, 1.0))
+        z = np.where(fixed, low, np.clip(0.0, low + 0.1 * size, high - 0.1 * size))
+        slack = self._slack((fixed, np.zeros_like(fixed)))
+        # Around a motion near the minimum multipliers have to grow, which takes large products.
+        stake = rows.whole.stake.moved
+        mu = max(plan.expected_decrease, _LARGE * stake) / count
+        gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+        duals = [mu / gap for gap in gaps]
+        pushes = Pushes(rows, self._rows_at(plan, z), mu)
+        for _ in range(_STEPS_WITH_ROWS):
+            # Products of multipliers and gaps: now, and where a step should lead.
+            mu = (_complementarity(gaps, duals, bounded) + float(pushes.products.sum())) / count
+            aims = [np.zeros(z.shape)] * 2
+            aim = np.zeros(1)
+            stiff = duals[0] / gaps[0] + duals[1] / gaps[1]
+            # First towards zero, then towards a multiple of mu that goes by how far this leads, with the products'
+            # second-order terms (Mehrotra 1992).
+            for centered in (False, True):
+                pull = aims[1] / gaps[1] - aims[0] / gaps[0] - stiff * z
+                box = Box(pushes.along(aim), self.curvature).with_proximal(self.proximal)
+                found = box._passed(around_nominal(slack, self.along.states), stiff, pull)
+                if found is None:
+                    return None
+                to = foreseen(box.along, found, slack)[1]
+                d = np.where(fixed, 0.0, to - z)
+                after = [(aims[0] - duals[0] * d) / gaps[0], (aims[1] + duals[1] * d) / gaps[1]]
+                value = -found.expected_decrease - float(((0.5 * stiff * to + pull) * to).sum())
+                value += pushes.towards(rows.ahead(box.along, found, slack), aim)
+                turning = after[0] - duals[0], after[1] - duals[1]
+                values, changes = pushes.signs
+                length = min(1.0, _INSIDE * _free_length((*gaps, *duals, *values), (d, -d, *turning, *changes)))
+                if centered:
+                    break
+                opening = d, -d
+                ahead = [gap + length * more for gap, more in zip(gaps, opening, strict=True)]
+                aims = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
+                left = _complementarity(ahead, aims, bounded) + pushes.left(length)
+                center = mu * (left / (count * mu)) ** 3
+                aims = [
+                    np.where(some, center - a * b, 0.0) for some, a, b in zip(bounded, opening, turning, strict=True)
+                ]
+                aim = center - pushes.bent
+            z, before = z + length * d, (gaps, duals)
+            gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+            duals = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
+            pushes.move(length)
+            left = _complementarity(gaps, duals, bounded) + float(pushes.products.sum())
+            if length > 0.9 and left <= _CLOSE * abs(value) + _NOTHING * stake:
+                break
+        # In the last step the gap of a limit that binds fell by more than its multiplier, and that of others by less.
+        held = [
+            some & (np.where(some, gap, 0.0) * old_dual < dual * np.where(some, old_gap, 0.0))
+            for some, gap, dual, old_gap, old_dual in zip(bounded, gaps, duals, *before, strict=True)
+        ]
+        return z, (held[0] | fixed, held[1] & ~held[0] & ~fixed), self._with_active(pushes.active)
+
+    def _rows_at(self, plan: Plan, moves: Floats) -> Floats:
+        """The shifted values of all rows at changes of the controls."""
+        assert self.rows is not None
+        return flat(self.rows.ahead(self.along, without_feedback(plan, moves), np.stack([moves, moves], axis=1)))
+
     def _passed(self, limits: Limits, stiff: Floats | None = None, pull: Floats | None = None) -> Plan | None:
         """A pass with a further cost of the controls' changes: its Hessian's diagonal and its gradient (R, m)."""
         along = self.along
@@ -255,16 +386,15 @@ class _Box:
 
     def _at(self, plan: Plan, moves: Floats) -> _Point | None:
         """The model and its gradient at changes of the controls."""
-        still = replace(plan, feedforward=moves, feedback=np.zeros(plan.feedback.shape))
-        if plan.previous is not None:
-            still = replace(still, previous=np.zeros(plan.previous.shape))
+        still = without_feedback(plan, moves)
         slack, pressure = np.stack([moves, moves], axis=1), np.zeros(moves.shape)
         expected = foreseen(self.along, still, slack)[0]
         found = self._passed(Limits(slack, expected, pressure=pressure))
         return None if found is None else _Point(moves, expected, -found.expected_decrease, pressure)
 
-    def _leading(self, plan: Plan, at: _Point) -> Plan:
-        """The plan to a point of the model, with the feedback of ``plan``."""
+    def leading(self, least: _Least) -> Plan:
+        """The plan to a minimum, with the feedback of its pass."""
+        plan, at = least.plan, least.at
         x = 2 * self.along.problem.scene.robot.dof
         ahead = at.moves - np.einsum("kmx,kx->km", plan.feedback, at.expected[:, :x])
         if plan.previous is not None:
@@ -273,6 +403,14 @@ class _Box:
         value = at.value - 0.5 * float((self.proximal * at.moves**2).sum())
         curvature, left = 2.0 * (value - slope), at.pressure - self.proximal * at.moves
         return replace(plan, feedforward=ahead, slope=slope, curvature=curvature, limited=True, left=left)
+
+
+class _Least(NamedTuple):
+    """A minimum of a model within limits: the model with the rows active there, the pass, and the point."""
+
+    box: Box
+    plan: Plan
+    at: _Point
 
 
 class _Point(NamedTuple):

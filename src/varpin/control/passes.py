@@ -118,6 +118,12 @@ def feedforward_beside(along: Along, plan: Plan, regularization: float, trajecto
     return feedforward
 
 
+def without_feedback(plan: Plan, moves: Floats) -> Plan:
+    """A plan of changes of the controls (R, m) alone."""
+    previous = None if plan.previous is None else np.zeros(plan.previous.shape)
+    return replace(plan, feedforward=moves, feedback=np.zeros(plan.feedback.shape), previous=previous)
+
+
 def foreseen(along: Along, plan: Plan, slack: Floats | None = None) -> tuple[Floats, Floats]:
     """The linearized motion under a plan whose controls are clipped to their limits, or to ``slack`` (R, 2, m).
 

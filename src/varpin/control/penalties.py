@@ -109,16 +109,27 @@ class PenalizedRate(Frozen):
         total: Floats = self.shares(u, period).sum(axis=-1)
         return total
 
-    def expand(self, u: Floats, period: float, held: Sequence[Mask] | None = None) -> tuple[Floats, Floats]:
-        """See :meth:`ControlRate.expand`; ``held`` selects the penalty rows, by default the active ones."""
+    def expand(
+        self,
+        u: Floats,
+        period: float,
+        held: Sequence[Mask | Floats] | None = None,
+        shifted: Sequence[Floats] | None = None,
+    ) -> tuple[Floats, Floats]:
+        """See :meth:`ControlRate.expand`.
+
+        ``held`` selects the penalty rows, by default the active ones, or has shares of their weights; ``shifted`` are
+        their shifted values, by default those at ``u``.
+        """
         gradient, hessian = self.plain.expand(u, period)
         for i, penalty in enumerate(self.penalties):
             bound = _rate_of(penalty)
-            s, columns = penalty.signed(bound.of_decisions(u)), bound.limited
-            pushed = penalty.held(s) if held is None else held[i]
-            pull, count = np.where(pushed, s, 0.0), len(columns)
+            s = penalty.signed(bound.of_decisions(u)) if shifted is None else shifted[i]
+            pushed = (penalty.held(s) if held is None else held[i]).astype(float)
+            columns, pull = bound.limited, pushed * s
+            count = len(columns)
             gradient[np.ix_(bound.places, columns)] += penalty.weight / period * (pull[:, :count] - pull[:, count:])
-            curved = penalty.weight / period**2 * (pushed[:, :count].astype(float) + pushed[:, count:])
+            curved = penalty.weight / period**2 * (pushed[:, :count] + pushed[:, count:])
             for c, column in enumerate(columns):
                 hessian[bound.places, column, column] += curved[:, c]
         return gradient, hessian
@@ -247,10 +258,15 @@ class PenalizedProblem(OptimalControlProblem):
         return super().expand_running(trajectory)
 
     def with_held(
-        self, expansion: Expansion, shifted: Sequence[Floats], slopes: Sequence[Slopes | None], held: Sequence[Mask]
+        self,
+        expansion: Expansion,
+        shifted: Sequence[Floats],
+        slopes: Sequence[Slopes | None],
+        held: Sequence[Mask | Floats],
     ) -> Expansion:
         """The running costs' expansion plus the penalties of the rows in ``held``, each (K, rows).
 
+        ``held`` has either flags or shares of the rows' weights.
         ``shifted`` are the values whose squares are penalized (:meth:`Penalty.signed`), ``slopes`` their derivatives,
         None where no row is in ``held``.
         """
