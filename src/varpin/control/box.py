@@ -223,20 +223,13 @@ class Box:
         """
         if self.rows is not None:
             return self._interior_with_rows(plan, self.rows)
-        low, high = self.lower, self.upper
-        fixed = low >= high
-        bounded = [np.isfinite(low) & ~fixed, np.isfinite(high) & ~fixed]
+        fixed, bounded, size, z = self._begin(plan)
         count = int(bounded[0].sum() + bounded[1].sum())
         if count == 0 or not plan.expected_decrease > 0.0:
             return None
-        # The size of changes of each control.
-        moved = np.abs(plan.feedforward).max(axis=0)
-        both = bounded[0] & bounded[1]
-        size = np.where(both, np.where(both, high, 0.0) - np.where(both, low, 0.0), np.where(moved > 0.0, moved, 1.0))
-        z = np.where(fixed, low, np.clip(0.0, low + 0.1 * size, high - 0.1 * size))
         slack = self._slack((fixed, np.zeros_like(fixed)))
         mu = plan.expected_decrease / count
-        gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+        gaps = self._gaps(z, bounded)
         duals = [mu / gap for gap in gaps]
         for _ in range(_INTERIOR_STEPS):
             # A step without centring, and one corrected by what that foresees (Mehrotra 1992).
@@ -264,7 +257,7 @@ class Box:
             turning = after[0] - duals[0], after[1] - duals[1]
             length = min(1.0, _INSIDE * _free_length((*gaps, *duals), (d, -d, *turning)))
             z = z + length * d
-            gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+            gaps = self._gaps(z, bounded)
             duals = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
             value = 0.5 * float(((plan.gradient - stiff * (to - z) - push) * to).sum())
             if length > 0.9 and _complementarity(gaps, duals, bounded) <= _GAP * abs(value):
@@ -303,24 +296,35 @@ class Box:
         more: Floats = foreseen(alone, replace(plan, feedforward=feedforward), np.zeros((0, 2, m)))[1]
         return to + more
 
-    def _interior_with_rows(self, plan: Plan, rows: Rows) -> tuple[Floats, tuple[Mask, Mask], Box] | None:
-        """The same with the rows of penalties; it begins at the motion, as those far away would be far from bounds."""
+    def _begin(self, plan: Plan) -> tuple[Mask, list[Mask], Floats, Floats]:
+        """The beginning of an interior-point method.
+
+        Returns the controls that cannot move, those with a lower and with an upper limit, the sizes of changes of each
+        control, and changes close to none that are within the limits, all (R, m).
+        """
         low, high = self.lower, self.upper
         fixed = low >= high
         bounded = [np.isfinite(low) & ~fixed, np.isfinite(high) & ~fixed]
-        count = int(bounded[0].sum() + bounded[1].sum()) + int((~rows.equal).sum())
-        if count == 0:
-            return None
-        # The size of changes of each control.
         moved = np.abs(plan.feedforward).max(axis=0)
         both = bounded[0] & bounded[1]
         size = np.where(both, np.where(both, high, 0.0) - np.where(both, low, 0.0), np.where(moved > 0.0, moved, 1.0))
-        z = np.where(fixed, low, np.clip(0.0, low + 0.1 * size, high - 0.1 * size))
+        return fixed, bounded, size, np.where(fixed, low, np.clip(0.0, low + 0.1 * size, high - 0.1 * size))
+
+    def _gaps(self, z: Floats, bounded: list[Mask]) -> list[Floats]:
+        """Distances of changes to the lower and the upper limits, infinite where there is none."""
+        return [np.where(bounded[0], z - self.lower, np.inf), np.where(bounded[1], self.upper - z, np.inf)]
+
+    def _interior_with_rows(self, plan: Plan, rows: Rows) -> tuple[Floats, tuple[Mask, Mask], Box] | None:
+        """The same with the rows of penalties; it begins at the motion, as those far away would be far from bounds."""
+        fixed, bounded, _, z = self._begin(plan)
+        count = int(bounded[0].sum() + bounded[1].sum()) + int((~rows.equal).sum())
+        if count == 0:
+            return None
         slack = self._slack((fixed, np.zeros_like(fixed)))
         # Around a motion near the minimum multipliers have to grow, which takes large products.
         stake = rows.whole.stake.moved
         mu = max(plan.expected_decrease, _LARGE * stake) / count
-        gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+        gaps = self._gaps(z, bounded)
         duals = [mu / gap for gap in gaps]
         pushes = Pushes(rows, self._rows_at(plan, z), mu)
         for _ in range(_STEPS_WITH_ROWS):
@@ -357,7 +361,7 @@ class Box:
                 ]
                 aim = center - pushes.bent
             z, before = z + length * d, (gaps, duals)
-            gaps = [np.where(bounded[0], z - low, np.inf), np.where(bounded[1], high - z, np.inf)]
+            gaps = self._gaps(z, bounded)
             duals = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
             pushes.move(length)
             left = _complementarity(gaps, duals, bounded) + float(pushes.products.sum())
