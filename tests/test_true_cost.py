@@ -10,8 +10,9 @@ from naive import continuous
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control.refinement import halved, refine, start_of
+from varpin.control.refinement import refine
 from varpin.control.refinement_within import Warm, refine_within
+from varpin.control.steps_tried import halved, start_of
 
 
 def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
@@ -374,9 +375,9 @@ def test_interrupted_before_a_motion_is_made() -> None:
 
         if not plans:
             with pytest.raises(KeyboardInterrupt):
-                refine(reach(3), search, 1e-12, lambda: np.inf)
+                refine(reach(3), search, 1e-12, lambda: np.inf, search, search)
             continue
-        found = refine(reach(3), search, 1e-12, lambda: np.inf)
+        found = refine(reach(3), search, 1e-12, lambda: np.inf, search, search)
         assert found.status is vp.Status.INTERRUPTED
         assert found.cost == coarse.cost
 

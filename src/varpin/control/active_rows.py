@@ -7,15 +7,11 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Mask
 from varpin.control.along import Along
 from varpin.control.passes import Plan
-from varpin.control.penalties import PenalizedProblem, PenalizedRate, controls_of_steps, flat, rate_columns
-
-Mask = NDArray[np.bool_]
-
+from varpin.control.penalties import PenalizedProblem, PenalizedRate, controls_of_steps, flat, rate_columns, split
 
 # Bisections of the line search between two passes.
 _BISECTIONS = 40
@@ -61,8 +57,7 @@ class Rows:
 
     def split(self, values: Floats) -> list[Floats]:
         """Values of all rows, in the shapes of the penalties."""
-        ends = np.cumsum([s.size for s in self.signed])
-        return [part.reshape(s.shape) for part, s in zip(np.split(values, ends[:-1]), self.signed, strict=True)]
+        return split(self.signed, values)
 
     def along(self, held: Sequence[Mask | Floats], shifted: list[Floats] | None = None) -> Along:
         """Expansions for a pass with the active rows ``held``, or with these shares of the rows' weights.
@@ -177,6 +172,11 @@ class Rows:
             pull = item.weight * s * (t - s)
             slope += float(pull[now].sum() - pull[rows].sum())
         return change, slope
+
+
+def same_rows(some: Sequence[Mask], others: Sequence[Mask]) -> bool:
+    """Whether the same rows of all penalties are active."""
+    return all(np.array_equal(a, b) for a, b in zip(some, others, strict=True))
 
 
 class Pushes:

@@ -25,16 +25,8 @@ from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
-from varpin.control.multipliers import (
-    FEASIBLE,
-    REPORTED,
-    ConstraintReport,
-    Multipliers,
-    in_between,
-    reports_of,
-    split,
-)
-from varpin.control.penalties import PenalizedProblem, flat, penalized
+from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, in_between, reports_of
+from varpin.control.penalties import PenalizedProblem, flat, penalized, split
 from varpin.control.polish import deviations, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import SUFFICIENT

@@ -9,22 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.active_rows import Rows
+from varpin.control.active_rows import Rows, same_rows
 from varpin.control.along import Along, linearize
 from varpin.control.box import Box, to_minimum, within_limits
-from varpin.control.linear_controls import (
-    curvature_on_lines,
-    in_step,
-    widened,
-)
+from varpin.control.linear_controls import curvature_on_lines, in_step, widened
 from varpin.control.passes import Plan, impulses, single_pass
 from varpin.control.penalties import PenalizedProblem
 from varpin.control.problem import OptimalControlProblem
-from varpin.linearization import (
-    second_order_steps,
-    velocity_at_nodes,
-    velocity_curvature,
-)
+from varpin.linearization import second_order_steps, velocity_at_nodes, velocity_curvature
 from varpin.trajectory import Trajectory
 
 
@@ -128,7 +120,7 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
         if slope < 0.0 and change < least:
             best, least = replace(plan, slope=slope, curvature=2.0 * (change - slope), limited=True), change
         met = rows.held(ahead)
-        if all(np.array_equal(a, b) for a, b in zip(met, held, strict=True)):
+        if same_rows(met, held):
             break
         if active is not None:
             # The minimum to rounding errors, or nothing.

@@ -9,17 +9,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin import core
-from varpin.arrays import Floats
-from varpin.control.active_rows import Pushes, Rows
+from varpin.arrays import Floats, Mask
+from varpin.control.active_rows import Pushes, Rows, same_rows
 from varpin.control.along import Along, Limits, around_nominal, without_limits
 from varpin.control.passes import Plan, foreseen, gains_on_states, single_pass, without_feedback
 from varpin.control.penalties import flat
-
-Mask = NDArray[np.bool_]
-
 
 # Greatest numbers of active sets and of interior-point steps to the model's minimum within limits, its gap relative to
 # the model's change, and rounding errors of changes and slopes relative to the largest ones.
@@ -94,7 +90,7 @@ def _matching(along: Along, regularization: float, curvature: Floats | None, pla
 
     None if ever more of them change. The noise cost depends on the gains, so passes have no common model.
     """
-    held: NDArray[np.bool_] = np.zeros(plan.feedforward.shape, dtype=np.bool_)
+    held: Mask = np.zeros(plan.feedforward.shape, dtype=np.bool_)
     others, found, (expected, moves) = held.size + 1, plan, foreseen(along, plan)
     while others > 0:
         limits = Limits(along.slack, expected)
@@ -191,7 +187,7 @@ class Box:
         if rows is None or active is None:
             return None
         met = rows.held(rows.ahead(self.along, plan, self._slack(held)))
-        return None if all(np.array_equal(a, b) for a, b in zip(met, active, strict=True)) else met
+        return None if same_rows(met, active) else met
 
     def _with_active(self, active: list[Mask]) -> Box:
         """The model around points with other active rows."""
@@ -326,7 +322,8 @@ class Box:
         mu = max(plan.expected_decrease, _LARGE * stake) / count
         gaps = self._gaps(z, bounded)
         duals = [mu / gap for gap in gaps]
-        pushes = Pushes(rows, self._rows_at(plan, z), mu)
+        begun = rows.ahead(self.along, without_feedback(plan, z), np.stack([z, z], axis=1))
+        pushes = Pushes(rows, flat(begun), mu)
         for _ in range(_STEPS_WITH_ROWS):
             # Products of multipliers and gaps: now, and where a step should lead.
             mu = (_complementarity(gaps, duals, bounded) + float(pushes.products.sum())) / count
@@ -373,11 +370,6 @@ class Box:
             for some, gap, dual, old_gap, old_dual in zip(bounded, gaps, duals, *before, strict=True)
         ]
         return z, (held[0] | fixed, held[1] & ~held[0] & ~fixed), self._with_active(pushes.active)
-
-    def _rows_at(self, plan: Plan, moves: Floats) -> Floats:
-        """The shifted values of all rows at changes of the controls."""
-        assert self.rows is not None
-        return flat(self.rows.ahead(self.along, without_feedback(plan, moves), np.stack([moves, moves], axis=1)))
 
     def _passed(self, limits: Limits, stiff: Floats | None = None, pull: Floats | None = None) -> Plan | None:
         """A pass with a further cost of the controls' changes: its Hessian's diagonal and its gradient (R, m)."""

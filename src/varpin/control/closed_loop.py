@@ -9,9 +9,8 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers, Mask
 from varpin.control.along import Along
 from varpin.control.constraints import BoundConstraint, BoundRate, Slopes
 from varpin.control.descent import Model, Stake, at_stake
@@ -20,8 +19,6 @@ from varpin.control.penalties import PenalizedRate, controls_of_steps, penalized
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.spread import state_slopes
 from varpin.trajectory import Trajectory
-
-Mask = NDArray[np.bool_]
 
 # Least eigenvalue of the Hessian in a decision's controls, relative to the greatest.
 _CONVEX = 1e-13
@@ -206,8 +203,8 @@ class ClosedLoop:
         G = np.zeros((total, R, m))
         # For each row its derivatives in the state at its node.
         carried: list[Floats] = [np.zeros((0, x))]
-        node: list[NDArray[np.int64]] = []
-        of_row: list[NDArray[np.int64]] = []
+        node: list[Integers] = []
+        of_row: list[Integers] = []
         begin = 0
         for item, rows in zip(problem.bound_constraints, active, strict=True):
             k, r = np.nonzero(rows)
@@ -279,7 +276,7 @@ class ClosedLoop:
         return found
 
 
-def _joined(parts: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+def _joined(parts: list[Integers]) -> Integers:
     return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
 
@@ -291,7 +288,7 @@ def _inverse(matrix: Floats) -> Floats:
     return found
 
 
-def _of_rate(item: BoundRate, k: NDArray[np.int64], r: NDArray[np.int64], R: int, m: int) -> Floats:
+def _of_rate(item: BoundRate, k: Integers, r: Integers, R: int, m: int) -> Floats:
     """Derivatives (a, R, m) of rows of a rate limit in the controls."""
     rows, limited = np.zeros((len(k), R, m)), item.limited
     signs, columns = np.where(r < len(limited), 1.0, -1.0), limited[r % len(limited)]

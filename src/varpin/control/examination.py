@@ -12,7 +12,8 @@ from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
 from varpin.control.moments import noise_cost, noise_cost_in_halves
-from varpin.control.multipliers import FEASIBLE, REPORTED, split
+from varpin.control.multipliers import FEASIBLE, REPORTED
+from varpin.control.penalties import split
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes

@@ -10,7 +10,7 @@ from scipy.special import ndtr
 from varpin.arrays import Floats
 from varpin.control.history import Status
 from varpin.control.linear_controls import in_step
-from varpin.control.multipliers import split
+from varpin.control.penalties import split
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, decided, state_slopes
 from varpin.errors import VarpinError

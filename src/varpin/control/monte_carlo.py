@@ -194,7 +194,7 @@ def monte_carlo(
     found: tuple[Finding, ...] = ()
     extremes: Extremes = {}
     done, sent = 0, _sent(problem)
-    broken = [np.zeros((len(bound.places), len(bound.rows)), dtype=np.int64) for bound in _with_margins(problem)]
+    broken = [np.zeros(bound.shape, dtype=np.int64) for bound in _with_margins(problem)]
 
     def add(part: _Costs) -> None:
         nonlocal extremes, done
@@ -287,7 +287,7 @@ def _broken(problem: OptimalControlProblem, q: Floats, v: Floats, finished: NDAr
     """Number of finished paths (C, N + 1, n) that violate each constraint with a margin, by place and row."""
     no_controls, found = np.zeros((problem.decisions, problem.scene.controls)), []
     for bound in _with_margins(problem):
-        count = np.zeros((len(bound.places), len(bound.rows)), dtype=np.int64)
+        count = np.zeros(bound.shape, dtype=np.int64)
         for path in np.flatnonzero(finished):
             count += bound.value(q[path], v[path], no_controls) > 0.0
         found.append(count)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats, Integers
 from varpin.control.between_nodes import NOWHERE, Instants, enforced
 from varpin.control.constraints import BoundConstraint
+from varpin.control.penalties import split
 from varpin.control.problem import OptimalControlProblem
 from varpin.io.archive import Axes
 from varpin.support.frozen import Frozen
@@ -122,12 +123,6 @@ class ConstraintReport(Frozen):
         return f"{self.label}: {worst}, {held} of {self.values.size} bounds active, multipliers up to {most:.3g}"
 
     __repr__ = __str__
-
-
-def split(bound: tuple[BoundConstraint, ...], flat: Floats) -> list[Floats]:
-    """The part (K, rows) of each constraint in an array (M,)."""
-    ends = np.cumsum([item.size for item in bound])
-    return [part.reshape(item.shape) for item, part in zip(bound, np.split(flat, ends[:-1]), strict=True)]
 
 
 def in_between(coarse: BoundConstraint, fine: BoundConstraint, values: Floats) -> Floats:

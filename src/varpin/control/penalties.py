@@ -10,16 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from varpin.arrays import Floats, Integers
+from varpin.arrays import Floats, Integers, Mask
 from varpin.control.constraints import BoundBetween, BoundConstraint, BoundRate, Slopes
 from varpin.control.costs import ControlRate, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
-
-Mask = NDArray[np.bool_]
 
 # Greatest number of backward passes that determine the active rows of the penalties.
 _PASSES = 60
@@ -140,6 +137,12 @@ def flat(parts: Sequence[Floats]) -> Floats:
     return np.concatenate([np.ravel(part) for part in parts]) if parts else np.zeros(0)
 
 
+def split(like: Sequence[Floats | BoundConstraint], flattened: Floats) -> list[Floats]:
+    """Inverse of :func:`flat`: of entries (M,) the parts in the shapes of arrays or of constraints' values."""
+    ends = np.cumsum([item.size for item in like])
+    return [part.reshape(item.shape) for part, item in zip(np.split(flattened, ends[:-1]), like, strict=True)]
+
+
 def controls_of_steps(problem: OptimalControlProblem, u: Floats, steps: Integers) -> Floats:
     """Of decisions (R, m) those of steps (K,): the control of each (K, m), or those at both its ends (K, 2m)."""
     if problem.linear:
@@ -148,7 +151,7 @@ def controls_of_steps(problem: OptimalControlProblem, u: Floats, steps: Integers
     return found
 
 
-def rate_columns(penalty: Penalty) -> NDArray[np.int64]:
+def rate_columns(penalty: Penalty) -> Integers:
     """Indices of the controls that a rate penalty limits."""
     return _rate_of(penalty).limited
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Mask
+from varpin.control.active_rows import same_rows
 from varpin.control.along import states
 from varpin.control.closed_loop import ClosedLoop
 from varpin.control.constraints import BoundBetween, BoundConstraint
@@ -24,8 +24,6 @@ from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
 from varpin.integrators.base import open_line, open_loop
 from varpin.trajectory import Trajectory
-
-Mask = NDArray[np.bool_]
 
 # Greatest number of Newton steps, and how many of them, the last ones, lead onto the constraints only.
 _STEPS, _LAST = 15, 3
@@ -256,7 +254,7 @@ class _Step:
                 rows | (c > _DONE)
                 for rows, c in zip(self.rows, loop.values_after(self.c, response, change), strict=True)
             ]
-            if all(np.array_equal(a, b) for a, b in zip(met, self.rows, strict=True)) or self._crowded(met):
+            if same_rows(met, self.rows) or self._crowded(met):
                 break
             self.rows = met
         # The least step onto the constraints alone.

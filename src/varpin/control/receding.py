@@ -18,8 +18,8 @@ from varpin.control import search
 from varpin.control.between_nodes import enforced
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Iteration, Status
-from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers, split
-from varpin.control.penalties import flat, penalized
+from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers
+from varpin.control.penalties import flat, penalized, split
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.support.frozen import Frozen

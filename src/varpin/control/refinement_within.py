@@ -12,26 +12,23 @@ from varpin.control.history import Status
 from varpin.control.multipliers import FEASIBLE, REPORTED
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refined import Refined
-from varpin.control.refinement import (
-    KNOWN,
+from varpin.control.solution import Solution
+from varpin.control.steps_tried import (
     PATIENCE,
-    RESOLVED,
+    StepsTried,
     excess_over,
     halved,
     is_within,
     on_robot,
-    recorded,
     row_of,
     start_of,
 )
-from varpin.control.solution import Solution
 from varpin.control.verification import excess
 from varpin.errors import VarpinError
 from varpin.mechanics.policy import LinearPolicy
-from varpin.simulation.friction import rate_at_rest
 
 # Greatest number of halvings of the step: the last steps of plans within many bounds take long on fine grids.
-HALVINGS = 7
+_HALVINGS = 7
 # Greatest violation of a constraint on the continuous system, relative to its range.
 _HOLDS = 0.1 * REPORTED
 # Number of steps in a row without a plan within the constraints, or with one that has stalled, that end the refinement.
@@ -73,16 +70,13 @@ def refine_within(
     return _Refining(search, wish, time_left).run(problem)
 
 
-class _Refining:
-    """The state of a refinement: the steps tried, and the best plan."""
+class _Refining(StepsTried):
+    """A refinement within constraints."""
 
     def __init__(self, search: Search, wish: float, time_left: Callable[[], float]) -> None:
-        self.search, self.wish, self.time_left = search, wish, time_left
-        self.tried: list[Refined] = []
-        self.best: Solution | None = None
-        self.chosen = 0
+        super().__init__(wish, time_left, _HALVINGS)
+        self.search = search
         self.rank: tuple[float, ...] = ()
-        self.beyond = ""  # what the best plan violates on the continuous system
         self.without = 0  # steps in a row without a converged plan, whose loss is within the wish, in the constraints
         self.least: tuple[int, float] = (9, np.inf)  # the best of what has to fall, and the step that had it
         self.since = 0
@@ -97,14 +91,14 @@ class _Refining:
                 if solution is None:
                     solution = self.search(problem, start)
                 if solution.status is Status.INTERRUPTED:
-                    return self._interrupted(solution, f"interrupted {doing}")
+                    return self.interrupted(solution, f"interrupted {doing}")
                 told = on_robot(solution, self.wish)
                 self.tried.append(row_of(solution, told, time.perf_counter() - began))
                 row = self.tried[-1]
                 self._keep_better(row, solution, told.where)
                 ready = _meets(row, solution, self.wish)
                 doing = f"with half of dt = {problem.dt:g} s"
-                if ready and self._may_go_on():
+                if ready and self.may_go_on():
                     above = self._foreseen()
                     if not np.isfinite(above):
                         finer = self._in_half(problem, solution)
@@ -114,10 +108,10 @@ class _Refining:
                     row = replace(row, excess=above, seconds=time.perf_counter() - began)
                     self.tried[-1] = row
                     if above <= self.wish or (finer is None and not np.isfinite(above)):
-                        return recorded(solution, self.wish, self.tried, len(self.tried) - 1, "", met=True)
+                        return self.met(solution, len(self.tried) - 1)
                 ended = self._ended(problem, solution)
                 if ended:
-                    return self._given_up(ended)
+                    return self.given_up(ended)
                 if finer is not None:
                     problem, known = finer.problem, finer
                     continue
@@ -126,12 +120,9 @@ class _Refining:
             except VarpinError as error:
                 if self.best is None:
                     raise
-                return self._given_up(f"{doing} there is no plan: {error}")
+                return self.given_up(f"{doing} there is no plan: {error}")
             except KeyboardInterrupt:
-                return self._interrupted(solution, f"interrupted {doing}")
-
-    def _may_go_on(self) -> bool:
-        return len(self.tried) <= HALVINGS and self.time_left() > 0.0
+                return self.interrupted(solution, f"interrupted {doing}")
 
     def _in_half(self, problem: OptimalControlProblem, solution: Solution) -> Solution | None:
         """The plan with half the step; None where the problem is not defined there."""
@@ -143,12 +134,10 @@ class _Refining:
 
     def _foreseen(self) -> float:
         """Excess of the last row, where the halving before has hardly changed the cost; else infinite."""
-        if len(self.tried) < 2 or not all(row.status.converged for row in self.tried[-2:]):
+        gained, last = self.barely_changed(), self.tried[-1]
+        if gained is None:
             return np.inf
-        before, last = self.tried[-2:]
-        if not abs(before.cost - last.cost) <= KNOWN * self.wish * abs(last.cost):
-            return np.inf
-        return self._over_known(excess(last.true_cost, last.cost - max(before.cost - last.cost, 0.0)))
+        return self._over_known(excess(last.true_cost, last.cost - max(gained, 0.0)))
 
     def _above(self, solution: Solution, finer: Solution | None) -> float:
         """Excess of the last row over the optimum of finer controls by a plan with half the step; infinite if unknown.
@@ -186,10 +175,9 @@ class _Refining:
         feasible = solution.violation <= FEASIBLE
         fails = not feasible or (is_within(row, self.wish) and not solution.status.converged)
         self.without = self.without + 1 if fails else 0
-        if self.time_left() <= 0.0:
-            return f"the time limit came after {at}"
-        if len(self.tried) > HALVINGS:
-            return f"the step has been halved {HALVINGS} times"
+        spent = self.spent(problem)
+        if spent:
+            return spent
         if self.without >= (PATIENCE if solution.status is Status.MAX_ITERATIONS else _WITHOUT):
             if solution.status is Status.INFEASIBLE:
                 return f"with {at} there is no plan within the constraints, nor with twice that: {solution.reason}"
@@ -203,25 +191,10 @@ class _Refining:
                 kind, value = 1, abs(row.loss)
         if kind < self.least[0] or (kind == self.least[0] and value < _LOWER * self.least[1]):
             self.least, self.since = (kind, value), len(self.tried) - 1
-        resolved = problem.dt * rate_at_rest(problem.scene, problem.q0) <= RESOLVED
-        if resolved and len(self.tried) - 1 - self.since >= PATIENCE:
+        if self.without_gain(problem, self.since):
             what = ("excess over finer controls", "loss", "violation", "violation")[kind]
             return f"the last {PATIENCE} halvings of the step have not lowered the {what}"
         return ""
-
-    def _given_up(self, ended: str) -> Solution:
-        assert self.best is not None
-        return recorded(self.best, self.wish, self.tried, self.chosen, ended, beyond=self.beyond)
-
-    def _interrupted(self, solution: Solution | None, ended: str) -> Solution:
-        """The best plan of an interrupted refinement, or the only one."""
-        if self.best is not None:
-            best = replace(self.best, status=Status.INTERRUPTED, reason=ended)
-        elif solution is not None:
-            best = replace(solution, status=Status.INTERRUPTED)
-        else:
-            raise KeyboardInterrupt
-        return recorded(best, self.wish, self.tried, self.chosen, ended, beyond=self.beyond)
 
 
 def _meets(row: Refined, solution: Solution, wish: float) -> bool:

@@ -725,16 +725,14 @@ class _Search:
         if not self.whole or self.along.noise_differentiated:
             return 0
         rated, self.rated = self.rated, None
+        plan: Plan | None
         if rated is not None and rated.along is self.along:
-            self._along_noise(rated.plan)
-            return 0
-        plan = backward(self.problem, self.trajectory, regularization, along=self.along)
+            plan, passes = rated.plan, 0
+        else:
+            plan, passes = backward(self.problem, self.trajectory, regularization, along=self.along), 1
         if plan is not None:
-            self._along_noise(plan)
-        return 1
-
-    def _along_noise(self, plan: Plan) -> None:
-        self.along.differentiate_noise(Feedback(plan.feedback, plan.previous), plan.spread, self.steered)
+            self.along.differentiate_noise(Feedback(plan.feedback, plan.previous), plan.spread, self.steered)
+        return passes
 
     def _compare_with_best(self, plan: Plan) -> None:
         noise = self._noise(plan)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -284,7 +284,7 @@ def true_costs(
         # Motions are seen at the ends of substeps only.
         substeps, feedback = _LOOKS, _feedback(problem, policy, found.integrator, _LOOKS)
     bound = problem.bound_constraints
-    beyond = _beyond(problem, feedback, substeps, found.integrator)
+    (beyond,) = _beyond(problem, (feedback,), substeps, found.integrator)
     shares = [by / (10.0 * item.scale) for (by, _), item in zip(beyond, bound, strict=True)]
     if not np.isfinite(shares).all():
         return told._replace(violation=np.nan)
@@ -409,7 +409,7 @@ def _violations(
     """Violations of each constraint on the continuous system, under the controls alone and with feedback."""
     if not problem.constraints:
         return ()
-    opened, closed = (_beyond(problem, law, substeps, integrator) for law in laws)
+    opened, closed = _beyond(problem, laws, substeps, integrator)
     found = []
     for whole, (alone, _), (fed, where) in zip(problem.bound_constraints, opened, closed, strict=True):
         planned = _excess(whole, whole.value(plan.q, plan.v, problem.control_rows(plan)))
@@ -419,27 +419,31 @@ def _violations(
 
 
 def _beyond(
-    problem: OptimalControlProblem, law: Commands, substeps: int, integrator: Integrator
-) -> list[tuple[float, str]]:
-    """The largest violation of each constraint under given commands, and the row and time in words.
+    problem: OptimalControlProblem, laws: Sequence[Commands], substeps: int, integrator: Integrator
+) -> list[list[tuple[float, str]]]:
+    """The largest violation of each constraint under each of some commands, and the row and time in words.
 
     NaN where the motion diverges.
     """
     h = problem.dt / substeps
-    motion, failure = rollout(problem.scene, integrator, problem.q0, problem.v0, law, h)
-    if failure is not None:
-        return [(np.nan, "")] * len(problem.bound_constraints)
     fine = problem.constraints_on(h, problem.steps * substeps, problem.hold * substeps)
+    starts = [at_start(problem, whole) for whole in problem.bound_constraints]
     found = []
-    for bound, whole in zip(fine, problem.bound_constraints, strict=True):
-        excess = _excess(bound, bound.value(motion.q, motion.v, problem.control_rows(motion)))
-        outside = at_start(problem, whole)
-        if outside is not None:
-            # A row that is violated at the start cannot hold before the first node.
-            excess[: substeps - 1, outside > 0.0] = 0.0
-        sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
-        worst = float(excess[sample, row])
-        found.append((worst, f"{bound.rows[row]} at t = {bound.times[sample]:.4g} s" if worst > 0.0 else ""))
+    for law in laws:
+        motion, failure = rollout(problem.scene, integrator, problem.q0, problem.v0, law, h)
+        if failure is not None:
+            found.append([(np.nan, "")] * len(fine))
+            continue
+        of_law = []
+        for bound, outside in zip(fine, starts, strict=True):
+            excess = _excess(bound, bound.value(motion.q, motion.v, problem.control_rows(motion)))
+            if outside is not None:
+                # A row that is violated at the start cannot hold before the first node.
+                excess[: substeps - 1, outside > 0.0] = 0.0
+            sample, row = np.unravel_index(int(np.argmax(excess)), excess.shape)
+            worst = float(excess[sample, row])
+            of_law.append((worst, f"{bound.rows[row]} at t = {bound.times[sample]:.4g} s" if worst > 0.0 else ""))
+        found.append(of_law)
     return found
 
 

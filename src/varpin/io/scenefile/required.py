@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Mask
 from varpin.io.scenefile.layout import CostTerm, Layout, holding_controls, joints_of_frame, times_of
 from varpin.io.scenefile.plan_constraints import PLAN_CONSTRAINTS
 from varpin.io.scenefile.references import Timeline
@@ -18,7 +17,6 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.support.markup import facts, listed
 
-Mask = NDArray[np.bool_]
 # Forces that act only if the scene has them, by their names in the report.
 _ABSENT: Mapping[str, type[Force]] = {"stops at joint limits": JointStop, "dry friction": CoulombFriction}
 
