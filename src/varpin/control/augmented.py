@@ -72,9 +72,11 @@ _MUCH = 1e-2
 # Greatest number of last steps, each with the rows between nodes of the motion before.
 _LOOKS = 4
 # Number of rounds from which on none is added for the sake of what is between nodes.
-_BETWEEN = 25
+_BETWEEN = 40
+# Number of rounds from which on offsets between nodes are wide.
+_WIDE = 16
 # Violation between nodes that is left to the last steps.
-_CLOSE = 1e-5
+_CLOSE = 1e-6
 # Violation at which penalties stop growing; the last step removes the rest.
 _AIM = 1e-8
 
@@ -445,13 +447,15 @@ class _Rounds:
         )
         return None, ""
 
-    def _looked_between(self, motion: Trajectory, between: Instants, backoff: list[Floats], least: float) -> Instants:
+    def _looked_between(
+        self, motion: Trajectory, between: Instants, backoff: list[Floats], least: float, rounds: int
+    ) -> Instants:
         """Rows between nodes with the offsets of a motion, and those that it violates by more than ``least``."""
         values = seen(self.problem, motion)
         if values is None:
             return between
         margins = backoff[: len(self.problem.bound_constraints)]
-        return updated(self.problem, between, motion, values, margins, least)
+        return updated(self.problem, between, motion, values, margins, least, wide=rounds >= _WIDE)
 
     def _goes_between(self, kept: Solution, begun: _State, ended: Status | None) -> bool:
         """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
@@ -473,7 +477,7 @@ class _Rounds:
             if kept.violation > FEASIBLE:
                 return False
             base = replace(begun, multipliers=values, round=begun.round + 1, stuck=0)
-        between = self._looked_between(kept.trajectory, before, begun.backoff, FEASIBLE)
+        between = self._looked_between(kept.trajectory, before, begun.backoff, FEASIBLE, begun.round)
         if not len(between.rows):
             return False
         parts = (carried(self.problem, before, between, array) for array in (base.multipliers, base.backoff))
@@ -527,7 +531,7 @@ class _Rounds:
         motion, between, found, dense = kept.trajectory, known.between, None, len(known.between.rows) > 0
         least, bound = np.inf, np.inf
         if dense:
-            between = self._looked_between(motion, between, backoff, np.inf)
+            between = self._looked_between(motion, between, backoff, np.inf, known.round)
             least = self._left(motion, between, backoff)
             kept = replace(kept, multipliers=replace(known, **_of_instants(between)))
         try:
@@ -537,7 +541,7 @@ class _Rounds:
                 bound = self.tolerance * (after.stake + NOTHING * (0.0 if kept.search is None else kept.search.first))
                 told = between
                 if dense:
-                    told = self._looked_between(after.motion, between, backoff, np.inf)
+                    told = self._looked_between(after.motion, between, backoff, np.inf, known.round)
                     left = self._left(after.motion, told, backoff)
                     if left > max(least, FEASIBLE) or after.decrease > bound:
                         break

@@ -28,6 +28,8 @@ SHARES.setflags(write=False)
 _OUTSIDE = 1e-6
 # Change of an offset between rounds up to which it is halved, relative to the constraint's scale.
 _SAME = 1e-3
+# By how much wide offsets grow, in units of what they lack, and how much too large they stay, in scales.
+_AHEAD, _KEPT = 4.0, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,11 +151,12 @@ def updated(
     values: list[Floats | None],
     backoff: list[Floats],
     least: float,
+    *,
+    wide: bool,
 ) -> Instants:
     """The instants, with the offsets of a motion, and further ones where it violates a constraint by > ``least``.
 
-    These are where a row is greatest between its neighbours in the step. Small changes of offsets are halved:
-    else rounds may go to and fro between two motions whose peaks are on either side of an instant.
+    These are where a row is greatest between its neighbours in the step.
 
     Args:
         problem: The problem, without rows between nodes.
@@ -162,6 +165,7 @@ def updated(
         values: Its values of :func:`seen`.
         backoff: Margins of all constraints at the nodes (K, rows).
         least: In the unit of each constraint.
+        wide: Whether offsets are made larger than they are, so that peaks that slide are within them soon.
     """
     rows, offsets, u = [], [], problem.control_rows(motion)
     former = _offsets(problem, instants)
@@ -182,12 +186,24 @@ def updated(
         if before is not None:
             own = np.isin(_numbers(places), _numbers(instants.of(i)))
             change = offset[own] - before
-            offset[own] = before + np.where(np.abs(change) <= _SAME * bound.scale, 0.5, 1.0) * change
+            offset[own] = before + _followed(change, bound.scale, wide=wide)
         rows.append(np.column_stack([np.full(len(places), i), places]))
         offsets.append(offset.ravel())
     if not rows:
         return NOWHERE
     return Instants(np.concatenate(rows), np.concatenate(offsets))
+
+
+def _followed(change: Floats, scale: float, *, wide: bool) -> Floats:
+    """What offsets take up of their changes between rounds.
+
+    Small changes are halved: else rounds may go to and fro between two motions whose peaks are on either side of an
+    instant. Where this takes long, as peaks slide away, ``wide`` offsets only grow, by a multiple of what they lack.
+    """
+    if wide:
+        more: Floats = np.maximum(np.minimum(_AHEAD * change, _SAME * scale), change)
+        return np.where(change > 0.0, more, np.minimum(change + _KEPT * scale, 0.0))
+    return np.where(np.abs(change) <= _SAME * scale, 0.5, 1.0) * change
 
 
 def _numbers(rows: Integers) -> Integers:
