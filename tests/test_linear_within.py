@@ -206,7 +206,8 @@ def test_speeds_hold_between_nodes(name):
     assert plan.status.converged, plan.reason
     assert not about(plan.warnings, "between nodes")
     limit = problem.constraints[0].limits[1].max()
-    assert fastest(problem, plan.controls, 32).max() <= limit * (1.0 + 1e-4)
+    assert plan.violation <= 1e-6
+    assert fastest(problem, plan.controls, 32).max() <= limit * (1.0 + 1e-5)
 
 
 def test_scipy_finds_no_less_within_speeds_between_nodes():

@@ -20,7 +20,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.backward import backward
-from varpin.control.between_nodes import NOWHERE, Instants, carried, enforced, seen, updated
+from varpin.control.between_nodes import NOWHERE, Instants, beyond, carried, enforced, seen, updated
 from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
@@ -487,8 +487,8 @@ class _Rounds:
         whole = enforced(self.problem, between)
         told = reports_of(whole, kept.trajectory, multipliers, backoff)
         if ended is not None:
-            bounds = [_CLOSE if len(before.rows) else REPORTED * item.scale for item in whole.bound_constraints]
-            if all(item.violation <= most for item, most in zip(told, bounds, strict=True)):
+            bounds = [_CLOSE if len(before.rows) else REPORTED * item.scale for item in self.problem.bound_constraints]
+            if (self._beyond(kept.trajectory, begun.backoff) <= bounds).all():
                 return False
         most = max(told, key=lambda item: item.violation)
         logger.info(
@@ -508,10 +508,17 @@ class _Rounds:
             self.state = replace(self.state, weights=first_weights, worst=np.full(len(worst), np.inf), tolerance=_LOOSE)
         return True
 
-    def _left(self, motion: Trajectory, between: Instants, backoff: list[Floats]) -> float:
-        """The largest violation of a motion, with rows between nodes."""
-        whole = enforced(self.problem, between)
-        return max(told.violation for told in reports_of(whole, motion, backoff, backoff))
+    def _beyond(self, motion: Trajectory, backoff: list[Floats]) -> Floats:
+        """By how much a motion violates each constraint between its nodes."""
+        values = seen(self.problem, motion)
+        count = len(self.problem.bound_constraints)
+        return np.full(count, np.inf) if values is None else beyond(values, backoff[:count])
+
+    def _left(self, motion: Trajectory, backoff: list[Floats]) -> float:
+        """The largest violation of a motion, at the nodes and between them."""
+        margins = backoff[: len(self.problem.bound_constraints)]
+        at_nodes = max(told.violation for told in reports_of(self.problem, motion, margins, margins))
+        return max(at_nodes, float(self._beyond(motion, backoff).max()))
 
     def _margins(self, backoff: list[Floats], between: Instants) -> list[Floats]:
         """The margins of all rows, those between nodes as at the end of their step."""
@@ -531,9 +538,10 @@ class _Rounds:
         motion, between, found, dense = kept.trajectory, known.between, None, len(known.between.rows) > 0
         least, bound = np.inf, np.inf
         if dense:
-            between = self._looked_between(motion, between, backoff, np.inf, known.round)
-            least = self._left(motion, between, backoff)
-            kept = replace(kept, multipliers=replace(known, **_of_instants(between)))
+            least = self._left(motion, backoff)
+            if least > FEASIBLE:
+                between = self._looked_between(motion, between, backoff, np.inf, known.round)
+                kept = replace(kept, multipliers=replace(known, **_of_instants(between)))
         try:
             for _ in range(_LOOKS):
                 self.whole = enforced(self.problem, between)
@@ -541,11 +549,12 @@ class _Rounds:
                 bound = self.tolerance * (after.stake + NOTHING * (0.0 if kept.search is None else kept.search.first))
                 told = between
                 if dense:
-                    told = self._looked_between(after.motion, between, backoff, np.inf, known.round)
-                    left = self._left(after.motion, told, backoff)
+                    left = self._left(after.motion, backoff)
                     if left > max(least, FEASIBLE) or after.decrease > bound:
                         break
                     least = left
+                    if left > FEASIBLE:
+                        told = self._looked_between(after.motion, between, backoff, np.inf, known.round)
                 found, between = after, told
                 motion, values = found.motion, found.multipliers
                 if not dense or least <= FEASIBLE:

@@ -194,6 +194,21 @@ def updated(
     return Instants(np.concatenate(rows), np.concatenate(offsets))
 
 
+def beyond(values: list[Floats | None], backoff: list[Floats]) -> Floats:
+    """By how much a motion violates each constraint between its nodes, zero where it holds.
+
+    Args:
+        values: Values of the motion of :func:`seen`.
+        backoff: Margins of all constraints at the nodes (K, rows).
+    """
+    found = np.zeros(len(values))
+    for i, (near, margin) in enumerate(zip(values, backoff, strict=True)):
+        if near is not None:
+            peak, c = _peaks(near)
+            found[i] = np.where(peak, c + margin[:, None], 0.0).max(initial=0.0)
+    return found
+
+
 def _followed(change: Floats, scale: float, *, wide: bool) -> Floats:
     """What offsets take up of their changes between rounds.
 
