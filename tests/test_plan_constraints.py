@@ -365,6 +365,29 @@ def test_control_limits_and_hold():
         assert np.abs(plan.controls).max() <= limits[1]
 
 
+def test_a_last_step_is_tried_before_a_problem_is_called_infeasible():
+    """The rounds end a little beyond a goal and limits of rates; there is a motion within them."""
+    robot, goal, limit = vp.planar_chain(4), [2.5, 0.0, -2.2], 1000.0
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.3),
+        vp.ControlCost(1e-3) + vp.Terminal(vp.VelocityCost(5.0)),
+        [1.2, 0.1, 0.1, 0.1],
+        np.zeros(4),
+        dt=0.03,
+        steps=32,
+        control_limits=(-50.0, 50.0),
+        integrator=vp.Midpoint(),
+        constraints=[vp.ReachFrame(robot, "tip", position=goal), vp.WithinControlRate(limit)],
+    )
+    plan = vp.solve(problem, check=False)
+    assert plan.status is not vp.Status.INFEASIBLE
+    assert np.abs(np.diff(plan.controls, axis=0)).max() <= limit * problem.dt * (1.0 + 1e-9)
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.configuration(plan.trajectory.q[-1]))
+    place = data.oMf[robot.model.getFrameId("tip")].translation
+    np.testing.assert_allclose(place, goal, atol=1e-6)
+
+
 @pytest.mark.parametrize("torque", [1e-6, 1e-3])
 def test_a_first_motion_that_costs_next_to_nothing_does_not_call_a_goal_infeasible(torque):
     """The plan is that of the same cost without the small reference, whose first motion costs nothing."""

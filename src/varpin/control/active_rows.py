@@ -216,8 +216,10 @@ class Pushes:
 
     def _linear(self, aim: Floats) -> tuple[Floats, Floats]:
         """Shares of the weights, and the shifts, of the quadratic penalties of a step."""
-        share = np.where(self.free, 1.0 / (1.0 + self.rows.weights * self.p / self.y), 1.0)
-        return share, np.where(self.free, aim / self.y + self.p, 0.0)
+        # Rows of equality constraints may have a multiplier of zero.
+        y = np.where(self.free, self.y, 1.0)
+        share = np.where(self.free, 1.0 / (1.0 + self.rows.weights * self.p / y), 1.0)
+        return share, np.where(self.free, aim / y + self.p, 0.0)
 
     def along(self, aim: Floats) -> Along:
         """Expansions for the pass of a step towards the products ``aim``."""

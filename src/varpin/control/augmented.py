@@ -215,7 +215,12 @@ class _Rounds:
                 status, reason = self._ended_or_next(kept, begun, found, last)
                 if self._goes_between(kept, begun, status) or status is None:
                     continue
-                if kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
+                if status is Status.INFEASIBLE and not self._clearly_beyond(kept):
+                    # The last step may remove what the rounds have left.
+                    closed, closing = self._polished(replace(kept, status=Status.STALLED))
+                    if closed.violation <= FEASIBLE:
+                        kept, status, reason = closed, closed.status, f"{found.reason}; {closing}"
+                elif kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
                     kept, closing = self._polished(replace(kept, status=status))
                     status, reason = kept.status, f"{reason}; {closing}"
             except KeyboardInterrupt:
@@ -576,7 +581,7 @@ class _Rounds:
         return plan, closing
 
     def _clearly_beyond(self, plan: Solution) -> bool:
-        """Whether the motion violates a constraint between nodes by more than a thousandth of its range."""
+        """Whether the motion violates a constraint by more than a thousandth of its range."""
         bound = self.problem.bound_constraints
         return any(told.violation > REPORTED * item.scale for told, item in zip(plan.constraints, bound, strict=True))
 
