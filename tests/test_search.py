@@ -121,6 +121,18 @@ def test_a_constant_inside_a_cost_of_ones_own_changes_nothing(value):
     assert_same_search(known, plain, rtol=1e-9)
 
 
+def test_a_long_chain_converges_with_the_defaults():
+    # Five links, undamped, with an end ten thousand times dearer than their torques.
+    rng = np.random.default_rng(500)
+    begin = rng.uniform(-1.0, 1.0, 5)
+    end = vp.TrackingCost(begin + rng.uniform(-1.2, 1.2, 5), 1e4) + vp.VelocityCost(1e3)
+    cost = vp.ControlCost(1e-2) + vp.Terminal(end)
+    scene = vp.Scene(vp.planar_chain(5))
+    plan = vp.solve(vp.OptimalControlProblem(scene, cost, begin, np.zeros(5), dt=0.05, steps=20), check=False)
+    assert plan.status is vp.Status.CONVERGED
+    assert plan.iterations > 100
+
+
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 @pytest.mark.parametrize("most", [4, 100], ids=["cut short", "converged"])
 def test_scaling_a_cost_changes_nothing(factor, most):
@@ -234,19 +246,26 @@ def test_shares_add_up_to_the_cost():
 
 
 def test_a_stalled_search_gives_numbers_that_agree():
-    # A search that would end looks once more with its bounds lifted, and that look has no row: not so with 78 steps.
-    for steps in (50, 78):
+    told = []
+    for steps in (50, 60, 79, 82):
         sol = vp.solve(swing(steps))
         assert sol.status is vp.Status.STALLED
         promise, share = numbers(sol.reason)
         assert promise > share
         # The promise is that of the motion that is returned, not of some regularization.
         assert promise == pytest.approx(backward(sol.problem, sol.trajectory, 0.0).expected_decrease, rel=0.06)
-    gained = re.match(r"15 iterations have lowered the expected cost by (\S+);", sol.reason)
-    assert float(gained[1]) <= share
-    costs = [item.cost for item in sol.history]
-    # Two digits are printed.
-    assert costs[-17] - costs[-1] == pytest.approx(float(gained[1]), rel=0.05)
+        gained = re.match(r"15 iterations have lowered the expected cost by (\S+);", sol.reason)
+        if gained is None:
+            continue
+        told.append(steps)
+        assert float(gained[1]) <= share
+        costs = [item.cost for item in sol.history]
+        # A search that would end looks once more with its bounds lifted, and that look may have a row. Two digits are
+        # printed.
+        falls = [pytest.approx(costs[-rows] - costs[-1], rel=0.05) for rows in (16, 17)]
+        assert float(gained[1]) in falls
+    # How rounding falls decides which of them end so.
+    assert told
 
 
 def test_wrong_derivatives_stall_and_say_so():

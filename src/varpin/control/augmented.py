@@ -45,8 +45,6 @@ logger = logging.getLogger(__name__)
 
 # Default tolerance.
 _TOLERANCE = 1e-7
-# Default number of iterations over all rounds.
-_MOST_ITERATIONS = 5 * ITERATIONS
 # Greatest number of iterations in a round, and of rounds.
 _OF_ROUND = 40
 _ROUNDS = 40
@@ -161,7 +159,7 @@ class _Rounds:
         self.states = self.options.pop("states", None)
         self.resumed: Solution | None = self.options.pop("resume", None)
         self.tolerance = self.options.pop("tolerance", _TOLERANCE)
-        self.most = count("max_iterations", self.options.pop("max_iterations", _MOST_ITERATIONS))
+        self.most = count("max_iterations", self.options.pop("max_iterations", ITERATIONS))
         self.limit = checked_time(self.options.pop("time_limit", np.inf))
         self.report_all = require_reports(self.options.pop("callback", None), self.progress)
         self.label = f"{problem.scene.robot.name}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"

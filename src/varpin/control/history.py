@@ -7,8 +7,8 @@ from enum import Enum
 
 from varpin.trajectory import Trajectory
 
-# Default number of iterations.
-ITERATIONS = 100
+# Default number of iterations, over all rounds where there are any.
+ITERATIONS = 500
 
 
 class Status(Enum):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.control import Kept, OptimalControlProblem, Solution, kept, looked_at, replan, solve
 from varpin.control.costs import CostError
-from varpin.control.history import Status
+from varpin.control.history import ITERATIONS, Status
 from varpin.control.multipliers import REPORTED
 from varpin.control.solution import rest_of
 from varpin.errors import InputError
@@ -200,7 +200,7 @@ class Mpc:
     problem: OptimalControlProblem
     iterations: int = 2
     tolerance: float = 1e-6
-    first_iterations: int = 100
+    first_iterations: int = ITERATIONS
     budget: float = np.inf
 
     def __post_init__(self) -> None:

@@ -161,8 +161,7 @@ def solve(
             the cost's own quadratic models along the motion if each state and control were free, and at most their
             change over the motion's displacement. For squared distances it is about their value. Constants in the cost
             and the noise cost do not count.
-        max_iterations: Greatest number of iterations; by default 100, and 500 over all rounds for a problem with
-            constraints.
+        max_iterations: Greatest number of iterations, over all rounds for a problem with constraints.
 
     Other Args:
         second_order: Full differential dynamic programming: second derivatives of the dynamics too, wherever the
