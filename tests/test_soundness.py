@@ -738,15 +738,21 @@ def test_parts_of_unequal_length_are_repeated_as_short_as_the_shortest():
     assert (parts[split] <= 1 << deepest).all()
     assert np.mean(parts[split] == 1 << deepest) > 0.9
     assert motion.warnings
-    # As many equal parts are further off than the motion itself.
-    at, times = 138, vp.Gauss(4).stage_times
-    mean = int(2 ** np.ceil(np.log2(numbers.substeps[at : at + 24].mean())))
-    fine, right, coarse = (
-        taken_again(scene, vp.Gauss(5), motion, times, at, 3, own)[0] for own in (parts[at : at + 3], 1024, mean)
-    )
-    off = np.abs(motion.q[at : at + 4] - right).max()
-    assert np.abs(fine - right).max() < 0.1 * off
-    assert np.abs(coarse - right).max() > off
+    # As many equal parts, where they are longer than the shortest, are far further off. Single windows differ by how
+    # rounding falls.
+    times, fine_off, coarse_off = vp.Gauss(4).stage_times, [], []
+    for at in range(0, 196, 4):
+        own = parts[at : at + 3]
+        mean = int(2 ** np.ceil(np.log2(numbers.substeps[at : at + 24].mean())))
+        if mean >= own.min():
+            continue
+        fine, right, coarse = (taken_again(scene, vp.Gauss(5), motion, times, at, 3, n)[0] for n in (own, 1024, mean))
+        off = np.abs(motion.q[at : at + 4] - right).max()
+        fine_off.append(np.abs(fine - right).max() / off)
+        coarse_off.append(np.abs(coarse - right).max() / off)
+    assert len(fine_off) > 10
+    assert np.median(fine_off) < 0.1
+    assert np.median(np.divide(coarse_off, fine_off)) > 10.0
 
 
 @pytest.mark.filterwarnings("error")
