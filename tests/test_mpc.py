@@ -143,6 +143,30 @@ def test_a_late_plan_leaves_the_one_before_to_act():
     assert not unnamed(str(run), "19")
 
 
+@pytest.mark.parametrize(("name", "seed"), [("ur5", 0), ("panda", 0), ("panda", 1)])
+def test_beyond_the_last_horizon_the_robot_comes_to_rest(name, seed):
+    """Where no plan is ever in time, the robot stays where the first one ends, and no torque changes too fast."""
+    robot = vp.load_robot(name)
+    scene, rng = vp.Scene(robot, damping=0.5), np.random.default_rng(seed)
+    begin = rng.uniform(-0.5, 0.5, robot.dof)
+    end = vp.TrackingCost(begin + rng.uniform(-0.6, 0.6, robot.dof), 1e3) + vp.VelocityCost(10.0)
+    cost = vp.ControlCost(1e-3) + vp.VelocityCost(0.01) + vp.Terminal(end)
+    within = [
+        vp.WithinVelocityLimits(robot, (-0.7, 0.7)),
+        vp.WithinControlRate(300.0, before=scene.holding_controls(begin)),
+    ]
+    problem = vp.OptimalControlProblem(
+        scene, cost, begin, np.zeros(robot.dof), dt=0.02, steps=50, constraints=within,
+        control_limits=(-robot.model.effortLimit, robot.model.effortLimit),
+    )  # fmt: skip
+    run = vp.Mpc(problem, budget=1e-9).run(duration=3.0)
+    assert run.late[1:].all()
+    torques = run.motion.u[:: round(0.02 / run.motion.dt)]
+    assert np.abs(np.diff(torques, axis=0)).max() <= 300.0 * 0.02 * (1.0 + 1e-9)
+    assert np.abs(run.motion.v[-1]).max() < 0.01
+    np.testing.assert_allclose(run.motion.q[-1], run.plans[0].trajectory.q[-1], rtol=0, atol=0.01)
+
+
 def test_controls_stay_within_their_limits():
     problem = tracking(control_limits=(-12.0, 12.0))
     run = vp.Mpc(problem, iterations=1).run(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control import Kept, OptimalControlProblem, Solution, kept, looked_at, replan, solve
+from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.multipliers import REPORTED
@@ -22,7 +23,7 @@ from varpin.integrators import Integrator
 from varpin.integrators.base import Failure
 from varpin.mechanics.inputs import in_parts_of_steps, with_ends
 from varpin.mechanics.policy import FirstOrderHold
-from varpin.mechanics.scene import Scene, require_scene
+from varpin.mechanics.scene import Scene, closest_controls, require_scene
 from varpin.mechanics.wiener import generator, wiener_increments
 from varpin.simulation.chatter import alternation
 from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
@@ -193,8 +194,9 @@ class Mpc:
         first_iterations: Greatest number of iterations in the first tick, which has no plan to start from.
         budget: Time for planning in a tick [s]. No iteration begins that would exceed it if it took as long as the
             longest one of the tick. A late plan is discarded: the previous plan acts with its feedback, and
-            ``MpcRun.late`` marks the tick; more than one late tick in twenty gives a warning. Results then depend on
-            the machine. With an infinite budget they do not.
+            ``MpcRun.late`` marks the tick; more than one late tick in twenty gives a warning. Beyond that plan's
+            horizon the robot is brought to rest where the plan ends, if every joint can be driven; else the last
+            decision is repeated. Results then depend on the machine. With an infinite budget they do not.
     """
 
     problem: OptimalControlProblem
@@ -506,11 +508,40 @@ def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | N
     """
     policy, last, x = plan.policy_on("velocity"), len(plan.gains) - 1, np.concatenate([q, v])
     if plan.problem.linear:
-        return rest_of(plan, policy, min(age, last)).control(0, x, before)
-    if age > last and before is not None and policy.previous is not None:
-        # The last decision is repeated, with itself as the previous control.
-        before = before - policy.u[last] + policy.previous[last]
-    return policy.control(min(age, last), x, before)
+        u = rest_of(plan, policy, min(age, last)).control(0, x, before)
+    else:
+        held = _at_rest(plan, q, v) if age > last else None
+        if held is not None:
+            u = held
+        elif age > last and before is not None and policy.previous is not None:
+            # The last decision is repeated, with itself as the previous control.
+            u = policy.control(last, x, before - policy.u[last] + policy.previous[last])
+        else:
+            u = policy.control(min(age, last), x, before)
+    return u if before is None else _within_rates(plan, u, before)
+
+
+def _at_rest(plan: Solution, q: Floats, v: Floats) -> Floats | None:
+    """Control (m,) that brings the robot to rest where the plan ends; None where not every joint can be driven.
+
+    The plan's own last gains are of one step before its end. Repeated, those of steep terminal costs and of penalties
+    do not stabilize.
+    """
+    end = plan.problem.at(q0=plan.trajectory.q[-1], v0=np.zeros_like(v))
+    gains = end.holding_feedback("velocity", slower=True)
+    if gains is None:
+        return None
+    u = closest_controls(end.scene, end.q0) + gains @ np.concatenate([q - end.q0, v])
+    return np.asarray(np.clip(u, *end.control_limits), dtype=np.float64)
+
+
+def _within_rates(plan: Solution, u: Floats, before: Floats) -> Floats:
+    """The control nearest to ``u`` (m,) that limits of control rates allow after the control ``before`` (m,)."""
+    for bound in plan.problem.bound_constraints:
+        if isinstance(bound, BoundRate):
+            most = bound.limit * bound.period
+            u = np.clip(u, before - most, before + most)
+    return u
 
 
 def _unplanned(failure: StepFailure, motion: Trajectory) -> StepFailure:

@@ -521,27 +521,18 @@ class OptimalControlProblem(Frozen):
         The feedback is M(q0) (omega^2 (q0 - q) - 2 omega v), twice as fast as the fastest natural motion at q0. Without
         feedback rounding errors alone make an upright arm fall over.
         """
-        n, m, R = self.scene.robot.dof, self.scene.controls, self.decisions
-        jet = lagrangian_jet(self.scene, self.q0, np.zeros(n))
-        along = tangent_basis(self.scene, self.q0)
-        inertia, bend = (along.T @ x @ along for x in (jet.Lvv, self._static_curvature(jet.Lqq)))
-        rates = np.abs(np.linalg.eigvals(np.linalg.solve(inertia, bend)))
-        omega = 2.0 * float(np.sqrt(rates.max(initial=0.0))) + 1.0 / self.duration
-        if self.linear:
-            R = self.steps
-        gains = np.zeros((R, m, 2 * n))
-        driven = along.T @ self.scene.actuation
-        if np.linalg.matrix_rank(driven) == len(driven) and omega * self.dt * self.hold <= 0.25:
-            in_v = np.eye(n) if self.integrator.variational else jet.Lvv
-            wanted = np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
-            gains[:] = -np.linalg.pinv(driven) @ (along.T @ wanted)
+        n, m = self.scene.robot.dof, self.scene.controls
+        R = self.steps if self.linear else self.decisions
+        on: Literal["momentum", "velocity"] = "momentum" if self.integrator.variational else "velocity"
+        feedback = self.holding_feedback(on)
+        gains = np.zeros((R, m, 2 * n)) if feedback is None else np.tile(feedback, (R, 1, 1))
         u = np.tile(self.holding_controls(), (R, 1))
         return LinearPolicy(
             u,
             gains,
             np.tile(np.append(self.q0, np.zeros(n)), (R, 1)),
             hold=self.hold,
-            on="momentum" if self.integrator.variational else "velocity",
+            on=on,
             limits=(self.control_limits[0], self.control_limits[1]),
             before=self.holding_controls() if self.linear else None,
             period=self.period,
@@ -549,6 +540,30 @@ class OptimalControlProblem(Frozen):
             servos=self.scene.servo_joints,
             linear=self.linear,
         )
+
+    def holding_feedback(self, on: Literal["momentum", "velocity"], *, slower: bool = False) -> Floats | None:
+        """Gains (m, 2n) that stabilize rest at q0, on (q, p) or (q, v): see :meth:`holding_policy`.
+
+        None where not every joint can be driven, or where controls are held too long for them. With ``slower`` they are
+        then as fast as that allows, and None only where the robot would still fall over.
+        """
+        n = self.scene.robot.dof
+        jet = lagrangian_jet(self.scene, self.q0, np.zeros(n))
+        along = tangent_basis(self.scene, self.q0)
+        driven = along.T @ self.scene.actuation
+        inertia, bend = (along.T @ x @ along for x in (jet.Lvv, self._static_curvature(jet.Lqq)))
+        squares = np.linalg.eigvals(np.linalg.solve(inertia, bend))
+        omega = 2.0 * float(np.sqrt(np.abs(squares).max(initial=0.0))) + 1.0 / self.duration
+        fastest = 0.25 / (self.dt * self.hold)
+        if slower:
+            omega = min(omega, fastest)
+        falls = float(squares.real.max(initial=0.0)) >= omega**2
+        if np.linalg.matrix_rank(driven) < len(driven) or falls or omega > fastest:
+            return None
+        in_v = np.eye(n) if on == "momentum" else jet.Lvv
+        wanted = np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
+        gains: Floats = -np.linalg.pinv(driven) @ (along.T @ wanted)
+        return gains
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""
