@@ -175,8 +175,9 @@ class _Step:
         multipliers, pull = self._dual(room, np.zeros(self.free.shape), loop.gradient)
         self.rows = met
         u, (lower, upper) = problem.decided(motion), problem.control_limits
-        # A control at its limit is free again where the cost decreases inwards.
-        self.inwards = ~self.free & (((u <= lower) & (pull < 0.0)) | ((u >= upper) & (pull > 0.0)))
+        # A control at its limit is free again where the cost decreases inwards, if there is a way inwards.
+        inwards = ((u <= lower) & (pull < 0.0)) | ((u >= upper) & (pull > 0.0))
+        self.inwards = ~self.free & inwards & (lower < upper)
         steep = np.where(loop.curvature > 0.0, loop.curvature, np.inf)
         decrease = float(np.einsum("ki,kij,kj->", pull, loop.inverse, pull) + (pull**2 / steep)[self.inwards].sum())
         decrease = 0.5 * decrease - sum(float((lam * c).sum()) for lam, c in zip(multipliers, room, strict=True))
