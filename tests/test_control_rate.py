@@ -19,11 +19,17 @@ MATRIX = np.array([[2e-2, 5e-3], [5e-3, 1e-2]])
 BEFORE = np.array([0.7, -0.3])
 
 
-def linear(rate=None, integrator=None, sampling="midpoint", noise=None, steps=24, limits=None, hold=1, q0=(0.3, -0.4)):
+ACTUATION = ((1.0, 0.4), (-0.2, 1.3))
+
+
+def linear(
+    rate=None, integrator=None, sampling="midpoint", noise=None, steps=24, limits=None, hold=1, q0=(0.3, -0.4),
+    actuation=ACTUATION,
+):  # fmt: skip
     """Two sliders with springs, which follow a wave and end at rest."""
     scene = vp.Scene(
-        sliders(2), gravity=False, damping=[0.3, 0.1], stiffness=[1.0, 0.0], rest=[0.1, -0.2],
-        actuation=[[1.0, 0.4], [-0.2, 1.3]], noise=noise,
+        sliders(2), gravity=False, damping=[0.3, 0.1], stiffness=[1.0, 0.0], rest=[0.1, -0.2], actuation=actuation,
+        noise=noise,
     )  # fmt: skip
     cost = vp.TrackingCost(lambda t: [np.sin(3 * t), 0.2], [[2.0, 0.3], [0.3, 1.0]])
     cost += vp.ControlCost([0.05, 0.02], reference=[0.3, -0.1])
@@ -421,8 +427,9 @@ def test_late_plans_feed_the_control_before_back():
 
 
 def test_the_last_decision_of_a_late_plan_expects_itself_before():
-    """A plan that is held beyond its end, on the plant that it was made for, repeats its last decision."""
-    problem = linear(vp.ControlRateCost(MATRIX, BEFORE), integrator=vp.RungeKutta4(), steps=6)
+    """A plan that is held beyond its end repeats its last decision where not every joint can be driven to rest."""
+    one_way = [[1.0, 0.4], [0.5, 0.2]]
+    problem = linear(vp.ControlRateCost(MATRIX, BEFORE), integrator=vp.RungeKutta4(), steps=6, actuation=one_way)
     ran = vp.Mpc(problem, budget=1e-9).run(
         vp.Plant(problem.scene, integrator=vp.RungeKutta4(), substeps=1), duration=0.5
     )
