@@ -11,10 +11,12 @@ import pytest
 from findings import about
 
 import varpin as vp
-from varpin.control import search
+from varpin.control import line_search, search
 from varpin.control.backward import backward
 from varpin.control.descent import at_stake
+from varpin.control.line_search import LineSearch
 from varpin.control.trials import Trials
+from varpin.control.watchdog import Watchdog
 from varpin.core import Watch, stake_of
 from varpin.integrators.base import open_loop
 
@@ -259,7 +261,9 @@ def test_a_stalled_search_gives_numbers_that_agree():
             continue
         told.append(steps)
         assert float(gained[1]) <= share
-        costs = [item.cost for item in sol.history]
+        # Without the iterations that were away from the best motion.
+        costs = np.array([item.cost for item in sol.history])
+        costs = costs[costs <= np.minimum.accumulate(costs)]
         # A search that would end looks once more with its bounds lifted, and that look may have a row. Two digits are
         # printed.
         falls = [pytest.approx(costs[-rows] - costs[-1], rel=0.05) for rows in (16, 17)]
@@ -360,8 +364,8 @@ def test_trials_that_are_cut_to_pieces_are_given_up(monkeypatch):
     problem = tool_reach()
     sol, parts = work(monkeypatch, problem, max_iterations=12)
     with monkeypatch.context() as patch:
-        patch.setattr(search, "_HALVINGS", problem.integrator.guard.max_halvings)
-        patch.setattr(search, "_PARTS", np.inf)
+        patch.setattr(line_search, "_HALVINGS", problem.integrator.guard.max_halvings)
+        patch.setattr(line_search, "_PARTS", np.inf)
         unbounded, all_parts = work(monkeypatch, problem, max_iterations=12)
     assert parts < 0.4 * all_parts
     assert sol.cost <= 1.01 * unbounded.cost
@@ -371,8 +375,8 @@ def test_trials_that_are_cut_to_pieces_are_given_up(monkeypatch):
 def test_what_was_given_up_is_tried_again_where_nothing_else_helps(steps, monkeypatch):
     """With no halvings to begin with, motions that need them are found all the same."""
     free = vp.solve(swing(steps))
-    monkeypatch.setattr(search, "_HALVINGS", 0)
-    monkeypatch.setattr(search, "_MORE_HALVINGS", 0)
+    monkeypatch.setattr(line_search, "_HALVINGS", 0)
+    monkeypatch.setattr(line_search, "_MORE_HALVINGS", 0)
     bounded = vp.solve(swing(steps))
     assert bounded.trajectory.statistics.substeps.max() > 1
     assert bounded.cost <= 1.05 * free.cost
@@ -485,7 +489,7 @@ def test_a_step_is_extended_while_the_cost_falls_on():
     robot = vp.planar_chain(2)
     swing = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
     swing += vp.Terminal(vp.TrackingCost([np.pi / 2, 0.0], 1e3) + vp.VelocityCost(1e2))
-    options = {"dt": 2.0 / 36, "steps": 36, "integrator": vp.RungeKutta4(), "control_limits": (-20.0, 20.0)}
+    options = {"dt": 0.05, "steps": 40, "integrator": vp.RungeKutta4(), "control_limits": (-20.0, 20.0)}
     problem = vp.OptimalControlProblem(vp.Scene(robot), swing, [-np.pi / 2, 0.0], np.zeros(2), **options)
     plan = vp.solve(problem, tolerance=1e-4, check=False)
     assert plan.status.converged
@@ -498,50 +502,84 @@ def test_a_step_is_extended_while_the_cost_falls_on():
     assert costs == sorted(costs, reverse=True)
 
 
-def steep_reach():
-    """Three links reach with little on the controls and much on the end: long steps along the model miss it."""
-    end = vp.Terminal(vp.TrackingCost([1.0, -1.5, 1.0], 1e4) + vp.VelocityCost(1e3))
-    options = {"dt": 1.0 / 30, "steps": 30, "integrator": vp.RungeKutta4()}
-    scene = vp.Scene(vp.planar_chain(3), damping=0.1)
-    return vp.OptimalControlProblem(scene, vp.ControlCost(1e-3) + end, np.zeros(3), np.zeros(3), **options)
+def valley():
+    """Four links reach with little on the controls and much on the end: long steps along the model miss it."""
+    end = vp.Terminal(vp.TrackingCost([1.0, -1.5, 1.0, -0.5], 1e4) + vp.VelocityCost(1e3))
+    options = {"dt": 1.0 / 30, "steps": 30, "integrator": vp.Gauss(2)}
+    scene = vp.Scene(vp.planar_chain(4))
+    return vp.OptimalControlProblem(scene, vp.ControlCost(1e-3) + end, np.zeros(4), np.zeros(4), **options)
 
 
-def test_corrections_of_poor_trials_save_iterations_and_lead_to_the_same_plan(monkeypatch):
-    corrected = vp.solve(steep_reach(), check=False)
-    monkeypatch.setattr(search, "_CORRECTIONS", 0)
-    plain = vp.solve(steep_reach(), check=False)
-    assert corrected.status.converged
+def test_a_watchdog_saves_iterations_and_leads_to_the_same_plan(monkeypatch):
+    watched = vp.solve(valley(), check=False)
+    monkeypatch.setattr(Watchdog, "departs", lambda *_: False)
+    plain = vp.solve(valley(), check=False)
+    assert watched.status.converged
     assert plain.status.converged
-    assert corrected.cost == pytest.approx(plain.cost, rel=1e-6)
-    assert corrected.iterations <= 0.8 * plain.iterations
-    assert sum(row.rollouts for row in corrected.history) < sum(row.rollouts for row in plain.history)
-    costs = [row.cost for row in corrected.history]
-    assert costs == sorted(costs, reverse=True)
+    assert watched.cost == pytest.approx(plain.cost, rel=1e-6)
+    assert watched.iterations <= 0.8 * plain.iterations
+    rises = [row for row in watched.history if row.decrease < 0.0]
+    assert rises
+    assert all(row.step >= 0.125 and row.cost - watched.cost < 0.01 * watched.search.first for row in rises)
+    assert all(row.decrease >= 0.0 for row in plain.history)
 
 
-@pytest.mark.parametrize("before", [2, 4, 6])
-def test_searches_that_correct_trials_go_on_as_if_not_interrupted(before):
-    problem = steep_reach()
-    whole = vp.solve(problem, check=False)
-    part = vp.solve(problem, max_iterations=before, check=False)
-    assert_same_search(whole, vp.solve(problem, resume=part, check=False))
+def test_a_watchdog_that_finds_nothing_returns_to_the_motion_that_it_left(monkeypatch):
+    """Where the iterations away lead nowhere: here they may take no step."""
+    own = LineSearch.run
+
+    def stuck(self, start, shortest=0.0):
+        return line_search.Step() if away() else own(self, start, shortest)
+
+    searches = []
+    begin = search._Search.begin
+    monkeypatch.setattr(search._Search, "begin", lambda self, *args: (searches.append(self), begin(self, *args))[1])
+    away = lambda: searches[-1].watchdog.away > 0  # noqa: E731
+    monkeypatch.setattr(LineSearch, "run", stuck)
+    plan = vp.solve(valley(), check=False, max_iterations=60)
+    rows = plan.history
+    departures = [k for k, row in enumerate(rows) if row.decrease < 0.0]
+    assert len(departures) > 1
+    for k in departures:
+        # The step of length 0 that ends the departure, and then the iteration that would have been the next.
+        assert rows[k + 1].step == 0.0
+        assert rows[k + 2].cost < rows[k - 1].cost
+    # Each departure in vain doubles the time until the next, and divides its rise by ten.
+    assert np.all(np.diff(np.diff(departures)) > 0)
+    allowed = 0.01 * plan.search.first * 0.1 ** np.arange(len(departures))
+    assert all(-rows[k].decrease <= most for k, most in zip(departures, allowed, strict=True))
+    # The best motion is returned, also where the search ends while it is away.
+    assert plan.cost == min(row.cost for row in rows)
 
 
-@pytest.mark.parametrize("iterations", [2, 3, 5])
-def test_a_correction_brings_a_poor_trial_close_to_the_cost_that_the_model_promises(iterations, monkeypatch):
-    problem = steep_reach()
-    part = vp.solve(problem, max_iterations=iterations, check=False)
-    monkeypatch.setattr(search._Search, "_corrects", lambda *_: True)
-    monkeypatch.setattr(search, "_CORRECTIONS", 1)
-    at = search._Search(problem, second_order=False)
-    at.resume(part.search)
-    at._plan()
-    feedback = search.with_feedback(problem, at.trajectory, at.plan, closed=True)
-    here = search._Here(problem.decided(at.trajectory), feedback, np.zeros(0), at.cost)
-    bounds = search._Bounds(problem.integrator, np.inf, watched=False)
-    trial = at._try(1.0, at.plan, here, bounds)
-    assert trial.cost > 0.3 * at.plan.slope
-    corrected, trials, _ = at._corrected(1.0, trial, at.plan, here, bounds)
-    assert trials == 1
-    promised = -at.plan.expected_decrease
-    assert abs(corrected.cost - promised) < 0.5 * abs(trial.cost - promised)
+@pytest.mark.parametrize(
+    ("backtracking", "found", "lengths"),
+    [
+        # The parabola through a decrease of half of what the slope gives has its minimum at the trial.
+        (0.5, [-0.5, -0.25], [1.0, 0.5, 0.25]),
+        # Through an increase as large as what the slope gives, at a quarter. Beyond that no more powers are left out.
+        (0.5, [1.0, 25.0], [1.0, 0.25, 0.0625]),
+        # So it is after a trial that has no cost.
+        (0.5, [0.1, np.inf], [1.0, 0.5, 0.125]),
+        (0.25, [1.0, 25.0], [1.0, 0.25, 0.0625]),
+    ],
+)
+def test_lengths_of_a_line_search_follow_the_parabola_through_a_trial(backtracking, found, lengths):
+    """``found``: changes of the cost where the slope is -1."""
+    steps, tried = line_search._Lengths(backtracking, 0.0), []
+    for length, change in zip(steps, [*found, np.inf], strict=False):
+        tried.append(length)
+        steps.learn(length, change, -1.0)
+    assert tried[:3] == lengths
+
+
+@pytest.mark.parametrize("into", [0, 1, 2])
+def test_searches_go_on_as_if_not_interrupted_while_they_are_away(into, tmp_path):
+    whole = vp.solve(valley(), check=False)
+    departure = next(k for k, row in enumerate(whole.history) if row.decrease < 0.0)
+    part = vp.solve(valley(), max_iterations=departure + into, check=False)
+    part.save(tmp_path / "part.npz")
+    read = vp.Solution.load(tmp_path / "part.npz", part.problem)
+    assert read.search.watchdog == part.search.watchdog
+    for known in (part, read):
+        assert_same_search(whole, vp.solve(part.problem, resume=known, check=False))

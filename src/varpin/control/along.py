@@ -110,14 +110,6 @@ class Along:
         # Hessians of a further cost of controls, added to those of steps (N, 2n + m, 2n + m).
         self.firm: Floats | None = None
 
-    def beside(self, trajectory: Trajectory) -> Along:
-        """The expansions with the gradients of the running cost along a motion close by."""
-        made, problem = copy(self), self.problem
-        made.running = Expansion(problem.expand_running(trajectory).gradient, self.running.hessian)
-        if problem.rate is not None:
-            made.pull, _ = problem.rate.expand(problem.decided(trajectory), problem.period)
-        return made
-
     @cached_property
     def running(self) -> Expansion:
         """The running cost at its samples."""

@@ -136,4 +136,4 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
             break
     if best is None:
         return within_limits(along, regularization, curvature)
-    return replace(best, model=along.model, factors=None)
+    return replace(best, model=along.model)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
+from varpin.control.watchdog import Watchdog
 from varpin.trajectory import Trajectory
 
 # Default number of iterations, over all rounds where there are any.
@@ -58,8 +59,8 @@ class Iteration:
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
         backward_passes: Number of backward passes with different regularizations. Those that determine the controls at
-            their limits, on the same derivatives, do not count, nor do those that correct trials.
-        rollouts: Number of trials of the line search, corrections included.
+            their limits, on the same derivatives, do not count.
+        rollouts: Number of trials of the line search.
         seconds: Time of the iteration [s].
         second_order: Whether second derivatives of the dynamics were used.
     """
@@ -99,7 +100,7 @@ class SearchState:
         best: The motion of least expected cost so far; None before the first backward pass.
         best_cost: Cost of the best motion without noise.
         best_noise: Noise cost of the best motion, without the noise of constant strength, which changes no plan.
-        gains: Decrease of the least expected cost in each iteration.
+        gains: Decrease of the least expected cost in each iteration; those away from the best motion are left out.
         regularization: Relative to the diagonal of Quu.
         growth: Last factor of the regularization.
         bounded: Whether the line search stops trials with many substeps.
@@ -108,6 +109,7 @@ class SearchState:
         saturated: Whether it takes into account that drives of servos are at their limits.
         clips: Whether plans may leave control limits to the clipping of motions where steps are short.
         returned: Whether it has just gone back from a motion that cannot be linearized.
+        watchdog: Whether it is away from the best motion.
         history: The iterations before.
     """
 
@@ -128,6 +130,7 @@ class SearchState:
     saturated: bool = False
     clips: bool = True
     returned: bool = False
+    watchdog: Watchdog = field(default_factory=Watchdog)
 
     def __repr__(self) -> str:
         return f"SearchState(cost {self.cost:.6g}, after {len(self.history)} iterations)"

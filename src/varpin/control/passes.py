@@ -42,7 +42,6 @@ class Plan:
     limited: bool
     loss: float  # estimated relative rounding error of Quu, or of its root
     model: Model  # of the cost along the motion
-    factors: Floats | None  # (R, m, m) L D L' of the regularized Quu, without limits and along motions of one block
     left: Floats | None = None  # (R, m) the model's gradient after a full step, which presses controls against limits
 
     @property
@@ -92,30 +91,6 @@ def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floa
     if left < 1.0:
         g[:, n:] += (1.0 - left) * noise_fields(scene, trajectory, q[1:], v[1:], problem.q0).F
     return g
-
-
-def feedforward_beside(along: Along, plan: Plan, regularization: float, trajectory: Trajectory) -> Floats:
-    """The feed-forward part (R, m) of a plan around a motion close to its own, of which it has ``factors``.
-
-    The cost's gradients are those along the motion close by; its Hessians, those of the dynamics and the gains are the
-    plan's.
-    """
-    problem, m = along.problem, along.problem.scene.controls
-    terminal, x = along.terminal, along.states
-    end = problem.expand_terminal(trajectory).gradient[0, :x]
-    feedforward = np.empty_like(plan.feedforward)
-    gains = core.Gains(
-        feedforward=feedforward,
-        feedback=plan.feedback,
-        previous=np.zeros((0, m, m)) if plan.previous is None else plan.previous,
-        control_gradient=plan.gradient,
-        costate=np.zeros((0, x)),
-        spread=plan.spread,
-        factors=plan.factors,
-    )
-    steps = along.beside(trajectory).steps(0, problem.steps, None, without_limits(m, x))
-    core.run_gradients(problem.dt, problem.hold, regularization, steps, gains, terminal.slopes.T @ end)
-    return feedforward
 
 
 def without_feedback(plan: Plan, moves: Floats) -> Plan:
@@ -222,10 +197,8 @@ def one_pass(
         if final is None or squares is None or change is None or (within is None and along.within is not None):
             return None, costate
         by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change, within)
-    factors = None
     if limits is None:
-        factors = np.empty((R, m, m)) if len(along.blocks) == 1 else None
-        limits = without_limits(m, 2 * n)._replace(factors=factors)
+        limits = without_limits(m, 2 * n)
     samples = len(problem.model_rule)
     for begin, end in reversed(along.blocks):
         steps, points = slice(begin, end), slice(begin * samples, end * samples)
@@ -267,7 +240,6 @@ def one_pass(
         limits.slack.size > 0,
         found.loss,
         along.model,
-        factors,
     )
     return plan, costate
 
@@ -337,6 +309,5 @@ def _one_pass_on_lines(
         limits.slack.size > 0,
         found.loss,
         along.model,
-        None,
     )
     return plan, of_states

@@ -1,7 +1,7 @@
 """Stochastic differential dynamic programming on the structured linearization of any integrator.
 
-The iterations, the line search, equation (O13) of docs/mathematics.md, and the stopping criteria. The backward pass is
-in :mod:`varpin.control.backward`; :mod:`varpin.control.augmented` adds hard constraints.
+The iterations, their regularization and the stopping criteria. The backward pass is in :mod:`varpin.control.backward`,
+the line search in :mod:`varpin.control.line_search`; :mod:`varpin.control.augmented` adds hard constraints.
 """
 
 from __future__ import annotations
@@ -9,11 +9,9 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import is_dataclass, replace
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,26 +19,23 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.control.along import Along
 from varpin.control.backward import backward
-from varpin.control.commands import controls_along, first_commands, shifted_commands, with_feedback
+from varpin.control.commands import controls_along, first_commands, shifted_commands
 from varpin.control.costs import CostError
-from varpin.control.descent import rounding
 from varpin.control.examination import looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
+from varpin.control.line_search import TRIAL_ERRORS, VERY_SHORT, LineSearch, Rated, Start, Step
 from varpin.control.multiple_shooting import GapClosing, Path, path_of
 from varpin.control.noise_adjoint import is_exact
-from varpin.control.passes import Plan, feedforward_beside, noise_shares
+from varpin.control.passes import Plan, noise_shares
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import COMPARISON, SLOW, SUFFICIENT, refine
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback
-from varpin.control.trials import Attempt, Trials
-from varpin.core import Watch
+from varpin.control.trials import Trials
+from varpin.control.watchdog import Watchdog
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError
-from varpin.integrators import Integrator
-from varpin.integrators.variational import Variational
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.failures import StepFailure, named
 from varpin.simulation.kinks import saturates
@@ -64,28 +59,15 @@ Progress = Callable[[int, int], None]
 
 logger = logging.getLogger(__name__)
 
-_EPS = float(np.finfo(np.float64).eps)
 # Least share of the expected decrease that a step must reach (Armijo), and the factor between trials.
 ARMIJO, BACKTRACKING = 1e-5, 0.5
-# Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
-_POOR = 0.3
-# Where a step of late was of a length between these, poor trials no shorter are corrected, so many times at most, while
-# the change of the cost falls below this share of itself. Not where it exceeds _FAR times what the slope gives, nor
-# where a correction of the controls, in units of the trial's step, is outside the last bounds.
-_TINY, _BENT, _CORRECTIONS, _CONTRACTION, _FAR = 0.03, 0.25, 3, 0.3, 3.0
-_SMALLEST, _LARGEST = 0.03, 1.0
-# A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
-# half. The step is extended by a factor while that lowers the cost.
-_EARLY, _EXTENSION = 0.85, 4.0
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it decreases after
 # long steps and increases after a very short one, or after two short ones in a row.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
-_LONG, _SHORT, _VERY_SHORT = 0.5, 0.1, 0.01
+_LONG, _SHORT = 0.5, 0.1
 # A step with clipped controls is preferred to a short one where its decrease is so many times as great, and where it
 # brings no more than this share of the controls to limits.
 _MUCH_MORE, _FEW = 3.0, 0.02
-# Errors that reject a trial.
-_TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
 # Greatest regularization with which a search may converge. Controls without effect or cost need some.
 _LITTLE = 1e-4
 # Relative rounding error of Quu above which the gains are reported as unreliable.
@@ -98,17 +80,8 @@ _NEAR = 1e-4
 _SLOW = 8
 # Share of the first motion's cost at stake that is added to the current one: an optimum of cost zero has none.
 NOTHING = 1e-9
-# Approximate shortest step of a line search, and its greatest number of trials.
-_SHORTEST, _TRIALS = 1e-6, 40
-# Bounds on the substeps of a trial. A trial stops where a step needs more than _HALVINGS halvings and more than the
-# current motion, or where the total exceeds _PARTS times that of the current motion. If no other trial leads far, the
-# stopped ones are repeated with larger bounds, then with none. A search that stalls continues without bounds.
-_HALVINGS, _MORE_HALVINGS = 2, 3
-_PARTS = 3
 # Marks a cost at stake that no backward pass has computed yet.
 UNKNOWN = -1.0
-# Relative margin above the greatest acceptable cost at which a trial stops; well above rounding errors.
-_DEARER = 1e-9
 
 
 def solve(
@@ -170,7 +143,8 @@ def solve(
         forward: ``"closed"``: the feedback gains act in the line search. ``"open"``: only the feed-forward part, as in
             the paper; it diverges where the open loop is unstable over the horizon.
         armijo: Least share of the expected decrease that a step must reach (the paper's alpha).
-        backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1).
+        backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1). Where the parabola
+            through a trial's cost and the slope has its minimum far below the next length, that length is left out.
         regularization: Initial value, relative to the diagonal of Quu; it increases and decreases as needed.
         time_limit: No iteration begins after this time since the call [s]. The result then depends on the machine.
         callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table`. The
@@ -384,111 +358,6 @@ def _search_of(problem: OptimalControlProblem, controls: object, resume: Solutio
     return resume.search
 
 
-def _at_rounding(limits: Floats) -> Floats:
-    """Rounding errors of controls at their limits (2, m); (m,)."""
-    rounding: Floats = 8.0 * _EPS * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
-    return rounding
-
-
-def _onto_limits(u: Floats, limits: Floats, rounding: Floats) -> Floats:
-    """Controls (R, m), moved exactly onto a limit where they differ from it by no more than ``rounding`` (m,)."""
-    close = np.abs(u - limits[:, None]) <= rounding
-    if not close.any():
-        return u
-    for limit, onto in zip(limits, close, strict=True):
-        u = np.where(onto, limit, u)
-    return u
-
-
-def _relative(change: Floats, step: Floats) -> float:
-    """Root mean square over the controls of the size of a change (R, m) relative to that of a step (R, m)."""
-    squares, moved = (change**2).sum(axis=0), (step**2).sum(axis=0)
-    moves = moved > 0.0
-    return math.sqrt(float((squares[moves] / moved[moves]).mean())) if moves.any() else math.inf
-
-
-@functools.lru_cache(maxsize=16)
-def _lengths(backtracking: float) -> tuple[float, ...]:
-    """Step lengths of a line search, the longest first."""
-    shorter = max(1, round(np.log(_SHORTEST) / np.log(backtracking)))
-    return tuple(backtracking**i for i in range(min(1 + shorter, _TRIALS)))
-
-
-@functools.lru_cache(maxsize=256)
-def _cut_less(integrator: Variational, halvings: int) -> Variational:
-    """The integrator with at most ``halvings`` halvings of a step; itself where it has no guard."""
-    guard = integrator.guard
-    if guard is None or not is_dataclass(integrator):
-        return integrator
-    return replace(integrator, guard=replace(guard, max_halvings=min(halvings, guard.max_halvings)))
-
-
-class _Bounds(NamedTuple):
-    """Bounds on the work of a trial of the line search.
-
-    Attributes:
-        integrator: Bounds the halvings of a step.
-        parts: Greatest number of substeps, relative to the current motion.
-        watched: Whether a trial of length 1 is also stopped early. Most searches accept it, and the check takes time.
-    """
-
-    integrator: Integrator
-    parts: float
-    watched: bool
-
-
-class _Here(NamedTuple):
-    """What all trials of a line search start from."""
-
-    controls: Floats  # of the decisions (R, m)
-    feedback: Commands  # without the feed-forward part
-    added: Floats  # noise cost of each step
-    total: float  # the expected cost
-
-
-class _Rated(NamedTuple):
-    """A motion's expansions and their plan with the Hessian of the value function held."""
-
-    along: Along
-    plan: Plan
-
-
-class _Trial(NamedTuple):
-    """A trial of the line search.
-
-    Attributes:
-        motion: None where the trial was stopped or has no finite cost.
-        shares: The terms of its cost (:meth:`OptimalControlProblem.shares`).
-        cost: Change of the cost without noise.
-        expected: Change of the expected cost.
-        cut: Whether it was stopped for its number of substeps.
-        rated: The expansions along it and their plan, where the expected cost needed them.
-    """
-
-    motion: Attempt | None = None
-    shares: Floats | None = None
-    cost: float = np.inf
-    expected: float = np.inf
-    cut: bool = False
-    rated: _Rated | None = None
-
-
-class _Step(NamedTuple):
-    """Result of a line search.
-
-    Attributes:
-        length: Length of the accepted step; 0 if none was.
-        trials: Number of trials.
-        decrease: Decrease of the expected cost.
-        hidden: Rounding error of a difference of costs; 0 if a step was accepted or no trial has a cost.
-    """
-
-    length: float
-    trials: int
-    decrease: float
-    hidden: float
-
-
 class _Search:
     """The state of a search: the current motion, its plan and the history."""
 
@@ -505,7 +374,7 @@ class _Search:
         whole_noise: bool = False,
     ) -> None:
         self.problem, self.second_order, self.forward = problem, second_order, forward
-        self.armijo, self.backtracking, self.regularization = armijo, backtracking, regularization
+        self.regularization = regularization
         self.growth = 1.0
         self.exact = second_order
         # Whether drives of servos have come to their limits while steps were short: from then on changes of their
@@ -513,15 +382,10 @@ class _Search:
         self.saturated = False
         # Whether plans leave out the limits now, and whether they may do so: no step of theirs has been rejected.
         self.clipping, self.clips = False, problem.limited
-        self.rounding = _at_rounding(problem.control_limits)
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
         self.trials = Trials(problem)
-        integrator = problem.integrator
-        # Whether steps may be divided, and the integrator with fewer halvings, by their greatest number.
-        self.divides = isinstance(integrator, Variational) and integrator.guard is not None and is_dataclass(integrator)
-        self.less: dict[int, Integrator] = {}
         self._around: Along | None = None
         self.trajectory: Trajectory
         self.shares: Floats  # the terms of the trajectory's cost
@@ -537,9 +401,10 @@ class _Search:
         self.before: tuple[Trajectory, Floats, float, float] | None = None
         # Whether the search has just gone back from a motion that cannot be linearized.
         self.returned = False
+        self.watchdog = Watchdog()
         # Whether short trials of the last line searches were rejected where they divide other steps than the motion.
         self.jumps = False
-        self.gains: list[float] = []  # decrease of the least expected cost in each iteration
+        self.gains: list[float] = []  # decrease of the least expected cost in each iteration, those away left out
         self.reason = ""
         self.anew = anew  # whether the final motion gets a backward pass of its own
         self.followed = 0.0  # without one, the length of the last step
@@ -549,10 +414,18 @@ class _Search:
         # limits the noise cost is discontinuous where a control meets one and loses its gains, so it has no gradient.
         self.wants_whole = whole_noise and not (second_order or problem.limited) and self.any_steered
         self.whole = False
-        self.rated: _Rated | None = None  # of the current motion
+        self.rated: Rated | None = None  # of the current motion
         # Prefix of each log line: it tells several problems, and a controller's ticks, apart.
         robot, begin = problem.scene.robot.name, problem.t0
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {begin:g} s"
+        self.line_search = LineSearch(
+            problem,
+            self.trials,
+            armijo=armijo,
+            backtracking=backtracking,
+            closed=forward == "closed",
+            label=self.label,
+        )
 
     def begin(self, commands: Commands) -> None:
         problem = self.problem
@@ -594,6 +467,7 @@ class _Search:
         self.whole = state.whole and self.wants_whole
         self.clips = state.clips and self.clips
         self.returned = state.returned
+        self.watchdog = state.watchdog
         if state.saturated:
             self._take_saturation()
 
@@ -616,6 +490,7 @@ class _Search:
             saturated=self.saturated,
             clips=self.clips,
             returned=self.returned,
+            watchdog=self.watchdog,
         )
 
     def run(
@@ -626,23 +501,15 @@ class _Search:
         while True:
             self.state = self._state()
             started = time.perf_counter()
-            try:
-                passes = self._plan()
-            except _TRIAL_ERRORS as error:
-                if not self.history:
-                    raise
-                if isinstance(error, LinearizationError) and self._go_back():
-                    continue
-                logger.warning("%s: %s", self.label, error)
-                self.reason = str(error)
-                return Status.NOT_DIFFERENTIABLE
-            if self.plan is None:
-                self.reason = f"the regularization has reached {self.regularization:.1e} of the diagonal of Quu"
-                return Status.INDEFINITE
+            failed, passes = self._next_plan()
+            if failed is not None or self.plan is None:
+                return failed or Status.INDEFINITE
             self._compare_with_best(self.plan)
             if not self.history or self.first == UNKNOWN:
                 self.first = self._at_first()
             there = self._is_there(self.plan, tolerance)
+            if self._is_back(there):
+                continue
             if self._turns_whole(ends=there):
                 self._take_whole()
                 continue
@@ -655,26 +522,15 @@ class _Search:
                 self.reason = "ended early for slow progress; " + self._numbers(tolerance)
                 return Status.MAX_ITERATIONS
             ended, why = self._ended(tolerance, last, deadline)
-            if ended is Status.STALLED and self._lift():
-                continue
-            if ended is Status.STALLED and self._turns_whole(ends=True):
-                self._take_whole()
+            if ended is Status.STALLED and self._goes_on():
                 continue
             if ended is not None:
                 self._note(report, started, passes)
                 self.reason = why + self._numbers(tolerance, afresh=True)
                 return ended
-            meets = self._meets_limits(self.plan)
-            step = self._line_search()
-            if step.length == 0.0 and self.exact:
-                passes += self._plan(exact=False)
-                more = self._line_search()
-                step = more._replace(trials=step.trials + more.trials, hidden=max(step.hidden, more.hidden))
-            if step.length <= _SHORT and meets:
-                more, added = self._clipped_instead(step)
-                step, passes = more, passes + added
-            self._note(report, started, passes, step)
-            if step.length == 0.0 and self._decrease_at_most(step.hidden):
+            step, more = self._step()
+            self._note(report, started, passes + more, step)
+            if step.length == 0.0 and not self.watchdog.away and self._decrease_at_most(step.hidden):
                 self.reason = f"{self._expected()}, and rounding hides {step.hidden:.1e} of the cost"
                 return Status.CONVERGED
             # A tick's iteration begins only if it will end in time, should it take as long as the longest before.
@@ -684,15 +540,114 @@ class _Search:
                 self.followed = step.length
                 self.reason = f"{self._expected()} before the last step"
                 return ended
-            if self.returned:
-                # With less regularization the step might lead there again.
-                self.returned = False
-            elif step.length >= _LONG:
-                self._relax()
-            elif self._steps_short() and not self._stiffen() and not self._lift():
+            self.watchdog = self.watchdog.stepped()
+            if not self._regularized(step):
                 self.reason = f"no step lowers the cost, whatever the regularization; {self._jump()}"
                 self.reason += self._numbers(tolerance, afresh=True)
                 return Status.STALLED
+
+    def _next_plan(self) -> tuple[Status | None, int]:
+        """Backward passes along the motion, or along an earlier one where they fail, and their number.
+
+        The status is that of a search that has no plan, else None.
+        """
+        passes = 0
+        while True:
+            try:
+                passes += self._plan()
+            except TRIAL_ERRORS as error:
+                if not self.history:
+                    raise
+                if not (self._returns() or (isinstance(error, LinearizationError) and self._go_back())):
+                    logger.warning("%s: %s", self.label, error)
+                    self.reason = str(error)
+                    return Status.NOT_DIFFERENTIABLE, passes
+            else:
+                if self.plan is not None:
+                    return None, passes
+                if not self._returns():
+                    self.reason = f"the regularization has reached {self.regularization:.1e} of the diagonal of Quu"
+                    return Status.INDEFINITE, passes
+            self.state = self._state()
+
+    def _step(self) -> tuple[Step, int]:
+        """A step along the plan, or along others where that is none or short, and the backward passes it took."""
+        meets = self.plan is not None and self._meets_limits(self.plan)
+        step, passes = self._departure()
+        if step.length == 0.0:
+            step = _after(step, self._line_search())
+        if step.length == 0.0 and self.exact:
+            passes += self._plan(exact=False)
+            step = _after(step, self._line_search())
+        if step.length <= _SHORT and meets:
+            step, more = self._clipped_instead(step)
+            passes += more
+        return step, passes
+
+    def _goes_on(self) -> bool:
+        """Whether a search that has stalled goes on in another way."""
+        if self._returns() or self._lift():
+            return True
+        if self._turns_whole(ends=True):
+            self._take_whole()
+            return True
+        return False
+
+    def _regularized(self, step: Step) -> bool:
+        """Adapt the regularization to the last step; False if no more of it helps."""
+        if step.length <= VERY_SHORT and self._returns():
+            return True
+        if self.returned:
+            # With less regularization the step might lead there again.
+            self.returned = False
+        elif step.length >= _LONG:
+            self._relax()
+        elif self._steps_short():
+            return self._stiffen() or self._lift()
+        return True
+
+    def _departure(self) -> tuple[Step, int]:
+        """A long step that may raise the cost, where steps have been short, (O16); and the backward passes it took."""
+        dog = self.watchdog
+        # Under noise that changes plans the costs of motions are not comparable from one plan to the next.
+        if not self.anew or self.any_steered or not dog.departs([item.step for item in self.history]):
+            return Step(), 0
+        home, step, passes = (self.plan, self.planned, self.regularization, self.growth), Step(), 0
+        if self.regularization > 0.0:
+            self.regularization, self.growth = 0.0, 1.0
+            passes = self._plan()
+        if self.plan is not None:
+            step = self._along_plan(functools.partial(self.line_search.leap, most=dog.rise * self.first))
+            if step.length > 0.0:
+                self.watchdog = dog.departed(*home[2:])
+                logger.info("%s: steps stay short: departs from the best motion", self.label)
+                return step, passes
+        self.plan, self.planned, self.regularization, self.growth = home
+        self.watchdog = dog.returned()
+        return step, passes
+
+    def _is_back(self, there: bool) -> bool:
+        """Whether a search has returned to the best motion in vain; ``there``: it would converge where it is."""
+        if self.watchdog.away and self.best is self.trajectory:
+            self.watchdog = Watchdog()
+            return False
+        return (there or self.watchdog.overdue) and self._returns()
+
+    def _returns(self) -> bool:
+        """Return to the best motion if away; whether it was."""
+        dog = self.watchdog
+        if not dog.away or self.best is None:
+            return False
+        logger.info("%s: returns to the best motion", self.label)
+        self._take_best()
+        self.regularization, self.growth, self.watchdog = dog.regularization, dog.growth, dog.returned()
+        return True
+
+    def _take_best(self) -> None:
+        """Go on from the best motion so far."""
+        if self.best is not None and self.best is not self.trajectory:
+            self.trajectory, self.cost, self.above = self.best, self.best_cost, 0.0
+            self.shares = self.problem.shares(self.best)
 
     def _at_first(self) -> float:
         """The cost at stake on the first motion."""
@@ -712,9 +667,7 @@ class _Search:
     def _take_whole(self) -> None:
         """Use the whole gradient of the noise cost from now on, starting at the best motion so far."""
         logger.info("%s: continues with the whole gradient of the noise cost", self.label)
-        if self.best is not None and self.best is not self.trajectory:
-            self.trajectory, self.cost = self.best, self.best_cost
-            self.shares = self.problem.shares(self.best)
+        self._take_best()
         # Noise costs before and after this switch are not comparable.
         self.whole, self.best, self.best_cost, self.best_noise, self.above = True, None, np.inf, np.inf, 0.0
         self.gains, self._around, self.regularization, self.growth = [], None, 0.0, 1.0
@@ -739,7 +692,7 @@ class _Search:
         if self.best is None or gain > 0.0:
             self.gains.append(0.0 if self.best is None else gain)
             self.best, self.best_cost, self.best_noise, self.above = self.trajectory, self.cost, noise, 0.0
-        else:
+        elif not self.watchdog.away:
             self.gains.append(0.0)
 
     def _noise(self, plan: Plan) -> float:
@@ -817,7 +770,7 @@ class _Search:
         """Expected decrease and tolerance in words; ``afresh`` with as little regularization as the model needs."""
         needed = ""
         if afresh and self.regularization > 0.0:
-            with contextlib.suppress(*_TRIAL_ERRORS):
+            with contextlib.suppress(*TRIAL_ERRORS):
                 plan, least = self._least_regularized()
                 if plan is not None:
                     self.plan = plan
@@ -825,7 +778,7 @@ class _Search:
         share = np.nan if self.plan is None else self._share(tolerance)
         return f"{self._expected()}{needed}; the tolerance of {tolerance:g} times the cost at stake is {share:.1e}"
 
-    def _note(self, report: Report, started: float, passes: int, step: _Step | None = None) -> None:
+    def _note(self, report: Report, started: float, passes: int, step: Step | None = None) -> None:
         if self.plan is None:
             return
         item = Iteration(
@@ -858,7 +811,7 @@ class _Search:
     def _steps_short(self) -> bool:
         """Whether the last step is very short, or short like the one before it."""
         lengths = [item.step for item in self.history[-2:]]
-        return lengths[-1] <= _VERY_SHORT or (max(lengths) <= _SHORT and len(lengths) > 1)
+        return lengths[-1] <= VERY_SHORT or (max(lengths) <= _SHORT and len(lengths) > 1)
 
     def _relax(self) -> None:
         self.growth = min(1.0 / _GROWTH, self.growth / _GROWTH)
@@ -935,53 +888,30 @@ class _Search:
                     return plan, float(regularization)
         return None, np.inf
 
-    def _line_search(self, shortest: float = 0.0) -> _Step:
-        """Move to the first trial along the plan with sufficient decrease of the expected cost, (O13)."""
+    def _line_search(self, shortest: float = 0.0) -> Step:
+        """Move to the first trial along the plan with sufficient decrease of the expected cost."""
+        return self._along_plan(functools.partial(self.line_search.run, shortest=shortest))
+
+    def _along_plan(self, search: Callable[[Start], Step]) -> Step:
+        """Take the step that a line search finds along the plan."""
         if self.plan is None:
-            return _Step(0.0, 0, 0.0, 0.0)
-        added = noise_shares(self.problem, self.trajectory, self.plan)
-        taken, length, tried, trials, jumps = _Trial(), 0.0, None, 0, False
-        longest = np.inf  # of the steps that are corrected
-        here = _Here(
-            self.problem.decided(self.trajectory),
-            with_feedback(self.problem, self.trajectory, self.plan, closed=self.forward == "closed"),
-            added,
-            self.cost + (float(added.sum()) if added.size else 0.0),
+            return Step()
+        step = search(
+            Start(
+                plan=self.plan,
+                trajectory=self.trajectory,
+                shares=self.shares,
+                cost=self.cost,
+                regularization=self.regularization,
+                exact=self.exact,
+                whole=self.whole,
+                extends=self._extends(),
+                bounded=self.bounded,
+            )
         )
-        left: Sequence[float] = [length for length in _lengths(self.backtracking) if length > shortest]
-        for bounds in self._bounds():
-            cut = []
-            for step in left:
-                trials += 1
-                trial = self._try(step, self.plan, here, bounds)
-                if trial.expected > _POOR * step * self.plan.slope and _TINY < step <= longest:
-                    trial, more, longest = self._corrected(step, trial, self.plan, here, bounds)
-                    trials += more
-                if trial.expected <= self.armijo * step * self.plan.slope and trial.expected < taken.expected:
-                    taken, length = trial, step
-                    if trial.expected <= _POOR * step * self.plan.slope:
-                        break
-                    continue
-                if length > 0.0:
-                    break
-                if trial.cut:
-                    cut.append(step)
-                    self.cut = True
-                elif trial.shares is not None:
-                    tried = trial.shares
-                if step <= _VERY_SHORT:
-                    jumps = jumps or trial.cut or self._divides_others(trial)
-            left = [step for step in cut if step > length]
-            if not left or length > (_VERY_SHORT if bounds.parts == _PARTS else 0.0):
-                break
-        while self._extends() and length >= 1.0 and taken.expected <= _EARLY * length * self.plan.slope:
-            trials += 1
-            trial = self._try(_EXTENSION * length, self.plan, here, bounds)
-            if not trial.expected < taken.expected:
-                break
-            taken, length = trial, _EXTENSION * length
-        self.jumps = length < _LONG and (self.jumps or jumps)
-        hidden = 0.0
+        self.cut = self.cut or step.cut
+        self.jumps = step.length < _LONG and (self.jumps or step.jumps)
+        taken = step.taken
         if taken.motion is not None and taken.shares is not None:
             self.before = self.trajectory, self.shares, self.cost, self.above
             self.trajectory, self.shares = taken.motion.trajectory(), taken.shares
@@ -990,9 +920,7 @@ class _Search:
                 self._around, self.rated = taken.rated.along, taken.rated
             self.cost = float(taken.shares.sum())
             self.above += taken.cost
-        elif tried is not None:
-            hidden = rounding(self.problem, self.trajectory, self.shares, tried, self.plan.model)
-        return _Step(length, trials, -taken.expected if length > 0.0 else 0.0, hidden)
+        return step
 
     def _extends(self) -> bool:
         """Whether full steps that end early are extended: not after a last extension that did not lower the cost."""
@@ -1009,7 +937,7 @@ class _Search:
         u = self.problem.decided(self.trajectory)
         return float(((u <= lower) | (u >= upper)).mean())
 
-    def _clipped_instead(self, step: _Step) -> tuple[_Step, int]:
+    def _clipped_instead(self, step: Step) -> tuple[Step, int]:
         """The better of a short step and one along the plan without limits, whose trials clip the controls.
 
         A control that a plan holds at a limit has no feedback, also on trials so short that it is far from there.
@@ -1027,12 +955,6 @@ class _Search:
         self.plan, self.planned, self.trajectory, self.shares, self.cost, self.above, self.before, self.jumps = after
         return step._replace(trials=trials), passes
 
-    def _divides_others(self, trial: _Trial) -> bool:
-        """Whether a trial divides other steps into parts than the motion."""
-        if trial.motion is None:
-            return False
-        return not np.array_equal(trial.motion.written.tally[0, :, 3], self.trajectory.statistics.substeps)
-
     def _jump(self) -> str:
         """What makes the motion jump, if it does."""
         if not self.jumps:
@@ -1042,122 +964,12 @@ class _Search:
             "dt, or a Radau integrator where dampers are fast, avoids that; "
         )
 
-    def _bounds(self) -> Iterator[_Bounds]:
-        """Bounds on trials, from tight to none."""
-        integrator = self.problem.integrator
-        if not (self.bounded and self.divides and isinstance(integrator, Variational)):
-            yield _Bounds(integrator, np.inf, watched=False)
-            return
-        # A step cut into s substeps has taken at most s - 1 halvings.
-        statistics = self.trajectory.statistics
-        few = max(_HALVINGS, int(statistics.substeps.max()) - 1) if statistics.halvings.size else _HALVINGS
-        for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
-            less = self.less.get(halvings)
-            if less is None:
-                less = self.less[halvings] = _cut_less(integrator, halvings)
-            yield _Bounds(less, parts, watched=halvings > _HALVINGS)
-        yield _Bounds(integrator, np.inf, watched=True)
-
-    def _try(self, step: float, plan: Plan, here: _Here, bounds: _Bounds) -> _Trial:
-        """A trial of length ``step`` along the plan."""
-        return self._run(step, here.controls + step * plan.feedforward, plan, here, bounds)
-
-    def _corrected(
-        self, step: float, trial: _Trial, plan: Plan, here: _Here, bounds: _Bounds
-    ) -> tuple[_Trial, int, float]:
-        """A poor trial moved towards the motion that the plan's model has there.
-
-        A correction is a Newton step with the cost's gradients along the trial, and the second derivatives of the cost
-        and the first of the dynamics along the current motion. It removes what the curvature of motions adds to steep
-        costs, such as those of the end.
-
-        Returns:
-            The trial, the number of further trials, and the longest step of the line search to correct from now on.
-        """
-        trials, longest, most = 0, np.inf, -_FAR * step * plan.slope
-        while trials < _CORRECTIONS and trial.motion is not None and trial.expected <= most and self._corrects(plan):
-            motion = trial.motion.trajectory()
-            # Around the trial, the plan also has what it has left.
-            there = feedforward_beside(self.along, plan, self.regularization, motion)
-            change = there - (1.0 - step) * plan.feedforward
-            size = _relative(change, step * plan.feedforward)
-            if not _SMALLEST <= size <= _LARGEST:
-                # The size is about proportional to the step.
-                longest = step * _LARGEST / size if size > _LARGEST else 0.0
-                break
-            around = here._replace(feedback=with_feedback(self.problem, motion, plan, closed=True))
-            more = self._run(step, around.feedback.u + change, plan, around, bounds)
-            trials += 1
-            if not more.expected < trial.expected:
-                break
-            before, trial = trial, more
-            if trial.expected <= _POOR * step * plan.slope or trial.expected > _CONTRACTION * before.expected:
-                break
-        return trial, trials, longest
-
-    def _corrects(self, plan: Plan) -> bool:
-        """Whether poor trials are corrected: after short steps, with first derivatives, where no control is held."""
-        special = self.exact or self.whole or self.saturated or self.forward != "closed"
-        if special or not self.anew or plan.factors is None:
-            return False
-        return any(_TINY < item.step <= _BENT for item in self.history[-2:])
-
-    def _run(self, step: float, u: Floats, plan: Plan, here: _Here, bounds: _Bounds) -> _Trial:
-        """A trial under controls u (R, m), stopped early where its substeps or its cost exceed bounds.
-
-        What is acceptable is that of a trial of length ``step`` along the plan.
-        """
-        problem = self.problem
-        # Where the rest of the cost and the noise cost cannot be negative, a partial sum bounds the total from below.
-        bounded = problem.cost.nonnegative and not (self.exact and problem.processes)
-        most = here.total + self.armijo * step * plan.slope if bounded else np.inf
-        parts = np.inf
-        if bounds.parts < np.inf and (bounds.watched or step < 1.0):
-            # Explicit methods have no substeps.
-            parts = bounds.parts * max(1, int(self.trajectory.statistics.substeps[: self.trials.third].sum()))
-        if problem.limited:
-            u = _onto_limits(u, problem.control_limits, self.rounding)
-        commands = Commands(u, *here.feedback[1:])
-        if problem.linear:
-            # The first control has no feedback: its state is given.
-            commands = commands._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
-        try:
-            attempt = self.trials.attempt(
-                commands, integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
-            )
-            if not attempt.whole:
-                # A step that fails with few halvings may succeed with more.
-                few = attempt.failure is not None and bounds.integrator != problem.integrator
-                return _Trial(cut=few or attempt.verdict is Watch.Verdict.cut)
-            there = attempt.shares()
-            noise, more, rated = 0.0, 0.0, None
-            if problem.processes:
-                noise = float((noise_shares(problem, attempt.trajectory(), plan) - here.added).sum())
-            if self.whole:
-                more, rated = self._noise_beyond(attempt.trajectory(), plan)
-        except _TRIAL_ERRORS as error:
-            logger.info("%s: trial of length %g: %s", self.label, step, error)
-            return _Trial()
-        cost = float((there - self.shares).sum())
-        if not math.isfinite(cost):
-            return _Trial()
-        return _Trial(attempt, there, cost, cost + noise + more, rated=rated)
-
-    def _noise_beyond(self, trial: Trajectory, plan: Plan) -> tuple[float, _Rated | None]:
-        """Noise cost along a trial with the value function there, minus that with the current plan's."""
-        along = Along(self.problem, trial)
-        found = backward(self.problem, trial, self.regularization, along=along)
-        if found is None:
-            return np.inf, None
-        shares, held = (noise_shares(self.problem, trial, each, self.steered).sum() for each in (found, plan))
-        return float(shares - held), _Rated(along, found)
-
     def _last_plan(self) -> Plan | None:
         if self.plan is not None and self.planned == (self.trajectory, 0.0, self.second_order):
             return self.plan
         try:
             return self._least_regularized()[0]
-        except _TRIAL_ERRORS:
+        except TRIAL_ERRORS:
             return None
 
     def solution(self, status: Status) -> Solution:
@@ -1192,6 +1004,11 @@ class _Search:
             history=tuple(self.history),
             search=self.state,
         )
+
+
+def _after(failed: Step, step: Step) -> Step:
+    """A step with the trials of the line search before, which found none."""
+    return step._replace(trials=failed.trials + step.trials, hidden=max(failed.hidden, step.hidden))
 
 
 def _previous_gains(problem: OptimalControlProblem, plan: Plan | None) -> Floats | None:

@@ -18,6 +18,7 @@ from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.multipliers import Multipliers
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refined import Refined, Refinement
+from varpin.control.watchdog import Watchdog
 from varpin.errors import FileError
 from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
 from varpin.mechanics.scene import same
@@ -57,6 +58,7 @@ class _Search:
     saturated: int = 0
     clips: int = 1
     returned: int = 0
+    watchdog: Annotated[Floats, Axes(len(Watchdog._fields), finite=True)] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,8 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     if state is not None:
         numbers: dict[str, Any] = {name: getattr(state, name) for name in _NUMBERS}
         numbers |= {name: int(getattr(state, name)) for name in _FLAGS} | {"history": len(state.history)}
-        search = _Search(prefixes[id(state.trajectory)], gains=np.array(state.gains), **numbers)
+        numbers |= {"gains": np.array(state.gains), "watchdog": np.array(state.watchdog, dtype=np.float64)}
+        search = _Search(prefixes[id(state.trajectory)], **numbers)
         best = None if state.best is None else _Best(prefixes[id(state.best)])
     apart = ("search", "best", "refined", "refinement", "second_order")
     given = {item.name: solution[item.name] for item in fields(_Plan) if item.name not in apart}
@@ -230,9 +233,14 @@ def _search(
         best=None if best is None else motions[best],
         gains=tuple(state.gains.tolist()),
         history=history[: state.history],
+        watchdog=Watchdog() if state.watchdog is None else _watchdog(*state.watchdog.tolist()),
         **{name: bool(getattr(state, name)) for name in _FLAGS},
         **{name: getattr(state, name) for name in _NUMBERS},
     )
+
+
+def _watchdog(away: float, failed: float, rest: float, regularization: float, growth: float) -> Watchdog:
+    return Watchdog(int(away), int(failed), int(rest), regularization, growth)
 
 
 def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:

@@ -1,0 +1,381 @@
+"""The line search along a plan, equation (O13) of docs/mathematics.md: the lengths and the bounds of trials."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import is_dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from varpin.arrays import Floats
+from varpin.control.along import Along
+from varpin.control.backward import backward
+from varpin.control.commands import with_feedback
+from varpin.control.costs import CostError
+from varpin.control.descent import rounding
+from varpin.control.passes import Plan, noise_shares
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.trials import Attempt, Trials
+from varpin.core import Watch
+from varpin.core.arrays import Commands
+from varpin.errors import LinearizationError
+from varpin.integrators import Integrator
+from varpin.integrators.variational import Variational
+from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.noise import NoiseFieldError
+from varpin.trajectory import Trajectory
+
+logger = logging.getLogger(__name__)
+
+_EPS = float(np.finfo(np.float64).eps)
+# Errors that reject a trial.
+TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
+# Steps no longer than that are very short.
+VERY_SHORT = 0.01
+# Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
+_POOR = 0.3
+# A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
+# half. The step is extended by a factor while that lowers the cost.
+_EARLY, _EXTENSION = 0.85, 4.0
+# Approximate shortest step of a line search, its greatest number of trials, and the least factor between two of them.
+_SHORTEST, _TRIALS, _SHARPEST = 1e-6, 40, 0.25
+# Bounds on the substeps of a trial. A trial stops where a step needs more than _HALVINGS halvings and more than the
+# current motion, or where the total exceeds _PARTS times that of the current motion. If no other trial leads far, the
+# stopped ones are repeated with larger bounds, then with none. A search that stalls continues without bounds.
+_HALVINGS, _MORE_HALVINGS = 2, 3
+_PARTS = 3
+# Increase of the cost at which a trial stops, in units of what the slope gives: the next lengths do not depend on what
+# is beyond that. A relative margin well above rounding errors.
+_DEAR, _DEARER = 1.0, 1e-9
+# Lengths of steps that may raise the cost.
+_LEAPS = (1.0, 0.5, 0.25, 0.125)
+
+
+class Start(NamedTuple):
+    """What a line search starts from.
+
+    Attributes:
+        plan: The plan it goes along.
+        trajectory: The motion that the plan is around.
+        shares: The terms of the motion's cost (:meth:`OptimalControlProblem.shares`).
+        cost: Their sum.
+        regularization: That of the backward pass.
+        exact: Whether the pass had second derivatives of the dynamics.
+        whole: Whether the pass had the whole gradient of the noise cost.
+        extends: Whether full steps that end early are extended.
+        bounded: Whether trials stop at a number of substeps.
+    """
+
+    plan: Plan
+    trajectory: Trajectory
+    shares: Floats
+    cost: float
+    regularization: float
+    exact: bool
+    whole: bool
+    extends: bool
+    bounded: bool
+
+
+class Rated(NamedTuple):
+    """A motion's expansions and their plan with the Hessian of the value function held."""
+
+    along: Along
+    plan: Plan
+
+
+class Trial(NamedTuple):
+    """A trial of the line search.
+
+    Attributes:
+        motion: None where the trial was stopped or has no finite cost.
+        shares: The terms of its cost (:meth:`OptimalControlProblem.shares`).
+        cost: Change of the cost without noise.
+        expected: Change of the expected cost.
+        cut: Whether it was stopped for its number of substeps.
+        rated: The expansions along it and their plan, where the expected cost needed them.
+    """
+
+    motion: Attempt | None = None
+    shares: Floats | None = None
+    cost: float = np.inf
+    expected: float = np.inf
+    cut: bool = False
+    rated: Rated | None = None
+
+
+class Step(NamedTuple):
+    """Result of a line search.
+
+    Attributes:
+        length: Length of the accepted step; 0 if none was.
+        trials: Number of trials.
+        decrease: Decrease of the expected cost.
+        hidden: Rounding error of a difference of costs; 0 if a step was accepted or no trial has a cost.
+        taken: The accepted trial.
+        cut: Whether trials without an accepted one were stopped for their number of substeps.
+        jumps: Whether very short trials were rejected where they divide other steps than the motion.
+    """
+
+    length: float = 0.0
+    trials: int = 0
+    decrease: float = 0.0
+    hidden: float = 0.0
+    taken: Trial = Trial()
+    cut: bool = False
+    jumps: bool = False
+
+
+class _Bounds(NamedTuple):
+    """Bounds on the work of a trial.
+
+    Attributes:
+        integrator: Bounds the halvings of a step.
+        parts: Greatest number of substeps, relative to the current motion.
+        watched: Whether a trial of length 1 is also stopped early. Most searches accept it, and the check takes time.
+    """
+
+    integrator: Integrator
+    parts: float
+    watched: bool
+
+
+class _Here(NamedTuple):
+    """What all trials have in common, beside the start."""
+
+    controls: Floats  # of the decisions (R, m)
+    feedback: Commands  # without the feed-forward part
+    added: Floats  # noise cost of each step
+    total: float  # the expected cost
+
+
+class _Lengths:
+    """Step lengths of a line search: powers of the factor ``backtracking``, the longest first.
+
+    Powers are left out that are longer than the minimum of the parabola through the last trial's cost and slope, down
+    to :data:`_SHARPEST` of the last length (J. E. Dennis and R. B. Schnabel, "Numerical Methods for Unconstrained
+    Optimization and Nonlinear Equations", 1983, section 6.3).
+    """
+
+    def __init__(self, backtracking: float, shortest: float) -> None:
+        self._backtracking, self._shortest = backtracking, max(shortest, _SHORTEST)
+        self._most = max(1, math.floor(math.log(_SHARPEST) / math.log(backtracking)))
+        self._powers = 1
+
+    def learn(self, step: float, change: float, slope: float) -> None:
+        """Learn from the change of the cost with a trial of length ``step``, infinite if it has no cost."""
+        least = 0.5 / (1.0 - change / (step * slope)) if change > step * slope else 1.0
+        self._powers = 1
+        if least < self._backtracking:
+            powers = math.log(least) / math.log(self._backtracking) if least > 0.0 else math.inf
+            self._powers = self._most if powers >= self._most else max(1, math.floor(powers))
+
+    def __iter__(self) -> Iterator[float]:
+        length, count = 1.0, 0
+        while length > self._shortest and count < _TRIALS:
+            yield length
+            count += 1
+            length *= self._backtracking**self._powers
+
+
+class LineSearch:
+    """Line searches of one problem.
+
+    Args:
+        problem: The problem.
+        trials: Its trial motions.
+        armijo: Least share of the expected decrease that a step must reach.
+        backtracking: Factor between the lengths of trials.
+        closed: Whether the plan's feedback acts in trials.
+        label: Prefix of each log line.
+    """
+
+    def __init__(
+        self,
+        problem: OptimalControlProblem,
+        trials: Trials,
+        *,
+        armijo: float,
+        backtracking: float,
+        closed: bool,
+        label: str,
+    ) -> None:
+        self.problem, self.trials, self.label = problem, trials, label
+        self.armijo, self.backtracking, self.closed = armijo, backtracking, closed
+        self._rounding = _at_rounding(problem.control_limits)
+        integrator = problem.integrator
+        # Whether steps may be divided, and the integrator with fewer halvings, by their greatest number.
+        self._divides = (
+            isinstance(integrator, Variational) and integrator.guard is not None and is_dataclass(integrator)
+        )
+        self._less: dict[int, Integrator] = {}
+
+    def run(self, start: Start, shortest: float = 0.0) -> Step:
+        """Find the first trial along the plan with sufficient decrease of the expected cost, (O13)."""
+        slope = start.plan.slope
+        taken, length, tried, trials, cuts, jumps = Trial(), 0.0, None, 0, False, False
+        here = self._here(start)
+        lengths = _Lengths(self.backtracking, shortest)
+        left: Iterable[float] = lengths
+        for bounds in self._bounds(start):
+            cut = []
+            for step in left:
+                trials += 1
+                trial = self._try(step, start, here, bounds)
+                lengths.learn(step, trial.expected, slope)
+                if trial.expected <= self.armijo * step * slope and trial.expected < taken.expected:
+                    taken, length = trial, step
+                    if trial.expected <= _POOR * step * slope:
+                        break
+                    continue
+                if length > 0.0:
+                    break
+                if trial.cut:
+                    cut.append(step)
+                    cuts = True
+                elif trial.shares is not None:
+                    tried = trial.shares
+                if step <= VERY_SHORT:
+                    jumps = jumps or trial.cut or _divides_others(trial, start)
+            left = [step for step in cut if step > length]
+            if not left or length > (VERY_SHORT if bounds.parts == _PARTS else 0.0):
+                break
+        while start.extends and length >= 1.0 and taken.expected <= _EARLY * length * slope:
+            trials += 1
+            trial = self._try(_EXTENSION * length, start, here, bounds)
+            if not trial.expected < taken.expected:
+                break
+            taken, length = trial, _EXTENSION * length
+        if length > 0.0:
+            return Step(length, trials, -taken.expected, taken=taken, cut=cuts, jumps=jumps)
+        hidden = 0.0
+        if tried is not None:
+            hidden = rounding(self.problem, start.trajectory, start.shares, tried, start.plan.model)
+        return Step(trials=trials, hidden=hidden, cut=cuts, jumps=jumps)
+
+    def leap(self, start: Start, most: float) -> Step:
+        """Take the longest trial along the plan that raises the expected cost by at most ``most``."""
+        here, bounds = self._here(start), next(self._bounds(start))
+        for trials, step in enumerate(_LEAPS, start=1):
+            u = here.controls + step * start.plan.feedforward
+            trial = self._run(step, u, start, here, bounds, rise=most)
+            if trial.expected <= most:
+                return Step(step, trials, -trial.expected, taken=trial)
+        return Step(trials=len(_LEAPS))
+
+    def _here(self, start: Start) -> _Here:
+        added = noise_shares(self.problem, start.trajectory, start.plan)
+        return _Here(
+            self.problem.decided(start.trajectory),
+            with_feedback(self.problem, start.trajectory, start.plan, closed=self.closed),
+            added,
+            start.cost + (float(added.sum()) if added.size else 0.0),
+        )
+
+    def _bounds(self, start: Start) -> Iterator[_Bounds]:
+        """Bounds on trials, from tight to none."""
+        integrator = self.problem.integrator
+        if not (start.bounded and self._divides and isinstance(integrator, Variational)):
+            yield _Bounds(integrator, np.inf, watched=False)
+            return
+        # A step cut into s substeps has taken at most s - 1 halvings.
+        statistics = start.trajectory.statistics
+        few = max(_HALVINGS, int(statistics.substeps.max()) - 1) if statistics.halvings.size else _HALVINGS
+        for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
+            less = self._less.get(halvings)
+            if less is None:
+                less = self._less[halvings] = _cut_less(integrator, halvings)
+            yield _Bounds(less, parts, watched=halvings > _HALVINGS)
+        yield _Bounds(integrator, np.inf, watched=True)
+
+    def _try(self, step: float, start: Start, here: _Here, bounds: _Bounds) -> Trial:
+        """A trial of length ``step`` along the plan."""
+        rise = -_DEAR * step * start.plan.slope
+        return self._run(step, here.controls + step * start.plan.feedforward, start, here, bounds, rise=rise)
+
+    def _run(self, step: float, u: Floats, start: Start, here: _Here, bounds: _Bounds, *, rise: float) -> Trial:
+        """A trial of length ``step`` under controls u (R, m).
+
+        It is stopped early where its substeps exceed bounds, or where the expected cost rises by more than ``rise``.
+        """
+        problem, plan = self.problem, start.plan
+        # Where the rest of the cost and the noise cost cannot be negative, a partial sum bounds the total from below.
+        bounded = problem.cost.nonnegative and not (start.exact and problem.processes)
+        most = here.total + rise if bounded else np.inf
+        parts = np.inf
+        if bounds.parts < np.inf and (bounds.watched or step < 1.0):
+            # Explicit methods have no substeps.
+            parts = bounds.parts * max(1, int(start.trajectory.statistics.substeps[: self.trials.third].sum()))
+        if problem.limited:
+            u = _onto_limits(u, problem.control_limits, self._rounding)
+        commands = Commands(u, *here.feedback[1:])
+        if problem.linear:
+            # The first control has no feedback: its state is given.
+            commands = commands._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))
+        try:
+            attempt = self.trials.attempt(
+                commands, integrator=bounds.integrator, most=most + _DEARER * abs(most), parts=parts
+            )
+            if not attempt.whole:
+                # A step that fails with few halvings may succeed with more.
+                few = attempt.failure is not None and bounds.integrator != problem.integrator
+                return Trial(cut=few or attempt.verdict is Watch.Verdict.cut)
+            there = attempt.shares()
+            noise, more, rated = 0.0, 0.0, None
+            if problem.processes:
+                noise = float((noise_shares(problem, attempt.trajectory(), plan) - here.added).sum())
+            if start.whole:
+                more, rated = self._noise_beyond(attempt.trajectory(), start)
+        except TRIAL_ERRORS as error:
+            logger.info("%s: trial of length %g: %s", self.label, step, error)
+            return Trial()
+        cost = float((there - start.shares).sum())
+        if not math.isfinite(cost):
+            return Trial()
+        return Trial(attempt, there, cost, cost + noise + more, rated=rated)
+
+    def _noise_beyond(self, trial: Trajectory, start: Start) -> tuple[float, Rated | None]:
+        """Noise cost along a trial with the value function there, minus that with the current plan's."""
+        along = Along(self.problem, trial)
+        found = backward(self.problem, trial, start.regularization, along=along)
+        if found is None:
+            return np.inf, None
+        steered = self.problem.steered
+        shares, held = (noise_shares(self.problem, trial, each, steered).sum() for each in (found, start.plan))
+        return float(shares - held), Rated(along, found)
+
+
+def _divides_others(trial: Trial, start: Start) -> bool:
+    """Whether a trial divides other steps into parts than the motion."""
+    if trial.motion is None:
+        return False
+    return not np.array_equal(trial.motion.written.tally[0, :, 3], start.trajectory.statistics.substeps)
+
+
+def _at_rounding(limits: Floats) -> Floats:
+    """Rounding errors of controls at their limits (2, m); (m,)."""
+    rounding: Floats = 8.0 * _EPS * np.where(np.isfinite(limits), np.abs(limits), 0.0).max(axis=0)
+    return rounding
+
+
+def _onto_limits(u: Floats, limits: Floats, rounding: Floats) -> Floats:
+    """Controls (R, m), moved exactly onto a limit where they differ from it by no more than ``rounding`` (m,)."""
+    close = np.abs(u - limits[:, None]) <= rounding
+    if not close.any():
+        return u
+    for limit, onto in zip(limits, close, strict=True):
+        u = np.where(onto, limit, u)
+    return u
+
+
+@functools.lru_cache(maxsize=256)
+def _cut_less(integrator: Variational, halvings: int) -> Variational:
+    """The integrator with at most ``halvings`` halvings of a step; itself where it has no guard."""
+    guard = integrator.guard
+    if guard is None or not is_dataclass(integrator):
+        return integrator
+    return replace(integrator, guard=replace(guard, max_halvings=min(halvings, guard.max_halvings)))
