@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 # A search departs after so many steps in a row that are no longer than _SHORT.
 _IN_A_ROW, _SHORT = 3, 0.25
-# Iterations after which it returns, and how many more they are after each departure in vain. Iterations before it departs
-# again; they double with each departure in vain.
+# Iterations after which it returns, and how many more they are after each departure in vain. Iterations before it
+# departs again; they double with each departure in vain.
 _AWAY, _LONGER, _REST = 6, 2, 4
 # Greatest increase of the cost at a departure, as a share of the cost at stake on the first motion; its factor after a
 # departure in vain.
