@@ -24,6 +24,7 @@ from varpin.control.between_nodes import NOWHERE, Instants, beyond, carried, enf
 from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
+from varpin.control.first_node import out_of_reach
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, in_between, reports_of
 from varpin.control.penalties import PenalizedProblem, flat, penalized, split
@@ -65,6 +66,8 @@ _FAR = 1e-2
 _MOVING, _SETTLED = 12, 1e-3
 # A plan is infeasible when _STUCK rounds in a row have left more than _LOWERED of the worst violation.
 _STUCK, _LOWERED = 3, 0.9
+# Greatest number of iterations of a plan whose first node cannot meet a constraint.
+_HOPELESS = 5
 # Expected decrease, relative to the cost with penalties, with which a stalled search has not shown infeasibility.
 _MUCH = 1e-2
 # Greatest number of last steps, each with the rows between nodes of the motion before.
@@ -179,7 +182,8 @@ class _Rounds:
         if self.check:
             # Before the search, which takes long where there is no plan.
             announce(logger, self.problem.scene, self.problem.dt, foreseen(self.problem))
-        last = len(self.history) + self.most
+        hopeless = out_of_reach(self.problem, first.trajectory)
+        last = len(self.history) + (min(self.most, _HOPELESS) if hopeless else self.most)
         found, resume = first, self._resumed_search()
         while True:
             begun = self.state
@@ -211,6 +215,9 @@ class _Rounds:
             kept = self._steady(self._kept(found, problem, begun, known))
             try:
                 status, reason = self._ended_or_next(kept, begun, found, last)
+                if hopeless and found.status not in (Status.INTERRUPTED, Status.OUT_OF_TIME):
+                    status, reason = Status.INFEASIBLE, hopeless
+                    break
                 if self._goes_between(kept, begun, status) or status is None:
                     continue
                 if status is Status.INFEASIBLE and not self._clearly_beyond(kept):
