@@ -28,7 +28,7 @@ from varpin.control.first_node import out_of_reach
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, in_between, reports_of
 from varpin.control.penalties import PenalizedProblem, flat, penalized, split
-from varpin.control.polish import deviations, polished
+from varpin.control.polish import deviations, least_slope, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import SUFFICIENT
 from varpin.control.refinement_within import Warm, refine_within
@@ -574,6 +574,7 @@ class _Rounds:
         self.whole = enforced(self.problem, between)
         if found is None:
             closing = f"constraints hold to {kept.violation:.1e}"
+            kept = self._with_least_slope(kept)
             return replace(kept, status=Status.STALLED) if self._clearly_beyond(kept) else kept, closing
         plan = self._along(kept, found.motion, replace(known, values=flat(values), **_of_instants(between)))
         closing = (
@@ -584,6 +585,17 @@ class _Rounds:
             there = found.decrease <= bound and not self._clearly_beyond(plan)
             plan = replace(plan, status=Status.CONVERGED if there else Status.STALLED)
         return plan, closing
+
+    def _with_least_slope(self, kept: Solution) -> Solution:
+        """The plan as it is, with the multipliers of the Lagrangian's least slope where that has derivatives."""
+        known = kept.multipliers
+        assert known is not None
+        values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
+        try:
+            values = least_slope(self.whole, kept.trajectory, values, known.weights, backoff)
+        except (CostError, NoiseFieldError, LinearizationError):
+            return kept
+        return replace(kept, multipliers=replace(known, values=flat(values)))
 
     def _clearly_beyond(self, plan: Solution) -> bool:
         """Whether the motion violates a constraint by more than a thousandth of its range."""
