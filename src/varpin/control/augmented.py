@@ -20,7 +20,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.backward import backward
-from varpin.control.between_nodes import NOWHERE, Instants, beyond, carried, enforced, seen, updated
+from varpin.control.between_nodes import NOWHERE, Instants, beyond, carried, enforced, seen, updated, watched
 from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
@@ -231,7 +231,7 @@ class _Rounds:
             except KeyboardInterrupt:
                 status, reason = Status.INTERRUPTED, found.reason
             break
-        plan = replace(kept, status=status, reason=reason)
+        plan = self._told_between(replace(kept, status=status, reason=reason))
         return looked_at(plan)[0] if self.check else plan
 
     def _first(self) -> Solution:
@@ -470,16 +470,16 @@ class _Rounds:
     def _goes_between(self, kept: Solution, begun: _State, ended: Status | None) -> bool:
         """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
 
-        Only linear controls lead around the nodes. There are no such rows until the rounds have ended with a motion
-        that violates a constraint by more than a thousandth of its range. From then on each round has the offsets of
-        the motion before, and the rows that it violates. The weights of penalties are the first ones again when there
-        are rows for the first time.
+        Only linear controls lead around the nodes, and held ones have such rows where the problem asks for them. There
+        are none until the rounds have ended with a motion that violates a constraint, by more than a thousandth of its
+        range if the problem does not ask. From then on each round has the offsets of the motion before, and the rows
+        that it violates. The weights of penalties are the first ones again when there are rows for the first time.
         """
         before, base, known = begun.between, self.state, kept.multipliers
         assert known is not None
         values = split(self.bound, known.values)
-        if not self.problem.linear or (ended is None and not len(before.rows)):
-            # Motions under held controls stay closer to their nodes.
+        asked = self.problem.between_nodes
+        if not (self.problem.linear or asked) or (ended is None and not len(before.rows)):
             return False
         if ended is not None:
             if begun.round + 1 >= _BETWEEN or ended not in (Status.CONVERGED, Status.STALLED):
@@ -497,7 +497,8 @@ class _Rounds:
         whole = enforced(self.problem, between)
         told = reports_of(whole, kept.trajectory, multipliers, backoff)
         if ended is not None:
-            bounds = [_CLOSE if len(before.rows) else REPORTED * item.scale for item in self.problem.bound_constraints]
+            close = asked or len(before.rows) > 0
+            bounds = [_CLOSE if close else REPORTED * item.scale for item in self.problem.bound_constraints]
             if (self._beyond(kept.trajectory, begun.backoff) <= bounds).all():
                 return False
         most = max(told, key=lambda item: item.violation)
@@ -523,6 +524,23 @@ class _Rounds:
         values = seen(self.problem, motion)
         count = len(self.problem.bound_constraints)
         return np.full(count, np.inf) if values is None else beyond(values, backoff[:count])
+
+    def _told_between(self, plan: Solution) -> Solution:
+        """The plan, which is not CONVERGED and says so where it violates constraints between nodes against the wish."""
+        known = plan.multipliers
+        if not self.problem.between_nodes or known is None or not any(watched(self.problem)):
+            return plan
+        bound = enforced(self.problem, known.between).bound_constraints
+        left = self._beyond(plan.trajectory, split(bound, known.backoff))
+        worst = int((left / [item.scale for item in self.problem.bound_constraints]).argmax())
+        if (left <= FEASIBLE).all():
+            return plan
+        item = self.problem.bound_constraints[worst]
+        told = f"between nodes {item.source.label} is violated by {left[worst]:.1e} {item.unit}"
+        if not np.isfinite(left[worst]):
+            told = "the motion between nodes is not known, as a step cannot be integrated in parts"
+        status = Status.STALLED if plan.status.converged else plan.status
+        return replace(plan, status=status, reason=f"{plan.reason}; {told}")
 
     def _left(self, motion: Trajectory, backoff: list[Floats]) -> float:
         """The largest violation of a motion, at the nodes and between them."""
