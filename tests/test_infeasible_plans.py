@@ -1,5 +1,8 @@
 """Plans that no motion within the constraints makes: each says so, with the constraint, within bounded iterations."""
 
+import itertools
+import re
+
 import numpy as np
 import pytest
 from findings import about
@@ -66,23 +69,35 @@ TASKS = {
         ["KeepInSphere"],
     ),
 }
+# Those of them that the first node after the start cannot meet.
+AT_ONCE = (
+    "a start in an obstacle",
+    "an obstacle at the base",
+    "a start too fast to brake",
+    "torques that rise too slowly",
+    "a start outside of limits",
+    "a sphere that the tip starts far from",
+)
+
+
+def problem_of(constraints, **options):
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
+    options = {"q0": [0.0, 0.0], "v0": [0.0, 0.0], "dt": 0.05, "steps": 20, **options}
+    return vp.OptimalControlProblem(vp.Scene(ROBOT, damping=0.1), cost, constraints=constraints, **options)
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_no_plan(name):
     constraints, options, labels = TASKS[name]
-    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
-    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
-    options = {"q0": [0.0, 0.0], "v0": [0.0, 0.0], "dt": 0.05, "steps": 20, **options}
-    problem = vp.OptimalControlProblem(vp.Scene(ROBOT, damping=0.1), cost, constraints=constraints, **options)
-    plan = vp.solve(problem, check=False)
+    plan = vp.solve(problem_of(constraints, **options), check=False)
     assert plan.status is vp.Status.INFEASIBLE
     assert len(plan.history) <= 250
     assert plan.reason.split("(")[0].split()[0] in labels
     assert about(plan.reason, "unmet constraint")
-    # It is the one that is violated most.
     worst = max(plan.constraints, key=lambda item: item.violation)
-    assert plan.reason.startswith(worst.label)
+    # It is the one that is violated most, if not the one that the first node cannot meet.
+    assert plan.reason.startswith(worst.label) or about(plan.reason, "unmet first node")
     assert worst.violation > 1e-3
     assert np.isfinite(plan.trajectory.q).all()
 
@@ -113,3 +128,115 @@ def test_a_search_that_jumps_does_not_call_a_plan_infeasible():
     for fact in ("WithinVelocityLimits is violated", "divide other steps", "Radau"):
         assert fact in jumping.reason
     assert plan(vp.Radau(2)).status.converged
+
+
+@pytest.mark.parametrize("name", AT_ONCE)
+def test_no_plan_at_once(name):
+    """Where no control meets a constraint at the first node, its reason says so, and there is no long search."""
+    constraints, options, _ = TASKS[name]
+    plan = vp.solve(problem_of(constraints, **options), check=False)
+    assert len(plan.history) <= 6
+    assert about(plan.reason, "unmet first node")
+    # The constraint does stay violated there, by no less than said, unless rates of controls are.
+    told = {item.label: item for item in plan.constraints}
+    if "WithinControlRate" not in told:
+        worst = next(item for label, item in told.items() if plan.reason.startswith(label))
+        assert 0.0 < said(plan.reason) <= worst.excess[0].max() * (1.0 + 5e-3)
+    for option in (None, 0, 1):
+        few = {} if option is None else {"max_iterations": option}
+        assert vp.solve(plan.problem, check=False, **few).status is vp.Status.INFEASIBLE
+    again = vp.solve(plan.problem, resume=plan, check=False)
+    assert again.status is vp.Status.INFEASIBLE
+    assert again.reason == plan.reason
+
+
+def said(reason):
+    return float(re.search(r"stays violated by ([0-9.e+-]+)", reason)[1])
+
+
+# With joint limits, controls as given, and an integrator whose positions controls reach a step later.
+FIRST_STEPS = {
+    "limits of joints": ([vp.WithinJointLimits(ROBOT, ([0.5, -1], [2.0, 1]))], LIMITS),
+    "limits of velocities": (
+        [vp.WithinVelocityLimits(ROBOT, (-0.5, 0.5))],
+        {"v0": [3.0, 1.0], "control_limits": (-20.0, 20.0)},
+    ),
+    "a box": ([vp.KeepInBox(ROBOT, "tip", [-3.0, -1.0, 0.3], [3.0, 1.0, 3.0])], LIMITS),
+    "linear controls": ([vp.WithinJointLimits(ROBOT, ([0.5, -1], [2.0, 1]))], {"controls": "linear", **LIMITS}),
+    "positions a step later": (
+        [vp.WithinJointLimits(ROBOT, ([0.5, -1], [2.0, 1]))],
+        {"integrator": vp.ExplicitEuler()},
+    ),
+    "one joint free": (
+        [vp.WithinJointLimits(ROBOT, ([0.5, -1], [2.0, 1]))],
+        {"control_limits": ([-30.0, -np.inf], [30.0, np.inf])},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FIRST_STEPS)
+def test_first_node_beside_grids_of_controls(name):
+    """The violation that stays is that of one step under the best controls of grids, all corners included."""
+    constraints, options = FIRST_STEPS[name]
+    problem = problem_of(constraints, **options)
+    plan = vp.solve(problem, check=False)
+    if name == "one joint free":
+        # The elbow's torque, without a limit, moves the shoulder, too.
+        assert not about(plan.reason, "unmet first node")
+        return
+    assert about(plan.reason, "unmet first node")
+    ends = 2 if problem.linear else 1
+    low, high = problem.control_limits if "control_limits" in options else (np.full(2, -30.0), np.full(2, 30.0))
+    low, high = np.tile(low, ends), np.tile(high, ends)
+    best, least, wide = 0.5 * (low + high), np.inf, 0.5 * (high - low)
+    for _ in range(4):
+        # Around the best controls so far, on a grid that gets finer.
+        around = np.clip(best + np.linspace(-wide, wide, 7), low, high)
+        sides = [np.unique(side) for side in around.T]
+        for u in itertools.product(*sides):
+            now = after_one_step(problem, np.reshape(u, (ends, 2)), constraints[0])
+            if now < least:
+                least, best = now, np.array(u)
+        wide = 0.3 * wide
+    # The reason has three digits.
+    assert abs(said(plan.reason) - least) <= 0.01 * least
+
+
+def after_one_step(problem, controls, constraint):
+    """The largest violation of a constraint after one step, in its own unit."""
+    motion = vp.simulate(
+        problem.scene, problem.q0, problem.v0, dt=problem.dt, steps=1,
+        controls=vp.FirstOrderHold(controls) if problem.linear else controls,
+        integrator=problem.integrator, check=False,
+    )  # fmt: skip
+    return excess(constraint, motion.q[1], motion.v[1])
+
+
+def excess(constraint, q, v):
+    """The largest violation of a constraint, in its own terms."""
+    if isinstance(constraint, vp.KeepInBox):
+        y, (low, high) = ROBOT.frame_positions(q, "tip"), constraint.limits
+    else:
+        y, (low, high) = (v if isinstance(constraint, vp.WithinVelocityLimits) else q), constraint.limits
+    return max((y - high).max(), (low - y).max())
+
+
+def test_a_start_outside_that_one_step_can_mend():
+    """A start outside is no reason to end early where controls lead inside by the first node."""
+    for options in ({}, {"control_limits": (-2000.0, 2000.0)}):
+        plan = vp.solve(problem_of([vp.WithinJointLimits(ROBOT, ([0.05, -1], [2.0, 1]))], **options), check=False)
+        assert plan.status.converged
+        assert plan.violation <= 1e-9
+
+
+def test_two_constraints_that_the_first_node_cannot_meet_together():
+    """Each can be met alone, and the reason has both."""
+    joints, speeds = vp.WithinJointLimits(ROBOT, ([0.02, -1], [2.0, 1])), vp.WithinVelocityLimits(ROBOT, (-0.3, 0.3))
+    strong = {"control_limits": (-300.0, 300.0)}
+    for alone in (joints, speeds):
+        assert not about(vp.solve(problem_of([alone], **strong), check=False).reason, "unmet first node")
+    plan = vp.solve(problem_of([joints, speeds], **strong), check=False)
+    assert plan.status is vp.Status.INFEASIBLE
+    assert len(plan.history) <= 6
+    assert about(plan.reason, "unmet first node")
+    assert "WithinJointLimits and WithinVelocityLimits" in plan.reason

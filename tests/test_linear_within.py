@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from findings import about
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear, minimize
 
 import varpin as vp
 from varpin.control.between_nodes import Instants, enforced
+from varpin.control.closed_loop import ClosedLoop
+from varpin.errors import LinearizationError
 
 N = 8
 ROBOT = vp.planar_chain(2)
@@ -303,3 +305,65 @@ def test_files_with_other_rows_between_nodes_are_refused(tmp_path):
         np.savez(path, **members | {f"multipliers.{name}": array})
         with pytest.raises(vp.FileError, match="multipliers"):
             vp.Solution.load(path, problem)
+
+
+# Joints, their goal and start [rad], weights of controls and velocities, and steps.
+RATED = {
+    "two links": ([0.0, 0.2], [-0.47, -0.35], 6e-2, 1.6e-3, 15),
+    "three links": ([-0.53, -0.86, 0.43], [0.31, 0.05, 0.13], 3.2e-4, 4.6e-2, 25),
+}
+
+
+@pytest.mark.parametrize("name", RATED)
+def test_multipliers_leave_the_least_slope(name):
+    """Beside all multipliers of the right signs, the Lagrangian's slopes in the controls by differences are least."""
+    end, start, of_controls, of_velocities, steps = RATED[name]
+    robot = vp.planar_chain(len(end))
+    goal = vp.ReachFrame(robot, "tip", position=robot.frame_positions(np.array(end), "tip"))
+    cost = vp.ControlCost(of_controls) + vp.VelocityCost(of_velocities) + vp.ControlRateCost(1e-5)
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.1), cost, start, np.zeros(len(end)), dt=0.06, steps=steps,
+        integrator=vp.RungeKutta4(), controls="linear", constraints=[goal, vp.WithinControlRate(20.0)],
+    )  # fmt: skip
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    u, (N, n) = plan.controls, (steps, len(end))
+
+    def parts(u):
+        policy = vp.LinearPolicy(u[1:], np.zeros((N, n, 2 * n)), np.zeros((N, 2 * n)), before=u[0], linear=True)
+        motion = problem.simulate(policy)
+        return np.concatenate([[problem.cost_of(motion)], *(c.ravel() for c in values(problem, motion))])
+
+    change = 3e-6 * np.abs(u).max()
+    slopes = np.zeros((len(parts(u)), u.size))
+    for i, way in enumerate(change * np.eye(u.size)):
+        w = way.reshape(u.shape)
+        slopes[:, i] = (parts(u + w) - parts(u - w)) / (2.0 * change)
+    told = np.concatenate([report.multipliers.ravel() for report in plan.constraints])
+    met = np.concatenate([(np.abs(report.values) <= 1e-9).ravel() for report in plan.constraints])
+    equal = np.concatenate([np.full(report.values.size, report.equality) for report in plan.constraints])
+    assert met[~equal].any()
+    assert (told[~met] == 0.0).all()
+    best = lsq_linear(slopes[1:][met].T, -slopes[0], bounds=(np.where(equal[met], -np.inf, 0.0), np.inf), tol=1e-14)
+    least = np.linalg.norm(slopes[0] + best.x @ slopes[1:][met])
+    assert np.linalg.norm(slopes[0] + told @ slopes[1:]) <= 2.0 * least + 1e-6 * np.linalg.norm(slopes[0])
+
+
+def test_a_last_step_to_a_motion_without_derivative_is_not_taken(monkeypatch):
+    """The plan stays where it is, with the multipliers of its least slope, instead of those of the last round."""
+    found = []
+
+    class Loop(ClosedLoop):
+        def __init__(self, *args):
+            found.append(args)
+            if len(found) > 1:
+                raise LinearizationError(0, 0.0, "no derivative")
+            super().__init__(*args)
+
+    problem = links("goal", integrator=vp.Midpoint())
+    best = vp.solve(problem, check=False)
+    monkeypatch.setattr("varpin.control.polish.ClosedLoop", Loop)
+    plan = vp.solve(problem, check=False)
+    assert len(found) > 1
+    assert "the cost would fall by" in plan.reason
+    np.testing.assert_allclose(plan.constraints[0].multipliers, best.constraints[0].multipliers, rtol=1e-3, atol=1e-3)

@@ -101,7 +101,7 @@ CASES = {
     vp.SceneFileError: (
         scene_file,
         "arm.toml: horizon.step: unknown key; did you mean 'steps'? keys: dt, steps, duration, hold, sampling, "
-        "controls",
+        "controls, between_nodes",
     ),
     vp.CostError: (lambda _: plan(), "mine: function(t, q, v, u) must return shape (6,), got (6, 2)"),
     vp.NoiseFieldError: (

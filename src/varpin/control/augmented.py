@@ -20,14 +20,15 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.backward import backward
-from varpin.control.between_nodes import NOWHERE, Instants, beyond, carried, enforced, seen, updated
+from varpin.control.between_nodes import NOWHERE, Instants, beyond, carried, enforced, seen, updated, watched
 from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
+from varpin.control.first_node import out_of_reach
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, in_between, reports_of
 from varpin.control.penalties import PenalizedProblem, flat, penalized, split
-from varpin.control.polish import deviations, polished
+from varpin.control.polish import deviations, least_slope, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import SUFFICIENT
 from varpin.control.refinement_within import Warm, refine_within
@@ -65,6 +66,8 @@ _FAR = 1e-2
 _MOVING, _SETTLED = 12, 1e-3
 # A plan is infeasible when _STUCK rounds in a row have left more than _LOWERED of the worst violation.
 _STUCK, _LOWERED = 3, 0.9
+# Greatest number of iterations of a plan whose first node cannot meet a constraint.
+_HOPELESS = 5
 # Expected decrease, relative to the cost with penalties, with which a stalled search has not shown infeasibility.
 _MUCH = 1e-2
 # Greatest number of last steps, each with the rows between nodes of the motion before.
@@ -179,7 +182,8 @@ class _Rounds:
         if self.check:
             # Before the search, which takes long where there is no plan.
             announce(logger, self.problem.scene, self.problem.dt, foreseen(self.problem))
-        last = len(self.history) + self.most
+        hopeless = out_of_reach(self.problem, first.trajectory)
+        last = len(self.history) + (min(self.most, _HOPELESS) if hopeless else self.most)
         found, resume = first, self._resumed_search()
         while True:
             begun = self.state
@@ -211,6 +215,9 @@ class _Rounds:
             kept = self._steady(self._kept(found, problem, begun, known))
             try:
                 status, reason = self._ended_or_next(kept, begun, found, last)
+                if hopeless and found.status not in (Status.INTERRUPTED, Status.OUT_OF_TIME):
+                    status, reason = Status.INFEASIBLE, hopeless
+                    break
                 if self._goes_between(kept, begun, status) or status is None:
                     continue
                 if status is Status.INFEASIBLE and not self._clearly_beyond(kept):
@@ -224,7 +231,7 @@ class _Rounds:
             except KeyboardInterrupt:
                 status, reason = Status.INTERRUPTED, found.reason
             break
-        plan = replace(kept, status=status, reason=reason)
+        plan = self._told_between(replace(kept, status=status, reason=reason))
         return looked_at(plan)[0] if self.check else plan
 
     def _first(self) -> Solution:
@@ -463,16 +470,16 @@ class _Rounds:
     def _goes_between(self, kept: Solution, begun: _State, ended: Status | None) -> bool:
         """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
 
-        Only linear controls lead around the nodes. There are no such rows until the rounds have ended with a motion
-        that violates a constraint by more than a thousandth of its range. From then on each round has the offsets of
-        the motion before, and the rows that it violates. The weights of penalties are the first ones again when there
-        are rows for the first time.
+        Only linear controls lead around the nodes, and held ones have such rows where the problem asks for them. There
+        are none until the rounds have ended with a motion that violates a constraint, by more than a thousandth of its
+        range if the problem does not ask. From then on each round has the offsets of the motion before, and the rows
+        that it violates. The weights of penalties are the first ones again when there are rows for the first time.
         """
         before, base, known = begun.between, self.state, kept.multipliers
         assert known is not None
         values = split(self.bound, known.values)
-        if not self.problem.linear or (ended is None and not len(before.rows)):
-            # Motions under held controls stay closer to their nodes.
+        asked = self.problem.between_nodes
+        if not (self.problem.linear or asked) or (ended is None and not len(before.rows)):
             return False
         if ended is not None:
             if begun.round + 1 >= _BETWEEN or ended not in (Status.CONVERGED, Status.STALLED):
@@ -490,7 +497,8 @@ class _Rounds:
         whole = enforced(self.problem, between)
         told = reports_of(whole, kept.trajectory, multipliers, backoff)
         if ended is not None:
-            bounds = [_CLOSE if len(before.rows) else REPORTED * item.scale for item in self.problem.bound_constraints]
+            close = asked or len(before.rows) > 0
+            bounds = [_CLOSE if close else REPORTED * item.scale for item in self.problem.bound_constraints]
             if (self._beyond(kept.trajectory, begun.backoff) <= bounds).all():
                 return False
         most = max(told, key=lambda item: item.violation)
@@ -516,6 +524,23 @@ class _Rounds:
         values = seen(self.problem, motion)
         count = len(self.problem.bound_constraints)
         return np.full(count, np.inf) if values is None else beyond(values, backoff[:count])
+
+    def _told_between(self, plan: Solution) -> Solution:
+        """The plan, which is not CONVERGED and says so where it violates constraints between nodes against the wish."""
+        known = plan.multipliers
+        if not self.problem.between_nodes or known is None or not any(watched(self.problem)):
+            return plan
+        bound = enforced(self.problem, known.between).bound_constraints
+        left = self._beyond(plan.trajectory, split(bound, known.backoff))
+        worst = int((left / [item.scale for item in self.problem.bound_constraints]).argmax())
+        if (left <= FEASIBLE).all():
+            return plan
+        item = self.problem.bound_constraints[worst]
+        told = f"between nodes {item.source.label} is violated by {left[worst]:.1e} {item.unit}"
+        if not np.isfinite(left[worst]):
+            told = "the motion between nodes is not known, as a step cannot be integrated in parts"
+        status = Status.STALLED if plan.status.converged else plan.status
+        return replace(plan, status=status, reason=f"{plan.reason}; {told}")
 
     def _left(self, motion: Trajectory, backoff: list[Floats]) -> float:
         """The largest violation of a motion, at the nodes and between them."""
@@ -567,6 +592,7 @@ class _Rounds:
         self.whole = enforced(self.problem, between)
         if found is None:
             closing = f"constraints hold to {kept.violation:.1e}"
+            kept = self._with_least_slope(kept)
             return replace(kept, status=Status.STALLED) if self._clearly_beyond(kept) else kept, closing
         plan = self._along(kept, found.motion, replace(known, values=flat(values), **_of_instants(between)))
         closing = (
@@ -577,6 +603,17 @@ class _Rounds:
             there = found.decrease <= bound and not self._clearly_beyond(plan)
             plan = replace(plan, status=Status.CONVERGED if there else Status.STALLED)
         return plan, closing
+
+    def _with_least_slope(self, kept: Solution) -> Solution:
+        """The plan as it is, with the multipliers of the Lagrangian's least slope where that has derivatives."""
+        known = kept.multipliers
+        assert known is not None
+        values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
+        try:
+            values = least_slope(self.whole, kept.trajectory, values, known.weights, backoff)
+        except (CostError, NoiseFieldError, LinearizationError):
+            return kept
+        return replace(kept, multipliers=replace(known, values=flat(values)))
 
     def _clearly_beyond(self, plan: Solution) -> bool:
         """Whether the motion violates a constraint by more than a thousandth of its range."""

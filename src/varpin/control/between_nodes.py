@@ -88,7 +88,7 @@ def _bound(problem: OptimalControlProblem, constraint: int, rows: Integers) -> B
     """A constraint at the step and instant of ``rows`` (K, 2), without offsets."""
     of_nodes, (steps, samples) = problem.bound_constraints[constraint], rows.T
     times = problem.t0 + problem.dt * (steps + SHARES[samples])
-    inner = _at_times(problem, of_nodes.source, times)
+    inner = at_times(problem, of_nodes.source, times)
     zeros = np.zeros((len(times), len(of_nodes.rows)))
     given = of_nodes.source, steps + 1, times, of_nodes.rows, of_nodes.unit, of_nodes.scale
     return BoundBetween(*given, inner, _parts(problem), samples, zeros)
@@ -98,7 +98,7 @@ def _parts(problem: OptimalControlProblem) -> Parts:
     return Parts(quiet(problem.scene), problem.integrator, problem.dt, _PARTS, problem.linear)
 
 
-def _at_times(problem: OptimalControlProblem, constraint: PlanConstraint, times: Floats) -> BoundConstraint:
+def at_times(problem: OptimalControlProblem, constraint: PlanConstraint, times: Floats) -> BoundConstraint:
     """A constraint on a grid whose nodes after the first are at ``times`` (K,) [s]."""
     scene, grid = problem.scene, np.concatenate([times[:1], times])
     return constraint.bind(Horizon(grid, scene.robot, scene.controls, 1, scene.control_joints, None, problem.linear))
@@ -137,7 +137,7 @@ def seen(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats | No
     found: list[Floats | None] = [None] * len(looks)
     for i, item in enumerate(problem.bound_constraints):
         if looks[i]:
-            c = _at_times(problem, item.source, times).value(q, v, u)
+            c = at_times(problem, item.source, times).value(q, v, u)
             of_steps = c[points]
             of_steps[0][:, c[0] > _OUTSIDE] = -np.inf
             found[i] = of_steps

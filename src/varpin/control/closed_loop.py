@@ -164,6 +164,17 @@ class ClosedLoop:
             V = 0.5 * (V + V.T)
         self.gradient = self._slope()
 
+    def open(self) -> None:
+        """Leave the feedback out: w are then the changes of the controls themselves."""
+        self.gains, self.previous = np.zeros(self.gains.shape), np.zeros(self.previous.shape)
+        self.gradient = self._slope()
+
+    def leave_penalties(self, free: Mask) -> None:
+        """Take the feedback of the cost alone instead, for controls ``free`` (R, m)."""
+        self._active = [np.zeros(rows.shape, dtype=np.bool_) for rows in self._active]
+        self._expand()
+        self.close(free)
+
     def _slope(self) -> Floats:
         """The gradient of the cost in w (R, m)."""
         hold, A, B, (gradient, _) = self.problem.hold, self._A, self._B, self._steps

@@ -364,6 +364,8 @@ def _between(solution: Solution) -> list[Finding]:
         if c[sample, row] > REPORTED * bound.scale:
             if c[sample, row] < _NARROWED * bound.scale:
                 advice = "make the bound narrower by that much, or dt smaller"
+                if not (problem.linear or problem.between_nodes):
+                    advice = "between_nodes=True keeps it there, too; or " + advice
             else:
                 advice = "the motion goes around the nodes; take a smaller dt"
                 advice += ", or controls='held'" if problem.linear else ""

@@ -17,11 +17,13 @@ from varpin.control.active_rows import same_rows
 from varpin.control.along import states
 from varpin.control.closed_loop import ClosedLoop
 from varpin.control.constraints import BoundBetween, BoundConstraint
+from varpin.control.costs import CostError
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes
 from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
+from varpin.errors import LinearizationError
 from varpin.integrators.base import open_line, open_loop
 from varpin.trajectory import Trajectory
 
@@ -46,6 +48,8 @@ _CLOSE = 1e-4
 _LITTLE, _ROUNDED = 1e-13, 1e-12
 # Least size of a control, relative to the largest one.
 _SMALL = 1e-3
+# Growth of changes of the controls without feedback, beside those with that of the cost, from which on they have it.
+_UNSTABLE = 1e3
 # Pivots of the dual problem: of whole blocks without progress, and greatest number of single ones for each row.
 _TRIES, _PIVOTS = 4, 10
 
@@ -89,17 +93,11 @@ def polished(
         backoff: For each constraint (K, rows).
 
     Raises:
-        LinearizationError: A step of the motion has no derivative.
-        CostError: An expansion of the cost is not finite.
+        LinearizationError: A step of the given motion has no derivative.
+        CostError: An expansion of the cost is not finite along it.
     """
-    trials = Trials(problem)
-    lower, upper = problem.control_limits
-    u = problem.decided(motion)
-    free = (u > lower) & (u < upper)
-    if problem.begin is not None:
-        free[0] &= np.isnan(problem.begin)
-    step = _Step(problem, motion, weights, backoff, multipliers, free)
-    longest = 1.0
+    trials, longest = Trials(problem), 1.0
+    step = _first(problem, motion, multipliers, weights, backoff)
     for left in reversed(range(_STEPS)):
         if step.found.violation <= _DONE and step.found.decrease <= _FLAT * step.found.stake:
             break
@@ -118,6 +116,36 @@ def polished(
         else:
             break
     return replace(step.found, multipliers=step.least_slope())
+
+
+def least_slope(
+    problem: OptimalControlProblem,
+    motion: Trajectory,
+    multipliers: list[Floats],
+    weights: Floats,
+    backoff: list[Floats],
+) -> list[Floats]:
+    """Multipliers (K, rows) of the Lagrangian's least slope in the controls along a motion as it is.
+
+    See :func:`polished`.
+    """
+    return _first(problem, motion, multipliers, weights, backoff).least_slope()
+
+
+def _first(
+    problem: OptimalControlProblem,
+    motion: Trajectory,
+    multipliers: list[Floats],
+    weights: Floats,
+    backoff: list[Floats],
+) -> _Step:
+    """The first Newton step, around a given motion."""
+    lower, upper = problem.control_limits
+    u = problem.decided(motion)
+    free = (u > lower) & (u < upper)
+    if problem.begin is not None:
+        free[0] &= np.isnan(problem.begin)
+    return _Step(problem, motion, weights, backoff, multipliers, free)
 
 
 def _closer(after: Polished, before: Polished, length: float) -> bool:
@@ -205,8 +233,9 @@ class _Step:
     def least_slope(self) -> list[Floats]:
         """Multipliers (K, rows) with which the Lagrangian's gradient in the free controls is least.
 
-        In the metric of the cost to go, the directions in which penalties are stiff would hardly count: there a tiny
-        gradient in other directions changes the multipliers by any part.
+        In the metric of the cost to go, or beside a feedback with penalties, the directions in which these are stiff
+        would hardly count: there a tiny gradient in other directions changes the multipliers by any part. Where the
+        motion is so unstable that changes grow manifold, they count beside the feedback of the cost alone.
         """
         loop = self.loop
         pushing = [lam > 0.0 for lam in self.found.multipliers]
@@ -214,8 +243,13 @@ class _Step:
         equal, active = self._kinds(rows)
         size = np.abs(self.problem.decided(self.motion)).max(axis=0)
         size = np.where(self.free, np.maximum(size, _SMALL * size.max()), 0.0)
-        slopes = (loop.rows(rows) * size).reshape(len(equal), size.size)
-        gradient = (loop.gradient * size).ravel()
+        loop.leave_penalties(self.free)
+        calm, pull = loop.rows(rows), loop.gradient
+        loop.open()
+        G = loop.rows(rows)
+        if np.abs(G).max(initial=0.0) <= _UNSTABLE * np.abs(calm).max(initial=0.0):
+            calm, pull = G, loop.gradient
+        slopes, gradient = (calm * size).reshape(len(equal), size.size), (pull * size).ravel()
         found = _least(slopes @ slopes.T, -slopes @ gradient, equal, active)
         # The same without the squares, in which digits are lost.
         pushed = equal | (found > 0.0)
@@ -268,11 +302,17 @@ class _Step:
         return between and sum(int(rows.sum()) for rows in met) > self.free.size
 
     def after(self, trials: Trials, length: float) -> _Step | None:
-        """The next step, after ``length`` of this one's part along the constraints; None where the motion fails."""
+        """The next step, after ``length`` of this one's part along the constraints.
+
+        None where the motion fails, or has no derivative.
+        """
         attempt = trials.attempt(self._commands(length))
         if not attempt.whole:
             return None
-        return _Step(self.problem, attempt.trajectory(), self.weights, self.backoff, self.multipliers, self.free)
+        try:
+            return _Step(self.problem, attempt.trajectory(), self.weights, self.backoff, self.multipliers, self.free)
+        except (CostError, LinearizationError):
+            return None
 
     def _commands(self, length: float) -> Commands:
         """The commands of the motion after the step, ``length`` of its part along the constraints, with feedback."""

@@ -48,6 +48,7 @@ from varpin.support.checks import (
     control_values,
     count,
     finite,
+    flag,
     is_one_of,
     joint_array,
     named_limits,
@@ -121,6 +122,8 @@ class OptimalControlProblem(Frozen):
         constraints: Hard constraints on the motion (:class:`PlanConstraint`): joint limits, a frame's goal, regions,
             clearance. The constraints of a :class:`Scene` differ: they belong to the mechanism, and constraint forces
             maintain them in every motion.
+        between_nodes: Whether the constraints are to hold between nodes, too, which takes more time. Linear controls
+            keep them there anyway, to a thousandth of their range.
         integrator_by_default: Whether ``integrator`` was left out; :meth:`at` then chooses it anew.
         rate: Cost of changes of the controls: ``rate.weight`` (m, m) and ``rate.before``, the control before the
             horizon (m,) or None; None where changes cost nothing.
@@ -143,6 +146,7 @@ class OptimalControlProblem(Frozen):
     rule: Floats = field(repr=False)
     rate: ControlRate | None = field(repr=False)
     controls: Shape
+    between_nodes: bool
     integrator_by_default: bool = field(repr=False)
     bound_constraints: tuple[BoundConstraint, ...] = field(repr=False)
 
@@ -163,6 +167,7 @@ class OptimalControlProblem(Frozen):
         control_limits: tuple[JointValues, JointValues] | None = None,
         controls: Shape = "held",
         constraints: Sequence[PlanConstraint] = (),
+        between_nodes: bool = False,
     ) -> None:
         """Describe a problem; see the class for the arguments.
 
@@ -246,6 +251,7 @@ class OptimalControlProblem(Frozen):
             "rule": rule,
             "rate": rate,
             "controls": controls,
+            "between_nodes": flag("between_nodes", between_nodes),
             "integrator_by_default": integrator is None,
             "bound_constraints": _bind_constraints(
                 given, scene, t0, dt, steps, hold, rate, linear=controls == "linear"
@@ -345,6 +351,7 @@ class OptimalControlProblem(Frozen):
         t0: float | None = None,
         before: JointValues | None = None,
         controls: Shape | None = None,
+        between_nodes: bool | None = None,
     ) -> OptimalControlProblem:
         """The same problem with another discretization or initial state.
 
@@ -367,7 +374,8 @@ class OptimalControlProblem(Frozen):
                 raise InputError(f"the horizon of {self.duration:g} s is no multiple of dt = {dt:g} s")
         elif duration is not None:
             dt, steps = time_steps(self.dt if dt is None and steps is None else dt, steps, duration)
-        if all(option is None for option in (dt, steps, integrator, sampling, hold, controls)):
+        given = (dt, steps, integrator, sampling, hold, controls, between_nodes)
+        if all(option is None for option in given):
             return self._restarted(q0, v0, t0, before)
         return OptimalControlProblem(
             self.scene,
@@ -383,6 +391,7 @@ class OptimalControlProblem(Frozen):
             control_limits=(self.control_limits[0], self.control_limits[1]),
             controls=self.controls if controls is None else controls,
             constraints=self._after(before),
+            between_nodes=self.between_nodes if between_nodes is None else between_nodes,
         )
 
     def _after(self, before: JointValues | None) -> tuple[PlanConstraint, ...]:
@@ -432,7 +441,8 @@ class OptimalControlProblem(Frozen):
             return f"joints {', '.join(its.joint_names)}, not {', '.join(robot.joint_names)}"
         if not np.array_equal(robot.tree.mass, its.tree.mass):
             return f"links of {its.tree.mass.sum():.6g} kg, not {robot.tree.mass.sum():.6g} kg"
-        for name in ("dt", "steps", "hold", "controls", "sampling", "q0", "v0", "integrator", "control_limits"):
+        options = ("hold", "controls", "between_nodes", "sampling")
+        for name in ("dt", "steps", *options, "q0", "v0", "integrator", "control_limits"):
             mine, theirs = getattr(self, name), getattr(other, name)
             if not np.array_equal(mine, theirs):
                 return f"{name} = {theirs}, not {mine}"

@@ -29,7 +29,7 @@ from varpin.trajectory import Trajectory
 Members = Mapping[str, NDArray[Any]]
 
 _FORMAT = "varpin.solution/2"
-_PROBLEM = ("q0", "v0", "t0", "steps", "hold", "controls", "sampling", "control_limits")
+_PROBLEM = ("q0", "v0", "t0", "steps", "hold", "controls", "between_nodes", "sampling", "control_limits")
 _STATUSES = tuple(Status)
 _NUMBERS = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
 _FLAGS = ("bounded", "cut", "whole", "saturated", "clips", "returned")
@@ -276,8 +276,8 @@ def _surroundings(problem: OptimalControlProblem) -> dict[str, Floats]:
 def _require_problem(source: Path, members: Members, problem: OptimalControlProblem) -> None:
     """Refuse a solution of another problem, by its numbers and its noise."""
     given = {name: getattr(problem, name) for name in (*_PROBLEM, "dt")}
-    # Files without this entry are older than linear controls.
-    members = {"controls": np.array("held"), **members}
+    # Files without these entries are older than linear controls, and than rows between nodes of held ones.
+    members = {"controls": np.array("held"), "between_nodes": np.array(False), **members}
     for name, value in given.items():
         if name not in members or not np.array_equal(members[name], value):
             raise FileError(f"{source} is of a problem with {name} = {members.get(name, 'unknown')}, not {value}")

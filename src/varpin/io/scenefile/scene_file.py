@@ -120,6 +120,7 @@ class SceneFile:
                 control_limits=(-most, most),
                 controls=spec.shape,  # type: ignore[arg-type]
                 constraints=constraints,
+                between_nodes=spec.between_nodes,
             )
         except CostError as error:
             raise spec.root.error("cost", str(error)) from None

@@ -221,6 +221,7 @@ class HorizonKeys(Keys):
     hold: Annotated[int, whole(1)] = 1
     sampling: Annotated[str, word("gauss", "midpoint", "start")] = "gauss"
     controls: Annotated[str, word("held", "linear")] = "held"
+    between_nodes: Annotated[bool, FLAG] = False
 
     @property
     def count(self) -> int:
@@ -537,6 +538,7 @@ class SceneSpec:
         hold: Steps that share a control.
         sampling: Sampling of running costs.
         shape: Controls of a plan between nodes: ``"held"`` or ``"linear"``.
+        between_nodes: Whether the plan's constraints are to hold between nodes, too.
         integrator: The integrator; None where the file names none.
         costs: Terms of the cost.
         controls: Controls of a simulation: None for none, ``"hold"`` to hold the robot, or values over time.
@@ -571,6 +573,7 @@ class SceneSpec:
     hold: int
     sampling: str
     shape: str
+    between_nodes: bool
     integrator: Integrator | None
     costs: tuple[CostSpec, ...]
     controls: ReferenceSignal | str | None
@@ -633,6 +636,7 @@ def spec_of(data: Mapping[str, Any], path: Path, name: str) -> SceneSpec:
         hold=horizon.hold,
         sampling=horizon.sampling,
         shape=horizon.controls,
+        between_nodes=horizon.between_nodes,
         integrator=_integrator(root.table("integrator"), keys.integrator),
         costs=tuple(_cost(root.table(f"cost[{k}]"), entry, horizon.dt) for k, entry in enumerate(keys.cost)),
         controls=controls,

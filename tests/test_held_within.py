@@ -1,0 +1,183 @@
+"""Plans within hard constraints whose controls are held, and that are to hold between nodes, too."""
+
+import numpy as np
+import pytest
+from findings import about
+from scipy.optimize import minimize
+
+import varpin as vp
+
+ROBOT = vp.planar_chain(2)
+N, DT, LIMIT = 6, 0.1, 0.6
+
+
+def reach(limit=LIMIT, **options):
+    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([0.6, -0.6], 1e2) + vp.VelocityCost(1.0))
+    given = {"constraints": [vp.WithinVelocityLimits(ROBOT, (-limit, limit))], "between_nodes": True} | options
+    scene, rest = vp.Scene(ROBOT, damping=0.1), np.zeros(2)
+    return vp.OptimalControlProblem(scene, cost, rest, rest, dt=DT, steps=N, **given)
+
+
+def speeds(problem, u, parts):
+    """Speeds along the motion under u (N, 2), in classical Runge-Kutta steps."""
+    given = {"dt": DT / parts, "steps": N * parts, "controls": np.repeat(u, parts, axis=0), "check": False}
+    return np.abs(vp.simulate(problem.scene, problem.q0, problem.v0, integrator=vp.RungeKutta4(), **given).v)
+
+
+def test_speeds_hold_between_nodes_at_least_cost():
+    """Beside SLSQP with the limits at 16 instants of each step."""
+    problem = reach()
+    plan, alone = vp.solve(problem), vp.solve(problem.at(between_nodes=False))
+    assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert plan.violation <= 1e-6
+    assert not about(plan.warnings, "between nodes")
+    assert speeds(problem, alone.controls, 32).max() > LIMIT + 1e-2
+    assert speeds(problem, plan.controls, 32).max() <= LIMIT + 2e-6
+    (told,) = about(alone.warnings, "between nodes")
+    assert "between_nodes=True" in told
+    rules = [{"type": "ineq", "fun": lambda x: LIMIT - speeds(problem, x.reshape(N, 2), 16)[1:].ravel()}]
+    best = minimize(
+        lambda x: problem.cost_of(problem.simulate(x.reshape(N, 2))), plan.controls.ravel(), method="SLSQP",
+        constraints=rules, options={"maxiter": 30, "ftol": 1e-10},
+    )  # fmt: skip
+    assert abs(best.fun - plan.cost) <= 1e-4 * plan.cost
+
+
+def test_plans_within_constraints_between_nodes_are_those_at_nodes():
+    problem = reach(50.0)
+    plan, alone = vp.solve(problem), vp.solve(problem.at(between_nodes=False))
+    assert plan.controls.tobytes() == alone.controls.tobytes()
+    assert plan.reason == alone.reason
+    assert len(plan.history) == len(alone.history)
+
+
+def arm(name, load):
+    """A reach of a robot whose motion at the nodes alone goes through what is in its way, or too fast."""
+    if name == "decisions of two steps":
+        robot = vp.planar_chain(3)
+        cost = vp.ControlCost(1e-3) + vp.VelocityCost(1e-2)
+        cost += vp.Terminal(vp.TrackingCost([1.0, 0.5, 0.3], 1e2) + vp.VelocityCost(10.0))
+        options = {"dt": 0.04, "steps": 30, "hold": 2, "control_limits": (-60.0, 60.0)}
+        within = vp.WithinVelocityLimits(robot, (-1.2, 1.2))
+        begin = np.zeros(3)
+    else:
+        begin = {"ur5": [0.0, -1.2, 1.4, -1.8, -1.57, 0.0], "panda": [0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.8]}[name]
+        robot = vp.load_robot(name, lock={"panda_finger_joint1": 0.02}) if name == "panda" else load(name)
+        begin, frame = np.array(begin), {"ur5": "tool0", "panda": "panda_hand"}[name]
+        end = begin + np.pad([1.0, 0.4, -0.3], (0, robot.dof - 3))
+        middle = robot.frame_positions(0.5 * (begin + end), frame)
+        cost = vp.ControlCost(1.0 / robot.effort_limit**2) + vp.VelocityCost(0.2)
+        cost += vp.Terminal(vp.TrackingCost(end, 100.0) + vp.VelocityCost(100.0))
+        within = vp.KeepOutOfSphere(robot, frame, center=middle, radius=0.12)
+        if name == "ur5":
+            post = vp.Obstacle.capsule([*middle[:2], 0.0], [*middle[:2], 0.3], 0.06, name="post")
+            names = ["forearm_link", "wrist_1_link", "wrist_2_link", "wrist_3_link"]
+            within = vp.KeepClear(robot, [post], 0.02, links=names)
+        options = {"dt": 0.05, "steps": 24}
+    options |= {"constraints": [within], "between_nodes": True}
+    return vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, begin, np.zeros(robot.dof), **options)
+
+
+@pytest.mark.parametrize("name", ["decisions of two steps", "ur5", "panda"])
+def test_arms_hold_between_nodes(name, load):
+    """Held against the motion in 32 parts of each step; at least cost, it is more by little."""
+    problem = arm(name, load)
+    plan, alone = (vp.solve(problem.at(between_nodes=each), check=False) for each in (True, False))
+    assert plan.status is vp.Status.CONVERGED
+    assert plan.violation <= 1e-6
+    assert most(alone) > 3e-6
+    # Between eighths of a step a parabola through three of them counts.
+    assert most(plan) <= 2e-6
+    assert alone.cost <= plan.cost <= alone.cost * (1.0 + 1e-3)
+
+
+def most(plan, parts=32):
+    """The largest value of a plan's constraints along its motion in parts of the steps."""
+    problem = plan.problem
+    motion = vp.simulate(
+        problem.scene, problem.q0, problem.v0, dt=problem.dt / parts, steps=problem.steps * parts,
+        controls=np.repeat(plan.controls, parts * problem.hold, axis=0), integrator=problem.integrator, check=False,
+    )  # fmt: skip
+    fine = problem.constraints_on(problem.dt / parts, problem.steps * parts, problem.hold * parts)
+    return max(bound.value(motion.q, motion.v, motion.u).max() for bound in fine)
+
+
+@pytest.mark.parametrize("iterations", [14, 17])
+def test_a_plan_that_does_not_hold_between_nodes_says_so(iterations):
+    """With too few iterations for it: before there are rows between nodes, and after."""
+    problem = reach()
+    plan = vp.solve(problem, max_iterations=iterations, check=False)
+    assert most(plan) > 1e-4
+    assert not plan.status.converged
+    assert "between nodes WithinVelocityLimits is violated by" in plan.reason
+
+
+def test_steps_that_cannot_be_looked_at_are_said(monkeypatch):
+    monkeypatch.setattr("varpin.control.augmented.seen", lambda *_: None)
+    plan = vp.solve(reach(), check=False)
+    assert plan.status is vp.Status.STALLED
+    assert "between nodes is not known" in plan.reason
+
+
+def test_rounds_with_rows_between_nodes_go_on_where_they_stopped(tmp_path):
+    problem = reach()
+    whole = vp.solve(problem, check=False)
+    cut = len(vp.solve(problem.at(between_nodes=False), check=False).history) + 3
+    assert cut < len(whole.history)
+
+    def stop(item, _motion):
+        if item.index == cut:
+            raise KeyboardInterrupt
+
+    part = vp.solve(problem, callback=stop, check=False)
+    assert part.status is vp.Status.INTERRUPTED
+    rest = vp.solve(problem, resume=vp.Solution.load(part.save(tmp_path / "plan.npz"), problem), check=False)
+    assert rest.controls.tobytes() == whole.controls.tobytes()
+    again = vp.solve(problem, resume=vp.Solution.load(whole.save(tmp_path / "whole.npz"), problem), check=False)
+    assert again.status is vp.Status.CONVERGED
+    assert again.cost == pytest.approx(whole.cost, rel=1e-4)
+
+
+def test_copies_and_files_know_the_option(tmp_path):
+    problem, alone = reach(), reach(between_nodes=False)
+    for copy in (problem.at(dt=DT / 2), problem.at(q0=[0.1, 0.0]), problem.at(controls="linear")):
+        assert copy.between_nodes
+    assert not alone.at(dt=DT / 2).between_nodes
+    assert "between_nodes" in problem.differs(alone)
+    plan = vp.solve(alone, check=False)
+    with pytest.raises(vp.InputError, match="between_nodes"):
+        vp.solve(problem, resume=plan, check=False)
+    with pytest.raises(vp.FileError, match="between_nodes"):
+        vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem)
+    # Files without the entry are of problems that ask for nothing between nodes.
+    with np.load(tmp_path / "plan.npz") as archive:
+        np.savez(tmp_path / "older.npz", **{name: archive[name] for name in archive if name != "between_nodes"})
+    assert vp.Solution.load(tmp_path / "older.npz", alone).controls.tobytes() == plan.controls.tobytes()
+    with pytest.raises(vp.InputError, match="between_nodes"):
+        reach(between_nodes="yes")
+
+
+def test_scene_files_have_the_option(tmp_path):
+    text = """
+[robot]
+source = "ur5"
+[horizon]
+dt = 0.1
+steps = 6
+{}
+[[cost]]
+type = "control"
+weight = 1e-4
+[[plan_constraint]]
+type = "velocity_limits"
+lower = -0.6
+upper = 0.6
+"""
+    for given, expected in (("", False), ("between_nodes = true", True), ("between_nodes = false", False)):
+        path = tmp_path / "scene.toml"
+        path.write_text(text.format(given))
+        assert vp.load_scene(path).problem.between_nodes is expected
+    path.write_text(text.format("between_nodes = 1"))
+    with pytest.raises(vp.SceneFileError, match="between_nodes"):
+        vp.load_scene(path)
