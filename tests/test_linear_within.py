@@ -7,6 +7,8 @@ from scipy.optimize import minimize
 
 import varpin as vp
 from varpin.control.between_nodes import Instants, enforced
+from varpin.control.multipliers import at_nodes
+from varpin.control.spread import Feedback, covariances
 
 N = 8
 ROBOT = vp.planar_chain(2)
@@ -303,3 +305,25 @@ def test_files_with_other_rows_between_nodes_are_refused(tmp_path):
         np.savez(path, **members | {f"multipliers.{name}": array})
         with pytest.raises(vp.FileError, match="multipliers"):
             vp.Solution.load(path, problem)
+
+
+def test_margins_of_plans_with_rows_between_nodes():
+    """The check of margins under noise, and a controller's ticks, are of the rows at nodes alone."""
+    robot = vp.planar_chain(1)
+    scene = vp.Scene(robot, gravity=False, damping=0.1, noise=vp.AdditiveNoise(0.01))
+    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-3) + vp.Terminal(vp.TrackingCost([0.4], 1e2))
+    within = vp.WithinVelocityLimits(robot, (-0.3, 0.3), margin=2.0)
+    given = {"dt": 0.05, "steps": N, "controls": "linear", "constraints": [within]}
+    problem = vp.OptimalControlProblem(scene, cost, [0.1], [0.0], **given)
+    plan = vp.solve(problem)
+    assert plan.status.converged, plan.reason
+    assert len(plan.constraints[0].t) > N
+    assert not about(plan.warnings, "small margin")
+    margins = at_nodes(problem, plan.multipliers, plan.multipliers.backoff)
+    feedback = Feedback(plan.gains, plan.previous_gains)
+    # Of a joint of constant inertia I, with p = I v.
+    inertia = robot.model.inertias[1]
+    moment = inertia.inertia[1, 1] + inertia.mass * inertia.lever @ inertia.lever
+    P = covariances(problem, plan.trajectory, feedback)[1:, 1, 1]
+    np.testing.assert_allclose(margins[0], np.tile(2.0 * np.sqrt(P)[:, None] / moment, 2), rtol=1e-2)
+    assert len(vp.Mpc(problem).run(duration=0.1, rng=0).plans) == 2

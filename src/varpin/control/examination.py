@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from varpin.control.between_nodes import enforced
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
 from varpin.control.moments import noise_cost, noise_cost_in_halves
-from varpin.control.multipliers import FEASIBLE, REPORTED
-from varpin.control.penalties import split
+from varpin.control.multipliers import FEASIBLE, REPORTED, at_nodes
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes
@@ -348,8 +346,7 @@ def _between(solution: Solution) -> list[Finding]:
     motion = kept
     found = []
     fine = problem.constraints_on(dt, problem.steps * PARTS, problem.hold * PARTS)
-    # Those at the nodes come first.
-    margins = split(enforced(problem, known.between).bound_constraints, known.backoff)[: len(fine)]
+    margins = at_nodes(problem, known, known.backoff)
     for bound, whole, margin in zip(fine, problem.bound_constraints, margins, strict=True):
         if bound.of_controls or bound.source.equality:
             continue

@@ -10,7 +10,7 @@ from scipy.special import ndtr
 from varpin.arrays import Floats
 from varpin.control.history import Status
 from varpin.control.linear_controls import in_step
-from varpin.control.penalties import split
+from varpin.control.multipliers import at_nodes
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, decided, state_slopes
 from varpin.errors import VarpinError
@@ -33,7 +33,7 @@ def too_small(solution: Solution) -> list[Finding]:
     problem = solution.problem
     if not problem.scene.processes or solution.multipliers is None or solution.status is Status.INFEASIBLE:
         return []
-    margins = split(problem.bound_constraints, solution.multipliers.backoff)
+    margins = at_nodes(problem, solution.multipliers, solution.multipliers.backoff)
     bounds = [(b, a) for b, a in zip(problem.bound_constraints, margins, strict=True) if a.any()]
     if not bounds:
         return []
