@@ -277,9 +277,8 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
         Finding(
             "noise within steps",
             f"noise costs {fine:.3g} in halves of dt = {problem.dt:g} s, "
-            f"and {planned:.3g} in the plan's steps, which are long for it: on the robot noise_cost is another, "
-            "although plan.monte_carlo(), in the same steps, "
-            f"agrees with it; {closer}",
+            f"and {planned:.3g} in the plan's steps, which are long for it: on the robot noise_cost is another, which "
+            f"plan.monte_carlo(), in the same steps, does not show; {closer}",
         )
     ]
 
