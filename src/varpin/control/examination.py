@@ -201,8 +201,9 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
             found.append(
                 Finding(
                     "start outside constraints",
-                    f"the start is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, "
-                    f"and the first node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
+                    f"the start is outside {problem.label_of(bound.source)}, "
+                    f"{bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the first node, {problem.dt:g} s later, "
+                    "has to be inside: begin inside, or widen the bound",
                 )
             )
     return found
@@ -366,8 +367,8 @@ def _between(solution: Solution) -> list[Finding]:
             found.append(
                 Finding(
                     "constraints between nodes",
-                    f"{bound.source.label} holds at the nodes, but between nodes {bound.rows[row]} is violated by "
-                    f"{c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: {advice}",
+                    f"{problem.label_of(bound.source)} holds at the nodes, but between nodes {bound.rows[row]} is "
+                    f"violated by {c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: {advice}",
                 )
             )
     return found

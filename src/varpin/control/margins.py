@@ -82,8 +82,8 @@ def _told(solution: Solution, bound: BoundConstraint, place: int, row: int, c: F
         needed = planned * margin / float(ndtri(often))
     return Finding(
         "small margin",
-        f"{bound.source.label}: margin={margin:g}, which is of the linear model, is too small for this noise: "
-        f"{bound.rows[row]} at t = {bound.times[place]:.4g} s is violated by {100.0 * often:.2g} +- "
+        f"{problem.label_of(bound.source)}: margin={margin:g}, which is of the linear model, is too small for this "
+        f"noise: {bound.rows[row]} at t = {bound.times[place]:.4g} s is violated by {100.0 * often:.2g} +- "
         f"{100.0 * error:.1g} % of all motions, not {100.0 * promised:.2g} %, as {len(c)} motions under noise say; "
         f"margin={math.ceil(10.0 * needed / deviation) / 10.0:g} is about enough there, and simulate_ensemble counts",
     )

@@ -143,7 +143,7 @@ def reports_of(
     found = []
     for item, margin, multipliers in zip(problem.bound_constraints, backoff, values, strict=True):
         c = item.value(motion.q, motion.v, problem.control_rows(motion)) + margin
-        given = item.source.label, item.rows, item.unit, item.times, c, multipliers
+        given = problem.label_of(item.source), item.rows, item.unit, item.times, c, multipliers
         found.append(ConstraintReport(*given, item.source.equality))
     return tuple(found)
 
