@@ -109,11 +109,7 @@ def by_fddp(task: vp.OptimalControlProblem, most: int) -> tuple[int, float]:
 
     from varpin.crocoddyl import first_guess, shooting_problem  # noqa: PLC0415
 
-    shooting = shooting_problem(task)
-    if task.limited:
-        for node in shooting.runningModels:
-            node.u_lb, node.u_ub = task.control_limits
-    solver = (crocoddyl.SolverBoxFDDP if task.limited else crocoddyl.SolverFDDP)(shooting)
+    solver = (crocoddyl.SolverBoxFDDP if task.limited else crocoddyl.SolverFDDP)(shooting_problem(task))
     solver.th_stop = 1e-7
     solver.solve(*first_guess(task), most, False)
     return min(solver.iter + 1, most), solver.cost

@@ -22,7 +22,7 @@ MARKS = {
     "nothing random": "nothing is random",
     "noise left out": "least cost without noise",
     "noise within steps": "noise costs",
-    "small margin": "is too strong for margin=",
+    "small margin": "is too small for this noise",
     "growth": "disturbances grow",
     "adding up": "errors of steps add up",
     "steps in parts": "parts",

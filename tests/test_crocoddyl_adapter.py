@@ -98,19 +98,36 @@ def test_a_solution_of_crocoddyl_goes_on_as_one_of_varpin():
     assert plan.verify(tolerance=1e-8).closed_loop_cost == pytest.approx(plan.cost, rel=0.01)
 
 
-def test_box_fddp_keeps_bounds():
-    problem = PROBLEMS["midpoint"]()
-    shooting = shooting_problem(problem)
-    free = crocoddyl.SolverFDDP(shooting)
-    free.solve(*first_guess(problem), 100)
-    most = 0.8 * np.abs(np.array(free.us.tolist())).max(axis=0)
-    for model in shooting.runningModels:
-        model.u_lb, model.u_ub = -most, most
-    boxed = crocoddyl.SolverBoxFDDP(shooting)
-    xs, us = first_guess(problem)
-    boxed.solve(xs, [np.clip(u, -most, most) for u in us], 200)
-    assert (np.abs(np.array(boxed.us.tolist())) <= most + 1e-9).all()
-    assert boxed.cost > free.cost
+@pytest.mark.parametrize(
+    ("lower", "upper"),
+    [([-10.0, -5.0], [10.0, 5.0]), ([-np.inf, -np.inf], [10.0, 5.0]), ([-10.0, -np.inf], [np.inf, np.inf])],
+    ids=["both sides", "upper", "one joint's lower"],
+)
+def test_box_fddp_keeps_control_limits(lower, upper):
+    """And ends at the cost of varpin's plan; its policy keeps them far from the plan, too."""
+    cost = vp.ControlCost(1e-4) + vp.Terminal(vp.TrackingCost([1.5, 0.5], 1e3) + vp.VelocityCost(10.0))
+    scene = vp.Scene(vp.planar_chain(2), damping=0.1)
+    given = {"dt": 0.02, "steps": 50, "control_limits": (lower, upper)}
+    problem = vp.OptimalControlProblem(scene, cost, [-1.5, 0.0], [0.0, 0.0], **given)
+    solver = crocoddyl.SolverBoxFDDP(shooting_problem(problem))
+    solver.th_stop = 1e-9
+    assert solver.solve(*first_guess(problem), 200)
+    controls = np.array(solver.us.tolist())
+    assert (controls >= lower).all()
+    assert (controls <= upper).all()
+    assert np.isclose(controls, lower).any() or np.isclose(controls, upper).any()
+    assert solver.cost == pytest.approx(vp.solve(problem, check=False).cost, rel=1e-6)
+    policy = policy_of(problem, solver)
+    again = problem.simulate(policy)
+    assert problem.cost_of(again) == pytest.approx(solver.cost, rel=1e-9)
+    pushed = policy.control(0, np.append(problem.q0 + 10.0, problem.v0))
+    assert (pushed >= lower).all()
+    assert (pushed <= upper).all()
+
+
+def test_actions_without_limits():
+    shooting = shooting_problem(PROBLEMS["midpoint"]())
+    assert not any(model.has_control_limits for model in shooting.runningModels)
 
 
 def test_held_controls_are_refused():

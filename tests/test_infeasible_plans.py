@@ -240,3 +240,17 @@ def test_two_constraints_that_the_first_node_cannot_meet_together():
     assert len(plan.history) <= 6
     assert about(plan.reason, "unmet first node")
     assert "WithinJointLimits and WithinVelocityLimits" in plan.reason
+
+
+def test_of_two_constraints_of_one_kind_the_reason_says_which():
+    robot = vp.planar_chain(2)
+    wide, narrow = (vp.WithinJointLimits(robot, (-limit, limit)) for limit in (3.0, 0.1))
+    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.5, 0.0], 10.0))
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.1), cost, [1.0, 0.0], [0.0, 0.0], dt=0.05, steps=8, constraints=[wide, narrow],
+        control_limits=(-1.0, 1.0),
+    )  # fmt: skip
+    plan = vp.solve(problem, check=False)
+    assert plan.status is vp.Status.INFEASIBLE
+    assert "WithinJointLimits (constraints[1])" in plan.reason
+    assert [report.label for report in plan.constraints] == [f"WithinJointLimits (constraints[{i}])" for i in (0, 1)]

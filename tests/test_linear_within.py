@@ -8,6 +8,8 @@ from scipy.optimize import lsq_linear, minimize
 import varpin as vp
 from varpin.control.between_nodes import Instants, enforced
 from varpin.control.closed_loop import ClosedLoop
+from varpin.control.multipliers import at_nodes
+from varpin.control.spread import Feedback, covariances
 from varpin.errors import LinearizationError
 
 N = 8
@@ -367,3 +369,25 @@ def test_a_last_step_to_a_motion_without_derivative_is_not_taken(monkeypatch):
     assert len(found) > 1
     assert "the cost would fall by" in plan.reason
     np.testing.assert_allclose(plan.constraints[0].multipliers, best.constraints[0].multipliers, rtol=1e-3, atol=1e-3)
+
+
+def test_margins_of_plans_with_rows_between_nodes():
+    """The check of margins under noise, and a controller's ticks, are of the rows at nodes alone."""
+    robot = vp.planar_chain(1)
+    scene = vp.Scene(robot, gravity=False, damping=0.1, noise=vp.AdditiveNoise(0.01))
+    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-3) + vp.Terminal(vp.TrackingCost([0.4], 1e2))
+    within = vp.WithinVelocityLimits(robot, (-0.3, 0.3), margin=2.0)
+    given = {"dt": 0.05, "steps": N, "controls": "linear", "constraints": [within]}
+    problem = vp.OptimalControlProblem(scene, cost, [0.1], [0.0], **given)
+    plan = vp.solve(problem)
+    assert plan.status.converged, plan.reason
+    assert len(plan.constraints[0].t) > N
+    assert not about(plan.warnings, "small margin")
+    margins = at_nodes(problem, plan.multipliers, plan.multipliers.backoff)
+    feedback = Feedback(plan.gains, plan.previous_gains)
+    # Of a joint of constant inertia I, with p = I v.
+    inertia = robot.model.inertias[1]
+    moment = inertia.inertia[1, 1] + inertia.mass * inertia.lever @ inertia.lever
+    P = covariances(problem, plan.trajectory, feedback)[1:, 1, 1]
+    np.testing.assert_allclose(margins[0], np.tile(2.0 * np.sqrt(P)[:, None] / moment, 2), rtol=1e-2)
+    assert len(vp.Mpc(problem).run(duration=0.1, rng=0).plans) == 2

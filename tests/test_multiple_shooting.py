@@ -1,5 +1,6 @@
 """Searches that start on states: where they end, in how many iterations, and what they refuse."""
 
+import contextlib
 import logging
 
 import numpy as np
@@ -165,6 +166,16 @@ def test_paths_beyond_limits_are_told_of(caplog):
 def test_refused_states(states, facts):
     with refused(vp.InputError, facts):
         vp.solve(reach(), states=states)
+
+
+def test_states_in_degrees_are_told_of(caplog):
+    """Where they begin at q0, as from zero, by the log; else by the error."""
+    # The motion along them may fail.
+    with contextlib.suppress(vp.VarpinError):
+        vp.solve(reach(), states=line([90.0, 45.0]), max_iterations=0)
+    assert naming(caplog.messages, "states", "'joint1'", "90", "degrees")
+    with refused(vp.InputError, "q0", "degrees"):
+        vp.solve(reach(), states=line([90.0, 45.0]) + 30.0)
 
 
 @pytest.mark.parametrize("given", [False, True])

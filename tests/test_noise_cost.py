@@ -87,6 +87,8 @@ def test_a_plan_whose_steps_are_long_for_the_noise_says_so():
     halves = float(sentence.split()[2])
     assert abs(halves - exact(long)) < 0.6 * abs(long.noise_cost - exact(long))
     assert "problem.at(dt=0.05, hold=2) is closer" in sentence
+    # Whether paths agree with the linear model is not known without them.
+    assert "agrees" not in sentence
 
 
 def test_one_whose_steps_are_short_does_not():

@@ -40,13 +40,17 @@ except ImportError as missing:
 
 logger = logging.getLogger(__name__)
 
+# Stands for infinity in limits: crocoddyl leaves out limits of which no lower one, or no upper one, is finite.
+_NO_LIMIT = 1e30
+
 
 class StepModel(crocoddyl.ActionModelAbstract):
     """Step ``step`` of a problem with its running cost, as an action of crocoddyl.
 
     The state is (q, p) for variational integrators and (q, v) for the others, (2n,). ``Fx`` and ``Fu`` are the exact
-    derivatives of the step; second derivatives of the cost are Gauss-Newton approximations. Noise is left out. A step
-    that cannot be solved is logged and returns NaN, for which crocoddyl's line search shortens its step.
+    derivatives of the step; second derivatives of the cost are Gauss-Newton approximations. Noise is left out. ``u_lb``
+    and ``u_ub`` are the problem's control limits. A step that cannot be solved is logged and returns NaN, for which
+    crocoddyl's line search shortens its step.
     """
 
     def __init__(self, problem: OptimalControlProblem, step: int) -> None:
@@ -59,6 +63,8 @@ class StepModel(crocoddyl.ActionModelAbstract):
         times = problem.running.points.t[step * samples : (step + 1) * samples]
         self._running, _ = bind_cost(problem.cost, times, problem.running.points)
         self._known: tuple[Floats, Floats, Trajectory] | None = None
+        if problem.limited:
+            self.u_lb, self.u_ub = np.clip(problem.control_limits, -_NO_LIMIT, _NO_LIMIT)
 
     def calc(self, data: Any, x: Floats, u: Floats | None = None) -> None:
         """The next state and the cost of the step."""
@@ -155,7 +161,8 @@ class EndModel(crocoddyl.ActionModelAbstract):
 def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProblem:
     """The problem for crocoddyl: an action for each step, and the terminal cost.
 
-    The actions are Python objects, so leave ``nthreads`` at 1.
+    ``SolverBoxFDDP`` and ``SolverBoxDDP`` keep control limits, crocoddyl's other solvers ignore them. The actions are
+    Python objects, so leave ``nthreads`` at 1.
 
     Raises:
         InputError: Controls are held over several steps, are linear between nodes, or have a cost of their rate; or the
@@ -186,13 +193,14 @@ def first_guess(problem: OptimalControlProblem) -> tuple[list[Floats], list[Floa
 
 
 def policy_of(problem: OptimalControlProblem, solver: Any) -> LinearPolicy:
-    """The policy us - K (x - xs) of a crocoddyl solver that has solved ``shooting_problem(problem)``."""
+    """The policy us - K (x - xs), within the control limits, of a solver of ``shooting_problem(problem)``."""
     gains: Sequence[Floats] = solver.K
     return LinearPolicy(
         np.array(solver.us.tolist()),
         -np.array(gains.tolist() if hasattr(gains, "tolist") else gains),
         np.array(solver.xs.tolist())[:-1],
         on="momentum" if problem.integrator.variational else "velocity",
+        limits=(problem.control_limits[0], problem.control_limits[1]),
         period=problem.period,
         joints=problem.scene.control_joints,
     )

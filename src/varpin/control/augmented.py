@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ParamSpec
 
 import numpy as np
+from scipy import ndimage
 
 from varpin.arrays import Floats
 from varpin.control.backward import backward
@@ -28,12 +29,13 @@ from varpin.control.first_node import out_of_reach
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, in_between, reports_of
 from varpin.control.penalties import PenalizedProblem, flat, penalized, split
-from varpin.control.polish import deviations, least_slope, polished
+from varpin.control.polish import least_slope, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import SUFFICIENT
 from varpin.control.refinement_within import Warm, refine_within
 from varpin.control.search import NOTHING, PATIENCE, checked_time, closing_of, require_reports
 from varpin.control.solution import Solution
+from varpin.control.spread import Feedback, deviations
 from varpin.errors import InputError, LinearizationError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.simulation.soundness import announce
@@ -63,7 +65,10 @@ _LIGHT, _HEAVIER, _LIFTS, _ROUNDED = 1e-2, 1e8, 8, 1e-9
 # Violation of the first motion, relative to the constraint's scale, up to which its penalties are not made heavier.
 _FAR = 1e-2
 # Rounds in which margins are updated, and the relative change below which they have settled.
-_MOVING, _SETTLED = 12, 1e-3
+_MOVING, _SETTLED = 16, 1e-3
+# From round _PLAIN on, margins that change by more than _DRIFT are made steadier over _NEAR nodes to either side, with
+# the share _TAKEN in those of the next round.
+_PLAIN, _DRIFT, _NEAR, _TAKEN = 5, 1e-2, 2, 0.5
 # A plan is infeasible when _STUCK rounds in a row have left more than _LOWERED of the worst violation.
 _STUCK, _LOWERED = 3, 0.9
 # Greatest number of iterations of a plan whose first node cannot meet a constraint.
@@ -418,11 +423,8 @@ class _Rounds:
         exact = begun.tolerance <= _FINAL * self.tolerance and found.status is not Status.MAX_ITERATIONS
         backoff, settled = begun.backoff, True
         if self.noisy and begun.round < _MOVING:
-            backoff = self._backoff(kept)
-            settled = all(
-                np.abs(new - old).max() <= _SETTLED * max(float(new.max()), 1e-300)
-                for new, old in zip(backoff, begun.backoff, strict=True)
-            )
+            backoff = self._next_backoff(kept, begun)
+            settled = _change(backoff, begun.backoff) <= _SETTLED
             backoff = begun.backoff if settled else backoff
         if exact and feasible and settled:
             return found.status, found.reason
@@ -665,12 +667,47 @@ class _Rounds:
 
     def _backoff(self, kept: Solution) -> list[Floats]:
         """The margins of all constraints around a plan, in their units."""
+        feedback = Feedback(kept.gains, kept.previous_gains)
         return [
-            item.source.margin * deviations(self.problem, kept, item)
+            item.source.margin * deviations(self.problem, kept.trajectory, feedback, item)
             if item.source.margin > 0.0
             else np.zeros(item.shape)
             for item in self.bound
         ]
+
+    def _next_backoff(self, kept: Solution, begun: _State) -> list[Floats]:
+        """The margins of the next round.
+
+        Where noise follows the controls, margins that differ from node to node make controls jump, which makes margins
+        differ more. Where they do not settle for that reason, steadier ones do, which are nowhere smaller.
+        """
+        backoff = self._backoff(kept)
+        if begun.round < _PLAIN or _change(backoff, begun.backoff) <= _DRIFT:
+            return backoff
+        count = len(self.problem.bound_constraints)
+        steady = self._margins([_steadier(part) for part in backoff[:count]], begun.between)
+        taken = 1.0 if begun.round == _PLAIN else _TAKEN
+        return [old + taken * (new - old) for new, old in zip(steady, begun.backoff, strict=True)]
+
+
+def _change(new: list[Floats], old: list[Floats]) -> float:
+    """Largest change of margins, relative to the largest margin of their constraint."""
+    changes = [
+        float(np.abs(after - before).max() / after.max()) for after, before in zip(new, old, strict=True) if after.any()
+    ]
+    return max(changes, default=0.0)
+
+
+def _steadier(margins: Floats) -> Floats:
+    """Margins (K, rows) that change less from node to node, and are at least the given ones.
+
+    They are no larger than all before: margins begin near zero, and later ones may not be possible there.
+    """
+    size = 2 * _NEAR + 1
+    most = ndimage.maximum_filter1d(margins, size, axis=0, mode="nearest")
+    smooth = ndimage.uniform_filter1d(most, size, axis=0, mode="nearest")
+    found: Floats = np.minimum(smooth, np.maximum.accumulate(margins, axis=0))
+    return found
 
 
 def _of_instants(between: Instants) -> dict[str, Any]:

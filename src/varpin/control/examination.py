@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from varpin.control.between_nodes import enforced
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
 from varpin.control.moments import noise_cost, noise_cost_in_halves
-from varpin.control.multipliers import FEASIBLE, REPORTED
-from varpin.control.penalties import split
+from varpin.control.multipliers import FEASIBLE, REPORTED, at_nodes
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, covariances, state_slopes
@@ -203,8 +201,9 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
             found.append(
                 Finding(
                     "start outside constraints",
-                    f"the start is outside {bound.source.label}, {bound.rows[row]} by {c[row]:.2g} {bound.unit}, "
-                    f"and the first node, {problem.dt:g} s later, has to be inside: begin inside, or widen the bound",
+                    f"the start is outside {problem.label_of(bound.source)}, "
+                    f"{bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the first node, {problem.dt:g} s later, "
+                    "has to be inside: begin inside, or widen the bound",
                 )
             )
     return found
@@ -279,9 +278,8 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
         Finding(
             "noise within steps",
             f"noise costs {fine:.3g} in halves of dt = {problem.dt:g} s, "
-            f"and {planned:.3g} in the plan's steps, which are long for it: on the robot noise_cost is another, "
-            "although plan.monte_carlo(), in the same steps, "
-            f"agrees with it; {closer}",
+            f"and {planned:.3g} in the plan's steps, which are long for it: on the robot noise_cost is another, which "
+            f"plan.monte_carlo(), in the same steps, does not show; {closer}",
         )
     ]
 
@@ -348,8 +346,7 @@ def _between(solution: Solution) -> list[Finding]:
     motion = kept
     found = []
     fine = problem.constraints_on(dt, problem.steps * PARTS, problem.hold * PARTS)
-    # Those at the nodes come first.
-    margins = split(enforced(problem, known.between).bound_constraints, known.backoff)[: len(fine)]
+    margins = at_nodes(problem, known, known.backoff)
     for bound, whole, margin in zip(fine, problem.bound_constraints, margins, strict=True):
         if bound.of_controls or bound.source.equality:
             continue
@@ -372,8 +369,8 @@ def _between(solution: Solution) -> list[Finding]:
             found.append(
                 Finding(
                     "constraints between nodes",
-                    f"{bound.source.label} holds at the nodes, but between nodes {bound.rows[row]} is violated by "
-                    f"{c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: {advice}",
+                    f"{problem.label_of(bound.source)} holds at the nodes, but between nodes {bound.rows[row]} is "
+                    f"violated by {c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: {advice}",
                 )
             )
     return found

@@ -299,7 +299,9 @@ def _reports(problem: OptimalControlProblem, broken: Sequence[Integers], paths: 
     for bound, counts in zip(_with_margins(problem), broken, strict=True):
         place, row = np.unravel_index(int(counts.argmax()), counts.shape)
         where = bound.rows[row], float(bound.times[place])
-        found.append(Broken(bound.source.label, *where, int(counts.max()), paths, float(ndtr(-bound.source.margin))))
+        found.append(
+            Broken(problem.label_of(bound.source), *where, int(counts.max()), paths, float(ndtr(-bound.source.margin)))
+        )
     return tuple(found)
 
 

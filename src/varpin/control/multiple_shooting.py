@@ -34,7 +34,7 @@ from varpin.mechanics.inputs import as_moved, with_ends
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene, assisted, quiet
-from varpin.model import joint_unit
+from varpin.model import degrees_hint, joint_unit
 from varpin.simulation.failures import StepFailure, named
 from varpin.simulation.record import Motions
 from varpin.support.checks import as_floats, finite_array
@@ -111,13 +111,17 @@ def path_of(problem: OptimalControlProblem, given: object) -> Path:
             raise InputError(f"states must be q, or a pair (q, v), got {len(given)} arrays")
         q, v = given
     positions = _rows("states", q, (nodes, n))
+    farthest = positions[int(np.argmax(np.abs(positions).max(axis=1)))]
+    units = degrees_hint(problem.scene.robot, "states: the position", farthest)
     off = np.abs(positions[0] - problem.q0)
     joint = int(np.argmax(off))
     if off[joint] > _SAME:
         raise InputError(
             f"states must begin at the problem's q0: joint {names[joint]!r} is at {positions[0, joint]:.6g} in their "
-            f"first row, and at {problem.q0[joint]:.6g} in q0"
+            f"first row, and at {problem.q0[joint]:.6g} in q0" + (f"; {units}" if units else "")
         )
+    if units:
+        logger.warning("%s", units)
     lower, upper = problem.scene.robot.position_limits
     beyond = np.maximum(positions - upper, lower - positions)
     if beyond.max() > _SAME:

@@ -131,6 +131,11 @@ def in_between(coarse: BoundConstraint, fine: BoundConstraint, values: Floats) -
     return np.stack(found, axis=1) if found else np.zeros(fine.shape)
 
 
+def at_nodes(problem: OptimalControlProblem, known: Multipliers, values: Floats) -> list[Floats]:
+    """Of numbers (M,) like those of ``known``, those of each constraint at the nodes (K, rows)."""
+    return split(enforced(problem, known.between).bound_constraints, values)[: len(problem.bound_constraints)]
+
+
 def reports_of(
     problem: OptimalControlProblem, motion: Trajectory, values: list[Floats], backoff: list[Floats]
 ) -> tuple[ConstraintReport, ...]:
@@ -138,7 +143,7 @@ def reports_of(
     found = []
     for item, margin, multipliers in zip(problem.bound_constraints, backoff, values, strict=True):
         c = item.value(motion.q, motion.v, problem.control_rows(motion)) + margin
-        given = item.source.label, item.rows, item.unit, item.times, c, multipliers
+        given = problem.label_of(item.source), item.rows, item.unit, item.times, c, multipliers
         found.append(ConstraintReport(*given, item.source.equality))
     return tuple(found)
 

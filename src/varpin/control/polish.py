@@ -19,8 +19,6 @@ from varpin.control.closed_loop import ClosedLoop
 from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.solution import Solution
-from varpin.control.spread import Feedback, covariances, state_slopes
 from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
@@ -405,13 +403,3 @@ def _nonnegative(S: Floats, d: Floats, equal: Mask) -> Floats:
     found = np.empty(len(d))
     found[order] = x
     return found
-
-
-def deviations(problem: OptimalControlProblem, plan: Solution, bound: BoundConstraint) -> Floats:
-    """Standard deviations (K, rows) of a state constraint under the plan's feedback and the scene's noise."""
-    motion = plan.trajectory
-    found = covariances(problem, motion, Feedback(plan.gains, plan.previous_gains))
-    J = bound.jacobian(motion.q, motion.v) @ state_slopes(problem, motion)[bound.places]
-    variance = np.einsum("krx,kxy,kry->kr", J, found[bound.places], J)
-    spread: Floats = np.sqrt(np.maximum(variance, 0.0))
-    return spread

@@ -465,6 +465,12 @@ class OptimalControlProblem(Frozen):
         lines = self.linear if linear is None else linear
         return _bind_constraints(self.constraints, self.scene, self.t0, dt, steps, hold, self.rate, linear=lines)
 
+    def label_of(self, constraint: PlanConstraint) -> str:
+        """The name of one of the constraints in reports, with its index where several have the same name."""
+        alike = [i for i, other in enumerate(self.constraints) if other.label == constraint.label]
+        index = [i for i in alike if self.constraints[i] is constraint]
+        return f"{constraint.label} (constraints[{index[0]}])" if len(alike) > 1 and index else constraint.label
+
     @property
     def described_constraints(self) -> str:
         """A full description of the constraints, for comparison; empty without any.

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control import search
-from varpin.control.between_nodes import enforced
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Iteration, Status
-from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers
+from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers, at_nodes
 from varpin.control.penalties import flat, penalized, split
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
@@ -122,16 +121,12 @@ def replan(
 
 def _at_nodes(problem: OptimalControlProblem, known: Multipliers) -> Multipliers:
     """Multipliers of the rows at nodes only: a tick has no time for those between them."""
-    bound, count = enforced(problem, known.between).bound_constraints, len(problem.bound_constraints)
-
-    def first(values: Floats) -> Floats:
-        return flat(split(bound, values)[:count])
-
+    count = len(problem.bound_constraints)
     return replace(
         known,
-        values=first(known.values),
-        backoff=first(known.backoff),
-        begun=first(known.begun),
+        values=flat(at_nodes(problem, known, known.values)),
+        backoff=flat(at_nodes(problem, known, known.backoff)),
+        begun=flat(at_nodes(problem, known, known.begun)),
         weights=known.weights[:count],
         first_weights=known.first_weights[:count],
         worst=known.worst[:count],

@@ -122,8 +122,9 @@ def solve(
 
     Where controls have limits, each decision minimizes the model within them at the state that the linearized motion
     will have then, and a control at a limit has no feedback (after Tassa, Mansard and Todorov, "Control-limited
-    differential dynamic programming", 2014). Inactive limits cost no iterations. The noise cost is that of the linear
-    feedback: the model does not include controls that noise drives into their limits. ``monte_carlo`` does.
+    differential dynamic programming", 2014). Limits that no motion of the search meets do not change it; those
+    that bind on the way may take more iterations, though the plan keeps clear of them. The noise cost is that of the
+    linear feedback: the model does not include controls that noise drives into their limits. ``monte_carlo`` does.
 
     Main args:
         problem: What to minimize.

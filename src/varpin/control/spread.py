@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.control.constraints import BoundConstraint
 from varpin.control.linear_controls import in_step
 from varpin.control.problem import OptimalControlProblem
 from varpin.linearization import linearize_steps, velocity_at_nodes
@@ -92,3 +93,14 @@ def covariances(problem: OptimalControlProblem, motion: Trajectory, feedback: Fe
     lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0, ramps=problem.linear)
     (J, gz), x = in_step(lin), lin.A.shape[1]
     return propagated(J, lin.G, gz, problem, feedback)[:, :x, :x]
+
+
+def deviations(
+    problem: OptimalControlProblem, motion: Trajectory, feedback: Feedback, bound: BoundConstraint
+) -> Floats:
+    """Standard deviations (K, rows) of a state constraint about a motion under feedback and the scene's noise."""
+    found = covariances(problem, motion, feedback)
+    J = bound.jacobian(motion.q, motion.v) @ state_slopes(problem, motion)[bound.places]
+    variance = np.einsum("krx,kxy,kry->kr", J, found[bound.places], J)
+    spread: Floats = np.sqrt(np.maximum(variance, 0.0))
+    return spread

@@ -413,7 +413,7 @@ def _violations(
     found = []
     for whole, (alone, _), (fed, where) in zip(problem.bound_constraints, opened, closed, strict=True):
         planned = _excess(whole, whole.value(plan.q, plan.v, problem.control_rows(plan)))
-        label, unit = whole.source.label, whole.unit
+        label, unit = problem.label_of(whole.source), whole.unit
         found.append(ViolationOnRobot(label, unit, float(planned.max(initial=0.0)), alone, fed, where))
     return tuple(found)
 
