@@ -225,7 +225,8 @@ class _Rounds:
                     break
                 if self._goes_between(kept, begun, status) or status is None:
                     continue
-                if status is Status.INFEASIBLE and not self._clearly_beyond(kept):
+                ended = status in (Status.INFEASIBLE, Status.STALLED) and kept.violation > FEASIBLE
+                if ended and not self._clearly_beyond(kept):
                     # The last step may remove what the rounds have left.
                     closed, closing = self._polished(replace(kept, status=Status.STALLED))
                     if closed.violation <= FEASIBLE:

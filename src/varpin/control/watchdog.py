@@ -23,7 +23,7 @@ _RISE, _LESS = 0.01, 0.1
 
 
 class Watchdog(NamedTuple):
-    """Whether a search is away from its best motion.
+    """Whether a search is away from its best motion, (O16).
 
     Attributes:
         away: Iterations since the departure, that one included; 0 at home.
