@@ -110,7 +110,8 @@ def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -
     held, best, least, together = rows.begun, None, 0.0, True
     for done in range(1, problem.passes + 1):
         passing = rows.along(held)
-        box = Box(passing, curvature, rows, held) if together else Box(passing, curvature)
+        known = (rows, held) if together else ()
+        box = Box(passing, curvature, *known, until=problem.until)
         plan, active = to_minimum(box, regularization)
         if plan is None:
             break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
@@ -117,13 +118,20 @@ class Box:
     steps are passes, too. ``proximal`` (R, m) regularizes: the Hessian of a further cost of the changes.
 
     With ``rows`` the model is piecewise quadratic: the rows of the penalties that are active at its minimum are found
-    together with the controls at limits. Around a point it has the rows ``active``.
+    together with the controls at limits. Around a point it has the rows ``active``. The interior-point method has no
+    step that begins after the time ``until`` (of ``time.perf_counter``).
     """
 
     def __init__(
-        self, along: Along, curvature: Floats | None, rows: Rows | None = None, active: list[Mask] | None = None
+        self,
+        along: Along,
+        curvature: Floats | None,
+        rows: Rows | None = None,
+        active: list[Mask] | None = None,
+        *,
+        until: float = math.inf,
     ) -> None:
-        self.along, self.curvature, self.rows, self.active = along, curvature, rows, active
+        self.along, self.curvature, self.rows, self.active, self.until = along, curvature, rows, active, until
         self.proximal = np.zeros((along.problem.decisions, along.problem.scene.controls))
         self.lower, self.upper = along.slack[:, 0], along.slack[:, 1]
 
@@ -228,6 +236,8 @@ class Box:
         gaps = self._gaps(z, bounded)
         duals = [mu / gap for gap in gaps]
         for _ in range(_INTERIOR_STEPS):
+            if time.perf_counter() > self.until:
+                return None
             # A step without centring, and one corrected by what that foresees (Mehrotra 1992).
             stiff = duals[0] / gaps[0] + duals[1] / gaps[1]
             limits = around_nominal(slack, self.along.states)._replace(factors=np.empty((*z.shape, z.shape[1])))
@@ -325,6 +335,8 @@ class Box:
         begun = rows.ahead(self.along, without_feedback(plan, z), np.stack([z, z], axis=1))
         pushes = Pushes(rows, flat(begun), mu)
         for _ in range(_STEPS_WITH_ROWS):
+            if time.perf_counter() > self.until:
+                return None
             # Products of multipliers and gaps: now, and where a step should lead.
             mu = (_complementarity(gaps, duals, bounded) + float(pushes.products.sum())) / count
             aims = [np.zeros(z.shape)] * 2
