@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from varpin.arrays import Floats, Mask
+from varpin.arrays import Floats, Integers, Mask
 from varpin.control.along import Along
+from varpin.control.constraints import BoundOnCubics
 from varpin.control.passes import Plan
 from varpin.control.penalties import PenalizedProblem, PenalizedRate, controls_of_steps, flat, rate_columns, split
 
@@ -49,7 +50,13 @@ class Rows:
         slopes = np.tile(np.eye(2 * n), (len(q), 1, 1))
         if problem.integrator.variational:
             slopes[:, n:] = velocity
-        self.by_state = [found.by_state @ slopes[found.nodes] for found in self.slopes]
+        # For each penalty the nodes (K,) whose states its rows depend on, and their derivatives (K, rows, 2n) in these.
+        self.by_state: list[list[tuple[Integers, Floats]]] = []
+        for item, found in zip(self.of_nodes, self.slopes, strict=True):
+            parts = [(found.nodes, found.by_state)]
+            if isinstance(item.bound, BoundOnCubics):
+                parts = list(zip((found.nodes - 1, found.nodes), item.bound.by_nodes(found.by_state), strict=True))
+            self.by_state.append([(nodes, by_state @ slopes[nodes]) for nodes, by_state in parts])
 
     def held(self, ahead: list[Floats]) -> list[Mask]:
         """The rows that are active where the shifted values are ``ahead``."""
@@ -96,8 +103,10 @@ class Rows:
         states = states[len(A) - problem.steps :, :x]
         self.ahead_of = states, moves
         found = []
-        for s, J, rows in zip(self.signed[: len(self.of_nodes)], self.by_state, self.slopes, strict=True):
-            after = s + np.einsum("krx,kx->kr", J, states[rows.nodes])
+        for s, parts, rows in zip(self.signed[: len(self.of_nodes)], self.by_state, self.slopes, strict=True):
+            after = s
+            for nodes, J in parts:
+                after = after + np.einsum("krx,kx->kr", J, states[nodes])
             if rows.by_controls.size:
                 after += np.einsum("krc,kc->kr", rows.by_controls, controls_of_steps(problem, moves, rows.nodes))
             found.append(after)

@@ -2,7 +2,8 @@
 
 A row is at one of a few instants of a step, the ends of equal parts of it. Its value, and its derivatives in the state
 before the step and the controls over it, are those of the motion integrated in these parts. An offset is added where
-the motion has a peak between two instants.
+the motion has a peak between two instants. A controller's ticks have rows on the cubics through the steps instead, which
+take hardly any time.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
-from varpin.control.constraints import BoundBetween, BoundConstraint, Horizon, PlanConstraint
+from varpin.control.constraints import BoundBetween, BoundConstraint, BoundOnCubics, Horizon, PlanConstraint
 from varpin.control.parts import Parts
-from varpin.control.problem import OptimalControlProblem
+from varpin.control.problem import OptimalControlProblem, cubics
 from varpin.mechanics.scene import quiet
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
@@ -24,6 +25,8 @@ from varpin.trajectory import Trajectory
 _PARTS = 8
 SHARES: Floats = np.arange(1, _PARTS) / _PARTS
 SHARES.setflags(write=False)
+# Where the rows of a controller's ticks are.
+_MIDDLE = 0.5
 # Violation of the start from which on a row cannot hold in the first step.
 _OUTSIDE = 1e-6
 # Change of an offset between rounds up to which it is halved, relative to the constraint's scale.
@@ -38,11 +41,13 @@ class Instants(Frozen):
 
     Attributes:
         rows: Constraint, step and instant (I, 3), each from 0, in ascending order.
-        offsets: Offsets of all rows of each of them (O,), one instant after another.
+        offsets: Offsets of all rows of each of them (O,), one instant after another; zero on cubics.
+        cubic: Whether rows are on the cubics through the steps, at their middles, not of steps integrated in parts.
     """
 
     rows: Integers
     offsets: Floats
+    cubic: bool = False
 
     def __post_init__(self) -> None:
         for array in (self.rows, self.offsets):
@@ -68,6 +73,9 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
     made = object.__new__(type(problem))
     found: list[BoundConstraint] = list(problem.bound_constraints)
     for i, offset in _offsets(problem, instants).items():
+        if instants.cubic:
+            found.append(_on_cubics(problem, i, instants.of(i)[:, 0]))
+            continue
         found.append(replace(_bound(problem, i, instants.of(i)), offset=offset))
     # The dataclass is frozen: attributes are set in its dictionary.
     vars(made).update(vars(problem) | {"bound_constraints": tuple(found)})
@@ -94,6 +102,15 @@ def _bound(problem: OptimalControlProblem, constraint: int, rows: Integers) -> B
     return BoundBetween(*given, inner, _parts(problem), samples, zeros)
 
 
+def _on_cubics(problem: OptimalControlProblem, constraint: int, steps: Integers) -> BoundOnCubics:
+    """A constraint at the middles of ``steps`` (K,) of the cubics through them."""
+    of_nodes = problem.bound_constraints[constraint]
+    times = problem.t0 + problem.dt * (steps + _MIDDLE)
+    inner = at_times(problem, of_nodes.source, times)
+    given = of_nodes.source, steps + 1, times, of_nodes.rows, of_nodes.unit, of_nodes.scale
+    return BoundOnCubics(*given, inner, _MIDDLE, cubics(np.array([_MIDDLE]), problem.dt)[0])
+
+
 def _parts(problem: OptimalControlProblem) -> Parts:
     return Parts(quiet(problem.scene), problem.integrator, problem.dt, _PARTS, problem.linear)
 
@@ -111,6 +128,19 @@ def watched(problem: OptimalControlProblem) -> list[bool]:
         np.array_equal(item.places, after) and not (item.of_controls or item.source.equality)
         for item in problem.bound_constraints
     ]
+
+
+def middles(problem: OptimalControlProblem) -> Instants:
+    """The middles of all steps, for each constraint that may have rows there; none where controls are held.
+
+    Linear controls can alternate, so that a motion keeps to constraints at its nodes and nowhere else.
+    """
+    of = [i for i, may in enumerate(watched(problem)) if may and problem.linear]
+    if not of:
+        return NOWHERE
+    rows = np.array([(i, step, _PARTS // 2 - 1) for i in of for step in range(problem.steps)])
+    entries = problem.steps * sum(len(problem.bound_constraints[i].rows) for i in of)
+    return Instants(rows, np.zeros(entries), cubic=True)
 
 
 def seen(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats | None] | None:

@@ -11,11 +11,12 @@ from varpin.arrays import Floats
 from varpin.control.along import states
 from varpin.control.passes import Plan
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.solution import Solution
+from varpin.control.solution import Solution, rest_of
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.integrators.base import open_line, open_loop
 from varpin.mechanics.policy import LinearPolicy
+from varpin.mechanics.scene import closest_controls
 from varpin.support.checks import JointValues, as_floats, control_array, finite_array
 from varpin.trajectory import Trajectory
 
@@ -79,7 +80,12 @@ def shifted_commands(problem: OptimalControlProblem, previous: Solution, decisio
         and old.control_limits is problem.control_limits
     )
     if problem.linear:
-        return first_commands(problem, previous.shifted(decisions, before))
+        # Within constraints the last control often leaps, and gains contain penalties of rows that are active elsewhere:
+        # neither fits beyond the end, where the motion goes on with the torques that hold the robot there.
+        # Limits of their rate keep controls from leaping.
+        leaps = bool(old.constraints) and not any(item.of_controls for item in old.bound_constraints)
+        means = closest_controls(problem.scene, previous.trajectory.q[-1]) if leaps else None
+        return first_commands(problem, rest_of(previous, previous.policy, decisions, before, means=means))
     if not (same and (old.dt, old.steps, old.hold) == (problem.dt, problem.steps, problem.hold)):
         return first_commands(problem, previous.shifted(decisions, before))
     rows = np.minimum(np.arange(R) + decisions, R - 1)

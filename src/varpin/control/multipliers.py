@@ -44,6 +44,8 @@ class Multipliers(Frozen):
         instants: Constraint, step and instant (I, 3) of each instant between nodes at which a constraint has rows; None
             where all hold there without.
         offsets: What is added to the values of these rows (O,), where the motion has a peak between two instants.
+        cubic: Whether these rows are on the cubics through the steps, as in a controller's ticks, not of steps
+            integrated in parts.
     """
 
     values: Annotated[Floats, Axes("rows", finite=True)]
@@ -58,6 +60,7 @@ class Multipliers(Frozen):
     stuck: int
     instants: Annotated[Integers, Axes("instants", 3)] | None = None
     offsets: Annotated[Floats, Axes("offsets", finite=True)] | None = None
+    cubic: bool = False
 
     def __post_init__(self) -> None:
         arrays = (self.values, self.backoff, self.begun, self.weights, self.first_weights, self.worst)
@@ -68,7 +71,9 @@ class Multipliers(Frozen):
     @property
     def between(self) -> Instants:
         """The rows between nodes."""
-        return NOWHERE if self.instants is None or self.offsets is None else Instants(self.instants, self.offsets)
+        if self.instants is None or self.offsets is None:
+            return NOWHERE
+        return Instants(self.instants, self.offsets, self.cubic)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from varpin.arrays import Floats, Integers, Mask
-from varpin.control.constraints import BoundBetween, BoundConstraint, BoundRate, Slopes
+from varpin.control.constraints import BoundBetween, BoundConstraint, BoundOnCubics, BoundRate, Slopes
 from varpin.control.costs import ControlRate, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.support.frozen import Frozen
@@ -166,10 +166,12 @@ class PenalizedProblem(OptimalControlProblem):
     """A problem with the penalties of its constraints in the cost. Made by :func:`penalized`.
 
     Penalties of states are evaluated at the end of each step, in addition to the samples of the cost. Those at instants
-    within steps are functions of the state at the begin of their step and of its controls.
+    within steps are functions of the state at the begin of their step and of its controls; those on the cubics through
+    the steps have samples of their own.
 
     Attributes:
         penalties: Penalties of constraints on states.
+        cubic: One of the constraints on the cubics, None without any.
         within: Whether there are rows within steps.
         all_penalties: Penalties of all constraints, in the problem's order.
         quiet: Whether plans leave the scene's noise out: otherwise stiff penalties would add to the noise cost.
@@ -180,6 +182,7 @@ class PenalizedProblem(OptimalControlProblem):
 
     penalties: tuple[Penalty, ...]
     within: bool
+    cubic: BoundOnCubics | None
     all_penalties: tuple[Penalty, ...]
     quiet: bool
     passes: int
@@ -208,7 +211,10 @@ class PenalizedProblem(OptimalControlProblem):
         node = [self.rule[0, 0], 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
         # With linear controls rows within steps depend on the controls at both ends, see Expansion.begun.
         begin = [self.rule[0, 0], 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
-        return np.vstack([self.rule, node, begin] if self._begins else [self.rule, node])
+        rows = [self.rule, node, begin] if self._begins else [self.rule, node]
+        if self.cubic is not None:
+            rows.append(np.append(self.rule[0, 0], self.cubic.coefficients))
+        return np.vstack(rows)
 
     @property
     def _begins(self) -> bool:
@@ -223,7 +229,8 @@ class PenalizedProblem(OptimalControlProblem):
     @property
     def model_places(self) -> Floats:
         """See :attr:`OptimalControlProblem.model_places`."""
-        return np.concatenate([self.places, [1.0, 0.0] if self._begins else [1.0]])
+        shares = [1.0, 0.0] if self._begins else [1.0]
+        return np.concatenate([self.places, shares if self.cubic is None else [*shares, self.cubic.share]])
 
     def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
         """See :meth:`OptimalControlProblem.model_samples`."""
@@ -237,6 +244,10 @@ class PenalizedProblem(OptimalControlProblem):
         if self._begins:
             begins = (q[:-1], v[:-1], u)
             joined = [np.concatenate([x, y[:, None]], axis=1) for x, y in zip(joined, begins, strict=True)]
+        if self.cubic is not None:
+            share = self.cubic.share
+            middles = (*self.cubic.states(q, v), (1.0 - share) * u[:-1] + share * u[1:])
+            joined = [np.concatenate([x, y[:, None]], axis=1) for x, y in zip(joined, middles, strict=True)]
         q, v, u = (x.reshape(-1, x.shape[-1]) for x in joined)
         return q, v, u
 
@@ -277,12 +288,15 @@ class PenalizedProblem(OptimalControlProblem):
         ends = np.zeros((N, size)), np.zeros((N, size, size))
         wide = x + 2 * m if self.linear else size
         begins = np.zeros((N, wide)), np.zeros((N, wide, wide))
+        middles = np.zeros((N, size)), np.zeros((N, size, size))
         for penalty, s, found, rows in zip(self.penalties, shifted, slopes, held, strict=True):
             if found is None or not rows.any():
                 continue
             within, counted = isinstance(penalty.bound, BoundBetween), rows.astype(float)
             J = found.in_step()
             z, (gradient, hessian) = slice(0, J.shape[2]), begins if within else ends
+            if isinstance(penalty.bound, BoundOnCubics):
+                gradient, hessian = middles
             # A step may have several places within it.
             steps = found.nodes if within else found.nodes - 1
             np.add.at(gradient[:, z], steps, penalty.weight * np.einsum("kr,krx->kx", s * counted, J))
@@ -291,6 +305,7 @@ class PenalizedProblem(OptimalControlProblem):
         weight = self.dt * float(self.rule[0, 0])
         there = np.broadcast_to(expansion.hessian, (len(expansion.gradient), size, size)).reshape(N, -1, size, size)
         samples = [ends, begins] if self._begins else [ends]
+        samples += [] if self.cubic is None else [middles]
         parts = [expansion.gradient.reshape(N, -1, size), *(gradient[:, None] / weight for gradient, _ in samples)]
         curved = [there, *(hessian[:, None] / weight for _, hessian in samples)]
         begun = Expansion(begins[0] / self.dt, begins[1] / self.dt) if self.within and self.linear else None
@@ -330,6 +345,7 @@ def penalized(
         "penalties": tuple(part for part in parts if not part.bound.of_controls),
         "all_penalties": tuple(parts),
         "within": any(isinstance(part.bound, BoundBetween) for part in parts),
+        "cubic": next((part.bound for part in parts if isinstance(part.bound, BoundOnCubics)), None),
     }
     changes |= {"constraints": (), "bound_constraints": (), "quiet": quiet, "passes": passes, "until": until}
     if on_rate:

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control import search
+from varpin.control.between_nodes import Instants, carried, enforced, middles
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Iteration, Status
-from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers, at_nodes
+from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers, at_nodes, reports_of
 from varpin.control.penalties import flat, penalized, split
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
@@ -51,7 +52,8 @@ def replan(
     """:func:`varpin.control.search.replan` for problems with or without constraints.
 
     With constraints each iteration is one of the augmented Lagrangian, followed by an update of the multipliers. They
-    start from those of the previous plan, shifted with the horizon. Margins are those of the first plan. A tick is
+    start from those of the previous plan, shifted with the horizon. Where controls are linear, constraints of states
+    hold at the middles of the steps, too. Margins are those of the first plan. A tick is
     INFEASIBLE where it violates a constraint by more than a thousandth of its range and several ticks in a row have not
     lowered the violation.
     """
@@ -65,8 +67,10 @@ def replan(
             max_iterations=max_iterations,
             deadline=deadline,
         )
-    old, new = previous.problem.bound_constraints, problem.bound_constraints
-    hold, known = problem.hold, _at_nodes(previous.problem, known)
+    instants = middles(problem)
+    hold, known = problem.hold, _at(previous.problem, known, instants)
+    whole = enforced(problem, instants)
+    old, new = enforced(previous.problem, instants).bound_constraints, whole.bound_constraints
     multipliers = [
         _shifted_to(*parts, decisions, hold) for parts in zip(old, new, split(old, known.values), strict=True)
     ]
@@ -82,7 +86,7 @@ def replan(
     for k in range(max_iterations):
         started = time.perf_counter()
         until = started + _SHARE * (deadline - started)
-        goal = penalized(problem, multipliers, weights, backoff, passes=_PASSES, until=until)
+        goal = penalized(whole, multipliers, weights, backoff, passes=_PASSES, until=until)
         found = search.replan(
             goal,
             found,
@@ -119,19 +123,33 @@ def replan(
     return _judged(kept, known)
 
 
-def _at_nodes(problem: OptimalControlProblem, known: Multipliers) -> Multipliers:
-    """Multipliers of the rows at nodes only: a tick has no time for those between them."""
-    count = len(problem.bound_constraints)
+def _at(problem: OptimalControlProblem, known: Multipliers, instants: Instants) -> Multipliers:
+    """Multipliers of the rows at nodes and at ``instants``; those of the latter go on where ``known`` has them."""
+    before, count = known.between, len(problem.bound_constraints)
+    if before.cubic == instants.cubic and np.array_equal(before.rows, instants.rows):
+        return known
+    bound, source = enforced(problem, before).bound_constraints, instants.constraints
+    backoff = at_nodes(problem, known, known.backoff)
+
+    def kept(values: Floats) -> Floats:
+        return flat(carried(problem, before, instants, split(bound, values)))
+
+    def of_constraints(values: Floats) -> Floats:
+        return np.concatenate([values[:count], values[source]])
+
+    some = len(instants.rows) > 0
     return replace(
         known,
-        values=flat(at_nodes(problem, known, known.values)),
-        backoff=flat(at_nodes(problem, known, known.backoff)),
-        begun=flat(at_nodes(problem, known, known.begun)),
-        weights=known.weights[:count],
-        first_weights=known.first_weights[:count],
-        worst=known.worst[:count],
-        instants=None,
-        offsets=None,
+        values=kept(known.values),
+        # As at the end of the step.
+        backoff=flat([*backoff, *(backoff[i][instants.of(i)[:, 0]] for i in source)]),
+        begun=kept(known.begun),
+        weights=of_constraints(known.weights),
+        first_weights=of_constraints(known.first_weights),
+        worst=of_constraints(known.worst),
+        instants=instants.rows if some else None,
+        offsets=instants.offsets if some else None,
+        cubic=instants.cubic,
     )
 
 
@@ -147,7 +165,9 @@ def _judged(plan: Solution, before: Multipliers) -> Solution:
     """The plan of a tick with the penalty weights of the next one; INFEASIBLE where violations persist."""
     known = plan.multipliers
     assert known is not None
-    bound, found = plan.problem.bound_constraints, plan.constraints
+    whole = enforced(plan.problem, known.between)
+    bound = whole.bound_constraints
+    found = reports_of(whole, plan.trajectory, split(bound, known.values), split(bound, known.backoff))
     violation = np.array([item.violation for item in found])
     scale = np.array([item.scale for item in bound])
     stays = violation > np.maximum(REPORTED * scale, _LOWERED * before.worst)

@@ -385,8 +385,18 @@ def _beyond(y: Floats, limits: Sequence[tuple[Floats, Floats] | Floats]) -> Floa
     return most
 
 
-def rest_of(plan: Solution, policy: LinearPolicy, decisions: int, before: JointValues | None = None) -> LinearPolicy:
-    """:meth:`Solution.shifted` of the plan's ``policy`` on (q, p) or (q, v)."""
+def rest_of(
+    plan: Solution,
+    policy: LinearPolicy,
+    decisions: int,
+    before: JointValues | None = None,
+    *,
+    means: Floats | None = None,
+) -> LinearPolicy:
+    """:meth:`Solution.shifted` of the plan's ``policy`` on (q, p) or (q, v).
+
+    With ``means`` (m,) lines beyond the plan's end have these mean controls, as far as limits allow, and no feedback.
+    """
     N = len(policy.u)
     later = np.arange(N) + decisions
     rows, expected = np.minimum(later, N - 1), policy.u[:0]
@@ -400,10 +410,17 @@ def rest_of(plan: Solution, policy: LinearPolicy, decisions: int, before: JointV
         before = expected[0] if before is None else before
     elif policy.previous is not None:
         expected = policy.previous[rows[:1]]
+    gains = policy.gains[rows]
     previous_gains = None if policy.previous_gains is None else policy.previous_gains[rows]
+    if plan.problem.linear and means is not None:
+        for k in np.flatnonzero(beyond):
+            u[k] = np.clip(2.0 * means - (u[k - 1] if k > 0 else expected[0]), *policy.limits)
+        gains[beyond] = 0.0
+        if previous_gains is not None:
+            previous_gains[beyond] = 0.0
     return LinearPolicy(
         u,
-        policy.gains[rows],
+        gains,
         reference,
         policy.hold,
         policy.on,

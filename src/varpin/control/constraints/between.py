@@ -67,6 +67,48 @@ class BoundBetween(BoundConstraint):
         return Slopes(self.begins, J[:, :, :x], J[:, :, x:])
 
 
+@dataclass(frozen=True, eq=False)
+class BoundOnCubics(BoundConstraint):
+    """A constraint within steps, at the same share of each, on the cubics through their nodes (q, v).
+
+    The places are the nodes at the ends of the steps. Derivatives are those in (q, v) on the cubics.
+
+    Attributes:
+        inner: The constraint, bound to a grid whose nodes after the first are the instants.
+        share: Where the instants are in a step of unit length.
+        coefficients: Those of (q0, v0, q1, v1) of a step, for q, then for v (8,).
+    """
+
+    inner: BoundConstraint
+    share: float
+    coefficients: Floats
+
+    def states(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
+        """The q and v (..., K, n) on the cubics of motions (..., N + 1, n)."""
+        nodes = [x[..., self.places - back, :] for back in (1, 0) for x in (q, v)]
+        found = [sum(c * x for c, x in zip(self.coefficients[half : half + 4], nodes, strict=True)) for half in (0, 4)]
+        return np.asarray(found[0]), np.asarray(found[1])
+
+    def by_nodes(self, of_state: Floats) -> tuple[Floats, Floats]:
+        """Derivatives (K, rows, 2n) in (q, v) at the nodes before and after, of those ``of_state`` on the cubics."""
+        n, c = of_state.shape[2] // 2, self.coefficients
+        by_q, by_v = of_state[:, :, :n], of_state[:, :, n:]
+        before, after = (
+            np.concatenate([c[i] * by_q + c[i + 4] * by_v, c[i + 1] * by_q + c[i + 5] * by_v], axis=2) for i in (0, 2)
+        )
+        return before, after
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """See :meth:`BoundConstraint.value`."""
+        q, v = self.states(q, v)
+        return self.inner.value(_after_first(q), _after_first(v), u)
+
+    def jacobian(self, q: Floats, v: Floats) -> Floats:
+        """dc/d(q, v) (K, rows, 2n), in the states on the cubics."""
+        q, v = self.states(q, v)
+        return self.inner.jacobian(_after_first(q), _after_first(v))
+
+
 def _after_first(x: Floats) -> Floats:
-    """Nodes (K + 1, n) whose last are the instants (K, n)."""
-    return np.concatenate([x[:1], x])
+    """Nodes (..., K + 1, n) whose last are the instants (..., K, n)."""
+    return np.concatenate([x[..., :1, :], x], axis=-2)
