@@ -25,6 +25,7 @@ from varpin.mechanics.inputs import in_parts_of_steps, with_ends
 from varpin.mechanics.policy import FirstOrderHold
 from varpin.mechanics.scene import Scene, closest_controls, require_scene
 from varpin.mechanics.wiener import generator, wiener_increments
+from varpin.model.units import joint_unit
 from varpin.simulation.chatter import alternation
 from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
@@ -44,6 +45,8 @@ _FEW = 0.05
 # Violation by the plant, in scales of a constraint (a tenth of its range), from which on no narrower bound is advised:
 # it would leave less than half of the range.
 _NARROWED = 2.5
+# Speeds of plans or motions, as multiples of those that the first plan foresaw, above which a loop is unstable.
+_FAR_FASTER = 20.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,8 @@ class MpcRun(Frozen):
         warnings: Warnings about the first plan that do not recur in the plant's motion; about the motion, as in
             :attr:`Trajectory.warnings`, and its velocities from tick to tick; about planning that took longer than the
             period, or than the budget, in more than one tick of twenty, which depends on the machine; about constraints
-            that the motion violated; and about ticks without a feasible plan.
+            that the motion violated; about ticks without a feasible plan; and about speeds, of plans or of the motion,
+            that are many times those of the first plan.
     """
 
     motion: Trajectory
@@ -394,7 +398,7 @@ class Mpc:
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
         found = (*found, *_whole_ticks(duration, ticks, self.period))
         held = kept(problem, tuple(plans), motion, plant.substeps)
-        found = (*found, *_outside(held, noisy=bool(motion.dw.any())))
+        found = (*found, *_outside(held, noisy=bool(motion.dw.any())), *_blown_up(plans, motion))
         announce(logger, plant.scene, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
         first = [finding.sentence for finding in of_plan if (finding.kind, finding.joint) not in again]
@@ -499,6 +503,32 @@ def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
         "the controls or on their changes, calms it"
     )
     return (Finding("alternating ticks", sentence),)
+
+
+def _blown_up(plans: Sequence[Solution], motion: Trajectory) -> tuple[Finding, ...]:
+    """A finding if plans or motion are far faster than the first plan, whose search has converged.
+
+    A first plan that is nearly at rest tells nothing: a tenth of the joint's velocity limit, or, without one, of a full
+    turn in a horizon, counts as foreseen, too.
+    """
+    robot, first = plans[0].problem.scene.robot, plans[0]
+    usual = np.where(np.isfinite(robot.velocity_limit), robot.velocity_limit, 2.0 * np.pi / first.problem.duration)
+    fastest = float(np.abs(first.trajectory.v).max())
+    foreseen = np.maximum(fastest, 0.1 * usual)
+    planned = np.array([np.abs(plan.trajectory.v).max(axis=0) for plan in plans])
+    moved = np.abs(motion.v).max(axis=0)
+    share = np.maximum(planned.max(axis=0), moved) / foreseen
+    joint = int(np.argmax(share))
+    if not share[joint] > _FAR_FASTER:
+        return ()
+    plan, unit = plans[int(np.argmax(planned[:, joint]))], joint_unit(robot, joint, speed=True)
+    sentence = (
+        f"the loop is unstable: {robot.joint_names[joint]} moves at up to {moved[joint]:.3g} {unit}, and at up to "
+        f"{planned[:, joint].max():.3g} {unit} in the plan made at t = {plan.problem.t0:.4g} s, where the first plan "
+        f"foresaw no more than {fastest:.3g} {unit} of any joint: more iterations a tick, or greater weights on "
+        "velocities and controls, may keep it stable"
+    )
+    return (Finding("unstable loop", sentence, joint),)
 
 
 def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None = None) -> Floats:
