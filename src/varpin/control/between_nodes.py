@@ -2,8 +2,8 @@
 
 A row is at one of a few instants of a step, the ends of equal parts of it. Its value, and its derivatives in the state
 before the step and the controls over it, are those of the motion integrated in these parts. An offset is added where
-the motion has a peak between two instants. A controller's ticks have rows on the cubics through the steps instead, which
-take hardly any time.
+the motion has a peak between two instants. A controller's ticks have rows on the cubics through the steps instead,
+which take hardly any time.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def _bound(problem: OptimalControlProblem, constraint: int, rows: Integers) -> B
 def _on_cubics(problem: OptimalControlProblem, constraint: int, steps: Integers) -> BoundOnCubics:
     """A constraint at the middles of ``steps`` (K,) of the cubics through them."""
     of_nodes = problem.bound_constraints[constraint]
-    times = problem.t0 + problem.dt * (steps + _MIDDLE)
+    times = problem.t0 + problem.dt * (steps.astype(np.float64) + _MIDDLE)
     inner = at_times(problem, of_nodes.source, times)
     given = of_nodes.source, steps + 1, times, of_nodes.rows, of_nodes.unit, of_nodes.scale
     return BoundOnCubics(*given, inner, _MIDDLE, cubics(np.array([_MIDDLE]), problem.dt)[0])

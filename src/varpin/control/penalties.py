@@ -211,7 +211,7 @@ class PenalizedProblem(OptimalControlProblem):
         node = [self.rule[0, 0], 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
         # With linear controls rows within steps depend on the controls at both ends, see Expansion.begun.
         begin = [self.rule[0, 0], 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
-        rows = [self.rule, node, begin] if self._begins else [self.rule, node]
+        rows: list[Floats | list[float]] = [self.rule, node, begin] if self._begins else [self.rule, node]
         if self.cubic is not None:
             rows.append(np.append(self.rule[0, 0], self.cubic.coefficients))
         return np.vstack(rows)
