@@ -60,13 +60,14 @@ def out_of_reach(problem: OptimalControlProblem, motion: Trajectory) -> str:
         own = step.of == i
         least = step.least(begin, lower, upper, own) if known[own].max() > REPORTED else None
         if least is not None:
-            return f"{item.source.label} cannot be met from here: {_told(item, least[own])}, {always}"
+            return f"{problem.label_of(item.source)} cannot be met from here: {_told(item, least[own])}, {always}"
     whole = step.of >= 0
     least = step.least(begin, lower, upper, whole) if len(bound) > 1 else None
     if least is None:
         return ""
     together = np.unique(step.of[least >= _TIED * least.max()])
-    labels, words = [bound[i].source.label for i in together], [_told(bound[i], least[step.of == i]) for i in together]
+    labels = [problem.label_of(bound[i].source) for i in together]
+    words = [_told(bound[i], least[step.of == i]) for i in together]
     return f"{' and '.join(labels)} cannot be met from here together: {' while '.join(words)}, {always}"
 
 
