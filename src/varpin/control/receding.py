@@ -36,6 +36,8 @@ _SHARE = 0.5
 _LARGEST = 1e3
 # A tick is infeasible when _STUCK ticks in a row have left more than _LOWERED of a violation.
 _LOWERED, _STUCK = 0.9, 3
+# Least step of an iteration after which multipliers and weights of linear controls are updated.
+_LONG = 0.5
 # Violation, relative to a tenth of a constraint's range, below which its penalty does not grow.
 _SMALL = 1e-3
 
@@ -53,9 +55,9 @@ def replan(
 
     With constraints each iteration is one of the augmented Lagrangian, followed by an update of the multipliers. They
     start from those of the previous plan, shifted with the horizon. Where controls are linear, constraints of states
-    hold at the middles of the steps, too. Margins are those of the first plan. A tick is
-    INFEASIBLE where it violates a constraint by more than a thousandth of its range and several ticks in a row have not
-    lowered the violation.
+    hold at the middles of the steps, too, and multipliers and weights stay after short steps. Margins are those of the
+    first plan. A tick is INFEASIBLE where it violates a constraint by more than a thousandth of its range and several
+    ticks in a row have not lowered the violation.
     """
     known = previous.multipliers
     if not problem.constraints or known is None:
@@ -100,10 +102,11 @@ def replan(
         u = problem.control_rows(motion)
         c = [item.value(motion.q, motion.v, u) for item in new]
         most = [_LARGEST * w * item.scale for item, w in zip(new, first_weights, strict=True)]
-        multipliers = [
-            np.clip(part.updated(values), -limit, limit)
-            for part, values, limit in zip(goal.all_penalties, c, most, strict=True)
-        ]
+        if _is_close(problem, found):
+            multipliers = [
+                np.clip(part.updated(values), -limit, limit)
+                for part, values, limit in zip(goal.all_penalties, c, most, strict=True)
+            ]
         state = replace(
             known,
             values=flat(multipliers),
@@ -121,6 +124,15 @@ def replan(
         if done or found.status is Status.INTERRUPTED or time.perf_counter() > deadline - longest:
             break
     return _judged(kept, known)
+
+
+def _is_close(problem: OptimalControlProblem, found: Solution) -> bool:
+    """Whether an iteration has ended close enough to the minimum of its penalties to update multipliers and weights.
+
+    After short steps violations are large, and multipliers would wind up by heavy weights times these. Held controls,
+    which respond at once, do as well without this.
+    """
+    return not problem.linear or found.status is Status.CONVERGED or found.history[-1].step >= _LONG
 
 
 def _at(problem: OptimalControlProblem, known: Multipliers, instants: Instants) -> Multipliers:
@@ -170,8 +182,9 @@ def _judged(plan: Solution, before: Multipliers) -> Solution:
     found = reports_of(whole, plan.trajectory, split(bound, known.values), split(bound, known.backoff))
     violation = np.array([item.violation for item in found])
     scale = np.array([item.scale for item in bound])
+    close = _is_close(plan.problem, plan)
     stays = violation > np.maximum(REPORTED * scale, _LOWERED * before.worst)
-    heavier = violation > np.maximum(_SMALL * scale, _ENOUGH * before.worst)
+    heavier = close & (violation > np.maximum(_SMALL * scale, _ENOUGH * before.worst))
     weights = np.where(heavier, np.minimum(_GROWTH * known.weights, _HEAVIEST * known.first_weights), known.weights)
     stuck = before.stuck + 1 if stays.any() else 0
     plan = replace(plan, multipliers=replace(known, weights=weights, worst=violation, stuck=stuck))
