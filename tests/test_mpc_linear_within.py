@@ -64,7 +64,7 @@ def chain(controls, constraints=None, **options):
 @pytest.mark.parametrize(
     ("build", "duration", "most"), [(beside_a_ball, 1.6, 2e-3), (within_speeds, 0.8, 1e-2), (chain, 1.5, 1e-2)]
 )
-def test_loops_of_linear_controls_are_as_stable_as_of_held_ones(build, duration, most, iterations, monkeypatch):
+def test_loops_of_linear_controls_do_not_run_away(build, duration, most, iterations, monkeypatch):
     """Speeds of plans and of the plant, its violations, and the work of a tick."""
     passes, ticks, one_pass, plan_of = [], [], box.single_pass, vp.Mpc.plan
 
@@ -89,6 +89,7 @@ def test_loops_of_linear_controls_are_as_stable_as_of_held_ones(build, duration,
         assert run.constraints[0].worst <= most
         assert not naming(run.warnings, "loop is unstable")
         assert max(item.rollouts for plan in run.plans[1:] for item in plan.history) <= 8
+    # Beside the ball, with one iteration a tick, 1.2 and 1.28.
     assert fastest["linear"] <= 1.4 * fastest["held"]
     assert costs["linear"] <= 1.4 * costs["held"]
     # At control limits the interior-point method has passes of its own.
