@@ -25,6 +25,12 @@ def ur5():
 
 
 @pytest.fixture(scope="module")
+def arm(ur5):
+    """A UR5 without meshes, a skeleton, which software draws in a tenth of the time."""
+    return vp.load_robot(ur5.model)
+
+
+@pytest.fixture(scope="module")
 def sweep():
     """Configurations of an arm with six joints, 0.05 s apart."""
     t = np.linspace(0.0, 1.0, 21)[:, None]
@@ -90,18 +96,18 @@ def farthest(points, path):
     return max(np.linalg.norm(path - point, axis=1).min() for point in points)
 
 
-def test_traces_are_where_pinocchio_puts_the_frame(browser, ur5, sweep, tmp_path):
+def test_traces_are_where_pinocchio_puts_the_frame(browser, arm, sweep, tmp_path):
     reference = np.array([[0.5, 0.0, 0.1], [0.5, 0.4, 0.1], [0.5, 0.4, 0.1], [0.5, 0.4, 0.6]])
     ghost = sweep[::-1] + 0.2
     marks = {"trace": [TIP, "wrist_1_link"], "reference": {"corner": reference}}
-    page = replay(ur5, sweep, dt=0.05, ghost=ghost, html=tmp_path / "traces.html", **marks)
+    page = replay(arm, sweep, dt=0.05, ghost=ghost, html=tmp_path / "traces.html", **marks)
     visit(browser, page)
     assert_no_errors(browser)
     assert len(names(browser, ["notes", "traces"])) == 5
     fine = np.arange(0.0, 20.0 + 1e-9, 0.01)
 
     def path(q, frame):
-        return placements(ur5, np.column_stack([np.interp(fine, np.arange(21), column) for column in q.T]), frame)
+        return placements(arm, np.column_stack([np.interp(fine, np.arange(21), column) for column in q.T]), frame)
 
     for name, q, frame in [
         ("1 motion tool0", sweep, TIP),
@@ -115,24 +121,24 @@ def test_traces_are_where_pinocchio_puts_the_frame(browser, ur5, sweep, tmp_path
         assert farthest(points, expected) < 2e-3  # between two of the dense samples
         assert farthest(expected, points) < 1e-2
         # The nodes themselves are on it, to single precision.
-        assert farthest(placements(ur5, q, frame)[:, :3, 3], points) < 1e-5
+        assert farthest(placements(arm, q, frame)[:, :3, 3], points) < 1e-5
     np.testing.assert_allclose(along(browser, "0 reference corner"), reference[[0, 1, 3]], atol=1e-6)
 
 
-def test_a_trace_of_a_long_motion_stays_small_and_true(browser, ur5, tmp_path):
+def test_a_trace_of_a_long_motion_stays_small_and_true(browser, arm, tmp_path):
     t = np.linspace(0.0, 20.0, 4_001)
     q = 0.5 * np.sin(t[:, None] * np.arange(1.0, 7.0) / 5.0)
-    visit(browser, replay(ur5, q, dt=5e-3, html=tmp_path / "long.html", trace=True))
-    points = along(browser, f"0 motion {ur5.end_effector}")
+    visit(browser, replay(arm, q, dt=5e-3, html=tmp_path / "long.html", trace=True))
+    points = along(browser, f"0 motion {arm.end_effector}")
     assert 500 < len(points) <= 1001
-    assert farthest(points, placements(ur5, q, ur5.end_effector)[:, :3, 3]) < 1e-5
+    assert farthest(points, placements(arm, q, arm.end_effector)[:, :3, 3]) < 1e-5
 
 
-def test_a_growing_trace_is_drawn_as_far_as_the_motion_has_come(browser, ur5, sweep, tmp_path):
+def test_a_growing_trace_is_drawn_as_far_as_the_motion_has_come(browser, arm, sweep, tmp_path):
     # It rests from 0.5 s to 0.75 s, and its ghost goes the other way.
     q = np.vstack([sweep[:11], np.repeat(sweep[10:11], 5, axis=0), sweep[11:]])
     ghost = q[::-1]
-    page = replay(ur5, q, dt=0.05, ghost=ghost, html=tmp_path / "growing.html", trace=TIP, growing=True, fps=100.0)
+    page = replay(arm, q, dt=0.05, ghost=ghost, html=tmp_path / "growing.html", trace=TIP, growing=True, fps=100.0)
     visit(browser, page)
     for name, rows in (("0 motion tool0", q), ("1 ghost tool0", ghost)):
         points = along(browser, name)
@@ -149,7 +155,7 @@ def test_a_growing_trace_is_drawn_as_far_as_the_motion_has_come(browser, ur5, sw
             if part > 1e-9:
                 end = (1.0 - part) * end + part * points[int(whole) + 1]
             now = [np.interp(seconds, 0.05 * np.arange(len(q)), column) for column in rows.T]
-            np.testing.assert_allclose(end, placements(ur5, now, TIP)[0, :3, 3], atol=2e-3)
+            np.testing.assert_allclose(end, placements(arm, now, TIP)[0, :3, 3], atol=2e-3)
             lengths.append(drawn)
         assert lengths[0] == 0.0
         assert lengths[-1] == pytest.approx(36.0 * (len(points) - 1))
@@ -211,15 +217,15 @@ def test_plans_are_not_shown_where_nobody_wants_them(browser, run, tmp_path):
     assert "plans" not in names(browser, ["notes"])
 
 
-def test_a_frame_that_stays_leaves_no_trace(browser, ur5, tmp_path):
+def test_a_frame_that_stays_leaves_no_trace(browser, arm, tmp_path):
     q = np.zeros((5, 6))
     q[:, -1] = np.linspace(0.0, 1.0, 5)
-    visit(browser, replay(ur5, q, dt=0.1, html=tmp_path / "still.html", trace=["forearm_link", "base_link"]))
+    visit(browser, replay(arm, q, dt=0.1, html=tmp_path / "still.html", trace=["forearm_link", "base_link"]))
     assert names(browser, ["notes"]) == []
 
 
-def test_frames_move_with_the_robot(browser, ur5, sweep, tmp_path):
-    visit(browser, replay(ur5, sweep, dt=0.05, html=tmp_path / "frames.html", frames=[TIP, "base_link"]))
+def test_frames_move_with_the_robot(browser, arm, sweep, tmp_path):
+    visit(browser, replay(arm, sweep, dt=0.05, html=tmp_path / "frames.html", frames=[TIP, "base_link"]))
     found = browser.execute_script(
         """
         const root = viewer.scene_tree.find(["meshcat"]).object, poses = {};
@@ -232,10 +238,10 @@ def test_frames_move_with_the_robot(browser, ur5, sweep, tmp_path):
     q = 0.5 * (sweep[14] + sweep[15])
     assert sorted(found) == ["base_link", TIP]
     for name, numbers in found.items():
-        np.testing.assert_allclose(np.array(numbers).reshape(4, 4).T, placements(ur5, q, name)[0], atol=2e-5)
+        np.testing.assert_allclose(np.array(numbers).reshape(4, 4).T, placements(arm, q, name)[0], atol=2e-5)
 
 
-def test_targets_stand_or_move(browser, ur5, sweep, tmp_path):
+def test_targets_stand_or_move(browser, arm, sweep, tmp_path):
     turn = Rotation.from_euler("z", 90.0, degrees=True)
     first, last = pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])), pin.SE3(turn.as_matrix(), np.array([0.5, 0.2, 0.3]))
     targets = {
@@ -244,7 +250,7 @@ def test_targets_stand_or_move(browser, ur5, sweep, tmp_path):
         "pose": last,
         "turns": [first, last],
     }
-    page = replay(ur5, sweep, dt=0.05, speed=0.5, html=tmp_path / "targets.html", targets=targets)
+    page = replay(arm, sweep, dt=0.05, speed=0.5, html=tmp_path / "targets.html", targets=targets)
     visit(browser, page)
     assert_no_errors(browser)
     assert sorted(names(browser, ["notes", "targets"])) == sorted(targets)
@@ -281,10 +287,10 @@ def test_targets_stand_or_move(browser, ur5, sweep, tmp_path):
     assert all(f">{name}</text>" in plate for name, plate in plates.items())
 
 
-def test_one_target_is_named_in_the_key_and_several_have_labels_below_them(browser, ur5, sweep, tmp_path):
+def test_one_target_is_named_in_the_key_and_several_have_labels_below_them(browser, arm, sweep, tmp_path):
     """Nothing is drawn over the tool at its target, and meshcat's own controls are out of view."""
     for targets, labels in (({"cup": [0.3, 0.1, 0.5]}, 0), ({"cup": [0.3, 0.1, 0.5], "shelf": [0.1, 0.1, 0.5]}, 2)):
-        visit(browser, replay(ur5, sweep, dt=0.05, html=tmp_path / "page.html", targets=targets))
+        visit(browser, replay(arm, sweep, dt=0.05, html=tmp_path / "page.html", targets=targets))
         assert f"target: {', '.join(targets)}" in browser.find_element("id", "about").text
         plates = browser.execute_script(
             """

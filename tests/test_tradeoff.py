@@ -486,10 +486,12 @@ def test_advice_meets_the_tolerance_and_takes_the_cheapest():
 
 def test_advice_within_a_budget():
     scene, rest = vp.Scene(vp.planar_chain(3)), np.zeros(3)
-    small, large = (vp.advise(scene, rest, rest, duration=1.0, budget=budget) for budget in (1e-3, 2e-2))
+    large = vp.advise(scene, rest, rest, duration=1.0, budget=2e-2)
+    # Of what the other took, which is at rounding on a fast machine.
+    small = vp.advise(scene, rest, rest, duration=1.0, budget=0.3 * large.seconds)
     assert small.reached
     assert large.reached
-    assert small.seconds <= 1e-3
+    assert small.seconds <= 0.3 * large.seconds
     assert large.seconds <= 2e-2
     assert large.error < small.error
     assert all(large.error <= other.error for other in large.alternatives)

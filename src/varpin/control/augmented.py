@@ -27,6 +27,7 @@ from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
 from varpin.control.first_node import out_of_reach
 from varpin.control.history import ITERATIONS, Iteration, Status
+from varpin.control.margins import widened
 from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, in_between, reports_of
 from varpin.control.penalties import PenalizedProblem, flat, penalized, split
 from varpin.control.polish import least_slope, polished
@@ -69,6 +70,8 @@ _MOVING, _SETTLED = 16, 1e-3
 # From round _PLAIN on, margins that change by more than _DRIFT are made steadier over _NEAR nodes to either side, with
 # the share _TAKEN in those of the next round.
 _PLAIN, _DRIFT, _NEAR, _TAKEN = 5, 1e-2, 2, 0.5
+# How often motions under noise are counted at most, and rounds in which margins are updated after each count.
+_COUNTS, _ANEW = 3, 6
 # A plan is infeasible when _STUCK rounds in a row have left more than _LOWERED of the worst violation.
 _STUCK, _LOWERED = 3, 0.9
 # Greatest number of iterations of a plan whose first node cannot meet a constraint.
@@ -143,6 +146,8 @@ class _State:
     round: int = 0
     stuck: int = 0
     between: Instants = NOWHERE
+    added: list[Floats] | None = None
+    counts: int = 0
 
 
 class _Rounds:
@@ -234,6 +239,8 @@ class _Rounds:
                 elif kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
                     kept, closing = self._polished(replace(kept, status=status))
                     status, reason = kept.status, f"{reason}; {closing}"
+                if self._counts_anew(kept, begun, status):
+                    continue
             except KeyboardInterrupt:
                 status, reason = Status.INTERRUPTED, found.reason
             break
@@ -286,10 +293,12 @@ class _Rounds:
             share = len(before.places) / len(item.places)
             values[i] = share * in_between(before, item, values[i])
             weights[i] = max(weights[i], share * known.weights[i])
-        margins = [
-            in_between(before, item, part) for before, item, part in zip(bound, self.bound, backoff, strict=True)
-        ]
-        return replace(begun, multipliers=values, weights=weights, backoff=margins)
+
+        def finer(parts: list[Floats]) -> list[Floats]:
+            return [in_between(before, item, part) for before, item, part in zip(bound, self.bound, parts, strict=True)]
+
+        added = None if known.added is None else finer(split(bound, known.added))
+        return replace(begun, multipliers=values, weights=weights, backoff=finer(backoff), added=added)
 
     def _heavier(self, plain: OptimalControlProblem, motion: Trajectory, weights: Floats) -> float:
         """Factor of first weights that are light: those of a first motion that costs next to nothing.
@@ -352,6 +361,8 @@ class _Rounds:
             known.round,
             known.stuck,
             known.between,
+            None if known.added is None else split(self.problem.bound_constraints, known.added),
+            known.counts,
         )
         self.history = list(resumed.search.history)
         return resumed
@@ -389,6 +400,8 @@ class _Rounds:
             round=begun.round,
             iterations=known,
             stuck=begun.stuck,
+            added=None if begun.added is None else flat(begun.added),
+            counts=begun.counts,
             **_of_instants(begun.between),
         )
         search = found.search
@@ -423,7 +436,7 @@ class _Rounds:
         feasible = worst.violation <= FEASIBLE
         exact = begun.tolerance <= _FINAL * self.tolerance and found.status is not Status.MAX_ITERATIONS
         backoff, settled = begun.backoff, True
-        if self.noisy and begun.round < _MOVING:
+        if self.noisy and begun.round < _MOVING + _ANEW * begun.counts:
             backoff = self._next_backoff(kept, begun)
             settled = _change(backoff, begun.backoff) <= _SETTLED
             backoff = begun.backoff if settled else backoff
@@ -441,7 +454,7 @@ class _Rounds:
         if not feasible and (stuck >= _STUCK or begun.round + 1 >= _ROUNDS or (heavy and stuck)):
             if _blocked(found):
                 return found.status, f"{state}; {found.reason}"
-            return Status.INFEASIBLE, _infeasible(worst)
+            return Status.INFEASIBLE, _infeasible(worst, counted=begun.counts > 0)
         if feasible and begun.round + 1 >= _ROUNDS:
             return found.status, found.reason
         more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
@@ -457,6 +470,8 @@ class _Rounds:
             round=begun.round + 1,
             stuck=stuck,
             between=begun.between,
+            added=begun.added,
+            counts=begun.counts,
         )
         return None, ""
 
@@ -520,6 +535,23 @@ class _Rounds:
         )
         if not len(before.rows):
             self.state = replace(self.state, weights=first_weights, worst=np.full(len(worst), np.inf), tolerance=_LOOSE)
+        return True
+
+    def _counts_anew(self, kept: Solution, begun: _State, status: Status) -> bool:
+        """Whether rounds follow with wider margins, as motions under noise violate bounds more often than promised.
+
+        The last round is repeated from its own multipliers and weights.
+        """
+        ended = status in (Status.CONVERGED, Status.STALLED) and kept.violation <= FEASIBLE
+        if not (self.noisy and ended) or begun.counts >= _COUNTS or begun.round + 1 >= _ROUNDS:
+            return False
+        added = widened(kept)
+        if added is None:
+            return False
+        logger.info("%s: motions under noise violate bounds with a margin more often than promised", self.label)
+        self.whole = enforced(self.problem, begun.between)
+        begun = replace(begun, added=added, counts=begun.counts + 1, round=begun.round + 1, stuck=0)
+        self.state = replace(begun, backoff=self._backoff(kept, begun))
         return True
 
     def _beyond(self, motion: Trajectory, backoff: list[Floats]) -> Floats:
@@ -666,14 +698,17 @@ class _Rounds:
             return replace(kept, noise_cost=np.nan)
         return replace(kept, gains=found.feedback, previous_gains=found.previous, noise_cost=found.noise)
 
-    def _backoff(self, kept: Solution) -> list[Floats]:
+    def _backoff(self, kept: Solution, begun: _State) -> list[Floats]:
         """The margins of all constraints around a plan, in their units."""
         feedback = Feedback(kept.gains, kept.previous_gains)
+        added = (
+            self._margins(begun.added, begun.between) if begun.added else [np.zeros(item.shape) for item in self.bound]
+        )
         return [
-            item.source.margin * deviations(self.problem, kept.trajectory, feedback, item)
+            item.source.margin * deviations(self.problem, kept.trajectory, feedback, item) + more
             if item.source.margin > 0.0
             else np.zeros(item.shape)
-            for item in self.bound
+            for item, more in zip(self.bound, added, strict=True)
         ]
 
     def _next_backoff(self, kept: Solution, begun: _State) -> list[Floats]:
@@ -682,7 +717,7 @@ class _Rounds:
         Where noise follows the controls, margins that differ from node to node make controls jump, which makes margins
         differ more. Where they do not settle for that reason, steadier ones do, which are nowhere smaller.
         """
-        backoff = self._backoff(kept)
+        backoff = self._backoff(kept, begun)
         if begun.round < _PLAIN or _change(backoff, begun.backoff) <= _DRIFT:
             return backoff
         count = len(self.problem.bound_constraints)
@@ -734,8 +769,9 @@ def _blocked(found: Solution) -> bool:
     return found.status is Status.STALLED and expected > _MUCH * abs(found.cost)
 
 
-def _infeasible(worst: ConstraintReport) -> str:
+def _infeasible(worst: ConstraintReport, *, counted: bool) -> str:
+    wide = ", with a margin as wide as motions under noise need" if counted else ""
     return (
         f"{worst.label} cannot be met from here: {worst.where} stays violated by {worst.violation:.3g} {worst.unit}, "
-        "whatever its penalty"
+        f"whatever its penalty{wide}"
     )

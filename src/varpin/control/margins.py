@@ -1,155 +1,307 @@
-"""Whether margins suffice: motions under noise beside the linear model that margins come from."""
+"""Margins by count: how often motions under noise violate a bound, and what a margin has to be for that, (P5)."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+from scipy import ndimage
+from scipy.special import ndtr
 
 from varpin.arrays import Floats, Mask
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Status
 from varpin.control.linear_controls import in_step
 from varpin.control.multipliers import at_nodes
+from varpin.control.paths import Chunk, chunks_of, sent, shared_by
+from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
-from varpin.control.spread import Feedback, decided, deviations, state_slopes
+from varpin.control.spread import Feedback, decided, propagated, state_slopes
+from varpin.ensemble.paths import simulate_paths
 from varpin.errors import VarpinError
 from varpin.linearization import linearize_steps
-from varpin.mechanics.wiener import wiener_increments
+from varpin.mechanics.wiener import Children, children
 from varpin.simulation.soundness import Finding
+from varpin.support.executors import executing, in_order
+from varpin.support.frozen import Frozen
 
-# Pairs of motions with opposite noise, and how much more often than promised a bound may be violated.
-_PAIRS, _OFTEN = 32, 1.2
-# Standard errors that count in favour of the margin.
-_DOUBT = 2.0
-# Further motions: those that choose one of the bounds that the pairs point at, and those that count how often it is
-# violated. The choice would make the first ones count too many.
-_CHOOSING, _COUNTING = 256, 1024
-# Motions beyond a quantile that determine it.
-_ENOUGH = 10
+# Motions that are counted: at first, then twice as many until standard errors of shares are at most _SHARP of what is
+# promised, and at most; and where only Python evaluates the noise.
+_FIRST, _SHARP, _MOST, _ALONE = 1024, 0.12, 8192, 512
+# How much more often than promised a bound is violated for wider margins, and, beyond doubt, for a warning.
+_MORE, _OFTEN = 1.05, 1.2
+# Standard errors of doubt, and those by which wider margins are on the safe side.
+_DOUBT, _SAFE = 2.0, 1.0
+# Motions beyond a quantile that determine it, and the share of motions from which the tail beyond is extrapolated.
+_ENOUGH, _TAIL = 20, 0.02
+# Bounds within _NEAR times their margin and _NEARER deviations are looked at.
+_NEAR, _NEARER = 1.5, 0.5
+# Nodes to either side over which what is added to margins is averaged.
+_BESIDE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Row(Frozen):
+    """Rows of a constraint with a margin, at the places where the plan is near them.
+
+    Attributes:
+        bound: The constraint.
+        near: Which rows at which places (K, rows), R in all.
+        planned: Their values in the plan (R,).
+        slopes: d(value)/dx (K, rows, 2n).
+        own: Their standard deviations in the linear model (R,).
+        simple: The same where the strength of the noise stays that along the plan (R,).
+    """
+
+    bound: BoundConstraint
+    near: Mask
+    planned: Floats
+    slopes: Floats
+    own: Floats
+    simple: Floats
+
+    @property
+    def promised(self) -> float:
+        """Share of the motions that the margin allows."""
+        return float(ndtr(-self.bound.source.margin))
+
+
+@dataclass(frozen=True, eq=False)
+class _Counted(Frozen):
+    """Values of the rows near their bounds in P motions under noise, and to first order under the same noise.
+
+    Attributes:
+        values: c (P, R).
+        linear: Deviations from the plan to first order, in standard deviations (P, R).
+    """
+
+    values: Floats
+    linear: Floats
+
+    def shares(self, row: _Row) -> tuple[Floats, Floats]:
+        """Shares of the motions that violate each row (R,), and standard errors (R,).
+
+        The share in the linear model is known, and motions mostly agree with it: it is a control variate.
+        """
+        apart = (self.values > 0.0).astype(float) - (self.linear > row.bound.source.margin)
+        share = np.clip(row.promised + apart.mean(axis=0), 0.0, 1.0)
+        return share, np.maximum(apart.std(axis=0) / math.sqrt(len(apart)), 1.0 / len(apart))
+
+    def and_more(self, other: _Counted) -> _Counted:
+        """These motions and others."""
+        return _Counted(np.concatenate([self.values, other.values]), np.concatenate([self.linear, other.linear]))
+
+    def needed(self, row: _Row) -> Floats:
+        """Distances from the plan that motions exceed as often as promised, on the safe side (R,).
+
+        As many motions exceed such a quantile as exceed that of the linear model, which is known.
+        """
+        beyond = self.linear > row.bound.source.margin
+        found = np.empty(len(row.planned))
+        for r, exceeding in enumerate(beyond.mean(axis=0)):
+            c = self.values[:, r] - row.planned[r]
+            differ = (c > np.quantile(c, 1.0 - exceeding)) != beyond[:, r]
+            share = max(exceeding - _SAFE * math.sqrt(differ.mean() / len(c)), 0.5 * row.promised)
+            if share * len(c) >= _ENOUGH:
+                found[r] = np.quantile(c, 1.0 - share)
+                continue
+            # An exponential tail, which is heavier than that of a normal distribution.
+            begin = float(np.quantile(c, 1.0 - _TAIL))
+            found[r] = begin + (c[c > begin].mean() - begin) * math.log(_TAIL / share)
+        return found
+
+
+def widened(plan: Solution) -> list[Floats] | None:
+    """What has to be added to margins (K, rows) for each constraint, in its unit, (P5); None if they suffice.
+
+    Margins are of the linear model. Where noise is strong, or where it follows the controls, values in motions are not
+    normally distributed, and violate bounds more often. None, too, where motions fail or only Python evaluates the
+    noise, as counting would take long.
+    """
+    problem = plan.problem
+    if problem.scene.noise.diffusion is None:
+        return None
+    try:
+        rows = _rows(plan)
+        counted = _counted(plan, rows, 0)
+    except VarpinError:
+        # Without such motions nothing is known; plan.monte_carlo() tells of motions that fail.
+        return None
+    enough = True
+    found = [np.zeros(bound.shape) for bound in problem.bound_constraints]
+    for row, motions in zip(rows, counted, strict=True):
+        enough = enough and bool((motions.shares(row)[0] <= _MORE * row.promised).all())
+        more = np.maximum(motions.needed(row) - row.bound.source.margin * row.own, 0.0)
+        found[problem.bound_constraints.index(row.bound)] = _spread(row.near, more)
+    return None if enough else found
+
+
+def _spread(near: Mask, more: Floats) -> Floats:
+    """Distances (K, rows) from those of rows near bounds: no smaller than around them, and in between elsewhere."""
+    whole = np.zeros(near.shape)
+    whole[near] = more
+    places = np.arange(len(near))
+    for r in np.flatnonzero(near.any(axis=0)):
+        known = np.flatnonzero(near[:, r])
+        whole[:, r] = np.interp(places, known, whole[known, r])
+    around = ndimage.uniform_filter1d(whole, 2 * _BESIDE + 1, axis=0, mode="nearest")
+    found: Floats = np.maximum(whole, around)
+    return found
 
 
 def too_small(solution: Solution) -> list[Finding]:
-    """Findings about constraints whose margin is too small, as noise is too strong for the linear model.
-
-    Motions are played with noise and with its opposite. The mean of a value over such a pair has only terms of even
-    order, and differences from the linear model have none of first order, so a few pairs suffice to point at bounds.
-    Further motions are played where they do, and count.
-    """
+    """Findings about constraints whose margin is too small, as noise is too strong for the linear model."""
     problem = solution.problem
     if not problem.scene.processes or solution.multipliers is None or solution.status is Status.INFEASIBLE:
         return []
-    margins = at_nodes(problem, solution.multipliers, solution.multipliers.backoff)
-    bounds = [bound for bound, margin in zip(problem.bound_constraints, margins, strict=True) if margin.any()]
-    if not bounds:
-        return []
-    rng = np.random.default_rng(0)
     try:
-        suspects = [(bound, rows) for bound, rows in _suspects(solution, bounds, rng) if rows.any()]
-        if not suspects:
-            return []
-        chosen, counts = [], _values(solution, [bound for bound, _ in suspects], _CHOOSING, rng)
-        for (bound, rows), c in zip(suspects, counts, strict=True):
-            share = np.where(rows, (c > 0.0).mean(axis=0), 0.0)
-            place, row = np.unravel_index(int(share.argmax()), share.shape)
-            if share.max() > _OFTEN * ndtr(-bound.source.margin):
-                chosen.append((bound, int(place), int(row)))
-        if not chosen:
-            return []
-        values = _values(solution, [bound for bound, *_ in chosen], _COUNTING, rng)
+        chosen = []
+        rows = _rows(solution)
+        looked = _counted(solution, rows, 1, sharp=np.inf)
+        for row, motions in zip(rows, looked, strict=True):
+            share, _ = motions.shares(row)
+            if share.max() > _OFTEN * row.promised:
+                one = np.zeros_like(row.near)
+                one[tuple(np.argwhere(row.near)[share.argmax()])] = True
+                chosen.append(_only(row, one))
+        # The choice would make the same motions count too many.
+        counted = _counted(solution, chosen, 2)
     except VarpinError:
-        # Without such motions nothing is known; plan.monte_carlo() tells of motions that fail.
         return []
-    found = [_told(solution, *at, c[:, at[1], at[2]]) for at, c in zip(chosen, values, strict=True)]
+    found = [_told(solution, row, motions) for row, motions in zip(chosen, counted, strict=True)]
     return [finding for finding in found if finding is not None]
 
 
-def _told(solution: Solution, bound: BoundConstraint, place: int, row: int, c: Floats) -> Finding | None:
-    """A finding if a row at a place is clearly violated more often than promised, by its values (P,) of motions."""
-    problem, motion, margin = solution.problem, solution.trajectory, bound.source.margin
-    promised, often = float(ndtr(-margin)), float((c > 0.0).mean())
-    error = math.sqrt(often * (1.0 - often) / len(c))
-    if often - _DOUBT * error <= _OFTEN * promised:
+def _only(row: _Row, near: Mask) -> _Row:
+    """Some of the rows."""
+    some = near[row.near]
+    return _Row(row.bound, near, row.planned[some], row.slopes, row.own[some], row.simple[some])
+
+
+def _told(solution: Solution, row: _Row, counted: _Counted) -> Finding | None:
+    """A finding if a row at a place is clearly violated more often than promised."""
+    bound, margin = row.bound, row.bound.source.margin
+    (often,), (error,) = counted.shares(row)
+    if often - _DOUBT * error <= _OFTEN * row.promised:
         return None
-    planned = float(bound.value(motion.q, motion.v, problem.control_rows(motion))[place, row])
-    feedback = Feedback(solution.gains, solution.previous_gains)
-    deviation = float(deviations(problem, motion, feedback, bound)[place, row])
-    if promised * len(c) >= _ENOUGH:
-        needed = float(np.quantile(c, 1.0 - promised)) - planned
-    else:
-        # As if the values were normally distributed with the share that is violated.
-        needed = planned * margin / float(ndtri(often))
+    place, r = np.argwhere(row.near)[0]
+    enough = math.ceil(10.0 * counted.needed(row)[0] / row.own[0]) / 10.0
     return Finding(
         "small margin",
-        f"{problem.label_of(bound.source)}: margin={margin:g}, which is of the linear model, is too small for this "
-        f"noise: {bound.rows[row]} at t = {bound.times[place]:.4g} s is violated by {100.0 * often:.2g} +- "
-        f"{100.0 * error:.1g} % of all motions, not {100.0 * promised:.2g} %, as {len(c)} motions under noise say; "
-        f"margin={math.ceil(10.0 * needed / deviation) / 10.0:g} is about enough there, and simulate_ensemble counts",
+        f"{solution.problem.label_of(bound.source)}: margin={margin:g}, which is of the linear model, is too small for "
+        f"this noise: {bound.rows[r]} at t = {bound.times[place]:.4g} s is violated by {100.0 * often:.2g} +- "
+        f"{100.0 * error:.1g} % of all motions, not {100.0 * row.promised:.2g} %, as {len(counted.values)} motions "
+        f"under noise say; margin={enough:g} is about enough there, and plan.monte_carlo counts",
     )
 
 
-def _values(solution: Solution, bounds: list[BoundConstraint], paths: int, rng: np.random.Generator) -> list[Floats]:
-    """Values (P, K, rows) of each bound in motions under noise.
+def _rows(plan: Solution) -> list[_Row]:
+    """The rows of constraints with a margin that the plan is near.
 
     Raises:
-        VarpinError: A motion fails.
+        VarpinError: The plan's steps have no derivatives.
     """
-    problem = solution.problem
-    found: list[Floats] = [np.zeros((paths, *bound.shape)) for bound in bounds]
-    for path, child in enumerate(rng.spawn(paths)):
-        motion = problem.simulate(solution.policy, rng=child)
-        for values, bound in zip(found, bounds, strict=True):
-            values[path] = bound.value(motion.q, motion.v, problem.control_rows(motion))
-    return found
-
-
-def _suspects(
-    solution: Solution, bounds: list[BoundConstraint], rng: np.random.Generator
-) -> list[tuple[BoundConstraint, Mask]]:
-    """Which rows (K, rows) of each bound a few pairs of motions point at.
-
-    Raises:
-        VarpinError: A motion fails.
-    """
-    problem, motion = solution.problem, solution.trajectory
-    width = problem.scene.increments(linear=problem.linear)
-    dw = np.stack([wiener_increments(width, problem.dt, problem.steps, rng) for _ in range(_PAIRS)])
-    linear = _linear(solution, dw)
-    ahead, back = ([problem.simulate(solution.policy, increments=sign * noise) for noise in dw] for sign in (1.0, -1.0))
-    found = []
-    slopes = state_slopes(problem, motion)
-    feedback = Feedback(solution.gains, solution.previous_gains)
-    for bound in bounds:
-        c, J = bound.value(motion.q, motion.v, problem.control_rows(motion)), bound.jacobian(motion.q, motion.v)
-        first = np.einsum("krx,Pkx->Pkr", J @ slopes[bound.places], linear[:, bound.places])
-        plus, minus = (
-            np.stack([bound.value(each.q, each.v, problem.control_rows(each)) for each in part])
-            for part in (ahead, back)
-        )
-        even, odd = 0.5 * (plus + minus) - c, 0.5 * (plus - minus)
-        planned = deviations(problem, motion, feedback, bound)
-        square = (first**2).sum(axis=0)
-        share = np.where(square > 0.0, (odd * first).sum(axis=0) / np.where(square > 0.0, square, 1.0), 1.0)
-        left = ((odd - share * first) ** 2).mean(axis=0)
-        spread = np.sqrt((share * planned) ** 2 + left + even.var(axis=0))
-        shift = even.mean(axis=0)
-        doubt = _DOUBT * even.std(axis=0) / math.sqrt(_PAIRS)
-        least = np.where(planned > 0.0, (c + shift - doubt) / np.where(spread > 0.0, spread, 1.0), -np.inf)
-        found.append((bound, ndtr(least) > _OFTEN * ndtr(-bound.source.margin)))
-    return found
-
-
-def _linear(solution: Solution, dw: Floats) -> Floats:
-    """Deviations of the state from the plan (P, N + 1, 2n) under increments (P, N, k), to first order."""
-    problem, motion = solution.problem, solution.trajectory
+    problem, motion, known = plan.problem, plan.trajectory, plan.multipliers
+    assert known is not None
+    margins = at_nodes(problem, known, known.backoff)
+    kept = [(bound, b) for bound, b in zip(problem.bound_constraints, margins, strict=True) if b.any()]
+    if not kept:
+        return []
     lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0, ramps=problem.linear)
-    J, x, m = in_step(lin)[0], lin.A.shape[1], problem.scene.controls
-    feedback = Feedback(solution.gains, solution.previous_gains)
-    found, y = np.zeros((len(dw), lin.steps + 1, x)), np.zeros((len(dw), x + m))
-    for k in range(lin.steps):
+    (J, gz), x = in_step(lin), lin.A.shape[1]
+    feedback = Feedback(plan.gains, plan.previous_gains)
+    spreads = [propagated(J, lin.G, part, problem, feedback)[:, :x, :x] for part in (gz, np.zeros_like(gz))]
+    to_state, u = state_slopes(problem, motion), problem.control_rows(motion)
+    found = []
+    for bound, b in kept:
+        slopes = bound.jacobian(motion.q, motion.v) @ to_state[bound.places]
+        own, simple = (
+            np.sqrt(np.maximum(np.einsum("krx,kxy,kry->kr", slopes, part[bound.places], slopes), 0.0))
+            for part in spreads
+        )
+        c = bound.value(motion.q, motion.v, u)
+        near = (simple > 0.0) & (-c <= _NEAR * b + _NEARER * own)
+        if near.any():
+            found.append(_Row(bound, near, c[near], slopes, own[near], simple[near]))
+    return found
+
+
+def _counted(plan: Solution, rows: list[_Row], seed: int, sharp: float = _SHARP) -> list[_Counted]:
+    """Motions under noise from a seed: as many as shares take whose errors are ``sharp`` of what is promised.
+
+    Raises:
+        VarpinError: Fewer than half of the motions get to the end.
+    """
+    if not rows:
+        return []
+    alone = plan.problem.scene.noise.diffusion is None
+    seeds, first, last = children(seed, _MOST), 0, _ALONE if alone else _FIRST
+    found: list[_Counted] = []
+    while True:
+        more = _played(plan, rows, seeds, first, last)
+        found = [one.and_more(two) for one, two in zip(found, more, strict=True)] if found else more
+        errors = (one.shares(row)[1].max() / row.promised for one, row in zip(found, rows, strict=True))
+        if alone or last >= _MOST or max(errors) <= sharp:
+            return found
+        first, last = last, 2 * last
+
+
+def _played(plan: Solution, rows: list[_Row], seeds: Children, first: int, last: int) -> list[_Counted]:
+    """The motions of the seeds first, ..., last - 1.
+
+    Raises:
+        VarpinError: Fewer than half of the motions get to the end.
+    """
+    problem = sent(plan.problem)
+    lin = linearize_steps(
+        plan.problem.scene, plan.trajectory, problem.integrator, problem.q0, ramps=plan.problem.linear
+    )
+    J, G = in_step(lin)[0], lin.G
+    feedback = Feedback(plan.gains, plan.previous_gains)
+
+    def linear(dw: Floats) -> list[Floats]:
+        x = _linear(problem, J, G, feedback, dw)
+        return [np.einsum("krx,Pkx->Pkr", row.slopes, x[:, row.bound.places])[:, row.near] / row.simple for row in rows]
+
+    def values(q: Floats, v: Floats) -> list[Floats]:
+        no_controls = np.zeros((len(q), problem.decisions, problem.scene.controls))
+        return [row.bound.value(q, v, no_controls)[:, row.near] for row in rows]
+
+    def together(chunk: Chunk) -> list[tuple[Floats, Floats]]:
+        task = chunk.task
+        dw = np.stack([task.shared.drawn(each) for each in seeds.generators(task.first, task.first + len(task.q0))])
+        stored = simulate_paths(task).stored
+        return list(zip(values(stored["q"], stored["v"]), linear(dw), strict=True))
+
+    shared = shared_by(problem, plan.policy, seeds)
+    parts: list[list[tuple[Floats, Floats]]] = []
+    if shared is not None:
+        with executing(None, None) as pool:
+            parts += in_order(pool, together, chunks_of(problem, shared, first, last))
+    else:
+        size = problem.steps, problem.scene.increments(linear=problem.linear)
+        for generator in seeds.generators(first, last):
+            dw = generator.normal(scale=math.sqrt(problem.dt), size=size)
+            motion = problem.simulate(plan.policy, increments=dw)
+            parts.append(list(zip(values(motion.q[None], motion.v[None]), linear(dw[None]), strict=True)))
+    found = []
+    for pairs in zip(*parts, strict=True):
+        c, deviation = (np.concatenate(part) for part in zip(*pairs, strict=True))
+        finished = np.isfinite(c).all(axis=1)
+        if 2 * finished.sum() < len(c):
+            raise VarpinError(f"{len(c) - int(finished.sum())} of {len(c)} motions under noise fail")
+        found.append(_Counted(c[finished], deviation[finished]))
+    return found
+
+
+def _linear(problem: OptimalControlProblem, J: Floats, G: Floats, feedback: Feedback, dw: Floats) -> Floats:
+    """Deviations of the state from the plan (P, N + 1, 2n) under increments (P, N, K), to first order."""
+    x, m = J.shape[1], problem.scene.controls
+    found, y = np.zeros((len(dw), len(J) + 1, x)), np.zeros((len(dw), x + m))
+    for k in range(len(J)):
         T = decided(problem, feedback, k, x)
         z = y if T is None else y @ T.T
-        y = np.hstack([z @ J[k].T + dw[:, k] @ lin.G[k].T, z[:, -m:]])
+        y = np.hstack([z @ J[k].T + dw[:, k] @ G[k].T, z[:, -m:]])
         found[:, k + 1] = y[:, :x]
     return found

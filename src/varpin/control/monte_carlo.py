@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import logging
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
@@ -15,15 +14,14 @@ from scipy.special import ndtr
 
 from varpin.arrays import Floats, Integers
 from varpin.control.constraints import BoundConstraint
-from varpin.control.costs import CostSum
+from varpin.control.paths import Chunk, chunks_of, sent, shared_by
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.verification import excess, percent
 from varpin.ensemble.looks import greater, looked_at, looked_at_here
-from varpin.ensemble.paths import Extremes, Shared, Task, chunks, simulate_paths, without_geometry
+from varpin.ensemble.paths import Extremes, simulate_paths
 from varpin.errors import VarpinError
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.wiener import Children, children
-from varpin.simulation.commands import commands_of
 from varpin.simulation.failures import NoiseError, StepFailure
 from varpin.simulation.loop_stability import examined_in_loop
 from varpin.simulation.soundness import Finding, announce
@@ -158,14 +156,6 @@ class _Costs(Frozen):
 
 
 @dataclass(frozen=True, eq=False)
-class _Chunk(Frozen):
-    """A chunk of paths that the core integrates."""
-
-    problem: OptimalControlProblem
-    task: Task
-
-
-@dataclass(frozen=True, eq=False)
 class _Alone(Frozen):
     """A path of a problem with noise that only Python evaluates."""
 
@@ -193,7 +183,7 @@ def monte_carlo(
     costs: list[Floats] = []
     found: tuple[Finding, ...] = ()
     extremes: Extremes = {}
-    done, sent = 0, _sent(problem)
+    done, bare = 0, sent(problem)
     broken = [np.zeros(bound.shape, dtype=np.int64) for bound in _with_margins(problem)]
 
     def add(part: _Costs) -> None:
@@ -206,27 +196,23 @@ def monte_carlo(
 
     with executing(executor, workers) as pool:
         seeds = children(rng, paths)
-        compiled = problem.scene.noise.diffusion is not None
-        q0, v0 = (np.broadcast_to(x, (paths, x.size)) for x in (sent.q0, sent.v0))
-        shared: Shared | None = None
-        if compiled:
-            commands = commands_of(sent.scene, sent.integrator, policy, sent.steps, sent.dt)
-            shared = Shared(sent.scene, sent.integrator, commands, sent.dt, sent.steps, seeds)
+        q0, v0 = (np.broadcast_to(x, (paths, x.size)) for x in (bare.q0, bare.v0))
+        shared = shared_by(bare, policy, seeds)
         try:
             parts: Generator[_Costs, None, None]
             if shared is not None:
-                parts = in_order(pool, _together, _tasks(sent, shared, q0, v0))
+                parts = in_order(pool, _together, chunks_of(bare, shared, 0, paths))
             elif executor is not None:
-                parts = in_order(pool, _alone, (_Alone(sent, policy, seeds, path) for path in range(paths)))
+                parts = in_order(pool, _alone, (_Alone(bare, policy, seeds, path) for path in range(paths)))
             else:
                 # Custom functions need not be thread-safe.
-                parts = (_alone(_Alone(sent, policy, seeds, path)) for path in range(paths))
+                parts = (_alone(_Alone(bare, policy, seeds, path)) for path in range(paths))
             with closing(parts):
                 take_all(parts, add, lambda: progress(done, paths) if progress is not None else None)
             if shared is not None:
                 found = looked_at(pool, shared, q0, v0, extremes)
             elif np.isfinite(costs[0]).all():
-                found = _look_alone(_Alone(sent, policy, seeds, 0))
+                found = _look_alone(_Alone(bare, policy, seeds, 0))
         except KeyboardInterrupt:
             so_far = _mean(costs, predicted, within, problem, broken)
             if so_far is None:
@@ -236,7 +222,7 @@ def monte_carlo(
             elif np.isfinite(costs[0]).all():
                 # A second Ctrl-C skips the check.
                 with suppress(KeyboardInterrupt):
-                    found = _look_alone(_Alone(sent, policy, seeds, 0))
+                    found = _look_alone(_Alone(bare, policy, seeds, 0))
             raise MonteCarloInterrupted(_warned(so_far, (*_lost(so_far), *found))) from None
     result = _mean(costs, predicted, within, problem, broken)
     if result is None:
@@ -246,20 +232,7 @@ def monte_carlo(
     return _warned(result, found)
 
 
-def _sent(problem: OptimalControlProblem) -> OptimalControlProblem:
-    """The problem without the robot's shapes and the cost's references, which no path needs."""
-    sent = copy.copy(problem)
-    vars(sent).update(scene=without_geometry(problem.scene), cost=CostSum(()))
-    return sent
-
-
-def _tasks(problem: OptimalControlProblem, shared: Shared, q0: Floats, v0: Floats) -> Iterator[_Chunk]:
-    for first, last in chunks(shared.steps, len(q0)):
-        task = Task(shared, first, q0[first:last].copy(), v0[first:last].copy(), store=True, moments=False)
-        yield _Chunk(problem, task)
-
-
-def _together(chunk: _Chunk) -> _Costs:
+def _together(chunk: Chunk) -> _Costs:
     part = simulate_paths(chunk.task)
     stored = part.stored
     u = stored["u_nodes" if chunk.problem.linear else "u"]

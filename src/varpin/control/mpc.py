@@ -18,10 +18,11 @@ from varpin.control.costs import CostError
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.multipliers import REPORTED
 from varpin.control.solution import rest_of
-from varpin.errors import InputError
+from varpin.errors import InputError, LinearizationError, VarpinError
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure
 from varpin.mechanics.inputs import in_parts_of_steps, with_ends
+from varpin.mechanics.noise import NoiseFieldError
 from varpin.mechanics.policy import FirstOrderHold
 from varpin.mechanics.scene import Scene, closest_controls, require_scene
 from varpin.mechanics.wiener import generator, wiener_increments
@@ -313,8 +314,9 @@ class Mpc:
 
         Raises:
             InputError: A plant with other controls or joints.
-            StepFailure: The plant's motion, or the first motion of a search, cannot be integrated. It holds the plant's
-                motion so far; after a search, its cause is the search's error.
+            StepFailure: The plant's motion, or the first motion of a search, cannot be integrated, or a plan's motion
+                cannot be linearized. It holds the plant's motion so far; after a search, its cause is the search's
+                error.
             CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far. In the first plan, a plain KeyboardInterrupt.
         """
@@ -363,7 +365,7 @@ class Mpc:
                     begin = time.perf_counter()
                     try:
                         fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1, before)
-                    except StepFailure as failure:
+                    except (StepFailure, LinearizationError, NoiseFieldError) as failure:
                         raise _unplanned(failure, _so_far(plant, method, parts)) from failure
                     except CostError as error:
                         raise CostError(error.cost, error.problem, _so_far(plant, method, parts)) from error
@@ -574,10 +576,13 @@ def _within_rates(plan: Solution, u: Floats, before: Floats) -> Floats:
     return u
 
 
-def _unplanned(failure: StepFailure, motion: Trajectory) -> StepFailure:
-    """The failure of a run whose next plan has no first motion; it holds the plant's motion so far."""
-    reason = f"no plan can be made from here, as step {failure.step} of its first motion fails: {failure.reason}"
-    return StepFailure(motion.steps, motion.t[-1], Failure(reason, failure.residual), motion)
+def _unplanned(failure: VarpinError, motion: Trajectory) -> StepFailure:
+    """The failure of a run whose next plan cannot be made; it holds the plant's motion so far."""
+    residual, reason = np.nan, f"no plan can be made from here: {failure}"
+    if isinstance(failure, StepFailure):
+        residual = failure.residual
+        reason = f"no plan can be made from here, as step {failure.step} of its first motion fails: {failure.reason}"
+    return StepFailure(motion.steps, motion.t[-1], Failure(reason, residual), motion)
 
 
 def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integrator:

@@ -32,7 +32,7 @@ class Multipliers(Frozen):
 
     Attributes:
         values: Multipliers of the plan's motion (M,) [cost / unit of the constraint].
-        backoff: ``margin`` standard deviations (M,), in the constraint's unit; zero without a margin.
+        backoff: ``margin`` standard deviations (M,) and what is ``added``, in the constraint's unit; zero without one.
         begun: Multipliers at the beginning of the last round (M,).
         weights: Weight of each constraint's penalty in the last round (C,) [cost / unit^2].
         first_weights: The same in the first round (C,).
@@ -44,6 +44,9 @@ class Multipliers(Frozen):
         instants: Constraint, step and instant (I, 3) of each instant between nodes at which a constraint has rows; None
             where all hold there without.
         offsets: What is added to the values of these rows (O,), where the motion has a peak between two instants.
+        added: What is added to margins of the rows at nodes, as motions under noise were counted; None where margins of
+            the linear model suffice.
+        counts: How often they were counted.
         cubic: Whether these rows are on the cubics through the steps, as in a controller's ticks, not of steps
             integrated in parts.
     """
@@ -61,10 +64,12 @@ class Multipliers(Frozen):
     instants: Annotated[Integers, Axes("instants", 3)] | None = None
     offsets: Annotated[Floats, Axes("offsets", finite=True)] | None = None
     cubic: bool = False
+    added: Annotated[Floats, Axes("node_rows", finite=True)] | None = None
+    counts: int = 0
 
     def __post_init__(self) -> None:
         arrays = (self.values, self.backoff, self.begun, self.weights, self.first_weights, self.worst)
-        for array in (*arrays, self.instants, self.offsets):
+        for array in (*arrays, self.instants, self.offsets, self.added):
             if array is not None:
                 array.setflags(write=False)
 

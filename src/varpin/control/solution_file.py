@@ -185,11 +185,13 @@ def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalContro
     if sum(len(item.rows) for item in own) != between.offsets.size:
         raise FileError(f"{source}: multipliers.offsets do not belong to multipliers.instants")
     sizes = [item.size for item in enforced(problem, between).bound_constraints]
+    at_nodes = sum(item.size for item in problem.bound_constraints)
     for name, found, expected in (
         ("values", multipliers.values, sum(sizes)),
         ("weights", multipliers.weights, len(sizes)),
+        ("added", multipliers.added, at_nodes),
     ):
-        if found.size != expected:
+        if found is not None and found.size != expected:
             raise FileError(f"{source}: multipliers.{name} has shape ({found.size},), where ({expected},) belongs")
 
 

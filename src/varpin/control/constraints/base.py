@@ -118,7 +118,8 @@ class PlanConstraint(Frozen, ABC):
     """A hard constraint of a plan. A subclass implements ``bind``.
 
     Attributes:
-        margin: Distance kept from the bound, in standard deviations of c under the scene's noise; 0 for none.
+        margin: Distance kept from the bound, in standard deviations of c under the scene's noise; 0 for none. Where
+            values are not normally distributed, it is as wide as motions under noise need (docs/plan-constraints.md).
     """
 
     margin: float = 0.0

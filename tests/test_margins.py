@@ -1,0 +1,178 @@
+"""Margins by count: chance constraints where values in motions under noise are not normally distributed."""
+
+import re
+
+import numpy as np
+import pytest
+from findings import about
+from scipy.special import ndtr
+
+import varpin as vp
+from varpin.control.margins import _Counted, _played, _Row, _rows, widened
+from varpin.control.spread import Feedback, deviations
+from varpin.mechanics.wiener import children
+
+ROBOT = vp.planar_chain(2)
+HANGING = np.array([np.pi / 2 - 0.3, 0.0])
+GRID = {"dt": 0.05, "steps": 20}
+PATHS = 10_000
+
+
+def under_a_lid(noise, margin=2.0, **grid):
+    """The tip of two hanging links is higher whichever way noise pushes it."""
+    scene = vp.Scene(ROBOT, damping=0.5, noise=noise)
+    cost = vp.ControlCost(1.0) + vp.VelocityCost(0.3) + vp.TrackingCost(HANGING, 10.0)
+    lid = vp.KeepInHalfSpace(ROBOT, "tip", [0.0, 0.0, -1.0], 1.86, margin=margin)
+    return vp.OptimalControlProblem(scene, cost, HANGING, np.zeros(2), constraints=[lid], **GRID | grid)
+
+
+def values(problem, plan, seed=1):
+    """Values (P, K, rows) of the problem's constraint in other motions."""
+    options = {"controls": plan.policy, "integrator": problem.integrator, "dt": problem.dt, "steps": problem.steps}
+    found = vp.simulate_ensemble(problem.scene, problem.q0, problem.v0, paths=PATHS, rng=seed, **options)
+    (bound,) = problem.bound_constraints
+    return bound.value(found.q, found.v, np.zeros((PATHS, problem.decisions, problem.scene.controls)))
+
+
+def allowed(margin=2.0):
+    share = ndtr(-margin)
+    return share + 3.0 * np.sqrt(share * (1.0 - share) / PATHS)
+
+
+def test_counts_are_those_of_other_motions():
+    """Shares, their standard errors, and the distances that as many motions exceed as promised."""
+    problem = under_a_lid(vp.AdditiveNoise(0.4))
+    plan = vp.solve(problem, check=False, max_iterations=6)
+    (row,) = _rows(plan)
+    (counted,) = _played(plan, [row], children(5, 4096), 0, 4096)
+    # Motions to first order have the variance that is known without them.
+    np.testing.assert_allclose(counted.linear.std(axis=0), 1.0, atol=4.0 / np.sqrt(2.0 * 4096))
+    c = values(problem, plan)[:, row.near]
+    share, error = counted.shares(row)
+    other = (c > 0.0).mean(axis=0)
+    apart = (share - other) / np.hypot(error, np.sqrt(other * (1.0 - other) / PATHS))
+    assert np.abs(apart).max() < 4.0
+    assert apart.std() > 0.1
+    beyond = (c - row.planned > counted.needed(row)).mean(axis=0)
+    assert (beyond < allowed()).all()
+    assert (beyond > 0.6 * ndtr(-2.0)).all()
+
+
+def test_tails_beyond_what_motions_show():
+    """Distances that fewer motions exceed than were played: of normal values, and of an exponential tail, at least."""
+    rng = np.random.default_rng(0)
+    near = np.ones((1, 2), dtype=bool)
+    (bound,) = under_a_lid(vp.AdditiveNoise(0.1), margin=4.0).bound_constraints
+    row = _Row(bound, near, np.full(2, -4.0), np.zeros((1, 2, 4)), np.ones(2), np.ones(2))
+    linear = rng.standard_normal((4096, 2))
+    heavy = np.sign(linear[:, 1]) * rng.exponential(size=4096)
+    counted = _Counted(np.column_stack([linear[:, 0], heavy]) - 4.0, linear)
+    normal, exponential = counted.needed(row)
+    assert 3.9 < normal < 5.5
+    # Beyond a half, of a distribution with two sides.
+    assert abs(exponential - np.log(0.5 / (0.5 * ndtr(-4.0)))) < 1.0
+
+
+def beyond_a_joint_limit(robot, begin, travel, noise, damping):
+    """A reach whose goal is a little beyond limits with a margin."""
+    begin = np.asarray(begin, dtype=float)
+    goal = begin + travel
+    scene = vp.Scene(robot, damping=damping, noise=noise)
+    cost = vp.ControlCost(1e-3, scene.holding_torque(begin)) + vp.TrackingCost(goal, 10.0)
+    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost(1.0))
+    within = vp.WithinJointLimits(robot, (begin - 0.3, goal - 0.1), margin=2.0)
+    rest = np.zeros(len(begin))
+    return vp.OptimalControlProblem(scene, cost, begin, rest, constraints=[within], **GRID)
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        under_a_lid(vp.AdditiveNoise(0.4)),
+        beyond_a_joint_limit(ROBOT, [0.0, 0.0], [1.0, 0.5], vp.ControlNoise(0.06), 0.3),
+    ],
+    ids=["additive", "of the controls"],
+)
+def test_chance_constraints_hold(problem):
+    """At most 2.3 % and three standard errors of other motions violate a bound; with plain margins more do."""
+    plan = vp.solve(problem)
+    assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert plan.multipliers.counts > 0
+    assert plan.multipliers.added.max() > 0.05 * plan.multipliers.backoff.max()
+    share = (values(problem, plan) > 0.0).mean(axis=0).max()
+    assert 0.5 * ndtr(-2.0) < share <= allowed()
+    assert not about(plan.warnings, "small margin")
+    assert widened(plan) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "begin", "travel"),
+    [
+        ("ur3", [0.0, -1.0, 1.0, 0.0, 0.5, 0.0], 0.6),
+        ("z1", [0.0, 1.5, -1.5, 0.0, 0.0, 0.0, 0.0], 0.4),
+        ("panda", [0.0, -0.5, 0.0, -1.8, 0.0, 1.5, 0.5], 0.4),
+    ],
+)
+def test_chance_constraints_of_arms_hold(name, begin, travel):
+    """By noise of their controls, with the linear model's margins, 3 to 5 % of motions were outside."""
+    robot = vp.load_robot(name, lock={"panda_finger_joint1": 0.02} if name == "panda" else None)
+    problem = beyond_a_joint_limit(robot, begin, travel, vp.ControlNoise(0.05), 0.5)
+    plan = vp.solve(problem, check=False)
+    assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert (values(problem, plan) > 0.0).mean(axis=0).max() <= allowed()
+
+
+def test_noise_that_leaves_no_room_is_told_of():
+    """With the linear model's margins, four motions in ten were above the lid."""
+    plan = vp.solve(under_a_lid(vp.AdditiveNoise(1.5)))
+    assert plan.status is vp.Status.INFEASIBLE
+    assert "a margin as wide as motions under noise need" in plan.reason
+    assert plan.multipliers.counts > 0
+
+
+def test_margins_that_suffice_stay():
+    """Where values are normally distributed, two standard deviations are two."""
+    scene = vp.Scene(ROBOT, damping=0.3, noise=vp.AdditiveNoise(0.02))
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1.0) + vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0))
+    limits = vp.WithinJointLimits(ROBOT, (-0.2, [0.9, 0.6]), margin=2.0)
+    problem = vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.03, steps=40, constraints=[limits])
+    plan = vp.solve(problem, check=False)
+    assert plan.multipliers.counts == 0
+    assert plan.multipliers.added is None
+    (bound,) = problem.bound_constraints
+    own = deviations(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains), bound)
+    np.testing.assert_allclose(plan.multipliers.backoff.reshape(own.shape), 2.0 * own, rtol=2e-3, atol=1e-12)
+
+
+def test_counted_margins_are_resumed_to_the_bit(tmp_path):
+    problem = under_a_lid(vp.AdditiveNoise(0.4))
+    whole = vp.solve(problem, check=False)
+    part = vp.solve(problem, check=False, max_iterations=whole.iterations - 1)
+    assert part.multipliers.counts == whole.multipliers.counts > 0
+    part.save(tmp_path / "part.npz")
+    rest = vp.solve(problem, resume=vp.Solution.load(tmp_path / "part.npz", problem), check=False)
+    assert rest.status is whole.status
+    np.testing.assert_array_equal(rest.controls, whole.controls)
+    np.testing.assert_array_equal(rest.multipliers.added, whole.multipliers.added)
+
+
+def test_a_warning_of_a_small_margin_counts():
+    """What it says of a bound is so by ten times as many other motions, and the margin that it names suffices there."""
+    coarse = {"dt": 0.1, "steps": 8}
+    problem = under_a_lid(vp.CustomNoise(lambda q, v, u: 1.5 * np.eye(2), 2), **coarse)
+    plan = vp.solve(problem)
+    (sentence,) = about(plan.warnings, "small margin")
+    time, share, error, margin = map(
+        float, re.search(r"t = (\S+) s .* by (\S+) \+- (\S+) % .*; margin=(\S+) is", sentence).groups()
+    )
+    (bound,) = problem.bound_constraints
+    place = int(np.argmin(np.abs(bound.times - time)))
+    # The same noise, compiled.
+    c = values(under_a_lid(vp.AdditiveNoise(1.5), **coarse), plan)[:, place, 0]
+    often = 100.0 * (c > 0.0).mean()
+    assert abs(often - share) < 3.5 * error
+    planned = bound.value(plan.trajectory.q, plan.trajectory.v, plan.controls)[place, 0]
+    own = deviations(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains), bound)[place, 0]
+    # Farther away by as much as the margin is larger, as if motions about the plan stayed the same.
+    assert (c - planned > margin * own).mean() < 0.03
