@@ -8,7 +8,9 @@ from findings import about
 from scipy.special import ndtr
 
 import varpin as vp
-from varpin.control.margins import _Counted, _played, _Row, _rows, widened
+from varpin.control import augmented
+from varpin.control.examination import PARTS, _within_steps
+from varpin.control.margins import _chosen, _Counted, _Model, _played, _Row, widened
 from varpin.control.spread import Feedback, deviations
 from varpin.mechanics.wiener import children
 
@@ -43,17 +45,19 @@ def test_counts_are_those_of_other_motions():
     """Shares, their standard errors, and the distances that as many motions exceed as promised."""
     problem = under_a_lid(vp.AdditiveNoise(0.4))
     plan = vp.solve(problem, check=False, max_iterations=6)
-    (row,) = _rows(plan)
-    (counted,) = _played(plan, [row], children(5, 4096), 0, 4096)
-    # Motions to first order have the variance that is known without them.
-    np.testing.assert_allclose(counted.linear.std(axis=0), 1.0, atol=4.0 / np.sqrt(2.0 * 4096))
+    model = _Model.along(plan)
+    (row,) = _chosen(plan, model, (3,))
+    (counted,) = _played(plan, model, [row], children(5, 4096), 0, 4096)
+    # Of the motions to first order as many are beyond two deviations as is known without them.
+    share = ndtr(-2.0)
+    np.testing.assert_allclose(counted.beyond.mean(axis=0), share, atol=4.0 * np.sqrt(share / 4096))
     c = values(problem, plan)[:, row.near]
     share, error = counted.shares(row)
     other = (c > 0.0).mean(axis=0)
     apart = (share - other) / np.hypot(error, np.sqrt(other * (1.0 - other) / PATHS))
     assert np.abs(apart).max() < 4.0
     assert apart.std() > 0.1
-    beyond = (c - row.planned > counted.needed(row)).mean(axis=0)
+    beyond = (c - row.planned[row.near] > counted.needed(row)).mean(axis=0)
     assert (beyond < allowed()).all()
     assert (beyond > 0.6 * ndtr(-2.0)).all()
 
@@ -61,16 +65,16 @@ def test_counts_are_those_of_other_motions():
 def test_tails_beyond_what_motions_show():
     """Distances that fewer motions exceed than were played: of normal values, and of an exponential tail, at least."""
     rng = np.random.default_rng(0)
-    near = np.ones((1, 2), dtype=bool)
     (bound,) = under_a_lid(vp.AdditiveNoise(0.1), margin=4.0).bound_constraints
-    row = _Row(bound, near, np.full(2, -4.0), np.zeros((1, 2, 4)), np.ones(2), np.ones(2))
-    linear = rng.standard_normal((4096, 2))
-    heavy = np.sign(linear[:, 1]) * rng.exponential(size=4096)
-    counted = _Counted(np.column_stack([linear[:, 0], heavy]) - 4.0, linear)
-    normal, exponential = counted.needed(row)
-    assert 3.9 < normal < 5.5
-    # Beyond a half, of a distribution with two sides.
-    assert abs(exponential - np.log(0.5 / (0.5 * ndtr(-4.0)))) < 1.0
+    one = np.ones((1, 2))
+    row = _Row(bound, one > 0.0, -4.0 * one, np.zeros((1, 2, 4)), one, one, 4.0 * one, 0.0 * one)
+    given = np.column_stack(
+        [rng.standard_normal(4096), np.sign(rng.standard_normal(4096)) * rng.exponential(size=4096)]
+    )
+    normal, exponential = _Counted(given - 4.0, given > 4.0).needed(row)
+    assert 4.0 < normal < 5.5
+    # One side of a distribution that has two.
+    assert exponential == pytest.approx(np.log(0.5 / ndtr(-4.0)), rel=0.25)
 
 
 def beyond_a_joint_limit(robot, begin, travel, noise, damping):
@@ -145,16 +149,61 @@ def test_margins_that_suffice_stay():
     np.testing.assert_allclose(plan.multipliers.backoff.reshape(own.shape), 2.0 * own, rtol=2e-3, atol=1e-12)
 
 
-def test_counted_margins_are_resumed_to_the_bit(tmp_path):
+@pytest.mark.parametrize("when", ["before the count", "at the count", "after it", "while counting"])
+def test_counted_margins_are_resumed_to_the_bit(when, tmp_path, monkeypatch):
     problem = under_a_lid(vp.AdditiveNoise(0.4))
+    rounds = []
+
+    def counting(*given):
+        rounds.append(given[0].iterations)
+        return widened(*given)
+
+    monkeypatch.setattr(augmented, "widened", counting)
     whole = vp.solve(problem, check=False)
-    part = vp.solve(problem, check=False, max_iterations=whole.iterations - 1)
-    assert part.multipliers.counts == whole.multipliers.counts > 0
+    counted = rounds[0]
+    if when == "while counting":
+
+        def interrupted(*given):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(augmented, "widened", interrupted)
+        part = vp.solve(problem, check=False)
+        assert part.status is vp.Status.INTERRUPTED
+        monkeypatch.setattr(augmented, "widened", widened)
+    else:
+        most = {"before the count": counted - 1, "at the count": counted, "after it": whole.iterations - 1}[when]
+        part = vp.solve(problem, check=False, max_iterations=most)
+        assert (part.multipliers.counts > 0) == (when == "after it")
     part.save(tmp_path / "part.npz")
     rest = vp.solve(problem, resume=vp.Solution.load(tmp_path / "part.npz", problem), check=False)
     assert rest.status is whole.status
     np.testing.assert_array_equal(rest.controls, whole.controls)
     np.testing.assert_array_equal(rest.multipliers.added, whole.multipliers.added)
+
+
+def test_a_start_near_a_bound_needs_no_later_margin():
+    """What is added where motions have spread is not asked for at the first nodes, where they have not."""
+    scene = vp.Scene(ROBOT, damping=0.5, noise=vp.AdditiveNoise(0.4))
+    cost = vp.ControlCost(1.0) + vp.VelocityCost(0.3) + vp.TrackingCost(HANGING, 10.0)
+    lid = vp.KeepInHalfSpace(ROBOT, "tip", [0.0, 0.0, -1.0], 1.905, margin=2.0)
+    problem = vp.OptimalControlProblem(scene, cost, HANGING, np.zeros(2), constraints=[lid], **GRID)
+    plan = vp.solve(problem)
+    assert plan.multipliers.counts > 0
+    assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert (values(problem, plan) > 0.0).mean(axis=0).max() <= allowed()
+
+
+def test_a_bound_that_the_linear_model_sees_no_motion_towards_is_counted():
+    """At rest at the bottom, the tip moves sideways to first order, and up to second order alone."""
+    bottom = np.array([np.pi / 2, 0.0])
+    scene = vp.Scene(ROBOT, damping=0.5, noise=vp.AdditiveNoise(0.6))
+    cost = vp.ControlCost(1.0) + vp.VelocityCost(0.3) + vp.TrackingCost(bottom, 0.1)
+    lid = vp.KeepInHalfSpace(ROBOT, "tip", [0.0, 0.0, -1.0], 1.99, margin=2.0)
+    problem = vp.OptimalControlProblem(scene, cost, bottom, np.zeros(2), constraints=[lid], **GRID)
+    plan = vp.solve(problem, check=False)
+    assert (values(problem, plan) > 0.0).mean() > 0.1
+    assert widened(plan) is not None
+    assert "more often than their margins allow" in plan.reason or plan.status is vp.Status.INFEASIBLE
 
 
 def test_a_warning_of_a_small_margin_counts():
@@ -176,3 +225,13 @@ def test_a_warning_of_a_small_margin_counts():
     own = deviations(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains), bound)[place, 0]
     # Farther away by as much as the margin is larger, as if motions about the plan stayed the same.
     assert (c - planned > margin * own).mean() < 0.03
+
+
+def test_margins_within_steps():
+    """Standard deviations of a Wiener process there, and none larger than at the end of the step."""
+    t = 0.1 * np.arange(1, 6)
+    found = _within_steps(np.sqrt(t)[:, None])[:, 0]
+    np.testing.assert_allclose(found, np.sqrt(0.1 * np.arange(1, 5 * PARTS + 1) / PARTS), rtol=1e-14)
+    falling = _within_steps(np.array([[3.0], [2.0]]))[:, 0]
+    assert (falling[:PARTS] <= 3.0).all()
+    np.testing.assert_array_equal(falling[PARTS:], 2.0)

@@ -267,8 +267,8 @@ def test_a_plant_that_fails_keeps_the_motion():
     assert caught.value.trajectory.dt == pytest.approx(0.02)
 
 
-@pytest.mark.parametrize("whose", ["simulated", "replan"])
-def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whose, monkeypatch):
+@pytest.mark.parametrize(("whose", "how"), [("simulated", "step"), ("replan", "step"), ("replan", "derivative")])
+def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whose, how, monkeypatch):
     """In the third tick's simulation, or in the search of the fourth."""
     mpc, calls, real = vp.Mpc(tracking(), iterations=1), [], getattr(varpin.control.mpc, whose)
     harsh = vp.Scene(mpc.problem.scene.robot, gravity=(0, 0, -1e6))
@@ -277,6 +277,8 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
         calls.append(given)
         if len(calls) < 3:
             return real(*given, **options)
+        if how == "derivative":
+            raise vp.LinearizationError(2, 0.04, "the solver stopped")
         return vp.simulate(
             harsh, np.zeros(3), np.zeros(3), dt=0.1, steps=5, integrator=vp.Midpoint(guard=vp.Guard(max_halvings=0))
         )
@@ -289,10 +291,20 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
     ticks = 2 if whose == "simulated" else 3
     np.testing.assert_array_equal(part.q[: 10 * ticks + 1], whole.q[: 10 * ticks + 1])
     assert (caught.value.step, caught.value.time) == (part.steps, pytest.approx(0.02 * ticks))
-    if whose == "solve":
+    if whose == "replan":
         assert part.steps == 10 * ticks
         assert about(str(caught.value), "no plan from here")
-        assert isinstance(caught.value.__cause__, vp.StepFailure)
+        assert isinstance(caught.value.__cause__, vp.StepFailure if how == "step" else vp.LinearizationError)
+
+
+def test_constraints_between_nodes_that_ticks_leave_out_are_told_of():
+    limits = vp.WithinVelocityLimits(cart().scene.robot, (-0.4, 0.4))
+    for asked in (True, False):
+        usual = cart(steps=8)
+        problem = vp.OptimalControlProblem(
+            usual.scene, usual.cost, usual.q0, usual.v0, dt=usual.dt, steps=8, constraints=[limits], between_nodes=asked
+        )
+        assert bool(about(vp.Mpc(problem).run(duration=0.2).warnings, "nodes alone")) == asked
 
 
 @pytest.mark.parametrize("whose", ["cost", "reference"])

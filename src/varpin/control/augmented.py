@@ -37,7 +37,7 @@ from varpin.control.refinement_within import Warm, refine_within
 from varpin.control.search import NOTHING, PATIENCE, checked_time, closing_of, require_reports
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, deviations
-from varpin.errors import InputError, LinearizationError
+from varpin.errors import InputError, LinearizationError, VarpinError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.simulation.soundness import announce
 from varpin.support.checks import count, flag, positive
@@ -70,8 +70,8 @@ _MOVING, _SETTLED = 16, 1e-3
 # From round _PLAIN on, margins that change by more than _DRIFT are made steadier over _NEAR nodes to either side, with
 # the share _TAKEN in those of the next round.
 _PLAIN, _DRIFT, _NEAR, _TAKEN = 5, 1e-2, 2, 0.5
-# How often motions under noise are counted at most, and rounds in which margins are updated after each count.
-_COUNTS, _ANEW = 3, 6
+# How often margins become wider at most, and further rounds in which they are updated each time.
+_COUNTS, _ANEW = 3, 12
 # A plan is infeasible when _STUCK rounds in a row have left more than _LOWERED of the worst violation.
 _STUCK, _LOWERED = 3, 0.9
 # Greatest number of iterations of a plan whose first node cannot meet a constraint.
@@ -222,7 +222,7 @@ class _Rounds:
             )
             resume = None
             self.history += [replace(item, index=item.index + known) for item in found.history]
-            kept = self._steady(self._kept(found, problem, begun, known))
+            kept = ended_with = self._steady(self._kept(found, problem, begun, known))
             try:
                 status, reason = self._ended_or_next(kept, begun, found, last)
                 if hopeless and found.status not in (Status.INTERRUPTED, Status.OUT_OF_TIME):
@@ -239,10 +239,13 @@ class _Rounds:
                 elif kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
                     kept, closing = self._polished(replace(kept, status=status))
                     status, reason = kept.status, f"{reason}; {closing}"
-                if self._counts_anew(kept, begun, status):
+                goes_on, counted = self._counts(kept, begun, status, began + self.limit)
+                if goes_on:
                     continue
+                reason += counted
             except KeyboardInterrupt:
-                status, reason = Status.INTERRUPTED, found.reason
+                # Without the last step: the search goes on from its own motion.
+                kept, status, reason = ended_with, Status.INTERRUPTED, found.reason
             break
         plan = self._told_between(replace(kept, status=status, reason=reason))
         return looked_at(plan)[0] if self.check else plan
@@ -454,7 +457,7 @@ class _Rounds:
         if not feasible and (stuck >= _STUCK or begun.round + 1 >= _ROUNDS or (heavy and stuck)):
             if _blocked(found):
                 return found.status, f"{state}; {found.reason}"
-            return Status.INFEASIBLE, _infeasible(worst, counted=begun.counts > 0)
+            return Status.INFEASIBLE, _infeasible(worst, counted=self._is_wider(begun, constraints.index(worst)))
         if feasible and begun.round + 1 >= _ROUNDS:
             return found.status, found.reason
         more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
@@ -474,6 +477,12 @@ class _Rounds:
             counts=begun.counts,
         )
         return None, ""
+
+    def _is_wider(self, begun: _State, constraint: int) -> bool:
+        """Whether the margins of one of a round's constraints are wider than those of the linear model."""
+        if begun.added is None:
+            return False
+        return bool(self._margins(begun.added, begun.between)[constraint].any())
 
     def _looked_between(
         self, motion: Trajectory, between: Instants, backoff: list[Floats], least: float, rounds: int
@@ -537,22 +546,28 @@ class _Rounds:
             self.state = replace(self.state, weights=first_weights, worst=np.full(len(worst), np.inf), tolerance=_LOOSE)
         return True
 
-    def _counts_anew(self, kept: Solution, begun: _State, status: Status) -> bool:
-        """Whether rounds follow with wider margins, as motions under noise violate bounds more often than promised.
+    def _counts(self, kept: Solution, begun: _State, status: Status, deadline: float) -> tuple[bool, str]:
+        """Whether rounds follow with wider margins, as motions under noise violate bounds too often; a note on it.
 
         The last round is repeated from its own multipliers and weights.
         """
         ended = status in (Status.CONVERGED, Status.STALLED) and kept.violation <= FEASIBLE
-        if not (self.noisy and ended) or begun.counts >= _COUNTS or begun.round + 1 >= _ROUNDS:
-            return False
-        added = widened(kept)
+        if not (self.noisy and ended):
+            return False, ""
+        try:
+            added = widened(kept, deadline)
+        except VarpinError as error:
+            return False, f"; how often motions under noise violate bounds with a margin was not counted: {error}"
         if added is None:
-            return False
-        logger.info("%s: motions under noise violate bounds with a margin more often than promised", self.label)
+            return False, ""
+        if begun.counts >= _COUNTS or begun.round + 1 >= _ROUNDS:
+            return False, "; motions under noise still violate bounds more often than their margins allow"
+        logger.info("%s: motions under noise violate bounds more often than their margins allow", self.label)
         self.whole = enforced(self.problem, begun.between)
-        begun = replace(begun, added=added, counts=begun.counts + 1, round=begun.round + 1, stuck=0)
+        worst = np.full(len(begun.worst), np.inf)
+        begun = replace(begun, added=added, counts=begun.counts + 1, round=begun.round + 1, stuck=0, worst=worst)
         self.state = replace(begun, backoff=self._backoff(kept, begun))
-        return True
+        return True, ""
 
     def _beyond(self, motion: Trajectory, backoff: list[Floats]) -> Floats:
         """By how much a motion violates each constraint between its nodes."""

@@ -351,8 +351,7 @@ def _between(solution: Solution) -> list[Finding]:
         if bound.of_controls or bound.source.equality:
             continue
         c = bound.value(motion.q, motion.v, problem.control_rows(motion))
-        # The margin is that of the plan's node at the end of the step.
-        c = c + margin.repeat(PARTS, axis=0)
+        c = c + _within_steps(margin)
         outside = at_start(problem, whole)
         if outside is not None:
             # A row that is violated at the start cannot hold before the first node, so it is not reported there.
@@ -373,6 +372,18 @@ def _between(solution: Solution) -> list[Finding]:
                     f"violated by {c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: {advice}",
                 )
             )
+    return found
+
+
+def _within_steps(margin: Floats) -> Floats:
+    """Margins (K PARTS, rows) in parts of steps, from those at the nodes after the first (K, rows).
+
+    Their squares are linear in time, as variances under constant noise are, and no margin is larger than at the end.
+    """
+    squares = np.concatenate([np.zeros_like(margin[:1]), margin**2])
+    share = np.arange(1, PARTS + 1)[:, None] / PARTS
+    inner = squares[:-1, None] + share * (squares[1:] - squares[:-1])[:, None]
+    found: Floats = np.minimum(np.sqrt(inner), margin[:, None]).reshape(-1, margin.shape[1])
     return found
 
 

@@ -1,9 +1,10 @@
-"""Margins by count: how often motions under noise violate a bound, and what a margin has to be for that, (P5)."""
+"""Margins by count: how often motions under noise violate a bound, and how wide its margin has to be, (P5)."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -15,43 +16,48 @@ from varpin.control.history import Status
 from varpin.control.linear_controls import in_step
 from varpin.control.multipliers import at_nodes
 from varpin.control.paths import Chunk, chunks_of, sent, shared_by
+from varpin.control.penalties import split
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, decided, propagated, state_slopes
 from varpin.ensemble.paths import simulate_paths
 from varpin.errors import VarpinError
 from varpin.linearization import linearize_steps
-from varpin.mechanics.wiener import Children, children
+from varpin.mechanics.wiener import Children, children, wiener_increments
+from varpin.simulation.failures import NoiseError, StepFailure
 from varpin.simulation.soundness import Finding
 from varpin.support.executors import executing, in_order
 from varpin.support.frozen import Frozen
 
-# Motions that are counted: at first, then twice as many until standard errors of shares are at most _SHARP of what is
-# promised, and at most; and where only Python evaluates the noise.
-_FIRST, _SHARP, _MOST, _ALONE = 1024, 0.12, 8192, 512
-# How much more often than promised a bound is violated for wider margins, and, beyond doubt, for a warning.
-_MORE, _OFTEN = 1.05, 1.2
-# Standard errors of doubt, and those by which wider margins are on the safe side.
-_DOUBT, _SAFE = 2.0, 1.0
+# Motions that choose the rows to count. Motions that are counted: _FIRST, then twice as many until standard errors of
+# shares are at most _SHARP of what is promised, up to _MOST; and _ALONE where only Python evaluates the noise.
+_CHOOSING, _FIRST, _SHARP, _MOST, _ALONE = 256, 1024, 0.12, 8192, 512
+# Standard errors above what is promised at which margins become wider. How much more often than promised, beyond
+# _DOUBT standard errors, a bound is violated for a warning.
+_CLEARLY, _OFTEN, _DOUBT = 1.0, 1.2, 2.0
 # Motions beyond a quantile that determine it, and the share of motions from which the tail beyond is extrapolated.
 _ENOUGH, _TAIL = 20, 0.02
-# Bounds within _NEAR times their margin and _NEARER deviations are looked at.
+# Rows within _NEAR times their margin and _NEARER deviations of the plan are counted, and those that motions violate.
 _NEAR, _NEARER = 1.5, 0.5
 # Nodes to either side over which what is added to margins is averaged.
 _BESIDE = 2
+# Seeds of these motions, which are no user's: those of a count, of a look at a finished plan, and of its warnings.
+_SEED, _COUNT, _LOOK, _WARN = 0x76A3, 0, 1, 2
 
 
 @dataclass(frozen=True, eq=False)
 class _Row(Frozen):
-    """Rows of a constraint with a margin, at the places where the plan is near them.
+    """Rows of a constraint with a margin that are counted.
 
     Attributes:
         bound: The constraint.
         near: Which rows at which places (K, rows), R in all.
-        planned: Their values in the plan (R,).
+        planned: Values of all in the plan (K, rows).
         slopes: d(value)/dx (K, rows, 2n).
-        own: Their standard deviations in the linear model (R,).
-        simple: The same where the strength of the noise stays that along the plan (R,).
+        own: Standard deviations of all in the linear model (K, rows).
+        simple: The same where the strength of the noise stays that along the plan (K, rows).
+        margin: Margins of all in the plan (K, rows).
+        added: The share of counted motions in these (K, rows).
     """
 
     bound: BoundConstraint
@@ -60,123 +66,143 @@ class _Row(Frozen):
     slopes: Floats
     own: Floats
     simple: Floats
+    margin: Floats
+    added: Floats
 
     @property
     def promised(self) -> float:
         """Share of the motions that the margin allows."""
         return float(ndtr(-self.bound.source.margin))
 
+    def only(self, near: Mask) -> _Row:
+        """The same with other rows to count."""
+        return replace(self, near=near)
+
 
 @dataclass(frozen=True, eq=False)
 class _Counted(Frozen):
-    """Values of the rows near their bounds in P motions under noise, and to first order under the same noise.
+    """P motions under noise.
 
     Attributes:
-        values: c (P, R).
-        linear: Deviations from the plan to first order, in standard deviations (P, R).
+        values: c in each (P, R).
+        beyond: Whether c is more than the margin's standard deviations beyond the plan to first order, under the same
+            noise (P, R).
     """
 
     values: Floats
-    linear: Floats
+    beyond: Mask
 
     def shares(self, row: _Row) -> tuple[Floats, Floats]:
         """Shares of the motions that violate each row (R,), and standard errors (R,).
 
-        The share in the linear model is known, and motions mostly agree with it: it is a control variate.
+        The share of the linear model is known, and most motions agree with it: it is a control variate.
         """
-        apart = (self.values > 0.0).astype(float) - (self.linear > row.bound.source.margin)
-        share = np.clip(row.promised + apart.mean(axis=0), 0.0, 1.0)
+        known = np.where(row.simple[row.near] > 0.0, row.promised, 0.0)
+        apart = (self.values > 0.0).astype(float) - self.beyond
+        share = np.clip(known + apart.mean(axis=0), 0.0, 1.0)
         return share, np.maximum(apart.std(axis=0) / math.sqrt(len(apart)), 1.0 / len(apart))
 
     def and_more(self, other: _Counted) -> _Counted:
         """These motions and others."""
-        return _Counted(np.concatenate([self.values, other.values]), np.concatenate([self.linear, other.linear]))
+        return _Counted(np.concatenate([self.values, other.values]), np.concatenate([self.beyond, other.beyond]))
 
     def needed(self, row: _Row) -> Floats:
-        """Distances from the plan that motions exceed as often as promised, on the safe side (R,).
-
-        As many motions exceed such a quantile as exceed that of the linear model, which is known.
-        """
-        beyond = self.linear > row.bound.source.margin
-        found = np.empty(len(row.planned))
-        for r, exceeding in enumerate(beyond.mean(axis=0)):
-            c = self.values[:, r] - row.planned[r]
-            differ = (c > np.quantile(c, 1.0 - exceeding)) != beyond[:, r]
-            share = max(exceeding - _SAFE * math.sqrt(differ.mean() / len(c)), 0.5 * row.promised)
-            if share * len(c) >= _ENOUGH:
-                found[r] = np.quantile(c, 1.0 - share)
+        """Distances from the plan that motions exceed as often as promised (R,), and a standard error more."""
+        planned, simple, P = row.planned[row.near], row.simple[row.near], len(self.values)
+        found = np.empty(len(planned))
+        for r in range(len(planned)):
+            c, promised = self.values[:, r] - planned[r], row.promised
+            if promised * P >= _ENOUGH:
+                # As many motions exceed such a quantile as exceed that of the linear model, which is known.
+                share = float(self.beyond[:, r].mean()) if simple[r] > 0.0 else promised
+                differ = float(((c > np.quantile(c, 1.0 - share)) != self.beyond[:, r]).mean())
+                found[r] = np.quantile(c, 1.0 - max(share - math.sqrt(differ / P), 0.5 * promised))
                 continue
             # An exponential tail, which is heavier than that of a normal distribution.
-            begin = float(np.quantile(c, 1.0 - _TAIL))
-            found[r] = begin + (c[c > begin].mean() - begin) * math.log(_TAIL / share)
+            tail = max(_TAIL, _ENOUGH / P)
+            begin = float(np.quantile(c, 1.0 - tail))
+            mean = float(c[c > begin].mean()) - begin
+            found[r] = begin + mean * (1.0 + 1.0 / math.sqrt(tail * P)) * math.log(tail / promised)
         return found
 
 
-def widened(plan: Solution) -> list[Floats] | None:
+def widened(plan: Solution, deadline: float = math.inf) -> list[Floats] | None:
     """What has to be added to margins (K, rows) for each constraint, in its unit, (P5); None if they suffice.
 
     Margins are of the linear model. Where noise is strong, or where it follows the controls, values in motions are not
-    normally distributed, and violate bounds more often. None, too, where motions fail or only Python evaluates the
-    noise, as counting would take long.
+    normally distributed, and violate bounds more often. Nothing is added where only Python evaluates the noise, as
+    counting would take long.
+
+    Args:
+        plan: The plan, with its margins.
+        deadline: When counting ends, of ``time.perf_counter``.
+
+    Raises:
+        VarpinError: Motions cannot be counted: most fail, or the time is up.
     """
     problem = plan.problem
     if problem.scene.noise.diffusion is None:
         return None
-    try:
-        rows = _rows(plan)
-        counted = _counted(plan, rows, 0)
-    except VarpinError:
-        # Without such motions nothing is known; plan.monte_carlo() tells of motions that fail.
-        return None
+    model = _Model.along(plan)
+    # The same noise in every count: what is left of a violation is then that of the plan, not of other noise.
+    rows = _chosen(plan, model, (_COUNT, 0))
+    counted = _counted(plan, model, rows, (_COUNT, 1), deadline=deadline)
     enough = True
     found = [np.zeros(bound.shape) for bound in problem.bound_constraints]
     for row, motions in zip(rows, counted, strict=True):
-        enough = enough and bool((motions.shares(row)[0] <= _MORE * row.promised).all())
-        more = np.maximum(motions.needed(row) - row.bound.source.margin * row.own, 0.0)
-        found[problem.bound_constraints.index(row.bound)] = _spread(row.near, more)
+        share, error = motions.shares(row)
+        enough = enough and bool((share - _CLEARLY * error <= row.promised).all())
+        more = motions.needed(row) - row.bound.source.margin * row.own[row.near]
+        more = np.where(share > row.promised, np.maximum(more, row.added[row.near]), row.added[row.near])
+        found[problem.bound_constraints.index(row.bound)] = _spread(row, more)
     return None if enough else found
 
 
-def _spread(near: Mask, more: Floats) -> Floats:
-    """Distances (K, rows) from those of rows near bounds: no smaller than around them, and in between elsewhere."""
-    whole = np.zeros(near.shape)
+def _spread(row: _Row, more: Floats) -> Floats:
+    """Distances (K, rows) from those of the rows that are counted: no smaller than around them.
+
+    In between they are as many deviations as there, and no longer: the first nodes have next to none.
+    """
+    near, whole = row.near, row.added.copy()
     whole[near] = more
     places = np.arange(len(near))
     for r in np.flatnonzero(near.any(axis=0)):
-        known = np.flatnonzero(near[:, r])
-        whole[:, r] = np.interp(places, known, whole[known, r])
+        known, left = np.flatnonzero(near[:, r]), np.flatnonzero(~near[:, r])
+        own = row.own[:, r]
+        shares = whole[known, r] / np.where(own[known] > 0.0, own[known], np.inf)
+        distances = np.interp(places[left], known, whole[known, r])
+        fewer = np.minimum(distances, np.interp(places[left], known, shares) * own[left])
+        whole[left, r] = np.maximum(fewer, row.added[left, r])
     around = ndimage.uniform_filter1d(whole, 2 * _BESIDE + 1, axis=0, mode="nearest")
-    found: Floats = np.maximum(whole, around)
+    found: Floats = np.where(near, np.maximum(whole, around), whole)
     return found
 
 
 def too_small(solution: Solution) -> list[Finding]:
-    """Findings about constraints whose margin is too small, as noise is too strong for the linear model."""
-    problem = solution.problem
-    if not problem.scene.processes or solution.multipliers is None or solution.status is Status.INFEASIBLE:
+    """Findings about constraints whose margin is too small, as noise is too strong for it."""
+    problem, known = solution.problem, solution.multipliers
+    if not problem.scene.processes or known is None or solution.status is Status.INFEASIBLE:
+        return []
+    if not any(bound.source.margin > 0.0 for bound in problem.bound_constraints):
         return []
     try:
+        model = _Model.along(solution)
         chosen = []
-        rows = _rows(solution)
-        looked = _counted(solution, rows, 1, sharp=np.inf)
-        for row, motions in zip(rows, looked, strict=True):
+        rows = _chosen(solution, model, (_LOOK, 0))
+        for row, motions in zip(rows, _counted(solution, model, rows, (_LOOK, 1), sharp=np.inf), strict=True):
             share, _ = motions.shares(row)
             if share.max() > _OFTEN * row.promised:
                 one = np.zeros_like(row.near)
                 one[tuple(np.argwhere(row.near)[share.argmax()])] = True
-                chosen.append(_only(row, one))
+                chosen.append(row.only(one))
         # The choice would make the same motions count too many.
-        counted = _counted(solution, chosen, 2)
-    except VarpinError:
-        return []
+        counted = _counted(solution, model, chosen, (_WARN, 0))
+    except VarpinError as error:
+        return [
+            Finding("margins not counted", f"how often motions violate bounds with a margin= is not known: {error}")
+        ]
     found = [_told(solution, row, motions) for row, motions in zip(chosen, counted, strict=True)]
     return [finding for finding in found if finding is not None]
-
-
-def _only(row: _Row, near: Mask) -> _Row:
-    """Some of the rows."""
-    some = near[row.near]
-    return _Row(row.bound, near, row.planned[some], row.slopes, row.own[some], row.simple[some])
 
 
 def _told(solution: Solution, row: _Row, counted: _Counted) -> Finding | None:
@@ -186,60 +212,127 @@ def _told(solution: Solution, row: _Row, counted: _Counted) -> Finding | None:
     if often - _DOUBT * error <= _OFTEN * row.promised:
         return None
     place, r = np.argwhere(row.near)[0]
-    enough = math.ceil(10.0 * counted.needed(row)[0] / row.own[0]) / 10.0
+    needed = float(counted.needed(row)[0])
+    if solution.problem.scene.noise.diffusion is None:
+        enough = math.ceil(10.0 * needed / row.own[place, r]) / 10.0
+        which, advice = ", which is of the linear model,", f"margin={enough:g} is about enough there"
+    else:
+        narrower = needed - row.margin[place, r]
+        which, advice = ", even as wide as it has become,", f"a bound narrower by {narrower:.2g} {bound.unit} may do"
     return Finding(
         "small margin",
-        f"{solution.problem.label_of(bound.source)}: margin={margin:g}, which is of the linear model, is too small for "
-        f"this noise: {bound.rows[r]} at t = {bound.times[place]:.4g} s is violated by {100.0 * often:.2g} +- "
-        f"{100.0 * error:.1g} % of all motions, not {100.0 * row.promised:.2g} %, as {len(counted.values)} motions "
-        f"under noise say; margin={enough:g} is about enough there, and plan.monte_carlo counts",
+        f"{solution.problem.label_of(bound.source)}: margin={margin:g}{which} is too small for this noise: "
+        f"{bound.rows[r]} at t = {bound.times[place]:.4g} s is violated by {100.0 * often:.2g} +- {100.0 * error:.1g} "
+        f"% of all motions, not {100.0 * row.promised:.2g} %, as {len(counted.values)} motions under noise say; "
+        f"{advice}, and plan.monte_carlo counts",
     )
 
 
-def _rows(plan: Solution) -> list[_Row]:
-    """The rows of constraints with a margin that the plan is near.
+@dataclass(frozen=True, eq=False)
+class _Model(Frozen):
+    """The linear model along a plan under feedback.
+
+    Attributes:
+        J: Derivatives of the steps in their variables (N, 2n, Z).
+        G: Derivatives in the noise (N, 2n, k).
+        gz: Derivatives of G in the variables (N, 2n, k, Z).
+        feedback: The gains.
+    """
+
+    J: Floats
+    G: Floats
+    gz: Floats
+    feedback: Feedback
+
+    @classmethod
+    def along(cls, plan: Solution) -> _Model:
+        """The model along a plan.
+
+        Raises:
+            LinearizationError: A step has no derivatives.
+        """
+        problem = plan.problem
+        lin = linearize_steps(problem.scene, plan.trajectory, problem.integrator, problem.q0, ramps=problem.linear)
+        J, gz = in_step(lin)
+        return cls(J, lin.G, gz, Feedback(plan.gains, plan.previous_gains))
+
+    def deviations(self, problem: OptimalControlProblem, dw: Floats) -> Floats:
+        """Deviations of the state from the plan (P, N + 1, 2n) under increments (P, N, k), to first order."""
+        x, m = self.J.shape[1], problem.scene.controls
+        found, y = np.zeros((len(dw), len(self.J) + 1, x)), np.zeros((len(dw), x + m))
+        for k in range(len(self.J)):
+            T = decided(problem, self.feedback, k, x)
+            z = y if T is None else y @ T.T
+            y = np.hstack([z @ self.J[k].T + dw[:, k] @ self.G[k].T, z[:, -m:]])
+            found[:, k + 1] = y[:, :x]
+        return found
+
+
+def _chosen(plan: Solution, model: _Model, seed: tuple[int, ...]) -> list[_Row]:
+    """The rows to count: those that the plan is near, and those that a few motions violate more often than promised.
 
     Raises:
-        VarpinError: The plan's steps have no derivatives.
+        VarpinError: Fewer than half of the motions get to the end.
     """
     problem, motion, known = plan.problem, plan.trajectory, plan.multipliers
     assert known is not None
-    margins = at_nodes(problem, known, known.backoff)
-    kept = [(bound, b) for bound, b in zip(problem.bound_constraints, margins, strict=True) if b.any()]
-    if not kept:
-        return []
-    lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0, ramps=problem.linear)
-    (J, gz), x = in_step(lin), lin.A.shape[1]
-    feedback = Feedback(plan.gains, plan.previous_gains)
-    spreads = [propagated(J, lin.G, part, problem, feedback)[:, :x, :x] for part in (gz, np.zeros_like(gz))]
+    x = model.J.shape[1]
+    spreads = [
+        propagated(model.J, model.G, part, problem, model.feedback)[:, :x, :x]
+        for part in (model.gz, np.zeros_like(model.gz))
+    ]
     to_state, u = state_slopes(problem, motion), problem.control_rows(motion)
-    found = []
-    for bound, b in kept:
+    rows = []
+    bounds, margins = problem.bound_constraints, at_nodes(problem, known, known.backoff)
+    added = [np.zeros(bound.shape) for bound in bounds] if known.added is None else split(bounds, known.added)
+    for bound, margin, more in zip(bounds, margins, added, strict=True):
+        if not bound.source.margin > 0.0:
+            continue
         slopes = bound.jacobian(motion.q, motion.v) @ to_state[bound.places]
         own, simple = (
             np.sqrt(np.maximum(np.einsum("krx,kxy,kry->kr", slopes, part[bound.places], slopes), 0.0))
             for part in spreads
         )
-        c = bound.value(motion.q, motion.v, u)
-        near = (simple > 0.0) & (-c <= _NEAR * b + _NEARER * own)
+        planned = bound.value(motion.q, motion.v, u)
+        rows.append(_Row(bound, np.ones(bound.shape, dtype=bool), planned, slopes, own, simple, margin, more))
+    found = []
+    few = _played(plan, model, rows, _children(seed, _CHOOSING), 0, _CHOOSING)
+    for row, motions in zip(rows, few, strict=True):
+        close = -row.planned <= _NEAR * row.margin + _NEARER * row.own
+        near = (close & (row.own > 0.0)) | ((motions.values > 0.0).mean(axis=0) > row.promised).reshape(close.shape)
         if near.any():
-            found.append(_Row(bound, near, c[near], slopes, own[near], simple[near]))
+            found.append(row.only(near))
     return found
 
 
-def _counted(plan: Solution, rows: list[_Row], seed: int, sharp: float = _SHARP) -> list[_Counted]:
-    """Motions under noise from a seed: as many as shares take whose errors are ``sharp`` of what is promised.
+def _children(seed: tuple[int, ...], paths: int) -> Children:
+    """The seeds of motions."""
+    return children(np.random.default_rng([_SEED, *seed]), paths)
+
+
+def _counted(
+    plan: Solution,
+    model: _Model,
+    rows: list[_Row],
+    seed: tuple[int, ...],
+    *,
+    sharp: float = _SHARP,
+    deadline: float = math.inf,
+) -> list[_Counted]:
+    """Motions under noise: as many as shares take whose errors are ``sharp`` of what is promised.
 
     Raises:
-        VarpinError: Fewer than half of the motions get to the end.
+        VarpinError: Fewer than half of the motions get to the end, or the time is up.
     """
     if not rows:
         return []
     alone = plan.problem.scene.noise.diffusion is None
-    seeds, first, last = children(seed, _MOST), 0, _ALONE if alone else _FIRST
+    seeds, first, last = _children(seed, _MOST), 0, _ALONE if alone else _FIRST
     found: list[_Counted] = []
     while True:
-        more = _played(plan, rows, seeds, first, last)
+        if time.perf_counter() > deadline:
+            raise VarpinError("the time is up")
+        more = _played(plan, model, rows, seeds, first, last)
         found = [one.and_more(two) for one, two in zip(found, more, strict=True)] if found else more
         errors = (one.shares(row)[1].max() / row.promised for one, row in zip(found, rows, strict=True))
         if alone or last >= _MOST or max(errors) <= sharp:
@@ -247,61 +340,50 @@ def _counted(plan: Solution, rows: list[_Row], seed: int, sharp: float = _SHARP)
         first, last = last, 2 * last
 
 
-def _played(plan: Solution, rows: list[_Row], seeds: Children, first: int, last: int) -> list[_Counted]:
+def _played(plan: Solution, model: _Model, rows: list[_Row], seeds: Children, first: int, last: int) -> list[_Counted]:
     """The motions of the seeds first, ..., last - 1.
 
     Raises:
         VarpinError: Fewer than half of the motions get to the end.
     """
     problem = sent(plan.problem)
-    lin = linearize_steps(
-        plan.problem.scene, plan.trajectory, problem.integrator, problem.q0, ramps=plan.problem.linear
-    )
-    J, G = in_step(lin)[0], lin.G
-    feedback = Feedback(plan.gains, plan.previous_gains)
 
-    def linear(dw: Floats) -> list[Floats]:
-        x = _linear(problem, J, G, feedback, dw)
-        return [np.einsum("krx,Pkx->Pkr", row.slopes, x[:, row.bound.places])[:, row.near] / row.simple for row in rows]
-
-    def values(q: Floats, v: Floats) -> list[Floats]:
+    def of_motions(q: Floats, v: Floats, dw: Floats) -> list[_Counted]:
         no_controls = np.zeros((len(q), problem.decisions, problem.scene.controls))
-        return [row.bound.value(q, v, no_controls)[:, row.near] for row in rows]
+        x, found = model.deviations(problem, dw), []
+        for row in rows:
+            linear = np.einsum("krx,Pkx->Pkr", row.slopes, x[:, row.bound.places])
+            limit = np.where(row.simple > 0.0, row.bound.source.margin * row.simple, np.inf)
+            values = row.bound.value(q, v, no_controls)
+            found.append(_Counted(values[:, row.near], (linear > limit)[:, row.near]))
+        return found
 
-    def together(chunk: Chunk) -> list[tuple[Floats, Floats]]:
+    def together(chunk: Chunk) -> list[_Counted]:
         task = chunk.task
         dw = np.stack([task.shared.drawn(each) for each in seeds.generators(task.first, task.first + len(task.q0))])
         stored = simulate_paths(task).stored
-        return list(zip(values(stored["q"], stored["v"]), linear(dw), strict=True))
+        return of_motions(stored["q"], stored["v"], dw)
 
     shared = shared_by(problem, plan.policy, seeds)
-    parts: list[list[tuple[Floats, Floats]]] = []
+    parts: list[list[_Counted]] = []
     if shared is not None:
         with executing(None, None) as pool:
             parts += in_order(pool, together, chunks_of(problem, shared, first, last))
     else:
-        size = problem.steps, problem.scene.increments(linear=problem.linear)
+        width = problem.scene.increments(linear=problem.linear)
         for generator in seeds.generators(first, last):
-            dw = generator.normal(scale=math.sqrt(problem.dt), size=size)
-            motion = problem.simulate(plan.policy, increments=dw)
-            parts.append(list(zip(values(motion.q[None], motion.v[None]), linear(dw[None]), strict=True)))
+            dw = wiener_increments(width, problem.dt, problem.steps, generator)
+            try:
+                motion = problem.simulate(plan.policy, increments=dw)
+            except (StepFailure, NoiseError):
+                continue
+            parts.append(of_motions(motion.q[None], motion.v[None], dw[None]))
     found = []
     for pairs in zip(*parts, strict=True):
-        c, deviation = (np.concatenate(part) for part in zip(*pairs, strict=True))
-        finished = np.isfinite(c).all(axis=1)
-        if 2 * finished.sum() < len(c):
-            raise VarpinError(f"{len(c) - int(finished.sum())} of {len(c)} motions under noise fail")
-        found.append(_Counted(c[finished], deviation[finished]))
-    return found
-
-
-def _linear(problem: OptimalControlProblem, J: Floats, G: Floats, feedback: Feedback, dw: Floats) -> Floats:
-    """Deviations of the state from the plan (P, N + 1, 2n) under increments (P, N, K), to first order."""
-    x, m = J.shape[1], problem.scene.controls
-    found, y = np.zeros((len(dw), len(J) + 1, x)), np.zeros((len(dw), x + m))
-    for k in range(len(J)):
-        T = decided(problem, feedback, k, x)
-        z = y if T is None else y @ T.T
-        y = np.hstack([z @ J[k].T + dw[:, k] @ G[k].T, z[:, -m:]])
-        found[:, k + 1] = y[:, :x]
+        values, beyond = (np.concatenate([getattr(part, name) for part in pairs]) for name in ("values", "beyond"))
+        finished = np.isfinite(values).all(axis=1)
+        found.append(_Counted(values[finished], beyond[finished]))
+    left = len(found[0].values) if found else 0
+    if rows and 2 * left < last - first:
+        raise VarpinError(f"{last - first - left} of {last - first} motions under noise fail")
     return found

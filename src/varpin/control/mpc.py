@@ -187,7 +187,8 @@ class Mpc:
     Constraints hold along every horizon, and moving obstacles are predicted. Multipliers are kept from tick to tick,
     shifted with the plan. Each iteration of a tick is one of the augmented Lagrangian, so a plan satisfies its
     constraints to the accuracy of few iterations; ``MpcRun.constraints`` has it for every tick. A goal
-    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan.
+    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. Held
+    controls keep to constraints at the nodes alone after the first plan, linear ones at the middles of steps, too.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -398,7 +399,7 @@ class Mpc:
         motion, found = examined_in_loop(plant.scene, method, chained(parts), plant.substeps, corrected=True)
         found = (*noise_forgotten(plant.scene, rng), *unfit, *found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
-        found = (*found, *_whole_ticks(duration, ticks, self.period))
+        found = (*found, *_whole_ticks(duration, ticks, self.period), *_at_nodes_alone(problem))
         held = kept(problem, tuple(plans), motion, plant.substeps)
         found = (*found, *_outside(held, noisy=bool(motion.dw.any())), *_blown_up(plans, motion))
         announce(logger, plant.scene, dt, found)
@@ -449,6 +450,17 @@ def _outside(held: Sequence[Kept], *, noisy: bool) -> tuple[Finding, ...]:
                 )
             )
     return tuple(found)
+
+
+def _at_nodes_alone(problem: OptimalControlProblem) -> tuple[Finding, ...]:
+    """A finding if the problem asks for constraints between nodes, which ticks with held controls leave out."""
+    if not problem.between_nodes or problem.linear:
+        return ()
+    sentence = (
+        "after the first plan, constraints hold at the nodes alone, although the problem has between_nodes=True: a "
+        'smaller dt, or controls="linear", which keeps to them at the middles of steps, too, leaves less between nodes'
+    )
+    return (Finding("nodes alone", sentence),)
 
 
 def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, ...]:

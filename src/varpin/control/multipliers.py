@@ -32,7 +32,7 @@ class Multipliers(Frozen):
 
     Attributes:
         values: Multipliers of the plan's motion (M,) [cost / unit of the constraint].
-        backoff: ``margin`` standard deviations (M,) and what is ``added``, in the constraint's unit; zero without one.
+        backoff: ``margin`` standard deviations (M,), and what is ``added`` to them, in the constraint's unit.
         begun: Multipliers at the beginning of the last round (M,).
         weights: Weight of each constraint's penalty in the last round (C,) [cost / unit^2].
         first_weights: The same in the first round (C,).
@@ -46,7 +46,7 @@ class Multipliers(Frozen):
         offsets: What is added to the values of these rows (O,), where the motion has a peak between two instants.
         added: What is added to margins of the rows at nodes, as motions under noise were counted; None where margins of
             the linear model suffice.
-        counts: How often they were counted.
+        counts: How often margins have become wider for that reason.
         cubic: Whether these rows are on the cubics through the steps, as in a controller's ticks, not of steps
             integrated in parts.
     """
