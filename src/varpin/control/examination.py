@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from varpin.arrays import Floats
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
