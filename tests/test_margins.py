@@ -71,7 +71,7 @@ def test_tails_beyond_what_motions_show():
     given = np.column_stack(
         [rng.standard_normal(4096), np.sign(rng.standard_normal(4096)) * rng.exponential(size=4096)]
     )
-    normal, exponential = _Counted(given - 4.0, given > 4.0).needed(row)
+    normal, exponential = _Counted(given - 4.0, given > 4.0, given > 4.0).needed(row)
     assert 4.0 < normal < 5.5
     # One side of a distribution that has two.
     assert exponential == pytest.approx(np.log(0.5 / ndtr(-4.0)), rel=0.25)
@@ -149,7 +149,15 @@ def test_margins_that_suffice_stay():
     np.testing.assert_allclose(plan.multipliers.backoff.reshape(own.shape), 2.0 * own, rtol=2e-3, atol=1e-12)
 
 
-@pytest.mark.parametrize("when", ["before the count", "at the count", "after it", "while counting"])
+@pytest.mark.parametrize(
+    "when",
+    [
+        pytest.param("before the count", marks=pytest.mark.slow),
+        "at the count",
+        pytest.param("after it", marks=pytest.mark.slow),
+        "while counting",
+    ],
+)
 def test_counted_margins_are_resumed_to_the_bit(when, tmp_path, monkeypatch):
     problem = under_a_lid(vp.AdditiveNoise(0.4))
     rounds = []
@@ -181,6 +189,7 @@ def test_counted_margins_are_resumed_to_the_bit(when, tmp_path, monkeypatch):
     np.testing.assert_array_equal(rest.multipliers.added, whole.multipliers.added)
 
 
+@pytest.mark.slow
 def test_a_start_near_a_bound_needs_no_later_margin():
     """What is added where motions have spread is not asked for at the first nodes, where they have not."""
     scene = vp.Scene(ROBOT, damping=0.5, noise=vp.AdditiveNoise(0.4))
@@ -200,10 +209,14 @@ def test_a_bound_that_the_linear_model_sees_no_motion_towards_is_counted():
     cost = vp.ControlCost(1.0) + vp.VelocityCost(0.3) + vp.TrackingCost(bottom, 0.1)
     lid = vp.KeepInHalfSpace(ROBOT, "tip", [0.0, 0.0, -1.0], 1.99, margin=2.0)
     problem = vp.OptimalControlProblem(scene, cost, bottom, np.zeros(2), constraints=[lid], **GRID)
-    plan = vp.solve(problem, check=False)
-    assert (values(problem, plan) > 0.0).mean() > 0.1
-    assert widened(plan) is not None
-    assert "more often than their margins allow" in plan.reason or plan.status is vp.Status.INFEASIBLE
+    plan = vp.solve(problem, check=False, max_iterations=3)
+    (bound,) = problem.bound_constraints
+    own = deviations(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains), bound)
+    assert own.max() < 1e-6
+    outside = (values(problem, plan) > 0.0).mean(axis=0)
+    assert outside.max() > 0.1
+    (added,) = widened(plan)
+    assert (added[outside > 0.1] > 0.01).all()
 
 
 def test_a_warning_of_a_small_margin_counts():

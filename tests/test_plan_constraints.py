@@ -1116,6 +1116,7 @@ def test_bounds_on_the_way_to_a_goal_that_they_forbid_settle():
     assert len(plan.history) <= 40
 
 
+@pytest.mark.slow
 def test_margins_settle_where_noise_follows_the_controls():
     """They are those of the plan at every node, or more; plain rounds end with half and twice as much, in turns."""
     robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})

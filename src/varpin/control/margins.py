@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from dataclasses import dataclass, replace
@@ -31,7 +32,7 @@ from varpin.support.frozen import Frozen
 
 # Motions that choose the rows to count. Motions that are counted: _FIRST, then twice as many until standard errors of
 # shares are at most _SHARP of what is promised, up to _MOST; and _ALONE where only Python evaluates the noise.
-_CHOOSING, _FIRST, _SHARP, _MOST, _ALONE = 256, 1024, 0.12, 8192, 512
+_CHOOSING, _FIRST, _SHARP, _MOST, _ALONE = 256, 512, 0.12, 8192, 512
 # Standard errors above what is promised at which margins become wider. How much more often than promised, beyond
 # _DOUBT standard errors, a bound is violated for a warning.
 _CLEARLY, _OFTEN, _DOUBT = 1.0, 1.2, 2.0
@@ -81,15 +82,16 @@ class _Row(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class _Counted(Frozen):
-    """P motions under noise.
+    """P motions under noise, and the linear model under the same noise.
 
     Attributes:
-        values: c in each (P, R).
-        beyond: Whether c is more than the margin's standard deviations beyond the plan to first order, under the same
-            noise (P, R).
+        values: c in each motion (P, R).
+        outside: Whether the linear model violates the bound (P, R).
+        beyond: Whether it is more than the margin's standard deviations beyond the plan (P, R).
     """
 
     values: Floats
+    outside: Mask
     beyond: Mask
 
     def shares(self, row: _Row) -> tuple[Floats, Floats]:
@@ -97,14 +99,16 @@ class _Counted(Frozen):
 
         The share of the linear model is known, and most motions agree with it: it is a control variate.
         """
-        known = np.where(row.simple[row.near] > 0.0, row.promised, 0.0)
-        apart = (self.values > 0.0).astype(float) - self.beyond
+        planned, simple = row.planned[row.near], row.simple[row.near]
+        known = np.where(simple > 0.0, ndtr(planned / np.where(simple > 0.0, simple, 1.0)), 0.0)
+        apart = (self.values > 0.0).astype(float) - self.outside
         share = np.clip(known + apart.mean(axis=0), 0.0, 1.0)
         return share, np.maximum(apart.std(axis=0) / math.sqrt(len(apart)), 1.0 / len(apart))
 
     def and_more(self, other: _Counted) -> _Counted:
         """These motions and others."""
-        return _Counted(np.concatenate([self.values, other.values]), np.concatenate([self.beyond, other.beyond]))
+        parts = zip(vars(self).values(), vars(other).values(), strict=True)
+        return _Counted(*(np.concatenate(pair) for pair in parts))
 
     def needed(self, row: _Row) -> Floats:
         """Distances from the plan that motions exceed as often as promised (R,), and a standard error more."""
@@ -352,10 +356,11 @@ def _played(plan: Solution, model: _Model, rows: list[_Row], seeds: Children, fi
         no_controls = np.zeros((len(q), problem.decisions, problem.scene.controls))
         x, found = model.deviations(problem, dw), []
         for row in rows:
-            linear = np.einsum("krx,Pkx->Pkr", row.slopes, x[:, row.bound.places])
-            limit = np.where(row.simple > 0.0, row.bound.source.margin * row.simple, np.inf)
-            values = row.bound.value(q, v, no_controls)
-            found.append(_Counted(values[:, row.near], (linear > limit)[:, row.near]))
+            linear = np.einsum("krx,Pkx->Pkr", row.slopes, x[:, row.bound.places])[:, row.near]
+            moves, limit = row.simple[row.near] > 0.0, row.bound.source.margin * row.simple[row.near]
+            values = row.bound.value(q, v, no_controls)[:, row.near]
+            outside, beyond = (moves & (linear > bound) for bound in (-row.planned[row.near], limit))
+            found.append(_Counted(values, outside, beyond))
         return found
 
     def together(chunk: Chunk) -> list[_Counted]:
@@ -380,9 +385,9 @@ def _played(plan: Solution, model: _Model, rows: list[_Row], seeds: Children, fi
             parts.append(of_motions(motion.q[None], motion.v[None], dw[None]))
     found = []
     for pairs in zip(*parts, strict=True):
-        values, beyond = (np.concatenate([getattr(part, name) for part in pairs]) for name in ("values", "beyond"))
-        finished = np.isfinite(values).all(axis=1)
-        found.append(_Counted(values[finished], beyond[finished]))
+        whole = functools.reduce(_Counted.and_more, pairs)
+        finished = np.isfinite(whole.values).all(axis=1)
+        found.append(_Counted(*(array[finished] for array in vars(whole).values())))
     left = len(found[0].values) if found else 0
     if rows and 2 * left < last - first:
         raise VarpinError(f"{last - first - left} of {last - first} motions under noise fail")
