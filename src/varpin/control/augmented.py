@@ -457,7 +457,7 @@ class _Rounds:
         if not feasible and (stuck >= _STUCK or begun.round + 1 >= _ROUNDS or (heavy and stuck)):
             if _blocked(found):
                 return found.status, f"{state}; {found.reason}"
-            return Status.INFEASIBLE, _infeasible(worst, counted=self._is_wider(begun, constraints.index(worst)))
+            return Status.INFEASIBLE, self._infeasible(kept, begun, worst, constraints.index(worst))
         if feasible and begun.round + 1 >= _ROUNDS:
             return found.status, found.reason
         more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
@@ -478,11 +478,19 @@ class _Rounds:
         )
         return None, ""
 
-    def _is_wider(self, begun: _State, constraint: int) -> bool:
-        """Whether the margins of one of a round's constraints are wider than those of the linear model."""
-        if begun.added is None:
-            return False
-        return bool(self._margins(begun.added, begun.between)[constraint].any())
+    def _infeasible(self, kept: Solution, begun: _State, worst: ConstraintReport, constraint: int) -> str:
+        """Why a problem is infeasible, by the worst report, of one of a round's constraints."""
+        motion, margin = kept.trajectory, begun.backoff[constraint]
+        c = self.bound[constraint].value(motion.q, motion.v, self.problem.control_rows(motion)) + margin
+        own = float(margin.ravel()[int(c.argmax())])
+        said = (
+            f"{worst.label} cannot be met from here: {worst.where} stays violated by {worst.violation:.3g} {worst.unit}"
+        )
+        if own > 0.0:
+            said += f", its margin of {own:.3g} {worst.unit} included"
+            if begun.added is not None and self._margins(begun.added, begun.between)[constraint].any():
+                said += ", which is as wide as motions under noise need"
+        return f"{said}, whatever its penalty"
 
     def _looked_between(
         self, motion: Trajectory, between: Instants, backoff: list[Floats], least: float, rounds: int
@@ -782,11 +790,3 @@ def _blocked(found: Solution) -> bool:
         return True
     expected = max((item.expected_decrease for item in found.history[-PATIENCE:]), default=0.0)
     return found.status is Status.STALLED and expected > _MUCH * abs(found.cost)
-
-
-def _infeasible(worst: ConstraintReport, *, counted: bool) -> str:
-    wide = ", with a margin as wide as motions under noise need" if counted else ""
-    return (
-        f"{worst.label} cannot be met from here: {worst.where} stays violated by {worst.violation:.3g} {worst.unit}, "
-        f"whatever its penalty{wide}"
-    )

@@ -159,7 +159,8 @@ def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: 
     """
     pair = (-np.inf, np.inf) if limits is None else limits
     if not isinstance(pair, tuple | list | np.ndarray) or len(pair) != 2:
-        raise InputError(f"{name} must be a pair (lower, upper), got {limits!r}")
+        both_sides = f"; for +-{limits:g} write (-{limits:g}, {limits:g})" if isinstance(limits, int | float) else ""
+        raise InputError(f"{name} must be a pair (lower, upper), got {limits!r}{both_sides}")
     both = np.empty((2, size))
     for row, side, value in zip(both, ("lower", "upper"), pair, strict=True):
         array = as_floats(f"{name}: {side}", value)
