@@ -279,8 +279,8 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
         Finding(
             "noise within steps",
             f"noise costs {fine:.3g} by half steps, and {planned:.3g} by the plan's of dt = {problem.dt:g} s, which "
-            "are long for it: on the robot it costs nearer to the former. plan.monte_carlo() takes the plan's steps and "
-            f"cannot show that; {closer}",
+            "are long for it: on the robot it costs nearer to the former. plan.monte_carlo() takes the plan's steps "
+            f"and cannot show that; {closer}",
         )
     ]
 
