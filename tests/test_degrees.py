@@ -108,6 +108,24 @@ def test_a_plan_names_units_before_everything_else(scene):
     assert not unnamed(vp.solve(problem).warnings[0], FACTS)
 
 
+@pytest.mark.parametrize(("fastest", "told"), [(60.0, True), (np.deg2rad(60.0), False)])
+def test_limits_of_velocities_in_degrees_per_second(scene, fastest, told):
+    limits = vp.WithinVelocityLimits(scene.robot, (-fastest, fastest))
+    options = {"dt": 0.05, "steps": 4, "constraints": [limits]}
+    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), np.zeros(6), np.zeros(6), **options)
+    facts = ("WithinVelocityLimits", "60 rad/s", "degrees per second")
+    assert any(not unnamed(warning, facts) for warning in vp.solve(problem, max_iterations=1).warnings) == told
+
+
+def test_a_plan_names_units_before_its_search(scene, caplog):
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(HOME, 1.0))
+    # Each warning is logged once for a scene and a step.
+    problem = vp.OptimalControlProblem(scene, cost, np.zeros(6), np.zeros(6), dt=0.045, steps=4)
+    said = []
+    vp.solve(problem, max_iterations=1, callback=lambda _: said.extend(each.getMessage() for each in caplog.records))
+    assert any("degrees" in message for message in said)
+
+
 def test_joints_without_limits_may_have_turned_many_times():
     """A wheel that has turned is no mistake; a number of two decimals is typed."""
     model = pin.Model()

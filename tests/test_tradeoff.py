@@ -486,14 +486,14 @@ def test_advice_meets_the_tolerance_and_takes_the_cheapest():
 
 def test_advice_within_a_budget():
     scene, rest = vp.Scene(vp.planar_chain(3)), np.zeros(3)
-    large = vp.advise(scene, rest, rest, duration=1.0, budget=2e-2)
-    # Of what the other took, which is at rounding on a fast machine.
-    small = vp.advise(scene, rest, rest, duration=1.0, budget=0.3 * large.seconds)
-    assert small.reached
+    # How much a time is enough for depends on the machine and on what else it does.
+    least, small, large = (vp.advise(scene, rest, rest, duration=1.0, budget=budget) for budget in (1e-6, 1e-3, 2e-2))
+    assert not least.reached
     assert large.reached
-    assert small.seconds <= 0.3 * large.seconds
-    assert large.seconds <= 2e-2
-    assert large.error < small.error
+    for advice, budget in ((small, 1e-3), (large, 2e-2)):
+        assert (advice.seconds <= budget) == advice.reached
+    rounding = 1e-12
+    assert large.error < small.error or large.error < rounding
     assert all(large.error <= other.error for other in large.alternatives)
 
 

@@ -18,6 +18,7 @@ from varpin.control.constraints import (
     PlanConstraint,
     ReachFrame,
     WithinJointLimits,
+    WithinVelocityLimits,
 )
 from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
 from varpin.control.costs.base import Scaled, weight_matrix
@@ -29,6 +30,7 @@ from varpin.model import (
     IN_MILLIMETRES,
     Robot,
     degrees_hint,
+    degrees_per_second_hint,
     joint_unit,
     looks_like_degrees,
     millimetres_hint,
@@ -165,9 +167,15 @@ def _away(term: FramePositionCost, root: Floats) -> float:
 
 
 def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Joint limits that look like degrees."""
+    """Limits of joints that look like degrees, and those of velocities that look like degrees per second."""
     turning = _turning(problem.scene.robot)
     for limits in problem.constraints:
+        if isinstance(limits, WithinVelocityLimits):
+            given = np.isfinite(limits.limits) & (np.abs(limits.limits) != limits.robot.velocity_limit)
+            fast = np.where(given, np.abs(limits.limits), 0.0).max(axis=0)
+            sentence = degrees_per_second_hint(limits.robot, f"{limits.label}: limit", fast)
+            if sentence:
+                yield Finding("limits in degrees", sentence)
         if not isinstance(limits, WithinJointLimits):
             continue
         # Limits of the robot's description are in radians, however wide.

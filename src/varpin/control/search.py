@@ -21,7 +21,7 @@ from varpin.control.along import Along
 from varpin.control.backward import backward
 from varpin.control.commands import controls_along, first_commands, shifted_commands
 from varpin.control.costs import CostError
-from varpin.control.examination import looked_at
+from varpin.control.examination import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
 from varpin.control.line_search import TRIAL_ERRORS, VERY_SHORT, LineSearch, Rated, Start, Step
 from varpin.control.multiple_shooting import GapClosing, Path, path_of
@@ -40,6 +40,7 @@ from varpin.mechanics.policy import LinearPolicy
 from varpin.simulation.failures import StepFailure, named
 from varpin.simulation.kinks import saturates
 from varpin.simulation.record import located
+from varpin.simulation.soundness import announce
 from varpin.support.checks import (
     JointValues,
     count,
@@ -219,6 +220,9 @@ def solve(
     if states is not None and resume is not None:
         raise InputError("resume goes on from the solution's own states: leave out either states or resume")
     path = None if states is None else path_of(problem, states)
+    if check:
+        # Before the search, which may take long where values are in wrong units.
+        announce(logger, problem.scene, problem.dt, foreseen(problem))
 
     def searched(
         problem: OptimalControlProblem,
