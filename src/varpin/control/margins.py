@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from varpin.control.paths import Chunk, chunks_of, sent, shared_by
 from varpin.control.penalties import split
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
-from varpin.control.spread import Feedback, decided, propagated, state_slopes
+from varpin.control.spread import Feedback, decided, of_values, propagated, state_slopes
 from varpin.ensemble.paths import simulate_paths
 from varpin.errors import VarpinError
 from varpin.linearization import linearize_steps
@@ -75,10 +75,6 @@ class _Row(Frozen):
         """Share of the motions that the margin allows."""
         return float(ndtr(-self.bound.source.margin))
 
-    def only(self, near: Mask) -> _Row:
-        """The same with other rows to count."""
-        return replace(self, near=near)
-
 
 @dataclass(frozen=True, eq=False)
 class _Counted(Frozen):
@@ -105,11 +101,6 @@ class _Counted(Frozen):
         share = np.clip(known + apart.mean(axis=0), 0.0, 1.0)
         return share, np.maximum(apart.std(axis=0) / math.sqrt(len(apart)), 1.0 / len(apart))
 
-    def and_more(self, other: _Counted) -> _Counted:
-        """These motions and others."""
-        parts = zip(vars(self).values(), vars(other).values(), strict=True)
-        return _Counted(*(np.concatenate(pair) for pair in parts))
-
     def needed(self, row: _Row) -> Floats:
         """Distances from the plan that motions exceed as often as promised (R,), and a standard error more."""
         planned, simple, P = row.planned[row.near], row.simple[row.near], len(self.values)
@@ -128,6 +119,15 @@ class _Counted(Frozen):
             mean = float(c[c > begin].mean()) - begin
             found[r] = begin + mean * (1.0 + 1.0 / math.sqrt(tail * P)) * math.log(tail / promised)
         return found
+
+
+def _joined(parts: Sequence[_Counted]) -> _Counted:
+    """The motions of all parts that got to the end."""
+    values = np.concatenate([part.values for part in parts])
+    outside = np.concatenate([part.outside for part in parts])
+    beyond = np.concatenate([part.beyond for part in parts])
+    finished = np.isfinite(values).all(axis=1)
+    return _Counted(values[finished], outside[finished], beyond[finished])
 
 
 def widened(plan: Solution, deadline: float = math.inf) -> list[Floats] | None:
@@ -198,7 +198,7 @@ def too_small(solution: Solution) -> list[Finding]:
             if share.max() > _OFTEN * row.promised:
                 one = np.zeros_like(row.near)
                 one[tuple(np.argwhere(row.near)[share.argmax()])] = True
-                chosen.append(row.only(one))
+                chosen.append(replace(row, near=one))
         # The choice would make the same motions count too many.
         counted = _counted(solution, model, chosen, (_WARN, 0))
     except VarpinError as error:
@@ -293,10 +293,7 @@ def _chosen(plan: Solution, model: _Model, seed: tuple[int, ...]) -> list[_Row]:
         if not bound.source.margin > 0.0:
             continue
         slopes = bound.jacobian(motion.q, motion.v) @ to_state[bound.places]
-        own, simple = (
-            np.sqrt(np.maximum(np.einsum("krx,kxy,kry->kr", slopes, part[bound.places], slopes), 0.0))
-            for part in spreads
-        )
+        own, simple = (of_values(slopes, part[bound.places]) for part in spreads)
         planned = bound.value(motion.q, motion.v, u)
         rows.append(_Row(bound, np.ones(bound.shape, dtype=bool), planned, slopes, own, simple, margin, more))
     found = []
@@ -305,7 +302,7 @@ def _chosen(plan: Solution, model: _Model, seed: tuple[int, ...]) -> list[_Row]:
         close = -row.planned <= _NEAR * row.margin + _NEARER * row.own
         near = (close & (row.own > 0.0)) | ((motions.values > 0.0).mean(axis=0) > row.promised).reshape(close.shape)
         if near.any():
-            found.append(row.only(near))
+            found.append(replace(row, near=near))
     return found
 
 
@@ -337,7 +334,7 @@ def _counted(
         if time.perf_counter() > deadline:
             raise VarpinError("the time is up")
         more = _played(plan, model, rows, seeds, first, last)
-        found = [one.and_more(two) for one, two in zip(found, more, strict=True)] if found else more
+        found = [_joined(pair) for pair in zip(found, more, strict=True)] if found else more
         errors = (one.shares(row)[1].max() / row.promised for one, row in zip(found, rows, strict=True))
         if alone or last >= _MOST or max(errors) <= sharp:
             return found
@@ -359,7 +356,7 @@ def _played(plan: Solution, model: _Model, rows: list[_Row], seeds: Children, fi
             linear = np.einsum("krx,Pkx->Pkr", row.slopes, x[:, row.bound.places])[:, row.near]
             moves, limit = row.simple[row.near] > 0.0, row.bound.source.margin * row.simple[row.near]
             values = row.bound.value(q, v, no_controls)[:, row.near]
-            outside, beyond = (moves & (linear > bound) for bound in (-row.planned[row.near], limit))
+            outside, beyond = moves & (linear > -row.planned[row.near]), moves & (linear > limit)
             found.append(_Counted(values, outside, beyond))
         return found
 
@@ -383,11 +380,7 @@ def _played(plan: Solution, model: _Model, rows: list[_Row], seeds: Children, fi
             except (StepFailure, NoiseError):
                 continue
             parts.append(of_motions(motion.q[None], motion.v[None], dw[None]))
-    found = []
-    for pairs in zip(*parts, strict=True):
-        whole = functools.reduce(_Counted.and_more, pairs)
-        finished = np.isfinite(whole.values).all(axis=1)
-        found.append(_Counted(*(array[finished] for array in vars(whole).values())))
+    found = [_joined(of_row) for of_row in zip(*parts, strict=True)]
     left = len(found[0].values) if found else 0
     if rows and 2 * left < last - first:
         raise VarpinError(f"{last - first - left} of {last - first} motions under noise fail")

@@ -101,6 +101,11 @@ def deviations(
     """Standard deviations (K, rows) of a state constraint about a motion under feedback and the scene's noise."""
     found = covariances(problem, motion, feedback)
     J = bound.jacobian(motion.q, motion.v) @ state_slopes(problem, motion)[bound.places]
-    variance = np.einsum("krx,kxy,kry->kr", J, found[bound.places], J)
+    return of_values(J, found[bound.places])
+
+
+def of_values(J: Floats, covariance: Floats) -> Floats:
+    """Standard deviations (K, rows) of values with derivatives J (K, rows, 2n), by covariances of x (K, 2n, 2n)."""
+    variance = np.einsum("krx,kxy,kry->kr", J, covariance, J)
     spread: Floats = np.sqrt(np.maximum(variance, 0.0))
     return spread
