@@ -189,9 +189,9 @@ class _Rounds:
         began = time.perf_counter()
         # A search without iterations checks the options and makes the first motion.
         first = self._first()
-        if self.check:
-            # Before the search, which takes long where there is no plan.
-            announce(logger, self.problem.scene, self.problem.dt, foreseen(self.problem))
+        # Before the search, which takes long where there is no plan.
+        before = foreseen(self.problem) if self.check else []
+        announce(logger, self.problem.scene, self.problem.dt, before)
         hopeless = out_of_reach(self.problem, first.trajectory)
         last = len(self.history) + (min(self.most, _HOPELESS) if hopeless else self.most)
         found, resume = first, self._resumed_search()
@@ -248,7 +248,7 @@ class _Rounds:
                 kept, status, reason = ended_with, Status.INTERRUPTED, found.reason
             break
         plan = self._told_between(replace(kept, status=status, reason=reason))
-        return looked_at(plan)[0] if self.check else plan
+        return looked_at(plan, before)[0] if self.check else plan
 
     def _first(self) -> Solution:
         """The first motion, and the state of the first round."""

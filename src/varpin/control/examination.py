@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,13 +69,14 @@ class Replay:
         return -GAIN <= self.feedback <= LOSS
 
 
-def looked_at(solution: Solution) -> tuple[Solution, tuple[Finding, ...]]:
+def looked_at(solution: Solution, before: Sequence[Finding] | None = None) -> tuple[Solution, tuple[Finding, ...]]:
     """Check a solution: returns it with its warnings, and the findings.
 
-    The log has each warning once for a scene and a time step. Ctrl-C ends the checks and keeps the plan.
+    The log has each warning once for a scene and a time step. Ctrl-C ends the checks and keeps the plan. ``before`` are
+    the findings of :func:`foreseen` about its problem, where they are known.
     """
     try:
-        found = findings(solution)
+        found = findings(solution, before)
     except KeyboardInterrupt:
         found = (Finding("interrupted", "interrupted before the plan was replayed: its accuracy is not known"),)
     problem = solution.problem
@@ -82,11 +84,11 @@ def looked_at(solution: Solution) -> tuple[Solution, tuple[Finding, ...]]:
     return replace(solution, warnings=tuple(finding.sentence for finding in found)), found
 
 
-def findings(solution: Solution) -> tuple[Finding, ...]:
+def findings(solution: Solution, before: Sequence[Finding] | None = None) -> tuple[Finding, ...]:
     """Findings about a plan: its energy balance, velocities, constraints, convergence and cost in finer steps."""
     problem, motion = solution.problem, solution.trajectory
     _, found = examined(problem.scene, problem.integrator, motion)
-    warnings = foreseen(problem)
+    warnings = [*(foreseen(problem) if before is None else before)]
     warnings += [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
     if solution.refinement is not None and not solution.refinement.met:
         warnings.append(Finding("true cost", solution.refinement.reason))

@@ -220,9 +220,9 @@ def solve(
     if states is not None and resume is not None:
         raise InputError("resume goes on from the solution's own states: leave out either states or resume")
     path = None if states is None else path_of(problem, states)
-    if check:
-        # Before the search, which may take long where values are in wrong units.
-        announce(logger, problem.scene, problem.dt, foreseen(problem))
+    # Before the search, which may take long where values are in wrong units.
+    before = foreseen(problem) if check else []
+    announce(logger, problem.scene, problem.dt, before)
 
     def searched(
         problem: OptimalControlProblem,
@@ -290,7 +290,7 @@ def solve(
         return looked_at(refined)[0] if check else refined
 
     solution = searched(problem, controls, resume, path=path)
-    return looked_at(solution)[0] if check else solution
+    return looked_at(solution, before)[0] if check else solution
 
 
 def closing_of(problem: OptimalControlProblem, states: object, controls: object) -> GapClosing:
