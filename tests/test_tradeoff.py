@@ -16,7 +16,9 @@ from refusals import naming, refused
 import varpin as vp
 from varpin.show.plots import plot_optimal_control_tradeoff, plot_work_precision
 from varpin.show.tradeoff_report import write_report
+from varpin.simulation.refinement import Sample
 from varpin.study.tradeoff import INTEGRATORS, optimal_control, precision
+from varpin.study.tradeoff import advice as advising
 from varpin.study.tradeoff.records import pareto_front
 from varpin.study.tradeoff.setting import Setting
 
@@ -484,16 +486,22 @@ def test_advice_meets_the_tolerance_and_takes_the_cheapest():
     assert 0.01 < advice.largest_step < 1.0
 
 
-def test_advice_within_a_budget():
+def test_advice_within_a_budget(monkeypatch):
+    """On a machine of a pace of its own: a microsecond for each stage of a step."""
+
+    def paced(setting, integrator, steps):
+        outcome = setting.run(integrator, steps)
+        pure = not outcome.failure and outcome.split_steps == 0
+        return Sample(steps, outcome.q[1:], 1e-6 * steps * getattr(integrator, "stages", 1), pure)
+
+    monkeypatch.setattr(advising, "_timed", paced)
     scene, rest = vp.Scene(vp.planar_chain(3)), np.zeros(3)
-    # How much a time is enough for depends on the machine and on what else it does.
-    least, small, large = (vp.advise(scene, rest, rest, duration=1.0, budget=budget) for budget in (1e-6, 1e-3, 2e-2))
-    assert not least.reached
+    small, large = (vp.advise(scene, rest, rest, duration=1.0, budget=budget) for budget in (1e-4, 2e-2))
+    assert small.reached
     assert large.reached
-    for advice, budget in ((small, 1e-3), (large, 2e-2)):
-        assert (advice.seconds <= budget) == advice.reached
-    rounding = 1e-10
-    assert large.error < small.error or large.error < rounding
+    assert small.seconds <= 1e-4
+    assert large.seconds <= 2e-2
+    assert large.error < small.error
     assert all(large.error <= other.error for other in large.alternatives)
 
 
