@@ -29,6 +29,13 @@ FLAGS = [
     "--window-size=800,600",
 ]
 
+# Without a graphics card drawing takes most of the time, and most tests look at what is drawn, not at the picture.
+UNDRAWN = """
+    for (const method of ["drawElements", "drawArrays"]) {
+        const draw = WebGL2RenderingContext.prototype[method];
+        WebGL2RenderingContext.prototype[method] = function(...given) { if (window.drawn) draw.apply(this, given); };
+    }"""
+
 
 @contextlib.contextmanager
 def session(chromium, driver, profile):
@@ -40,6 +47,7 @@ def session(chromium, driver, profile):
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=Service(driver))
     browser.set_script_timeout(60)
+    browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": UNDRAWN})
     try:
         yield browser
     finally:
@@ -54,7 +62,10 @@ def wait_until(condition, seconds=60.0):
 
 
 def visit(browser, path):
-    """Load a page offline; returns once every command has reached the viewer."""
+    """Load a page offline; returns once every command has reached the viewer.
+
+    It moves, but is not drawn until there is a picture of it.
+    """
     browser.get_log("browser")
     browser.execute_cdp_cmd("Network.enable", {})
     offline = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
@@ -74,7 +85,13 @@ def seek(browser, seconds):
 
 def picture(browser):
     """The scene (height, width, 3), without the strip that holds meshcat's controls, the bar and the key to colours."""
-    browser.execute_script("document.getElementById('about').style.visibility = 'hidden'")
+    browser.execute_async_script(
+        """
+        document.getElementById('about').style.visibility = 'hidden';
+        window.drawn = true;
+        viewer.set_dirty();
+        requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(arguments[0])));"""
+    )
     bar = browser.execute_script("return document.getElementById('bar')?.offsetHeight ?? 0")
     image = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
     return np.asarray(image, dtype=float)[40 : image.height - bar]

@@ -60,6 +60,8 @@ _FINAL, _FINEST = 1e-2, 1e-7
 _GROWTH, _ENOUGH = 10.0, 0.2
 # Greatest weight of a penalty, relative to its first one: rounding errors of a heavier penalty exceed the cost.
 _HEAVIEST = 1e9
+# Least cost, relative to that of the first motion, that first penalties are as heavy as.
+_LEFT = 1e-4
 # First penalties are light if the model would remove less than _LIGHT of them. They are made heavier until that is no
 # longer so, by at most _HEAVIER at a time, in at most _LIFTS times. Shares up to _ROUNDED may be rounding errors.
 _LIGHT, _HEAVIER, _LIFTS, _ROUNDED = 1e-2, 1e8, 8, 1e-9
@@ -267,13 +269,17 @@ class _Rounds:
         )
         if first.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        cost = abs(first.cost)
-        if self.states is not None:
+        cost, expected = abs(first.cost), 0.0
+        if self.states is None:
+            expected = _expected(plain, first.trajectory)
+            # What is left without constraints, as far as the model sees: a bad first motion costs much more than a plan.
+            cost = max(cost - expected, _LEFT * cost)
+        else:
             # Where the auxiliary forces are dropped at once, the motion may fall, and its cost says nothing.
             cost = min(cost, abs(closing_of(plain, self.states, self.controls).motion.cost))
         weights = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
         if self.states is None:
-            weights = weights * self._heavier(plain, first.trajectory, weights)
+            weights = weights * self._heavier(first.trajectory, weights, expected)
         nothing = np.full(len(self.bound), np.inf)
         self.state = _State(zeros, weights, weights, zeros, nothing, _LOOSE)
         if self.before is not None and self.before.multipliers is not None:
@@ -303,12 +309,12 @@ class _Rounds:
         added = None if known.added is None else finer(split(bound, known.added))
         return replace(begun, multipliers=values, weights=weights, backoff=finer(backoff), added=added)
 
-    def _heavier(self, plain: OptimalControlProblem, motion: Trajectory, weights: Floats) -> float:
+    def _heavier(self, motion: Trajectory, weights: Floats, base: float) -> float:
         """Factor of first weights that are light: those of a first motion that costs next to nothing.
 
         The share of the penalties that the model along the motion removes grows in proportion to light weights, and
         then goes towards the share that controls can remove at all. Where that is none, the factor is 1. So it is near
-        the constraints, as along a plan within them. ``plain`` is the problem whose penalties have no weight.
+        the constraints, as along a plan within them. ``base`` is the expected decrease without penalties.
         """
         zeros = [np.zeros(item.shape) for item in self.bound]
         known = reports_of(self.whole, motion, zeros, zeros)
@@ -322,10 +328,8 @@ class _Rounds:
             found = backward(made, motion, 0.0) if whole > 0.0 else None
             return np.nan if found is None else (found.expected_decrease - base) / whole
 
-        base, factor = 0.0, 1.0
+        factor = 1.0
         try:
-            alone = backward(plain, motion, 0.0)
-            base = 0.0 if alone is None else alone.expected_decrease
             share = removed(factor)
             for _ in range(_LIFTS):
                 if not share < _LIGHT:
@@ -747,6 +751,15 @@ class _Rounds:
         steady = self._margins([_steadier(part) for part in backoff[:count]], begun.between)
         taken = 1.0 if begun.round == _PLAIN else _TAKEN
         return [old + taken * (new - old) for new, old in zip(steady, begun.backoff, strict=True)]
+
+
+def _expected(problem: OptimalControlProblem, motion: Trajectory) -> float:
+    """Decrease of the cost that the model along a motion expects, or 0 where there is no model."""
+    try:
+        found = backward(problem, motion, 0.0)
+    except (CostError, NoiseFieldError, LinearizationError):
+        return 0.0
+    return 0.0 if found is None else found.expected_decrease
 
 
 def _change(new: list[Floats], old: list[Floats]) -> float:
