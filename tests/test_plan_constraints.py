@@ -308,6 +308,22 @@ def test_first_penalties_on_given_states_are_light():
     assert told < 1e-2 * plan.cost
 
 
+def test_first_penalties_are_not_those_of_a_bad_first_motion():
+    # Without torques the arm falls, at ten thousand times the cost of a plan. With penalties for that the search had
+    # 500 iterations and ended above the optimum.
+    robot, rest = vp.load_robot("kinova"), np.zeros(6)
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(rest + 0.3, 100.0) + vp.VelocityCost(1.0))
+    limits = [vp.WithinVelocityLimits(robot, (-1.0, 1.0))]
+    problem = vp.OptimalControlProblem(vp.Scene(robot), cost, rest, rest, dt=0.05, steps=10, constraints=limits)
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged, plan.reason
+    assert len(plan.history) <= 40
+    assert plan.violation <= 1e-6
+    # Other first motions end at the same cost.
+    held = np.tile(vp.Scene(robot).holding_torque(rest), (10, 1))
+    assert vp.solve(problem, held, check=False).cost == pytest.approx(plan.cost, rel=1e-6)
+
+
 def test_servos_within_velocity_limits():
     """A stiff servo: in steps that the guard divides the search would find no plan, and call the limits infeasible."""
     robot = vp.load_robot("ur5")

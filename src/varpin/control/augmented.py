@@ -60,8 +60,8 @@ _FINAL, _FINEST = 1e-2, 1e-7
 _GROWTH, _ENOUGH = 10.0, 0.2
 # Greatest weight of a penalty, relative to its first one: rounding errors of a heavier penalty exceed the cost.
 _HEAVIEST = 1e9
-# Least cost, relative to that of the first motion, that first penalties are as heavy as.
-_LEFT = 1e-4
+# Least share of the first motion's cost for which the penalties of the first round are.
+_LEFT, _SPARE = 1e-4, 10.0
 # First penalties are light if the model would remove less than _LIGHT of them. They are made heavier until that is no
 # longer so, by at most _HEAVIER at a time, in at most _LIFTS times. Shares up to _ROUNDED may be rounding errors.
 _LIGHT, _HEAVIER, _LIFTS, _ROUNDED = 1e-2, 1e8, 8, 1e-9
@@ -269,19 +269,21 @@ class _Rounds:
         )
         if first.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        cost, expected = abs(first.cost), 0.0
+        cost, left, expected = abs(first.cost), 1.0, 0.0
         if self.states is None:
             expected = _expected(plain, first.trajectory)
-            # What is left without constraints, as far as the model sees: a bad first motion costs much more than a plan.
-            cost = max(cost - expected, _LEFT * cost)
+            # What the model leaves of it without constraints: a bad first motion costs much more than a plan.
+            left = float(np.clip(_SPARE * (1.0 - expected / (cost or 1.0)), _LEFT, 1.0)) if expected > 0.0 else 1.0
         else:
             # Where the auxiliary forces are dropped at once, the motion may fall, and its cost says nothing.
             cost = min(cost, abs(closing_of(plain, self.states, self.controls).motion.cost))
-        weights = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
+        usual = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
+        # A motion that began within an obstacle may end on both of its sides.
+        weights = np.where([item.linear for item in self.bound], left, 1.0) * usual
         if self.states is None:
             weights = weights * self._heavier(first.trajectory, weights, expected)
         nothing = np.full(len(self.bound), np.inf)
-        self.state = _State(zeros, weights, weights, zeros, nothing, _LOOSE)
+        self.state = _State(zeros, weights, np.maximum(weights, usual), zeros, nothing, _LOOSE)
         if self.before is not None and self.before.multipliers is not None:
             self.state = self._carried(self.before.problem, self.before.multipliers)
         return first

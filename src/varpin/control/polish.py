@@ -196,7 +196,8 @@ class _Step:
         """
         problem, loop, motion = self.problem, self.loop, self.motion
         met = self.rows
-        room = [np.where(rows, 0.0, c) for rows, c in zip(met, self.c, strict=True)]
+        room = [np.where(rows & (item.source.equality | (c > 0.0)), 0.0, c)
+                for rows, (item, c) in zip(met, self._values(), strict=True)]  # fmt: skip
         self.rows = [rows | (c > -_CLOSE * item.scale) for rows, (item, c) in zip(met, self._values(), strict=True)]
         multipliers, pull = self._dual(room, np.zeros(self.free.shape), loop.gradient)
         self.rows = met

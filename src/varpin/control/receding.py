@@ -27,7 +27,7 @@ from varpin.trajectory import Trajectory
 
 # A penalty's weight grows by _GROWTH after a tick that leaves more than _ENOUGH of its constraint's violation, up to
 # _HEAVIEST times its first weight: stiffer penalties take more iterations than a tick has.
-_GROWTH, _ENOUGH, _HEAVIEST = 10.0, 0.5, 1e4
+_GROWTH, _ENOUGH, _HEAVIEST = 10.0, 0.5, 100.0
 # Greatest number of backward passes that determine an iteration's active rows; most are known from the tick before.
 _PASSES = 8
 # The share of the time left that these passes take at most; the rest is for the linearization and trials.
