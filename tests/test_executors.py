@@ -296,6 +296,7 @@ def deadly_once(number):
     return marker, os.getpid()
 
 
+@pytest.mark.slow
 def test_a_pool_made_anew_is_like_the_one_that_broke_and_told_of_once(tmp_path, caplog):
     marker = str(tmp_path / "marker")
     with (

@@ -254,6 +254,7 @@ def long_runs(integrator, dt, duration, starts):
     return np.array([run.energy - run.energy[0] for run in runs]) / (GRAVITY * 9 / 2), split, jets
 
 
+@pytest.mark.slow
 def test_energy_of_long_runs_has_no_trend_and_gauss_a_twentieth_of_the_midpoint_rules_error():
     """1000 s, chaotic, so eight starts within 1e-6 rad are eight independent runs; Gauss at twice the step."""
     starts = np.arange(8) * 1e-7

@@ -92,10 +92,11 @@ def beyond_a_joint_limit(robot, begin, travel, noise, damping):
 @pytest.mark.parametrize(
     "problem",
     [
-        under_a_lid(vp.AdditiveNoise(0.4)),
-        beyond_a_joint_limit(ROBOT, [0.0, 0.0], [1.0, 0.5], vp.ControlNoise(0.06), 0.3),
+        pytest.param(under_a_lid(vp.AdditiveNoise(0.4)), id="additive", marks=pytest.mark.slow),
+        pytest.param(
+            beyond_a_joint_limit(ROBOT, [0.0, 0.0], [1.0, 0.5], vp.ControlNoise(0.06), 0.3), id="of the controls"
+        ),
     ],
-    ids=["additive", "of the controls"],
 )
 def test_chance_constraints_hold(problem):
     """At most 2.3 % and three standard errors of other motions violate a bound; with plain margins more do."""
@@ -153,7 +154,7 @@ def test_margins_that_suffice_stay():
     "when",
     [
         pytest.param("before the count", marks=pytest.mark.slow),
-        "at the count",
+        pytest.param("at the count", marks=pytest.mark.slow),
         pytest.param("after it", marks=pytest.mark.slow),
         "while counting",
     ],

@@ -187,6 +187,7 @@ def test_reversible():
     np.testing.assert_allclose(-back.v[-1], v0, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_energy_round_off_walks_at_random():
     """A mass on a spring: the midpoint rule conserves its energy exactly, so what is left is rounding."""
     model = pin.Model()

@@ -60,7 +60,7 @@ def chain(controls, constraints=None, **options):
     return vp.OptimalControlProblem(vp.Scene(CHAIN, damping=0.3), cost, [0.0, 0.4], [0.0, 0.0], **given)
 
 
-@pytest.mark.parametrize("iterations", [1, 2])
+@pytest.mark.parametrize("iterations", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("build", "duration", "most"), [(beside_a_ball, 1.6, 2e-3), (within_speeds, 0.8, 1e-2), (chain, 1.5, 1e-2)]
 )
