@@ -278,8 +278,9 @@ class _Rounds:
             # Where the auxiliary forces are dropped at once, the motion may fall, and its cost says nothing.
             cost = min(cost, abs(closing_of(plain, self.states, self.controls).motion.cost))
         usual = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
-        # A motion that began within an obstacle may end on both of its sides.
-        weights = np.where([item.linear for item in self.bound], left, 1.0) * usual
+        # A motion that began within an obstacle may end on both of its sides, and margins change with the motion.
+        lighter = [item.linear and not self.noisy for item in self.bound]
+        weights = np.where(lighter, left, 1.0) * usual
         if self.states is None:
             weights = weights * self._heavier(first.trajectory, weights, expected)
         nothing = np.full(len(self.bound), np.inf)
