@@ -382,10 +382,10 @@ def test_control_limits_and_hold():
         assert np.abs(plan.controls).max() <= limits[1]
 
 
-def test_a_last_step_is_tried_before_a_problem_is_called_infeasible():
+def goal_within_rates(limit):
     """The rounds end a little beyond a goal and limits of rates; there is a motion within them."""
-    robot, goal, limit = vp.planar_chain(4), [2.5, 0.0, -2.2], 1000.0
-    problem = vp.OptimalControlProblem(
+    robot = vp.planar_chain(4)
+    return vp.OptimalControlProblem(
         vp.Scene(robot, damping=0.3),
         vp.ControlCost(1e-3) + vp.Terminal(vp.VelocityCost(5.0)),
         [1.2, 0.1, 0.1, 0.1],
@@ -394,15 +394,36 @@ def test_a_last_step_is_tried_before_a_problem_is_called_infeasible():
         steps=32,
         control_limits=(-50.0, 50.0),
         integrator=vp.Midpoint(),
-        constraints=[vp.ReachFrame(robot, "tip", position=goal), vp.WithinControlRate(limit)],
+        constraints=[vp.ReachFrame(robot, "tip", position=[2.5, 0.0, -2.2]), vp.WithinControlRate(limit)],
     )
+
+
+def test_a_last_step_is_tried_before_a_problem_is_called_infeasible():
+    problem, limit = goal_within_rates(1000.0), 1000.0
     plan = vp.solve(problem, check=False)
     assert plan.status is not vp.Status.INFEASIBLE
     assert np.abs(np.diff(plan.controls, axis=0)).max() <= limit * problem.dt * (1.0 + 1e-9)
+    robot = problem.scene.robot
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.configuration(plan.trajectory.q[-1]))
     place = data.oMf[robot.model.getFrameId("tip")].translation
-    np.testing.assert_allclose(place, goal, atol=1e-6)
+    np.testing.assert_allclose(place, [2.5, 0.0, -2.2], atol=1e-6)
+
+
+def test_what_is_left_of_a_violation_does_not_show_that_there_is_no_plan(monkeypatch):
+    """There is one, but a last step does not find it, and the rounds end a hair beyond the limits."""
+
+    def failed(*_):
+        raise vp.LinearizationError(0, 0.0, "no derivative")
+
+    monkeypatch.setattr("varpin.control.augmented.polished", failed)
+    monkeypatch.setattr("varpin.control.augmented._ROUNDS", 6)
+    plan = vp.solve(goal_within_rates(1000.0), check=False)
+    bound = plan.problem.bound_constraints
+    assert plan.violation > 1e-6
+    assert all(told.violation <= 1e-3 * item.scale for told, item in zip(plan.constraints, bound, strict=True))
+    assert plan.status is vp.Status.STALLED
+    assert naming([plan.reason], f"{plan.violation:.1e}")
 
 
 @pytest.mark.parametrize("torque", [1e-6, 1e-3])

@@ -238,6 +238,11 @@ class _Rounds:
                     closed, closing = self._polished(replace(kept, status=Status.STALLED))
                     if closed.violation <= FEASIBLE:
                         kept, status, reason = closed, closed.status, f"{found.reason}; {closing}"
+                    elif status is Status.INFEASIBLE:
+                        # So little says more of the search than of the constraints.
+                        worst = max(kept.constraints, key=lambda item: item.violation)
+                        status = Status.STALLED
+                        reason = f"{found.reason}; {worst.label} stays violated by {worst.violation:.1e} {worst.unit}"
                 elif kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
                     kept, closing = self._polished(replace(kept, status=status))
                     status, reason = kept.status, f"{reason}; {closing}"
