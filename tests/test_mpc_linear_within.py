@@ -109,7 +109,7 @@ def test_penalties_of_ticks_are_not_stiffer_than_one_iteration_can_follow():
         for controls in ("held", "linear")
     )  # fmt: skip
     assert linear.constraints[0].worst <= 1e-3
-    assert np.abs(linear.motion.v).max() <= np.abs(held.motion.v).max()
+    assert np.abs(linear.motion.v).max() <= 1.2 * np.abs(held.motion.v).max()
     costs = [np.mean([plan.cost for plan in run.plans]) for run in (held, linear)]
     assert costs[1] == pytest.approx(costs[0], rel=1e-2)
 

@@ -308,20 +308,33 @@ def test_first_penalties_on_given_states_are_light():
     assert told < 1e-2 * plan.cost
 
 
-def test_first_penalties_are_not_those_of_a_bad_first_motion():
-    # Without torques the arm falls, at ten thousand times the cost of a plan. With penalties for that the search had
-    # 500 iterations and ended above the optimum.
+def test_penalties_are_eased_after_a_first_motion_that_falls():
+    """It costs ten thousand times a plan. With penalties for that the search ended above the optimum, after 500."""
     robot, rest = vp.load_robot("kinova"), np.zeros(6)
     cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(rest + 0.3, 100.0) + vp.VelocityCost(1.0))
     limits = [vp.WithinVelocityLimits(robot, (-1.0, 1.0))]
     problem = vp.OptimalControlProblem(vp.Scene(robot), cost, rest, rest, dt=0.05, steps=10, constraints=limits)
     plan = vp.solve(problem, check=False)
     assert plan.status.converged, plan.reason
-    assert len(plan.history) <= 40
+    assert len(plan.history) <= 100
+    assert (plan.multipliers.weights < plan.multipliers.first_weights).all()
     assert plan.violation <= 1e-6
     # Other first motions end at the same cost.
     held = np.tile(vp.Scene(robot).holding_torque(rest), (10, 1))
     assert vp.solve(problem, held, check=False).cost == pytest.approx(plan.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("weight", [1e-7, 1e-3, 1e-2])
+def test_a_plan_that_would_cost_next_to_nothing_without_its_limit(weight):
+    """The goal is beyond it, so what the search expects without penalties says nothing of their weight."""
+    robot = vp.planar_chain(1)
+    cost = vp.ControlCost(weight) + vp.Terminal(vp.TrackingCost([1.3], 100.0) + vp.VelocityCost(1.0))
+    within = [vp.WithinJointLimits(robot, (-6.0, 1.0))]
+    given = {"dt": 0.02, "steps": 40, "constraints": within}
+    problem = vp.OptimalControlProblem(vp.Scene(robot, damping=0.5), cost, [0], [0], **given)
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged, plan.reason
+    assert plan.trajectory.q[-1, 0] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_servos_within_velocity_limits():
@@ -423,7 +436,7 @@ def test_what_is_left_of_a_violation_does_not_show_that_there_is_no_plan(monkeyp
     assert plan.violation > 1e-6
     assert all(told.violation <= 1e-3 * item.scale for told, item in zip(plan.constraints, bound, strict=True))
     assert plan.status is vp.Status.STALLED
-    assert naming([plan.reason], f"{plan.violation:.1e}")
+    assert naming([plan.reason], "stays violated", f"{plan.violation:.1e}")
 
 
 @pytest.mark.parametrize("torque", [1e-6, 1e-3])

@@ -58,10 +58,11 @@ _LOOSE, _TIGHTER = 1e-3, 0.1
 _FINAL, _FINEST = 1e-2, 1e-7
 # A penalty's weight grows by _GROWTH after a round that leaves more than _ENOUGH of its constraint's violation.
 _GROWTH, _ENOUGH = 10.0, 0.2
+# Penalties are eased to _AMPLE times what suits the cost at the end of the first round, and at least to _LEAST of the
+# first ones.
+_AMPLE, _LEAST = 10.0, 1e-4
 # Greatest weight of a penalty, relative to its first one: rounding errors of a heavier penalty exceed the cost.
 _HEAVIEST = 1e9
-# Least share of the first motion's cost for which the penalties of the first round are.
-_LEFT, _SPARE = 1e-4, 10.0
 # First penalties are light if the model would remove less than _LIGHT of them. They are made heavier until that is no
 # longer so, by at most _HEAVIER at a time, in at most _LIFTS times. Shares up to _ROUNDED may be rounding errors.
 _LIGHT, _HEAVIER, _LIFTS, _ROUNDED = 1e-2, 1e8, 8, 1e-9
@@ -240,9 +241,9 @@ class _Rounds:
                         kept, status, reason = closed, closed.status, f"{found.reason}; {closing}"
                     elif status is Status.INFEASIBLE:
                         # So little says more of the search than of the constraints.
-                        worst = max(kept.constraints, key=lambda item: item.violation)
-                        status = Status.STALLED
-                        reason = f"{found.reason}; {worst.label} stays violated by {worst.violation:.1e} {worst.unit}"
+                        told = max(kept.constraints, key=lambda item: item.violation)
+                        rest = f"{told.where} stays violated by {told.violation:.1e} {told.unit}"
+                        status, reason = Status.STALLED, f"{found.reason}; {told.label}: {rest}"
                 elif kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
                     kept, closing = self._polished(replace(kept, status=status))
                     status, reason = kept.status, f"{reason}; {closing}"
@@ -274,22 +275,15 @@ class _Rounds:
         )
         if first.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        cost, left, expected = abs(first.cost), 1.0, 0.0
-        if self.states is None:
-            expected = _expected(plain, first.trajectory)
-            # What the model leaves of it without constraints: a bad first motion costs much more than a plan.
-            left = float(np.clip(_SPARE * (1.0 - expected / (cost or 1.0)), _LEFT, 1.0)) if expected > 0.0 else 1.0
-        else:
+        cost = abs(first.cost)
+        if self.states is not None:
             # Where the auxiliary forces are dropped at once, the motion may fall, and its cost says nothing.
             cost = min(cost, abs(closing_of(plain, self.states, self.controls).motion.cost))
-        usual = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
-        # A motion that began within an obstacle may end on both of its sides, and margins change with the motion.
-        lighter = [item.linear and not self.noisy for item in self.bound]
-        weights = np.where(lighter, left, 1.0) * usual
+        weights = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
         if self.states is None:
-            weights = weights * self._heavier(first.trajectory, weights, expected)
+            weights = weights * self._heavier(plain, first.trajectory, weights)
         nothing = np.full(len(self.bound), np.inf)
-        self.state = _State(zeros, weights, np.maximum(weights, usual), zeros, nothing, _LOOSE)
+        self.state = _State(zeros, weights, weights, zeros, nothing, _LOOSE)
         if self.before is not None and self.before.multipliers is not None:
             self.state = self._carried(self.before.problem, self.before.multipliers)
         return first
@@ -317,12 +311,12 @@ class _Rounds:
         added = None if known.added is None else finer(split(bound, known.added))
         return replace(begun, multipliers=values, weights=weights, backoff=finer(backoff), added=added)
 
-    def _heavier(self, motion: Trajectory, weights: Floats, base: float) -> float:
+    def _heavier(self, plain: OptimalControlProblem, motion: Trajectory, weights: Floats) -> float:
         """Factor of first weights that are light: those of a first motion that costs next to nothing.
 
         The share of the penalties that the model along the motion removes grows in proportion to light weights, and
         then goes towards the share that controls can remove at all. Where that is none, the factor is 1. So it is near
-        the constraints, as along a plan within them. ``base`` is the expected decrease without penalties.
+        the constraints, as along a plan within them. ``plain`` is the problem whose penalties have no weight.
         """
         zeros = [np.zeros(item.shape) for item in self.bound]
         known = reports_of(self.whole, motion, zeros, zeros)
@@ -336,8 +330,10 @@ class _Rounds:
             found = backward(made, motion, 0.0) if whole > 0.0 else None
             return np.nan if found is None else (found.expected_decrease - base) / whole
 
-        factor = 1.0
+        base, factor = 0.0, 1.0
         try:
+            alone = backward(plain, motion, 0.0)
+            base = 0.0 if alone is None else alone.expected_decrease
             share = removed(factor)
             for _ in range(_LIFTS):
                 if not share < _LIGHT:
@@ -464,7 +460,8 @@ class _Rounds:
             self.state = replace(begun, tolerance=_TIGHTER * begun.tolerance, round=begun.round + 1, backoff=backoff)
             return None, ""
         stays = worst.violation > max(FEASIBLE, _LOWERED * float(begun.worst.max()))
-        stuck = begun.stuck + 1 if stays else 0
+        eased = bool((begun.weights < begun.first_weights).any())
+        stuck = begun.stuck + 1 if stays and not eased else 0
         heavy = bool((begun.weights >= _HEAVIEST * begun.first_weights).any())
         if not feasible and (stuck >= _STUCK or begun.round + 1 >= _ROUNDS or (heavy and stuck)):
             if _blocked(found):
@@ -474,6 +471,10 @@ class _Rounds:
             return found.status, found.reason
         more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
         weights = np.where(more, _GROWTH * begun.weights, begun.weights)
+        if begun.round == 0 and found.status is not Status.CONVERGED:
+            weights = self._eased(begun.weights, abs(found.cost))
+            if (weights < begun.weights).any():
+                violation = np.full(len(violation), np.inf)
         self.state = _State(
             multipliers=values,
             weights=weights,
@@ -489,6 +490,16 @@ class _Rounds:
             counts=begun.counts,
         )
         return None, ""
+
+    def _eased(self, weights: Floats, cost: float) -> Floats:
+        """The penalties' weights, lower ones where they were for a first motion that cost many times a plan.
+
+        So they are where an arm falls at first: then the first round does not get to its end. Only bounds that are
+        affine in states and controls are eased: behind others, as in an obstacle, there may be other plans.
+        """
+        ample = np.array([_AMPLE * cost / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
+        affine = np.array([item.affine for item in self.bound]) & (not self.noisy)
+        return np.where(affine, np.clip(ample, _LEAST * weights, weights), weights)
 
     def _infeasible(self, kept: Solution, begun: _State, worst: ConstraintReport, constraint: int) -> str:
         """Why a problem is infeasible, by the worst report, of one of a round's constraints."""
@@ -759,15 +770,6 @@ class _Rounds:
         steady = self._margins([_steadier(part) for part in backoff[:count]], begun.between)
         taken = 1.0 if begun.round == _PLAIN else _TAKEN
         return [old + taken * (new - old) for new, old in zip(steady, begun.backoff, strict=True)]
-
-
-def _expected(problem: OptimalControlProblem, motion: Trajectory) -> float:
-    """Decrease of the cost that the model along a motion expects, or 0 where there is no model."""
-    try:
-        found = backward(problem, motion, 0.0)
-    except (CostError, NoiseFieldError, LinearizationError):
-        return 0.0
-    return 0.0 if found is None else found.expected_decrease
 
 
 def _change(new: list[Floats], old: list[Floats]) -> float:

@@ -179,8 +179,9 @@ def _unfinished(solution: Solution) -> list[Finding]:
     if not (cut or ended) or not history:
         return []
     expected_decrease = history[-1].expected_decrease
-    # With a negligible expected decrease the plan is as good as converged.
-    if solution.status is Status.STALLED and expected_decrease <= _LITTLE * abs(solution.cost):
+    # With a negligible expected decrease the plan is as good as converged, if it keeps to its constraints.
+    little = expected_decrease <= _LITTLE * abs(solution.cost) and solution.violation <= FEASIBLE
+    if solution.status is Status.STALLED and little:
         return []
     return [Finding("not converged", f"the search ended before it converged: {solution.reason}")]
 

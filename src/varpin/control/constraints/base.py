@@ -70,7 +70,7 @@ class BoundConstraint(Frozen, ABC):
         rows: Description of each row of c.
         unit: Unit of c.
         scale: About a tenth of the range of c, in its unit; it scales the first penalty weights and tolerances.
-        linear: Whether c is linear in the states and controls.
+        affine: Whether c is an affine function of the states and controls.
     """
 
     source: PlanConstraint
@@ -80,7 +80,7 @@ class BoundConstraint(Frozen, ABC):
     unit: str
     scale: float
     of_controls: ClassVar[bool] = False
-    linear: ClassVar[bool] = False
+    affine: ClassVar[bool] = False
 
     @property
     def shape(self) -> tuple[int, int]:

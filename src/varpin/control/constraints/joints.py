@@ -31,7 +31,7 @@ class _BoundBox(BoundConstraint):
     columns: Integers  # the coordinate of each row
     signs: Floats  # 1 for upper limits, -1 for lower ones
     bounds: Floats  # signs times the limits
-    linear = True
+    affine = True
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
         y = (v if self.in_velocity else q)[..., self.places, :]
@@ -143,7 +143,7 @@ class BoundRate(BoundConstraint):
     limit: Floats
     before: Floats | None
     of_controls = True
-    linear = True
+    affine = True
 
     @property
     def limited(self) -> Integers:
