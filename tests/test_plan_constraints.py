@@ -308,20 +308,37 @@ def test_first_penalties_on_given_states_are_light():
     assert told < 1e-2 * plan.cost
 
 
-def test_penalties_are_eased_after_a_first_motion_that_falls():
-    """It costs ten thousand times a plan. With penalties for that the search ended above the optimum, after 500."""
+def falling_at_first():
     robot, rest = vp.load_robot("kinova"), np.zeros(6)
     cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(rest + 0.3, 100.0) + vp.VelocityCost(1.0))
     limits = [vp.WithinVelocityLimits(robot, (-1.0, 1.0))]
-    problem = vp.OptimalControlProblem(vp.Scene(robot), cost, rest, rest, dt=0.05, steps=10, constraints=limits)
+    return vp.OptimalControlProblem(vp.Scene(robot), cost, rest, rest, dt=0.05, steps=10, constraints=limits)
+
+
+def test_penalties_are_eased_after_a_first_motion_that_falls():
+    """It costs ten thousand times a plan. With penalties for that the search ended above the optimum, after 500."""
+    problem = falling_at_first()
     plan = vp.solve(problem, check=False)
     assert plan.status.converged, plan.reason
     assert len(plan.history) <= 100
     assert (plan.multipliers.weights < plan.multipliers.first_weights).all()
     assert plan.violation <= 1e-6
     # Other first motions end at the same cost.
-    held = np.tile(vp.Scene(robot).holding_torque(rest), (10, 1))
+    held = np.tile(problem.scene.holding_torque(problem.q0), (10, 1))
     assert vp.solve(problem, held, check=False).cost == pytest.approx(plan.cost, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cut", [20, 40, 45])
+def test_eased_penalties_are_resumed_to_the_bit(cut, tmp_path):
+    """Before the first round ends, at its end, and after it."""
+    problem = falling_at_first()
+    whole, begun = vp.solve(problem, check=False), vp.solve(problem, max_iterations=cut, check=False)
+    begun.save(tmp_path / "begun.npz")
+    resumed = vp.solve(problem, resume=vp.Solution.load(tmp_path / "begun.npz", problem), check=False)
+    assert len(resumed.history) == len(whole.history)
+    np.testing.assert_array_equal(resumed.controls, whole.controls)
+    np.testing.assert_array_equal(resumed.multipliers.weights, whole.multipliers.weights)
 
 
 @pytest.mark.parametrize("weight", [1e-7, 1e-3, 1e-2])
