@@ -100,8 +100,11 @@ def test_a_solution_of_crocoddyl_goes_on_as_one_of_varpin():
 
 @pytest.mark.parametrize(
     ("lower", "upper"),
-    [([-10.0, -5.0], [10.0, 5.0]), ([-np.inf, -np.inf], [10.0, 5.0]), ([-10.0, -np.inf], [np.inf, np.inf])],
-    ids=["both sides", "upper", "one joint's lower"],
+    [
+        pytest.param([-10.0, -5.0], [10.0, 5.0], id="both sides"),
+        pytest.param([-np.inf, -np.inf], [10.0, 5.0], id="upper", marks=pytest.mark.slow),
+        pytest.param([-10.0, -np.inf], [np.inf, np.inf], id="one joint's lower", marks=pytest.mark.slow),
+    ],
 )
 def test_box_fddp_keeps_control_limits(lower, upper):
     """And ends at the cost of varpin's plan; its policy keeps them far from the plan, too."""

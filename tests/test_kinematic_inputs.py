@@ -216,6 +216,7 @@ def hanging():
     return scene, cost, q0, goal
 
 
+@pytest.mark.slow
 def test_a_plan_chooses_where_a_joint_is_moved():
     """Against a quasi-Newton method on the same costs, by rollouts alone, within the same limits."""
     scene, cost, q0, goal = hanging()

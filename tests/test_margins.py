@@ -220,6 +220,7 @@ def test_a_bound_that_the_linear_model_sees_no_motion_towards_is_counted():
     assert (added[outside > 0.1] > 0.01).all()
 
 
+@pytest.mark.slow
 def test_a_warning_of_a_small_margin_counts():
     """What it says of a bound is so by ten times as many other motions, and the margin that it names suffices there."""
     coarse = {"dt": 0.1, "steps": 8}

@@ -341,6 +341,7 @@ def test_where_noise_matters_uncut(integrator):
     assert aware.monte_carlo(2000, 1, feedback=False).cost > ours.cost
 
 
+@pytest.mark.slow
 def test_paths_that_fail_are_counted():
     """Plain DDP's gains on the light finger, in noise they were not made for."""
     problem = noisy_reach("finger", 0.3)
