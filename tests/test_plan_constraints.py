@@ -412,7 +412,10 @@ def test_control_limits_and_hold():
         assert np.abs(plan.controls).max() <= limits[1]
 
 
-def goal_within_rates(limit):
+RATE, GOAL = 1000.0, [2.5, 0.0, -2.2]
+
+
+def goal_within_rates():
     """The rounds end a little beyond a goal and limits of rates; there is a motion within them."""
     robot = vp.planar_chain(4)
     return vp.OptimalControlProblem(
@@ -424,20 +427,20 @@ def goal_within_rates(limit):
         steps=32,
         control_limits=(-50.0, 50.0),
         integrator=vp.Midpoint(),
-        constraints=[vp.ReachFrame(robot, "tip", position=[2.5, 0.0, -2.2]), vp.WithinControlRate(limit)],
+        constraints=[vp.ReachFrame(robot, "tip", position=GOAL), vp.WithinControlRate(RATE)],
     )
 
 
 def test_a_last_step_is_tried_before_a_problem_is_called_infeasible():
-    problem, limit = goal_within_rates(1000.0), 1000.0
+    problem = goal_within_rates()
     plan = vp.solve(problem, check=False)
     assert plan.status is not vp.Status.INFEASIBLE
-    assert np.abs(np.diff(plan.controls, axis=0)).max() <= limit * problem.dt * (1.0 + 1e-9)
+    assert np.abs(np.diff(plan.controls, axis=0)).max() <= RATE * problem.dt * (1.0 + 1e-9)
     robot = problem.scene.robot
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.configuration(plan.trajectory.q[-1]))
     place = data.oMf[robot.model.getFrameId("tip")].translation
-    np.testing.assert_allclose(place, [2.5, 0.0, -2.2], atol=1e-6)
+    np.testing.assert_allclose(place, GOAL, atol=1e-6)
 
 
 def test_what_is_left_of_a_violation_does_not_show_that_there_is_no_plan(monkeypatch):
@@ -448,7 +451,7 @@ def test_what_is_left_of_a_violation_does_not_show_that_there_is_no_plan(monkeyp
 
     monkeypatch.setattr("varpin.control.augmented.polished", failed)
     monkeypatch.setattr("varpin.control.augmented._ROUNDS", 6)
-    plan = vp.solve(goal_within_rates(1000.0), check=False)
+    plan = vp.solve(goal_within_rates(), check=False)
     bound = plan.problem.bound_constraints
     assert plan.violation > 1e-6
     assert all(told.violation <= 1e-3 * item.scale for told, item in zip(plan.constraints, bound, strict=True))

@@ -29,7 +29,7 @@ from varpin.control.first_node import out_of_reach
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.margins import widened
 from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, in_between, reports_of
-from varpin.control.penalties import PenalizedProblem, flat, penalized, split
+from varpin.control.penalties import PenalizedProblem, flat, penalized, split, weights_for
 from varpin.control.polish import least_slope, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import SUFFICIENT
@@ -279,7 +279,7 @@ class _Rounds:
         if self.states is not None:
             # Where the auxiliary forces are dropped at once, the motion may fall, and its cost says nothing.
             cost = min(cost, abs(closing_of(plain, self.states, self.controls).motion.cost))
-        weights = np.array([(cost or 1.0) / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
+        weights = weights_for(cost or 1.0, self.bound)
         if self.states is None:
             weights = weights * self._heavier(plain, first.trajectory, weights)
         nothing = np.full(len(self.bound), np.inf)
@@ -460,13 +460,14 @@ class _Rounds:
             self.state = replace(begun, tolerance=_TIGHTER * begun.tolerance, round=begun.round + 1, backoff=backoff)
             return None, ""
         stays = worst.violation > max(FEASIBLE, _LOWERED * float(begun.worst.max()))
-        eased = bool((begun.weights < begun.first_weights).any())
+        own = constraints.index(worst)
+        eased = begun.weights[own] < begun.first_weights[own]
         stuck = begun.stuck + 1 if stays and not eased else 0
         heavy = bool((begun.weights >= _HEAVIEST * begun.first_weights).any())
         if not feasible and (stuck >= _STUCK or begun.round + 1 >= _ROUNDS or (heavy and stuck)):
             if _blocked(found):
                 return found.status, f"{state}; {found.reason}"
-            return Status.INFEASIBLE, self._infeasible(kept, begun, worst, constraints.index(worst))
+            return Status.INFEASIBLE, self._infeasible(kept, begun, worst, own)
         if feasible and begun.round + 1 >= _ROUNDS:
             return found.status, found.reason
         more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
@@ -497,7 +498,7 @@ class _Rounds:
         So they are where an arm falls at first: then the first round does not get to its end. Only bounds that are
         affine in states and controls are eased: behind others, as in an obstacle, there may be other plans.
         """
-        ample = np.array([_AMPLE * cost / item.scale**2 / np.sqrt(len(item.places)) for item in self.bound])
+        ample = weights_for(_AMPLE * cost, self.bound)
         affine = np.array([item.affine for item in self.bound]) & (not self.noisy)
         return np.where(affine, np.clip(ample, _LEAST * weights, weights), weights)
 

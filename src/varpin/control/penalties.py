@@ -313,6 +313,14 @@ class PenalizedProblem(OptimalControlProblem):
         return Expansion(gradients.reshape(-1, size), hessians.reshape(-1, size, size), begun)
 
 
+def weights_for(cost: float, bound: Sequence[BoundConstraint]) -> Floats:
+    """Weights (C,) of penalties with which a violation of a constraint's scale costs about ``cost``.
+
+    The cost is divided by the root of the number of places, as some of them are violated at a time.
+    """
+    return np.array([cost / item.scale**2 / np.sqrt(len(item.places)) for item in bound])
+
+
 def penalized(
     problem: OptimalControlProblem,
     multipliers: list[Floats],

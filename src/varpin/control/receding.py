@@ -19,7 +19,7 @@ from varpin.control.between_nodes import Instants, carried, enforced, middles
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Iteration, Status
 from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers, at_nodes, reports_of
-from varpin.control.penalties import flat, penalized, split
+from varpin.control.penalties import flat, penalized, split, weights_for
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.support.frozen import Frozen
@@ -77,9 +77,7 @@ def replan(
         _shifted_to(*parts, decisions, hold) for parts in zip(old, new, split(old, known.values), strict=True)
     ]
     backoff = [_shifted_to(*parts, 0, hold) for parts in zip(old, new, split(old, known.backoff), strict=True)]
-    cost = abs(previous.cost)
-    least = np.array([cost / item.scale**2 / np.sqrt(len(item.places)) for item in new])
-    first_weights = np.maximum(known.first_weights, least)
+    first_weights = np.maximum(known.first_weights, weights_for(abs(previous.cost), new))
     weights = np.clip(known.weights, first_weights, _HEAVIEST * first_weights)
     begun = flat(multipliers)
     found = kept = previous
