@@ -315,23 +315,21 @@ def falling_at_first():
     return vp.OptimalControlProblem(vp.Scene(robot), cost, rest, rest, dt=0.05, steps=10, constraints=limits)
 
 
-def test_penalties_are_eased_after_a_first_motion_that_falls():
-    """It costs ten thousand times a plan. With penalties for that the search ended above the optimum, after 500."""
+def test_penalties_that_a_first_motion_made_stiff():
+    """It falls and costs ten thousand times a plan. The search ended above the optimum, after 500 iterations."""
     problem = falling_at_first()
     plan = vp.solve(problem, check=False)
     assert plan.status.converged, plan.reason
-    assert len(plan.history) <= 100
-    assert (plan.multipliers.weights < plan.multipliers.first_weights).all()
+    assert len(plan.history) <= 50
     assert plan.violation <= 1e-6
     # Other first motions end at the same cost.
     held = np.tile(problem.scene.holding_torque(problem.q0), (10, 1))
     assert vp.solve(problem, held, check=False).cost == pytest.approx(plan.cost, rel=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("cut", [20, 40, 45])
-def test_eased_penalties_are_resumed_to_the_bit(cut, tmp_path):
-    """Before the first round ends, at its end, and after it."""
+@pytest.mark.parametrize("cut", [5, 20])
+def test_stiff_penalties_are_resumed_to_the_bit(cut, tmp_path):
+    """In the first round, and after it."""
     problem = falling_at_first()
     whole, begun = vp.solve(problem, check=False), vp.solve(problem, max_iterations=cut, check=False)
     begun.save(tmp_path / "begun.npz")

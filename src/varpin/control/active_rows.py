@@ -117,8 +117,8 @@ class Rows:
             found.append(s + np.concatenate([rate, -rate], axis=1))
         return found
 
-    def move(self, plan: Plan, held: list[Mask], ahead: list[Floats], along: float) -> None:
-        """Exact line search towards ``ahead``, the minimum of the model with active rows ``held``.
+    def move(self, plan: Plan, held: list[Mask], ahead: list[Floats], along: float, *, whole: bool = False) -> None:
+        """Exact line search towards ``ahead``, the minimum of the model with active rows ``held``, or all the way.
 
         ``along`` is the slope of the model at its start in the direction of ``ahead``.
         """
@@ -139,7 +139,7 @@ class Rows:
             return float((pull * s) @ way) + last - 2.0 * (1.0 - t) * curved
 
         low, high = 0.0, 1.0
-        if slope(high) <= 0.0:
+        if whole or slope(high) <= 0.0:
             low = high
         for _ in range(_BISECTIONS if low < high else 0):
             middle = 0.5 * (low + high)
@@ -158,8 +158,11 @@ class Rows:
             total += 0.5 * item.weight * float((t[item.held(t)] ** 2).sum() - (s[now] ** 2).sum())
         return total
 
-    def there(self, plan: Plan) -> Plan:
-        """A plan that leads to the present point of the steps, with the feedback of ``plan``."""
+    def there(self, plan: Plan, added: float = 0.0) -> Plan:
+        """A plan that leads to the present point of the steps, with the feedback of ``plan``.
+
+        ``added`` is what regularization adds to the model there.
+        """
         at = self.states[: -1 : self.problem.hold]
         if self.problem.linear:
             # A line is decided at its beginning, and so is the first control.
@@ -167,7 +170,7 @@ class Rows:
         ahead = self.moves - np.einsum("kmx,kx->km", plan.feedback, at)
         if plan.previous is not None:
             ahead[1:] -= np.einsum("kmi,ki->km", plan.previous[1:], self.moves[:-1])
-        curvature = 2.0 * (self.lowered - self.slope)
+        curvature = 2.0 * (self.lowered - added - self.slope)
         return replace(plan, feedforward=ahead, slope=self.slope, curvature=curvature, limited=True)
 
     def change(self, plan: Plan, held: list[Mask], ahead: list[Floats]) -> tuple[float, float]:
@@ -202,6 +205,7 @@ class Pushes:
         self.y = np.where(at > 0.0, 0.5 * w * (at + root), 2.0 * mu / np.maximum(root - at, 1e-300))
         self.p = mu / self.y
         self.to, self.to_y, self.to_p = self.s, self.y, self.p
+        self.last_y, self.last_p = self.y, self.p
 
     @property
     def products(self) -> Floats:
@@ -220,8 +224,9 @@ class Pushes:
 
     @property
     def active(self) -> list[Mask]:
-        """The active rows at the present point."""
-        return self.rows.held(self.rows.split(self.s))
+        """The rows that will be active: those whose distances fell by more than their multipliers in the last step."""
+        now = self.rows.equal | (self.p * self.last_y < self.y * self.last_p)
+        return split(self.rows.begun, now)
 
     def _linear(self, aim: Floats) -> tuple[Floats, Floats]:
         """Shares of the weights, and the shifts, of the quadratic penalties of a step."""
@@ -257,6 +262,7 @@ class Pushes:
 
     def move(self, length: float) -> None:
         """Go a share of the step."""
+        self.last_y, self.last_p = self.y, self.p
         self.s = self.s + length * (self.to - self.s)
         self.y = self.y + length * (self.to_y - self.y)
         self.p = self.p + length * (self.to_p - self.p)

@@ -58,9 +58,6 @@ _LOOSE, _TIGHTER = 1e-3, 0.1
 _FINAL, _FINEST = 1e-2, 1e-7
 # A penalty's weight grows by _GROWTH after a round that leaves more than _ENOUGH of its constraint's violation.
 _GROWTH, _ENOUGH = 10.0, 0.2
-# Penalties are eased to _AMPLE times what suits the cost at the end of the first round, and at least to _LEAST of the
-# first ones.
-_AMPLE, _LEAST = 10.0, 1e-4
 # Greatest weight of a penalty, relative to its first one: rounding errors of a heavier penalty exceed the cost.
 _HEAVIEST = 1e9
 # First penalties are light if the model would remove less than _LIGHT of them. They are made heavier until that is no
@@ -461,8 +458,7 @@ class _Rounds:
             return None, ""
         stays = worst.violation > max(FEASIBLE, _LOWERED * float(begun.worst.max()))
         own = constraints.index(worst)
-        eased = begun.weights[own] < begun.first_weights[own]
-        stuck = begun.stuck + 1 if stays and not eased else 0
+        stuck = begun.stuck + 1 if stays else 0
         heavy = bool((begun.weights >= _HEAVIEST * begun.first_weights).any())
         if not feasible and (stuck >= _STUCK or begun.round + 1 >= _ROUNDS or (heavy and stuck)):
             if _blocked(found):
@@ -472,10 +468,6 @@ class _Rounds:
             return found.status, found.reason
         more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
         weights = np.where(more, _GROWTH * begun.weights, begun.weights)
-        if begun.round == 0 and found.status is not Status.CONVERGED:
-            weights = self._eased(begun.weights, abs(found.cost))
-            if (weights < begun.weights).any():
-                violation = np.full(len(violation), np.inf)
         self.state = _State(
             multipliers=values,
             weights=weights,
@@ -491,16 +483,6 @@ class _Rounds:
             counts=begun.counts,
         )
         return None, ""
-
-    def _eased(self, weights: Floats, cost: float) -> Floats:
-        """The penalties' weights, lower ones where they were for a first motion that cost many times a plan.
-
-        So they are where an arm falls at first: then the first round does not get to its end. Only bounds that are
-        affine in states and controls are eased: behind others, as in an obstacle, there may be other plans.
-        """
-        ample = weights_for(_AMPLE * cost, self.bound)
-        affine = np.array([item.affine for item in self.bound]) & (not self.noisy)
-        return np.where(affine, np.clip(ample, _LEAST * weights, weights), weights)
 
     def _infeasible(self, kept: Solution, begun: _State, worst: ConstraintReport, constraint: int) -> str:
         """Why a problem is infeasible, by the worst report, of one of a round's constraints."""

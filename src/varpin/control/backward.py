@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from copy import copy
-from dataclasses import replace
 
 import numpy as np
 
-from varpin.arrays import Floats
-from varpin.control.active_rows import Rows, same_rows
+from varpin.arrays import Floats, Mask
 from varpin.control.along import Along, linearize
-from varpin.control.box import Box, to_minimum, within_limits
 from varpin.control.linear_controls import curvature_on_lines, in_step, widened
 from varpin.control.passes import Plan, impulses, single_pass
-from varpin.control.penalties import PenalizedProblem
+from varpin.control.piecewise import minimum
 from varpin.control.problem import OptimalControlProblem
 from varpin.linearization import second_order_steps, velocity_at_nodes, velocity_curvature
 from varpin.trajectory import Trajectory
@@ -67,11 +63,13 @@ def backward(
     along: Along | None = None,
     demands: bool = False,
     clipped: bool = False,
+    rows: Mask | None = None,
 ) -> Plan | None:
     """One backward pass along a motion; None where the model has no minimum in a control.
 
     ``along`` has the expansions of other passes along the motion. With ``demands``, ``regularization`` also applies to
     what servos demand of their drives, relative to the cost at stake. ``clipped`` leaves out the limits of controls.
+    ``rows`` are the active rows of penalties to begin with, :attr:`Plan.rows` of another motion.
 
     Raises:
         CostError: An expansion of the cost is not finite.
@@ -83,58 +81,10 @@ def backward(
         along.clipped = True
     damping = regularization * along.stake.moved * along.demands if demands and regularization > 0.0 else None
     if not second_order:
-        return _foreseeing(along, regularization, damping)
+        return minimum(along, regularization, damping, rows)
     # First derivatives of the cost to go, then with them second derivatives of the dynamics (stagewise Newton).
     plan, costate = single_pass(along, max(regularization, 1e-3), costates=True)
     if plan is None:
         return None
     curvature = _curvature(along, plan, costate)
-    return _foreseeing(along, regularization, curvature if damping is None else curvature + damping)
-
-
-def _foreseeing(along: Along, regularization: float, curvature: Floats | None) -> Plan | None:
-    """The pass with the penalties that are active on the linearized motion.
-
-    A penalty is zero up to its bound and a parabola beyond. A model around the nominal motion has only the rows active
-    there, not those that the step activates. So passes are repeated until their active rows are those of their
-    linearized motion: Newton steps with exact line search to the minimum of the piecewise quadratic model. If these do
-    not converge, the result is the best pass or the last point of the steps.
-    """
-    problem = along.problem
-    if (
-        not (isinstance(problem, PenalizedProblem) and problem.all_penalties and problem.passes)
-        or len(along.blocks) > 1
-    ):
-        return within_limits(along, regularization, curvature)
-    rows = Rows(along, problem)
-    held, best, least, together = rows.begun, None, 0.0, True
-    for done in range(1, problem.passes + 1):
-        passing = rows.along(held)
-        known = (rows, held) if together else ()
-        box = Box(passing, curvature, *known, until=problem.until)
-        plan, active = to_minimum(box, regularization)
-        if plan is None:
-            break
-        held = held if active is None else active
-        ahead = rows.ahead(passing, plan)
-        change, slope = rows.change(plan, held, ahead)
-        if slope < 0.0 and change < least:
-            best, least = replace(plan, slope=slope, curvature=2.0 * (change - slope), limited=True), change
-        met = rows.held(ahead)
-        if same_rows(met, held):
-            break
-        if active is not None:
-            # The minimum to rounding errors, or nothing.
-            if best is not None:
-                break
-            held, together = rows.begun, False
-            continue
-        rows.move(plan, held, ahead, slope)
-        held = rows.held(rows.at)
-        if done == problem.passes or time.perf_counter() > problem.until:
-            if rows.slope < 0.0 and rows.lowered < least:
-                best = rows.there(plan)
-            break
-    if best is None:
-        return within_limits(along, regularization, curvature)
-    return replace(best, model=along.model)
+    return minimum(along, regularization, curvature if damping is None else curvature + damping, rows)

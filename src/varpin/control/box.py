@@ -56,9 +56,7 @@ def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask]
     problem = along.problem
     if not problem.limited or along.clipped:
         return single_pass(along, regularization, curvature=curvature)[0], None
-    stiffness = np.zeros((problem.decisions, problem.scene.controls))
-    free = around_nominal(along.slack[:0], along.states)._replace(stiffness=stiffness)
-    plan = single_pass(along, regularization, curvature=curvature, limits=free)[0]
+    plan, stiffness = _free(along, regularization, curvature)
     if plan is not None:
         moves = foreseen(along, plan)[1]
         lower, upper = along.slack[:, 0], along.slack[:, 1]
@@ -73,6 +71,19 @@ def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask]
     return single_pass(along, regularization, curvature=curvature, limits=around_nominal(along.slack, along.states))[
         0
     ], None
+
+
+def _free(along: Along, regularization: float, curvature: Floats | None) -> tuple[Plan | None, Floats]:
+    """The pass without limits, and the diagonals of its Quu (R, m)."""
+    stiffness = np.zeros((along.problem.decisions, along.problem.scene.controls))
+    free = around_nominal(along.slack[:0], along.states)._replace(stiffness=stiffness)
+    return single_pass(along, regularization, curvature=curvature, limits=free)[0], stiffness
+
+
+def stiffness_of(along: Along, regularization: float, curvature: Floats | None) -> Floats | None:
+    """The diagonals of Quu (R, m) of the pass without limits; None where it has no minimum."""
+    plan, stiffness = _free(along, regularization, curvature)
+    return None if plan is None else stiffness
 
 
 def _sloped(plan: Plan, moves: Floats) -> Plan:
@@ -134,6 +145,8 @@ class Box:
         self.along, self.curvature, self.rows, self.active, self.until = along, curvature, rows, active, until
         self.proximal = np.zeros((along.problem.decisions, along.problem.scene.controls))
         self.lower, self.upper = along.slack[:, 0], along.slack[:, 1]
+        if not self.lower.size:
+            self.lower, self.upper = np.full(self.proximal.shape, -np.inf), np.full(self.proximal.shape, np.inf)
 
     def with_proximal(self, proximal: Floats) -> Box:
         """The model with a further cost of the changes."""
@@ -319,6 +332,11 @@ class Box:
     def _gaps(self, z: Floats, bounded: list[Mask]) -> list[Floats]:
         """Distances of changes to the lower and the upper limits, infinite where there is none."""
         return [np.where(bounded[0], z - self.lower, np.inf), np.where(bounded[1], self.upper - z, np.inf)]
+
+    def active_inside(self, plan: Plan) -> list[Mask] | None:
+        """The active rows near the minimum by an interior-point method, after a plan of the model without limits."""
+        inner = None if self.rows is None else self._interior_with_rows(plan, self.rows)
+        return None if inner is None else inner[2].active
 
     def _interior_with_rows(self, plan: Plan, rows: Rows) -> tuple[Floats, tuple[Mask, Mask], Box] | None:
         """The same with the rows of penalties; it begins at the motion, as those far away would be far from bounds."""

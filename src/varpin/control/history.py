@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 
+from varpin.arrays import Mask
 from varpin.control.watchdog import Watchdog
 from varpin.trajectory import Trajectory
 
@@ -110,6 +111,8 @@ class SearchState:
         clips: Whether plans may leave control limits to the clipping of motions where steps are short.
         returned: Whether it has just gone back from a motion that cannot be linearized.
         watchdog: Whether it is away from the best motion.
+        rows: Active rows of penalties (M,) at the end of the last backward pass, with which the next one begins; None
+            without penalties and before the first one.
         history: The iterations before.
     """
 
@@ -131,6 +134,7 @@ class SearchState:
     clips: bool = True
     returned: bool = False
     watchdog: Watchdog = field(default_factory=Watchdog)
+    rows: Mask | None = None
 
     def __repr__(self) -> str:
         return f"SearchState(cost {self.cost:.6g}, after {len(self.history)} iterations)"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin import core
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Mask
 from varpin.control.along import Along, Limits, around_nominal, without_limits
 from varpin.control.descent import Model
 from varpin.control.problem import OptimalControlProblem
@@ -43,6 +43,7 @@ class Plan:
     loss: float  # estimated relative rounding error of Quu, or of its root
     model: Model  # of the cost along the motion
     left: Floats | None = None  # (R, m) the model's gradient after a full step, which presses controls against limits
+    rows: Mask | None = None  # active rows of all penalties where the steps to the model's minimum ended
 
     @property
     def expected_decrease(self) -> float:

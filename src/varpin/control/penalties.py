@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers, Mask
 from varpin.control.constraints import BoundBetween, BoundConstraint, BoundOnCubics, BoundRate, Slopes
@@ -17,6 +19,8 @@ from varpin.control.costs import ControlRate, Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
+
+T = TypeVar("T", np.float64, np.bool_)
 
 # Greatest number of backward passes that determine the active rows of the penalties.
 _PASSES = 60
@@ -132,12 +136,13 @@ class PenalizedRate(Frozen):
         return gradient, hessian
 
 
-def flat(parts: Sequence[Floats]) -> Floats:
+def flat(parts: Sequence[NDArray[T]]) -> NDArray[T]:
     """Concatenate the entries of all parts (M,)."""
-    return np.concatenate([np.ravel(part) for part in parts]) if parts else np.zeros(0)
+    found: NDArray[Any] = np.concatenate([np.ravel(part) for part in parts]) if parts else np.zeros(0)
+    return found
 
 
-def split(like: Sequence[Floats | BoundConstraint], flattened: Floats) -> list[Floats]:
+def split(like: Sequence[NDArray[Any] | BoundConstraint], flattened: NDArray[T]) -> list[NDArray[T]]:
     """Inverse of :func:`flat`: of entries (M,) the parts in the shapes of arrays or of constraints' values."""
     ends = np.cumsum([item.size for item in like])
     return [part.reshape(item.shape) for part, item in zip(np.split(flattened, ends[:-1]), like, strict=True)]

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Mask
 from varpin.control.along import Along
 from varpin.control.backward import backward
 from varpin.control.commands import controls_along, first_commands, shifted_commands
@@ -240,6 +240,8 @@ def solve(
             search.resume(_search_of(problem, controls, resume))
         elif path is None:
             search.begin(first_commands(problem, controls))
+            if isinstance(controls, Solution) and controls.search is not None:
+                search.rows = controls.search.rows
         closing = None if path is None else closing_of(problem, path, controls)
         known = len(search.history)
 
@@ -413,6 +415,7 @@ class _Search:
         self.reason = ""
         self.anew = anew  # whether the final motion gets a backward pass of its own
         self.followed = 0.0  # without one, the length of the last step
+        self.rows: Mask | None = None  # active rows of penalties of the last plan
         self.steered = problem.steered
         self.all_steered, self.any_steered = bool(self.steered.all()), bool(self.steered.any())
         # Whether the search ends with the whole gradient of the noise cost, and whether it has come to that. Within
@@ -472,7 +475,7 @@ class _Search:
         self.whole = state.whole and self.wants_whole
         self.clips = state.clips and self.clips
         self.returned = state.returned
-        self.watchdog = state.watchdog
+        self.watchdog, self.rows = state.watchdog, state.rows
         if state.saturated:
             self._take_saturation()
 
@@ -496,6 +499,7 @@ class _Search:
             clips=self.clips,
             returned=self.returned,
             watchdog=self.watchdog,
+            rows=self.rows,
         )
 
     def run(
@@ -858,8 +862,10 @@ class _Search:
                 along=self.along,
                 demands=self.saturated,
                 clipped=self.clipping,
+                rows=self.rows,
             )
             if self.plan is not None:
+                self.rows = self.plan.rows
                 self.planned = self.trajectory, self.regularization, self.exact
                 return passes
             if self.exact:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Mask
 from varpin.control.between_nodes import SHARES, enforced, watched
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.multipliers import Multipliers
@@ -59,6 +59,7 @@ class _Search:
     clips: int = 1
     returned: int = 0
     watchdog: Annotated[Floats, Axes(len(Watchdog._fields), finite=True)] | None = None
+    rows: Annotated[Mask, Axes("rows")] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,11 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     if state is not None:
         numbers: dict[str, Any] = {name: getattr(state, name) for name in _NUMBERS}
         numbers |= {name: int(getattr(state, name)) for name in _FLAGS} | {"history": len(state.history)}
-        numbers |= {"gains": np.array(state.gains), "watchdog": np.array(state.watchdog, dtype=np.float64)}
+        numbers |= {
+            "rows": state.rows,
+            "gains": np.array(state.gains),
+            "watchdog": np.array(state.watchdog, dtype=np.float64),
+        }
         search = _Search(prefixes[id(state.trajectory)], **numbers)
         best = None if state.best is None else _Best(prefixes[id(state.best)])
     apart = ("search", "best", "refined", "refinement", "second_order")
@@ -235,6 +240,7 @@ def _search(
         best=None if best is None else motions[best],
         gains=tuple(state.gains.tolist()),
         history=history[: state.history],
+        rows=state.rows,
         watchdog=Watchdog() if state.watchdog is None else _watchdog(*state.watchdog.tolist()),
         **{name: bool(getattr(state, name)) for name in _FLAGS},
         **{name: getattr(state, name) for name in _NUMBERS},

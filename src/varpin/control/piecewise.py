@@ -1,0 +1,156 @@
+"""The minimum of the model along a motion whose penalties become active and inactive: a piecewise quadratic."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from varpin.arrays import Floats, Mask
+from varpin.control.active_rows import Rows, same_rows
+from varpin.control.along import Along
+from varpin.control.box import Box, stiffness_of, to_minimum, within_limits
+from varpin.control.passes import Plan, single_pass
+from varpin.control.penalties import PenalizedProblem, flat, split
+
+# Greatest number of passes in a row without a line search, and of those with one before the interior-point method,
+# whose steps are two passes each: as many as it takes is what has to be left for it.
+_AT_ONCE, _SEARCHED, _INTERIOR = 8, 4, 40
+
+
+def minimum(along: Along, regularization: float, curvature: Floats | None, likely: Mask | None) -> Plan | None:
+    """The pass with the penalties that are active on the linearized motion.
+
+    A penalty is zero up to its bound and a parabola beyond. A model around the nominal motion has only the rows active
+    there, not those that the step activates. So passes are repeated until their active rows are those of their
+    linearized motion, which leads to the minimum of the piecewise quadratic model. If they do not converge, the result
+    is the best pass or the last point of the steps.
+
+    Args:
+        along: Expansions along the motion.
+        regularization: Relative to the diagonal of Quu.
+        curvature: Further Hessians of the steps.
+        likely: Active rows to begin with.
+    """
+    problem = along.problem
+    if (
+        not (isinstance(problem, PenalizedProblem) and problem.all_penalties and problem.passes)
+        or len(along.blocks) > 1
+    ):
+        return within_limits(along, regularization, curvature)
+    steps = _Steps(along, problem, regularization, curvature)
+    steps.run(likely)
+    if steps.best is None:
+        return within_limits(along, regularization, curvature)
+    return replace(steps.best, model=along.model, rows=flat(steps.met))
+
+
+class _Steps:
+    """Passes that differ in their active rows, and the best of them so far."""
+
+    def __init__(
+        self, along: Along, problem: PenalizedProblem, regularization: float, curvature: Floats | None
+    ) -> None:
+        self.problem, self.regularization, self.curvature = problem, regularization, curvature
+        self.rows = Rows(along, problem)
+        self.best: Plan | None = None
+        self.least = 0.0  # change of the model by the best plan
+        self.done = 0  # passes
+        self.ended = False  # at the minimum, or as close as it gets
+        # Whether limits of controls and rows are found together.
+        self.together = True
+        # The last pass: its plan, its active rows, the values of all rows on its motion, and those active there.
+        self.plan: Plan | None = None
+        self.held = self.met = self.rows.begun
+        self.ahead: list[Floats] = self.rows.signed
+        self.change = self.slope = 0.0
+        self.passing = along
+        # What regularizes all passes: the Hessian's diagonal of a further cost of the changes of controls (R, m).
+        self.proximal: Floats | None = None
+
+    def run(self, likely: Mask | None) -> None:
+        """To the minimum: by likely rows, by Newton steps with line search, or by an interior-point method."""
+        problem, rows = self.problem, self.rows
+        if self.regularization > 0.0 and not problem.limited:
+            stiffness = stiffness_of(rows.along(rows.begun), self.regularization, self.curvature)
+            if stiffness is None:
+                return
+            self.proximal = self.regularization * np.abs(stiffness)
+        if likely is not None and likely.size == rows.weights.size:
+            self._settle(split(rows.begun, likely))
+        self._descend(problem.passes if problem.limited else self.done + _SEARCHED)
+        if not self.ended and problem.passes - self.done >= _INTERIOR and self.plan is not None:
+            box = Box(self.passing, self.curvature, rows, self.held, until=problem.until)
+            box = box if self.proximal is None else box.with_proximal(self.proximal)
+            inner = box.active_inside(self.plan)
+            if inner is not None:
+                self._settle(inner)
+        self._descend(problem.passes)
+
+    def _passed(self, held: list[Mask]) -> Plan | None:
+        """A pass with active rows; None if the model has no minimum with them."""
+        rows, self.done = self.rows, self.done + 1
+        self.passing = rows.along(held)
+        known = (rows, held) if self.together else ()
+        box = Box(self.passing, self.curvature, *known, until=self.problem.until)
+        if self.proximal is None:
+            self.plan, active = to_minimum(box, self.regularization)
+        else:
+            firm = self.passing.with_cost_of_controls(self.proximal)
+            self.plan, active = single_pass(firm, 0.0, curvature=self.curvature)[0], None
+        if self.plan is None:
+            return None
+        self.held = held if active is None else active
+        self.ahead = rows.ahead(self.passing, self.plan)
+        self.change, self.slope = rows.change(self.plan, self.held, self.ahead)
+        if self.slope < 0.0 and self.change < self.least:
+            curvature = 2.0 * (self.change - self._cost_of(rows.ahead_of[1]) - self.slope)
+            self.best = replace(self.plan, slope=self.slope, curvature=curvature, limited=True)
+            self.least = self.change
+        self.met = rows.held(self.ahead)
+        self.ended = same_rows(self.met, self.held)
+        if not self.ended and active is not None:
+            # The minimum to rounding errors, or nothing.
+            self.ended, self.together = self.best is not None, False
+        return self.plan
+
+    def _cost_of(self, moves: Floats) -> float:
+        """What regularization adds to the model at changes of the controls (R, m)."""
+        return 0.0 if self.proximal is None else 0.5 * float((self.proximal * moves**2).sum())
+
+    def _settle(self, held: list[Mask]) -> None:
+        """Passes each with the active rows of the motion before, as long as ever fewer of them change."""
+        most, together = self.rows.weights.size + 1, self.together
+        for _ in range(min(_AT_ONCE, self.problem.passes - self.done)):
+            if self._passed(held) is None or self.ended or self.together != together:
+                break
+            changed = sum(int((now != then).sum()) for now, then in zip(self.met, self.held, strict=True))
+            if changed >= most:
+                break
+            held, most = self.met, changed
+        if self.ended or self.plan is None:
+            return
+        if self.slope < 0.0 and self.change < self.rows.lowered:
+            self.rows.move(self.plan, self.held, self.ahead, self.slope, whole=True)
+
+    def _descend(self, most: int) -> None:
+        """Newton steps with exact line search, up to a number of passes altogether."""
+        rows, problem, held = self.rows, self.problem, self.rows.held(self.rows.at)
+        while not self.ended and self.done < min(most, problem.passes):
+            together = self.together
+            plan = self._passed(held)
+            if plan is None or self.ended:
+                self.ended = True
+                break
+            if self.together != together:
+                held = rows.begun
+                continue
+            rows.move(plan, self.held, self.ahead, self.slope)
+            held = self.met = rows.held(rows.at)
+            # Not the minimum only by rounding errors, and with the same rows the next pass would be the same.
+            still = same_rows(held, self.held)
+            if still or self.done == problem.passes or time.perf_counter() > problem.until:
+                if rows.slope < 0.0 and rows.lowered < self.least:
+                    self.best = rows.there(plan, self._cost_of(rows.moves))
+                self.ended = True
