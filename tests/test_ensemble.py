@@ -487,7 +487,7 @@ def test_bad_input(options, facts):
         run(**options)
 
 
-@pytest.mark.parametrize("kick", ["left", "split"])
+@pytest.mark.parametrize("kick", [pytest.param("left", marks=pytest.mark.slow), "split"])
 def test_small_noise_has_the_predicted_covariance(kick):
     """Mean and covariance of 20 000 paths against :func:`varpin.propagate_moments` around the quiet motion."""
     paths, strength, integrator = 20_000, 2e-4, vp.Midpoint(kick=kick)

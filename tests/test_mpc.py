@@ -143,7 +143,9 @@ def test_a_late_plan_leaves_the_one_before_to_act():
     assert not unnamed(str(run), "19")
 
 
-@pytest.mark.parametrize(("name", "seed"), [("ur5", 0), pytest.param("panda", 0, marks=pytest.mark.slow), ("panda", 1)])
+@pytest.mark.parametrize(
+    ("name", "seed"), [*(pytest.param(name, 0, marks=pytest.mark.slow) for name in ("ur5", "panda")), ("panda", 1)]
+)
 def test_beyond_the_last_horizon_the_robot_comes_to_rest(name, seed):
     """Where no plan is ever in time, the robot stays where the first one ends, and no torque changes too fast."""
     robot = vp.load_robot(name)

@@ -62,7 +62,12 @@ def chain(controls, constraints=None, **options):
 
 @pytest.mark.parametrize("iterations", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    ("build", "duration", "most"), [(beside_a_ball, 1.6, 2e-3), (within_speeds, 0.8, 1e-2), (chain, 1.5, 1e-2)]
+    ("build", "duration", "most"),
+    [
+        pytest.param(beside_a_ball, 1.6, 2e-3, marks=pytest.mark.slow),
+        (within_speeds, 0.8, 1e-2),
+        (chain, 1.5, 1e-2),
+    ],
 )
 def test_loops_of_linear_controls_do_not_run_away(build, duration, most, iterations, monkeypatch):
     """Speeds of plans and of the plant, its violations, and the work of a tick."""

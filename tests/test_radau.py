@@ -78,7 +78,9 @@ def test_one_stage_is_the_implicit_euler_method():
     assert left == pytest.approx(1.0 / (1.0 + 1e-2 * 1e5 / inertia), rel=1e-9)
 
 
-@pytest.mark.parametrize("damping", [[10, 10, 5, 5, 5, 2, 2], 0.1], ids=["the file's", "0.1"])
+@pytest.mark.parametrize(
+    "damping", [pytest.param([10, 10, 5, 5, 5, 2, 2], marks=pytest.mark.slow, id="the file's"), 0.1]
+)
 def test_torques_that_jump_on_a_damped_arm(damping):
     """Against SciPy's Radau on Pinocchio's forward dynamics: q within 1 % of the way, node velocities within 10 %."""
     robot = vp.load_robot("xarm7")

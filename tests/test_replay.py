@@ -55,7 +55,7 @@ def test_page_plays_offline_and_shows_the_finger_large(browser, finger, motion, 
     assert [url for url in fetched if not url.startswith(("data:", "blob:"))] == []
 
 
-@pytest.mark.parametrize("name", ["finger", "ur5", "panda", "kinova"])
+@pytest.mark.parametrize("name", ["finger", "ur5", "kinova", pytest.param("panda", marks=pytest.mark.slow)])
 def test_page_poses_every_shape_as_pinocchio_does(browser, tmp_path, name):
     robot = vp.load_robot(name)
     rng = np.random.default_rng(5)
@@ -219,7 +219,7 @@ def assert_ghost_at(browser, robot, q):
         np.testing.assert_allclose(pose, placements.oMg[k].homogeneous, atol=2e-5)
 
 
-@pytest.mark.parametrize("name", ["finger", "ur5"])
+@pytest.mark.parametrize("name", ["finger", pytest.param("ur5", marks=pytest.mark.slow)])
 def test_ghost_follows_its_own_motion(browser, tmp_path, name):
     robot = vp.load_robot(name)
     rng = np.random.default_rng(7)

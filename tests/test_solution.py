@@ -306,7 +306,7 @@ def path_costs(problem, policy, paths, seed):
     return np.concatenate(found)
 
 
-@pytest.mark.parametrize(("name", "intensity"), [("ur5", 0.13), ("finger", 0.16)])
+@pytest.mark.parametrize(("name", "intensity"), [pytest.param("ur5", 0.13, marks=pytest.mark.slow), ("finger", 0.16)])
 def test_where_noise_matters(name, intensity):
     """Noise adds a fifth to the cost. S-DDP's policy is better than plain DDP's by far, and costs what it predicts.
 

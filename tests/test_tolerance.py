@@ -78,7 +78,7 @@ def test_torques_of_time_are_right_in_continuous_time():
     assert np.abs(motion.u[0] - fine).max() < 1e-6
 
 
-@pytest.mark.parametrize("jump", [0.1234, 0.37, pytest.param(0.777, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("jump", [0.1234, *(pytest.param(jump, marks=pytest.mark.slow) for jump in (0.37, 0.777))])
 def test_a_torque_that_jumps_inside_steps_is_not_taken_for_met(jump):
     """Steps and half steps may have it on the same side of the times where they look."""
     scene, torque = chain(damping=1.0), np.array([20.0, 0.0, 0.0])

@@ -292,7 +292,7 @@ def derivative_of_geometric_noise(q, v, u):
 CORRECTED = ["left", "split"]
 
 
-@pytest.mark.parametrize("kick", CORRECTED)
+@pytest.mark.parametrize("kick", ["left", pytest.param("split", marks=pytest.mark.slow)])
 def test_velocity_dependent_noise_converges_to_the_stratonovich_limit(kick):
     """There v = exp(RATE w) on every path; log v - RATE w is 0 on average, at ever smaller spread."""
     spreads = []
@@ -447,7 +447,7 @@ def test_the_equations_in_numpy_are_those_of_the_robots():
 ])  # fmt: skip
 @pytest.mark.parametrize(("dt", "duration"), [
     pytest.param(1e-3, 60.0, marks=pytest.mark.slow),
-    (5e-3, 200.0),
+    pytest.param(5e-3, 200.0, marks=pytest.mark.slow),
     (2e-2, 400.0),
 ])  # fmt: skip
 def test_langevin_equipartition(name, kick, friction, dt, duration):
