@@ -145,8 +145,6 @@ class Box:
         self.along, self.curvature, self.rows, self.active, self.until = along, curvature, rows, active, until
         self.proximal = np.zeros((along.problem.decisions, along.problem.scene.controls))
         self.lower, self.upper = along.slack[:, 0], along.slack[:, 1]
-        if not self.lower.size:
-            self.lower, self.upper = np.full(self.proximal.shape, -np.inf), np.full(self.proximal.shape, np.inf)
 
     def with_proximal(self, proximal: Floats) -> Box:
         """The model with a further cost of the changes."""
@@ -334,8 +332,10 @@ class Box:
         return [np.where(bounded[0], z - self.lower, np.inf), np.where(bounded[1], self.upper - z, np.inf)]
 
     def active_inside(self, plan: Plan) -> list[Mask] | None:
-        """The active rows near the minimum by an interior-point method, after a plan of the model without limits."""
-        inner = None if self.rows is None else self._interior_with_rows(plan, self.rows)
+        """The active rows near the minimum without limits by an interior-point method, after a plan of the model."""
+        free = copy(self)
+        free.lower, free.upper = (np.full(self.proximal.shape, side) for side in (-np.inf, np.inf))
+        inner = None if self.rows is None else free._interior_with_rows(plan, self.rows)
         return None if inner is None else inner[2].active
 
     def _interior_with_rows(self, plan: Plan, rows: Rows) -> tuple[Floats, tuple[Mask, Mask], Box] | None:

@@ -79,8 +79,9 @@ class _Steps:
             self.proximal = self.regularization * np.abs(stiffness)
         if likely is not None and likely.size == rows.weights.size:
             self._settle(split(rows.begun, likely))
-        self._descend(problem.passes if problem.limited else self.done + _SEARCHED)
-        if not self.ended and problem.passes - self.done >= _INTERIOR and self.plan is not None:
+        self._descend(self.done + _SEARCHED)
+        left = problem.passes - self.done
+        if not self.ended and self.together and left >= _INTERIOR and self.plan is not None:
             box = Box(self.passing, self.curvature, rows, self.held, until=problem.until)
             box = box if self.proximal is None else box.with_proximal(self.proximal)
             inner = box.active_inside(self.plan)
