@@ -17,7 +17,7 @@ from varpin.control.augmented import within_constraints
 from varpin.control.backward import backward
 from varpin.control.hints import hints
 from varpin.control.hints import reach as hints_reach
-from varpin.control.penalties import penalized
+from varpin.control.penalties import penalized, split
 from varpin.control.spread import Feedback, deviations
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
@@ -448,13 +448,29 @@ def test_what_is_left_of_a_violation_does_not_show_that_there_is_no_plan(monkeyp
         raise vp.LinearizationError(0, 0.0, "no derivative")
 
     monkeypatch.setattr("varpin.control.augmented.polished", failed)
-    monkeypatch.setattr("varpin.control.augmented._ROUNDS", 6)
+    monkeypatch.setattr("varpin.control.augmented._ROUNDS", 5)
     plan = vp.solve(goal_within_rates(), check=False)
     bound = plan.problem.bound_constraints
     assert plan.violation > 1e-6
     assert all(told.violation <= 1e-3 * item.scale for told, item in zip(plan.constraints, bound, strict=True))
     assert plan.status is vp.Status.STALLED
     assert naming([plan.reason], "stays violated", f"{plan.violation:.1e}")
+
+
+def test_a_last_step_ends_with_the_time(monkeypatch):
+    """With many rows between nodes it took longer than the search."""
+    problem, solved = two_links(FAMILIES["velocities"]), []
+    plan = vp.solve(problem, tolerance=1e-3, check=False)
+    solve = polish._Step.solve
+    monkeypatch.setattr(polish._Step, "solve", lambda step: solved.append(step) or solve(step))
+    bound = problem.bound_constraints
+    zeros, weights = [np.zeros(item.shape) for item in bound], plan.multipliers.weights
+    motion = problem.simulate(plan.controls * 1.01)
+    for until, ends in ((0.0, True), (np.inf, False)):
+        solved.clear()
+        found = polish.polished(problem, motion, split(bound, plan.multipliers.values), weights, zeros, until)
+        assert (len(solved) == 0) is ends
+        assert (found.motion is motion) is ends
 
 
 @pytest.mark.parametrize("torque", [1e-6, 1e-3])

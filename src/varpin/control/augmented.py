@@ -176,6 +176,8 @@ class _Rounds:
         self.limit = checked_time(self.options.pop("time_limit", np.inf))
         self.report_all = require_reports(self.options.pop("callback", None), self.progress)
         self.label = f"{problem.scene.robot.name}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
+        # Time of time.perf_counter at which the rounds and the last step end.
+        self.until = np.inf
         self.history: list[Iteration] = []
         self.noisy = bool(problem.scene.processes) and any(item.margin > 0.0 for item in problem.constraints)
         self.state: _State
@@ -186,7 +188,7 @@ class _Rounds:
         return self.whole.bound_constraints
 
     def run(self) -> Solution:
-        began = time.perf_counter()
+        self.until = time.perf_counter() + self.limit
         # A search without iterations checks the options and makes the first motion.
         first = self._first()
         # Before the search, which takes long where there is no plan.
@@ -211,7 +213,7 @@ class _Rounds:
                 known -= done
                 self.history = self.history[:known]
             if np.isfinite(self.limit):
-                options["time_limit"] = max(self.limit - (time.perf_counter() - began), 1e-9)
+                options["time_limit"] = max(self.until - time.perf_counter(), 1e-9)
             found = self.search(
                 problem,
                 tolerance=begun.tolerance,
@@ -244,7 +246,7 @@ class _Rounds:
                 elif kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
                     kept, closing = self._polished(replace(kept, status=status))
                     status, reason = kept.status, f"{reason}; {closing}"
-                goes_on, counted = self._counts(kept, begun, status, began + self.limit)
+                goes_on, counted = self._counts(kept, begun, status, self.until)
                 if goes_on:
                     continue
                 reason += counted
@@ -637,7 +639,7 @@ class _Rounds:
         try:
             for _ in range(_LOOKS):
                 self.whole = enforced(self.problem, between)
-                after = polished(self.whole, motion, values, known.weights, backoff)
+                after = polished(self.whole, motion, values, known.weights, backoff, self.until)
                 bound = self.tolerance * (after.stake + NOTHING * (0.0 if kept.search is None else kept.search.first))
                 told = between
                 if dense:

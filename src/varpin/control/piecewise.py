@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from varpin.arrays import Floats, Mask
 from varpin.control.active_rows import Rows, same_rows
 from varpin.control.along import Along
 from varpin.control.box import Box, stiffness_of, to_minimum, within_limits
-from varpin.control.passes import Plan, single_pass
+from varpin.control.passes import Plan
 from varpin.control.penalties import PenalizedProblem, flat, split
 
 # Greatest number of passes in a row without a line search, and of those with one before the interior-point method,
@@ -72,7 +73,7 @@ class _Steps:
     def run(self, likely: Mask | None) -> None:
         """To the minimum: by likely rows, by Newton steps with line search, or by an interior-point method."""
         problem, rows = self.problem, self.rows
-        if self.regularization > 0.0 and not problem.limited:
+        if self.regularization > 0.0:
             stiffness = stiffness_of(rows.along(rows.begun), self.regularization, self.curvature)
             if stiffness is None:
                 return
@@ -82,9 +83,7 @@ class _Steps:
         self._descend(self.done + _SEARCHED)
         left = problem.passes - self.done
         if not self.ended and self.together and left >= _INTERIOR and self.plan is not None:
-            box = Box(self.passing, self.curvature, rows, self.held, until=problem.until)
-            box = box if self.proximal is None else box.with_proximal(self.proximal)
-            inner = box.active_inside(self.plan)
+            inner = self._box(rows, self.held).active_inside(self.plan)
             if inner is not None:
                 self._settle(inner)
         self._descend(problem.passes)
@@ -93,18 +92,15 @@ class _Steps:
         """A pass with active rows; None if the model has no minimum with them."""
         rows, self.done = self.rows, self.done + 1
         self.passing = rows.along(held)
-        known = (rows, held) if self.together else ()
-        box = Box(self.passing, self.curvature, *known, until=self.problem.until)
-        if self.proximal is None:
-            self.plan, active = to_minimum(box, self.regularization)
-        else:
-            firm = self.passing.with_cost_of_controls(self.proximal)
-            self.plan, active = single_pass(firm, 0.0, curvature=self.curvature)[0], None
+        self.plan, active = to_minimum(self._box(*((rows, held) if self.together else ())), 0.0)
         if self.plan is None:
             return None
         self.held = held if active is None else active
         self.ahead = rows.ahead(self.passing, self.plan)
         self.change, self.slope = rows.change(self.plan, self.held, self.ahead)
+        if self.plan.left is not None:
+            # Plans within limits leave out what regularization adds.
+            self.change += self._cost_of(rows.ahead_of[1])
         if self.slope < 0.0 and self.change < self.least:
             curvature = 2.0 * (self.change - self._cost_of(rows.ahead_of[1]) - self.slope)
             self.best = replace(self.plan, slope=self.slope, curvature=curvature, limited=True)
@@ -115,6 +111,11 @@ class _Steps:
             # The minimum to rounding errors, or nothing.
             self.ended, self.together = self.best is not None, False
         return self.plan
+
+    def _box(self, *known: Any) -> Box:
+        """The regularized model of the last pass, with rows and active ones that are to be found with limits."""
+        box = Box(self.passing, self.curvature, *known, until=self.problem.until)
+        return box if self.proximal is None else box.with_proximal(self.proximal)
 
     def _cost_of(self, moves: Floats) -> float:
         """What regularization adds to the model at changes of the controls (R, m)."""

@@ -6,6 +6,8 @@ the metric of the cost to go: a step onto the constraints then keeps to the opti
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -78,6 +80,7 @@ def polished(
     multipliers: list[Floats],
     weights: Floats,
     backoff: list[Floats],
+    until: float = math.inf,
 ) -> Polished:
     """The motion near a given one that satisfies its constraints, and the conditions of an optimum, most closely.
 
@@ -89,6 +92,7 @@ def polished(
         multipliers: For each constraint (K, rows); rows with positive multipliers are active.
         weights: Weights of the penalties (C,), which count in the feedback along the motion.
         backoff: For each constraint (K, rows).
+        until: Time of ``time.perf_counter`` from which on no step begins.
 
     Raises:
         LinearizationError: A step of the given motion has no derivative.
@@ -97,7 +101,8 @@ def polished(
     trials, longest = Trials(problem), 1.0
     step = _first(problem, motion, multipliers, weights, backoff)
     for left in reversed(range(_STEPS)):
-        if step.found.violation <= _DONE and step.found.decrease <= _FLAT * step.found.stake:
+        there = step.found.violation <= _DONE and step.found.decrease <= _FLAT * step.found.stake
+        if there or time.perf_counter() > until:
             break
         step.solve()
         # Where the model's curvature is too small, it is so in the next step, too.
