@@ -45,6 +45,8 @@ class Rows:
         # Changes of controls and states at this point, and the model's slope from its start in that direction.
         self.moves = np.zeros((problem.decisions, u.shape[1]))
         self.states, self.slope = np.zeros((len(q), 2 * q.shape[1])), 0.0
+        # What regularizes all passes: the Hessian's diagonal of a further cost of the changes of controls (R, m).
+        self.proximal: Floats | None = None
         # d(q, v)/dx at the nodes.
         n = problem.scene.robot.dof
         slopes = np.tile(np.eye(2 * n), (len(q), 1, 1))
@@ -80,7 +82,7 @@ class Rows:
         if isinstance(rate, PenalizedRate):
             u = self.problem.decided(self.whole.trajectory)
             passing.pull, passing.rate = rate.expand(u, self.problem.period, held[count:], signed[count:])
-        return passing
+        return passing if self.proximal is None else passing.regularized(self.proximal)
 
     def ahead(self, passing: Along, plan: Plan, slack: Floats | None = None) -> list[Floats]:
         """The penalties' shifted values on the linearized motion under a plan, with its controls clipped to ``slack``.
@@ -158,11 +160,12 @@ class Rows:
             total += 0.5 * item.weight * float((t[item.held(t)] ** 2).sum() - (s[now] ** 2).sum())
         return total
 
-    def there(self, plan: Plan, added: float = 0.0) -> Plan:
-        """A plan that leads to the present point of the steps, with the feedback of ``plan``.
+    def regularizing(self, moves: Floats) -> float:
+        """What regularization adds to the model at changes of the controls (R, m)."""
+        return 0.0 if self.proximal is None else 0.5 * float((self.proximal * moves**2).sum())
 
-        ``added`` is what regularization adds to the model there.
-        """
+    def there(self, plan: Plan) -> Plan:
+        """A plan that leads to the present point of the steps, with the feedback of ``plan``."""
         at = self.states[: -1 : self.problem.hold]
         if self.problem.linear:
             # A line is decided at its beginning, and so is the first control.
@@ -170,7 +173,7 @@ class Rows:
         ahead = self.moves - np.einsum("kmx,kx->km", plan.feedback, at)
         if plan.previous is not None:
             ahead[1:] -= np.einsum("kmi,ki->km", plan.previous[1:], self.moves[:-1])
-        curvature = 2.0 * (self.lowered - added - self.slope)
+        curvature = 2.0 * (self.lowered - self.regularizing(self.moves) - self.slope)
         return replace(plan, feedforward=ahead, slope=self.slope, curvature=curvature, limited=True)
 
     def change(self, plan: Plan, held: list[Mask], ahead: list[Floats]) -> tuple[float, float]:

@@ -160,6 +160,24 @@ class Along:
         made.added = added.reshape(-1, x + m) if self.added is None else self.added + added.reshape(-1, x + m)
         return made
 
+    def regularized(self, diagonal: Floats) -> Along:
+        """These expansions with a further cost of the changes of decided controls, its Hessian's diagonal (R, m).
+
+        Other than :meth:`with_cost_of_controls`, passes on square roots include it.
+        """
+        made, problem, m = copy(self), self.problem, diagonal.shape[1]
+        controls = np.arange(-m, 0)
+        if problem.linear:
+            hessian = self.line.hessian.copy()
+            hessian[:, controls, controls] += diagonal / problem.dt
+            vars(made)["line"] = self.line._replace(hessian=hessian)
+            return made
+        rule, hessian = problem.model_rule, self.running.hessian.copy()
+        weight = problem.hold * problem.dt * rule[0, 0]
+        hessian[:: len(rule), controls, controls] += np.repeat(diagonal / weight, problem.hold, axis=0)
+        made.running = Expansion(self.running.gradient, hessian)
+        return made
+
     def with_gradient_alone(self, gradient: Floats) -> Along:
         """These steps with a gradient of the changes of decided controls (R, m) as the only one."""
         made = copy(self)

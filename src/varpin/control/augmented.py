@@ -203,7 +203,7 @@ class _Rounds:
             known = len(self.history)
             done = 0 if resume is None or resume.search is None else len(resume.search.history)
             left = min(last - known, _OF_ROUND - done)
-            problem = penalized(self.whole, begun.multipliers, begun.weights, begun.backoff)
+            problem = penalized(self.whole, begun.multipliers, begun.weights, begun.backoff, until=self.until)
             options: dict[str, Any] = dict(self.options)
             if resume is None:
                 options["controls"] = self.controls if begun.round == 0 else found
@@ -246,7 +246,7 @@ class _Rounds:
                 elif kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
                     kept, closing = self._polished(replace(kept, status=status))
                     status, reason = kept.status, f"{reason}; {closing}"
-                goes_on, counted = self._counts(kept, begun, status, self.until)
+                goes_on, counted = self._counts(kept, begun, status)
                 if goes_on:
                     continue
                 reason += counted
@@ -562,7 +562,7 @@ class _Rounds:
             self.state = replace(self.state, weights=first_weights, worst=np.full(len(worst), np.inf), tolerance=_LOOSE)
         return True
 
-    def _counts(self, kept: Solution, begun: _State, status: Status, deadline: float) -> tuple[bool, str]:
+    def _counts(self, kept: Solution, begun: _State, status: Status) -> tuple[bool, str]:
         """Whether rounds follow with wider margins, as motions under noise violate bounds too often; a note on it.
 
         The last round is repeated from its own multipliers and weights.
@@ -571,7 +571,7 @@ class _Rounds:
         if not (self.noisy and ended):
             return False, ""
         try:
-            added = widened(kept, deadline)
+            added = widened(kept, self.until)
         except VarpinError as error:
             return False, f"; how often motions under noise violate bounds with a margin was not counted: {error}"
         if added is None:
@@ -667,7 +667,8 @@ class _Rounds:
         if kept.status in (Status.CONVERGED, Status.STALLED):
             # The decrease is a bound, whatever the multipliers, and the search may have stalled at a finer tolerance.
             there = found.decrease <= bound and not self._clearly_beyond(plan)
-            plan = replace(plan, status=Status.CONVERGED if there else Status.STALLED)
+            stopped = Status.OUT_OF_TIME if time.perf_counter() > self.until else Status.STALLED
+            plan = replace(plan, status=Status.CONVERGED if there else stopped)
         return plan, closing
 
     def _with_least_slope(self, kept: Solution) -> Solution:

@@ -54,8 +54,6 @@ def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask]
     """
     along, curvature = box.along, box.curvature
     problem = along.problem
-    if box.proximal.any():
-        along = along.with_cost_of_controls(box.proximal)
     if not problem.limited or along.clipped:
         return single_pass(along, regularization, curvature=curvature)[0], None
     plan, stiffness = _free(along, regularization, curvature)
@@ -67,7 +65,7 @@ def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask]
         if problem.processes:
             plan, active = _matching(along, regularization, curvature, plan), None
         else:
-            plan, active = box.with_proximal(box.proximal + regularization * np.abs(stiffness)).minimum(plan, moves)
+            plan, active = box.with_proximal(regularization * np.abs(stiffness)).minimum(plan, moves)
         if plan is not None:
             return plan, active
     return single_pass(along, regularization, curvature=curvature, limits=around_nominal(along.slack, along.states))[

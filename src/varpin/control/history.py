@@ -112,7 +112,7 @@ class SearchState:
         returned: Whether it has just gone back from a motion that cannot be linearized.
         watchdog: Whether it is away from the best motion.
         rows: Active rows of penalties (M,) at the end of the last backward pass, with which the next one begins; None
-            without penalties and before the first one.
+            where no rows were looked for.
         history: The iterations before.
     """
 

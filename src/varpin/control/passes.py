@@ -43,7 +43,7 @@ class Plan:
     loss: float  # estimated relative rounding error of Quu, or of its root
     model: Model  # of the cost along the motion
     left: Floats | None = None  # (R, m) the model's gradient after a full step, which presses controls against limits
-    rows: Mask | None = None  # active rows of all penalties where the steps to the model's minimum ended
+    rows: Mask | None = None  # active rows of all penalties where the last pass to the model's minimum ended
 
     @property
     def expected_decrease(self) -> float:

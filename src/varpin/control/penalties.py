@@ -180,7 +180,8 @@ class PenalizedProblem(OptimalControlProblem):
         within: Whether there are rows within steps.
         all_penalties: Penalties of all constraints, in the problem's order.
         quiet: Whether plans leave the scene's noise out: otherwise stiff penalties would add to the noise cost.
-        passes: Greatest number of passes that determine the active rows; 0 keeps those of the nominal motion.
+        passes: Greatest number of passes that determine the active rows, interior-point steps left out; 0 keeps those
+            of the nominal motion.
         until: Time (of ``time.perf_counter``) after which there is no further one of them.
         given: The given first controls, where controls are linear between nodes.
     """

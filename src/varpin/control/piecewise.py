@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -15,8 +14,8 @@ from varpin.control.box import Box, stiffness_of, to_minimum, within_limits
 from varpin.control.passes import Plan
 from varpin.control.penalties import PenalizedProblem, flat, split
 
-# Greatest number of passes in a row without a line search, and of those with one before the interior-point method,
-# whose steps are two passes each: as many as it takes is what has to be left for it.
+# Greatest number of passes in a row without a line search, and of those with one before the interior-point method. This
+# begins only if so many passes are left; its own, two for each of its steps, do not count.
 _AT_ONCE, _SEARCHED, _INTERIOR = 8, 4, 40
 
 
@@ -67,8 +66,6 @@ class _Steps:
         self.ahead: list[Floats] = self.rows.signed
         self.change = self.slope = 0.0
         self.passing = along
-        # What regularizes all passes: the Hessian's diagonal of a further cost of the changes of controls (R, m).
-        self.proximal: Floats | None = None
 
     def run(self, likely: Mask | None) -> None:
         """To the minimum: by likely rows, by Newton steps with line search, or by an interior-point method."""
@@ -77,13 +74,13 @@ class _Steps:
             stiffness = stiffness_of(rows.along(rows.begun), self.regularization, self.curvature)
             if stiffness is None:
                 return
-            self.proximal = self.regularization * np.abs(stiffness)
+            rows.proximal = self.regularization * np.abs(stiffness)
         if likely is not None and likely.size == rows.weights.size:
             self._settle(split(rows.begun, likely))
         self._descend(self.done + _SEARCHED)
         left = problem.passes - self.done
         if not self.ended and self.together and left >= _INTERIOR and self.plan is not None:
-            inner = self._box(rows, self.held).active_inside(self.plan)
+            inner = self._box(self.held).active_inside(self.plan)
             if inner is not None:
                 self._settle(inner)
         self._descend(problem.passes)
@@ -92,17 +89,14 @@ class _Steps:
         """A pass with active rows; None if the model has no minimum with them."""
         rows, self.done = self.rows, self.done + 1
         self.passing = rows.along(held)
-        self.plan, active = to_minimum(self._box(*((rows, held) if self.together else ())), 0.0)
+        self.plan, active = to_minimum(self._box(held if self.together else None), 0.0)
         if self.plan is None:
             return None
         self.held = held if active is None else active
         self.ahead = rows.ahead(self.passing, self.plan)
         self.change, self.slope = rows.change(self.plan, self.held, self.ahead)
-        if self.plan.left is not None:
-            # Plans within limits leave out what regularization adds.
-            self.change += self._cost_of(rows.ahead_of[1])
         if self.slope < 0.0 and self.change < self.least:
-            curvature = 2.0 * (self.change - self._cost_of(rows.ahead_of[1]) - self.slope)
+            curvature = 2.0 * (self.change - rows.regularizing(rows.ahead_of[1]) - self.slope)
             self.best = replace(self.plan, slope=self.slope, curvature=curvature, limited=True)
             self.least = self.change
         self.met = rows.held(self.ahead)
@@ -112,14 +106,10 @@ class _Steps:
             self.ended, self.together = self.best is not None, False
         return self.plan
 
-    def _box(self, *known: Any) -> Box:
-        """The regularized model of the last pass, with rows and active ones that are to be found with limits."""
-        box = Box(self.passing, self.curvature, *known, until=self.problem.until)
-        return box if self.proximal is None else box.with_proximal(self.proximal)
-
-    def _cost_of(self, moves: Floats) -> float:
-        """What regularization adds to the model at changes of the controls (R, m)."""
-        return 0.0 if self.proximal is None else 0.5 * float((self.proximal * moves**2).sum())
+    def _box(self, active: list[Mask] | None) -> Box:
+        """The model of the last pass, with its ``active`` rows if rows are to be found together with limits."""
+        rows = None if active is None else self.rows
+        return Box(self.passing, self.curvature, rows, active, until=self.problem.until)
 
     def _settle(self, held: list[Mask]) -> None:
         """Passes each with the active rows of the motion before, as long as ever fewer of them change."""
@@ -128,7 +118,7 @@ class _Steps:
             if self._passed(held) is None or self.ended or self.together != together:
                 break
             changed = sum(int((now != then).sum()) for now, then in zip(self.met, self.held, strict=True))
-            if changed >= most:
+            if changed >= most or time.perf_counter() > self.problem.until:
                 break
             held, most = self.met, changed
         if self.ended or self.plan is None:
@@ -154,5 +144,5 @@ class _Steps:
             still = same_rows(held, self.held)
             if still or self.done == problem.passes or time.perf_counter() > problem.until:
                 if rows.slope < 0.0 and rows.lowered < self.least:
-                    self.best = rows.there(plan, self._cost_of(rows.moves))
+                    self.best = rows.there(plan)
                 self.ended = True

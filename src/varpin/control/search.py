@@ -894,7 +894,9 @@ class _Search:
         for regularization in (0.0, *10.0 ** np.arange(-6, 11, 2)):
             self._differentiate_noise(float(regularization))
             for exact in (True, False) if self.second_order and regularization == 0.0 else (False,):
-                plan = backward(self.problem, self.trajectory, float(regularization), exact, along=self.along)
+                plan = backward(
+                    self.problem, self.trajectory, float(regularization), exact, along=self.along, rows=self.rows
+                )
                 if plan is not None:
                     return plan, float(regularization)
         return None, np.inf

@@ -59,7 +59,7 @@ class _Search:
     clips: int = 1
     returned: int = 0
     watchdog: Annotated[Floats, Axes(len(Watchdog._fields), finite=True)] | None = None
-    rows: Annotated[Mask, Axes("rows")] | None = None
+    rows: Annotated[Mask, Axes("penalty_rows")] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,7 +70,6 @@ class BoundConstraint(Frozen, ABC):
         rows: Description of each row of c.
         unit: Unit of c.
         scale: About a tenth of the range of c, in its unit; it scales the first penalty weights and tolerances.
-        affine: Whether c is an affine function of the states and controls.
     """
 
     source: PlanConstraint
@@ -80,7 +79,6 @@ class BoundConstraint(Frozen, ABC):
     unit: str
     scale: float
     of_controls: ClassVar[bool] = False
-    affine: ClassVar[bool] = False
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -31,7 +31,6 @@ class _BoundBox(BoundConstraint):
     columns: Integers  # the coordinate of each row
     signs: Floats  # 1 for upper limits, -1 for lower ones
     bounds: Floats  # signs times the limits
-    affine = True
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
         y = (v if self.in_velocity else q)[..., self.places, :]
@@ -143,7 +142,6 @@ class BoundRate(BoundConstraint):
     limit: Floats
     before: Floats | None
     of_controls = True
-    affine = True
 
     @property
     def limited(self) -> Integers:
