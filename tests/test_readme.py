@@ -44,14 +44,14 @@ def test_python_block(number, tmp_path):
 
 def test_the_blocks_of_the_page_on_integrators(tmp_path):
     page = (ROOT / "docs" / "which-integrator.md").read_text(encoding="utf-8")
-    # Which of two integrators takes less time goes by what else the machine does.
-    told = {(("1e-06", "Gauss(stages=4)"),), (("Midpoint",), ("RungeKutta4",))}
+    # No plan beats that of least true cost, however long each took on this machine.
+    told = {("1e-06", "Gauss(stages=4)"), ("RungeKutta4 0.004",)}
     blocks = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
     assert len(blocks) == len(told)
     for block in blocks:
         done = subprocess.run([sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
-        told -= {either for either in told if any(not unnamed(done.stdout, facts) for facts in either)}
+        told -= {facts for facts in told if not unnamed(done.stdout, facts)}
     assert not told
 
 

@@ -7,12 +7,13 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers, Mask
 from varpin.control.along import Along
 from varpin.control.constraints import BoundOnCubics
 from varpin.control.passes import Plan
-from varpin.control.penalties import PenalizedProblem, PenalizedRate, controls_of_steps, flat, rate_columns, split
+from varpin.control.penalties import PenalizedProblem, PenalizedRate, T, controls_of_steps, flat, rate_columns, split
 
 # Bisections of the line search between two passes.
 _BISECTIONS = 40
@@ -64,7 +65,7 @@ class Rows:
         """The rows that are active where the shifted values are ``ahead``."""
         return [item.held(s) for item, s in zip(self.penalties, ahead, strict=True)]
 
-    def split(self, values: Floats) -> list[Floats]:
+    def split(self, values: NDArray[T]) -> list[NDArray[T]]:
         """Values of all rows, in the shapes of the penalties."""
         return split(self.signed, values)
 
@@ -229,7 +230,7 @@ class Pushes:
     def active(self) -> list[Mask]:
         """The rows that will be active: those whose distances fell by more than their multipliers in the last step."""
         now = self.rows.equal | (self.p * self.last_y < self.y * self.last_p)
-        return split(self.rows.begun, now)
+        return self.rows.split(now)
 
     def _linear(self, aim: Floats) -> tuple[Floats, Floats]:
         """Shares of the weights, and the shifts, of the quadratic penalties of a step."""

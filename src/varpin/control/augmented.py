@@ -459,13 +459,12 @@ class _Rounds:
             self.state = replace(begun, tolerance=_TIGHTER * begun.tolerance, round=begun.round + 1, backoff=backoff)
             return None, ""
         stays = worst.violation > max(FEASIBLE, _LOWERED * float(begun.worst.max()))
-        own = constraints.index(worst)
         stuck = begun.stuck + 1 if stays else 0
         heavy = bool((begun.weights >= _HEAVIEST * begun.first_weights).any())
         if not feasible and (stuck >= _STUCK or begun.round + 1 >= _ROUNDS or (heavy and stuck)):
             if _blocked(found):
                 return found.status, f"{state}; {found.reason}"
-            return Status.INFEASIBLE, self._infeasible(kept, begun, worst, own)
+            return Status.INFEASIBLE, self._infeasible(kept, begun, worst, constraints.index(worst))
         if feasible and begun.round + 1 >= _ROUNDS:
             return found.status, found.reason
         more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)

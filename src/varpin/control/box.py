@@ -56,7 +56,7 @@ def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask]
     problem = along.problem
     if not problem.limited or along.clipped:
         return single_pass(along, regularization, curvature=curvature)[0], None
-    plan, stiffness = _free(along, regularization, curvature)
+    plan, stiffness = free_pass(along, regularization, curvature)
     if plan is not None:
         moves = foreseen(along, plan)[1]
         lower, upper = along.slack[:, 0], along.slack[:, 1]
@@ -73,17 +73,11 @@ def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask]
     ], None
 
 
-def _free(along: Along, regularization: float, curvature: Floats | None) -> tuple[Plan | None, Floats]:
+def free_pass(along: Along, regularization: float, curvature: Floats | None) -> tuple[Plan | None, Floats]:
     """The pass without limits, and the diagonals of its Quu (R, m)."""
     stiffness = np.zeros((along.problem.decisions, along.problem.scene.controls))
     free = around_nominal(along.slack[:0], along.states)._replace(stiffness=stiffness)
     return single_pass(along, regularization, curvature=curvature, limits=free)[0], stiffness
-
-
-def stiffness_of(along: Along, regularization: float, curvature: Floats | None) -> Floats | None:
-    """The diagonals of Quu (R, m) of the pass without limits; None where it has no minimum."""
-    plan, stiffness = _free(along, regularization, curvature)
-    return None if plan is None else stiffness
 
 
 def _sloped(plan: Plan, moves: Floats) -> Plan:

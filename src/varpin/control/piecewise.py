@@ -10,9 +10,9 @@ import numpy as np
 from varpin.arrays import Floats, Mask
 from varpin.control.active_rows import Rows, same_rows
 from varpin.control.along import Along
-from varpin.control.box import Box, stiffness_of, to_minimum, within_limits
+from varpin.control.box import Box, free_pass, to_minimum, within_limits
 from varpin.control.passes import Plan
-from varpin.control.penalties import PenalizedProblem, flat, split
+from varpin.control.penalties import PenalizedProblem, flat
 
 # Greatest number of passes in a row without a line search, and of those with one before the interior-point method. This
 # begins only if so many passes are left; its own, two for each of its steps, do not count.
@@ -71,12 +71,12 @@ class _Steps:
         """To the minimum: by likely rows, by Newton steps with line search, or by an interior-point method."""
         problem, rows = self.problem, self.rows
         if self.regularization > 0.0:
-            stiffness = stiffness_of(rows.along(rows.begun), self.regularization, self.curvature)
-            if stiffness is None:
+            found, stiffness = free_pass(rows.along(rows.begun), self.regularization, self.curvature)
+            if found is None:
                 return
             rows.proximal = self.regularization * np.abs(stiffness)
         if likely is not None and likely.size == rows.weights.size:
-            self._settle(split(rows.begun, likely))
+            self._settle(rows.split(likely))
         self._descend(self.done + _SEARCHED)
         left = problem.passes - self.done
         if not self.ended and self.together and left >= _INTERIOR and self.plan is not None:
