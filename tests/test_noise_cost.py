@@ -1,7 +1,5 @@
 """What noise costs a plan, against the exact covariance in continuous time; and the warning where steps are long."""
 
-from dataclasses import replace
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -166,15 +164,39 @@ def test_feedback_as_fast_as_the_steps_is_told_of_where_noise_matters(strength, 
 
 
 def test_steps_in_which_noise_grows_without_bound_have_no_cost(recwarn):
-    """As in trials that run away: no warning of NumPy, and an error that rejects the trial."""
-    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
+    """As those of a force that drives: no warning of NumPy, and an error that rejects the trial."""
     cost = vp.VelocityCost(1.0) + vp.ControlCost(1.0)
-    problem = vp.OptimalControlProblem(scene, cost, np.zeros(2), np.zeros(2), dt=0.05, steps=4)
-    motion = problem.simulate(np.zeros((4, 2)))
-    lin = linearize_steps(scene, motion, problem.integrator, problem.q0)
-    A = np.array(lin.A)
-    A[2, 2:, 2:] = 1e5 * np.eye(2)
-    hessian = problem.expand_running(motion).hessian
+
+    def problem(*forces):
+        scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1), forces=forces)
+        return vp.OptimalControlProblem(
+            scene, cost, np.zeros(2), np.zeros(2), dt=0.05, steps=4, integrator=vp.Gauss(2, kick="held")
+        )
+
+    damped = problem()
+    motion = damped.simulate(np.zeros((4, 2)))
+    lin = linearize_steps(damped.scene, motion, damped.integrator, damped.q0)
+    hessian = damped.expand_running(motion).hessian
+    driven = problem(vp.CustomForce(lambda q, v: 1e5 * v))
     with pytest.raises(vp.LinearizationError, match="without bound"):
-        beyond_samples(problem, motion, replace(lin, A=A), hessian, len(problem.rule))
+        beyond_samples(driven, motion, lin, hessian, len(driven.rule))
     assert not recwarn.list
+
+
+@pytest.mark.parametrize("damping", [0.01, 1.0])
+def test_in_fast_motions_of_arms_it_is_that_of_fine_steps(damping):
+    """A Panda at 2.5 rad/s turns by 0.1 rad in a step: its inertias change, and with them momenta."""
+    robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})
+    begin, goal = np.array([0.4, -0.3, 0.2, -1.2, 0.1, 1.0, 0.3]), np.array([0.9, 0.2, -0.3, -0.8, 0.6, 1.4, -0.1])
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1.0) + vp.Terminal(vp.TrackingCost(goal, 10.0))
+
+    def problem(noise):
+        scene = vp.Scene(robot, damping=damping, noise=noise)
+        return vp.OptimalControlProblem(scene, cost, begin, np.zeros(7), dt=0.05, steps=12)
+
+    plan = vp.solve(problem(None), check=False)
+    noisy, feedback = problem(vp.ControlNoise(0.05)), Feedback(plan.gains, plan.previous_gains)
+    fine = noisy.at(dt=0.05 / 16, hold=16)
+    there = noise_cost(fine, fine.simulate(np.repeat(plan.controls, 16, axis=0)), feedback)
+    assert noisy.integrator.kick == "held"
+    assert noise_cost(noisy, plan.trajectory, feedback) == pytest.approx(there, rel=0.05)

@@ -6,8 +6,10 @@ from expected_cost import expected_cost_slopes
 from refusals import refused
 
 import varpin as vp
+from varpin.control.along import Along
 from varpin.control.backward import backward
 from varpin.control.moments import noise_cost
+from varpin.control.passes import Plan, noise_shares
 from varpin.control.spread import Feedback
 from varpin.control.within_steps import mean_of_decay, mean_of_decay_slopes
 
@@ -22,6 +24,7 @@ def reach(
     rate: float = 0.0,
     damping: float = 0.2,
     place: bool = False,
+    forces: tuple = (),
     **options: object,
 ):
     cost = vp.ControlCost(0.05) + vp.VelocityCost(0.1)
@@ -33,7 +36,7 @@ def reach(
         # Hessians that depend on the configuration.
         cost += vp.FramePositionCost(robot, "tip", [0.5, 0.0, -1.0], 3.0)
         cost += vp.Terminal(vp.FramePositionCost(robot, "tip", [0.5, 0.0, -1.0], 10.0))
-    scene = vp.Scene(robot, damping=damping, noise=noise)
+    scene = vp.Scene(robot, damping=damping, noise=noise, forces=forces)
     return vp.OptimalControlProblem(scene, cost, [0.2, 0.2], [0.0, 0.0], dt=dt, steps=steps, **options)
 
 
@@ -50,6 +53,9 @@ def reach(
         (CONTROL, {"integrator": vp.Gauss(2, kick="held"), "hold": 2}),
         (STATE, {"integrator": vp.Gauss(2, kick="held")}),
         (CONTROL, {"integrator": vp.Radau(2, kick="held"), "damping": 1.0}),
+        (CONTROL, {"integrator": vp.Gauss(2, kick="held"), "forces": (vp.CoulombFriction(0.5, 0.5),)}),
+        (STATE, {"integrator": vp.Gauss(2, kick="held"), "forces": (vp.FrameDamper("tip", (0.5, 0.0, -1.0), 2.0),)}),
+        (CONTROL, {"integrator": vp.Gauss(2, kick="held"), "forces": (vp.CustomForce(lambda q, v: -v * abs(v)),)}),
         (STATE, {"integrator": vp.RungeKutta4()}),
         (vp.AdditiveNoise(0.5), {"integrator": vp.Gauss(2)}),
         (CONTROL, {"integrator": vp.Gauss(2, kick="held"), "place": True}),
@@ -113,6 +119,53 @@ def test_strong_noise_ends_converged_and_below_the_search_with_it_held(noise: ob
     held, found = (vp.solve(problem, noise=mode, check=False) for mode in ("held", None))
     assert found.status.converged
     assert found.expected_cost < (1.0 - 1e-5) * held.expected_cost
+
+
+def test_light_joints_in_long_steps_end_converged() -> None:
+    """The joints of a finger: their momenta change with the inertias that they move, whatever their damping."""
+    goal = np.array([0.3, 0.8, 0.9, -0.3, 0.2, 0.4])
+    scene = vp.Scene(vp.load_robot("so100"), damping=0.01, noise=vp.ControlNoise(0.05))
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost(1.0))
+    begin = goal + np.array([0.4, -0.3, 0.3, 0.4, -0.4, 0.2])
+    plan = vp.solve(vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=0.05, steps=12), check=False)
+    assert plan.status is vp.Status.CONVERGED
+    assert plan.iterations <= 60
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+@pytest.mark.parametrize("noise", [CONTROL, CONTROL + STATE + vp.AdditiveNoise(0.2)])
+def test_a_fixed_cost_in_place_of_the_noise(controls: str, noise: object) -> None:
+    """That with the value function of the pass itself leads to the same plan; under regularization it stays."""
+    problem = reach(noise, steps=10, dt=0.05, rate=1e-2, controls=controls, integrator=vp.Gauss(2))
+    motion = problem.simulate(problem.holding_policy())
+    along = Along(problem, motion)
+    plan = backward(problem, motion, 0.0, along=along)
+    held = along.with_noise_held(plan.spread)
+    again, away = (backward(problem, motion, regularization, along=held) for regularization in (0.0, 1e6))
+    for name in ("feedforward", "feedback", "previous", "gradient"):
+        expected = getattr(plan, name)
+        np.testing.assert_allclose(getattr(again, name), expected, atol=1e-9 * np.abs(expected).max(), rtol=0.0)
+    assert again.slope == pytest.approx(plan.slope, rel=1e-9)
+    if controls == "held":
+        # Large regularization leaves no gains, and the gradient is that of the controls alone.
+        slopes = slopes_of(problem, plan, problem.decided(motion))
+        np.testing.assert_allclose(away.gradient, slopes, atol=1e-5 * np.abs(slopes).max())
+
+
+def slopes_of(problem: vp.OptimalControlProblem, plan: Plan, u: np.ndarray) -> np.ndarray:
+    """The gradient of the cost, and of the noise cost with S held, by differences."""
+
+    def total(controls: np.ndarray) -> float:
+        motion = problem.simulate(controls)
+        return problem.cost_of(motion) + float(noise_shares(problem, motion, plan).sum())
+
+    found = np.empty_like(u)
+    for index in np.ndindex(u.shape):
+        away = np.zeros_like(u)
+        away[index] = 1e-5
+        found[index] = (total(u + away) - total(u - away)) / 2e-5
+    return found
 
 
 def test_the_prediction_is_that_of_paths_where_noise_is_small() -> None:

@@ -20,6 +20,7 @@ from varpin.control.linear_controls import (
     after_impulse,
     at_samples,
     derivatives,
+    in_step,
     linear_steps,
     noisy,
     size,
@@ -107,8 +108,9 @@ class Along:
         # With linear controls in (x, w, u) of each step (N, 2n + 2m).
         self.pulled: Floats | None = None
         self.noise_differentiated = False
-        # Hessians of a further cost of controls, added to those of steps (N, 2n + m, 2n + m).
+        # Hessians of a further cost, added to those of steps (N, 2n + m, 2n + m).
         self.firm: Floats | None = None
+        self.processes = problem.processes  # number of those that passes see as noise
 
     @cached_property
     def running(self) -> Expansion:
@@ -127,8 +129,14 @@ class Along:
         problem, N = self.problem, self.problem.steps
         lin = self.linearized(0, N)[0] if len(self.blocks) == 1 else None
         pull = noise_gradient(problem, self.trajectory, feedback, self.rate, processes, lin, spread)
+        self._pull(pull)
+        self.noise_differentiated = True
+
+    def _pull(self, gradient: Floats) -> None:
+        """Add a gradient of the steps' costs (N, Z), in (x, u) or with linear controls in (x, w, u)."""
+        problem, N = self.problem, self.problem.steps
         if problem.linear:
-            self.pulled, self.noise_differentiated = pull, True
+            self.pulled = gradient if self.pulled is None else self.pulled + gradient
             vars(self).pop("line", None)
             return
         # A gradient in (x, u) is one in (q, v, u) at the step's first sample.
@@ -138,8 +146,23 @@ class Along:
         D[:, :x] = at_samples(rule[:1], np.concatenate([lin.A, lin.B], axis=2), velocity)[0]
         D[:, x:, x:] = np.eye(m)
         added = np.zeros((N, len(rule), x + m))
-        added[:, 0] = np.linalg.solve(np.swapaxes(D, 1, 2), pull[:, :, None])[:, :, 0] / (problem.dt * rule[0, 0])
-        self.added, self.noise_differentiated = added.reshape(-1, x + m), True
+        added[:, 0] = np.linalg.solve(np.swapaxes(D, 1, 2), gradient[:, :, None])[:, :, 0] / (problem.dt * rule[0, 0])
+        self.added = added.reshape(-1, x + m) if self.added is None else self.added + added.reshape(-1, x + m)
+
+    def with_noise_held(self, spread: Floats) -> Along:
+        """These expansions without noise, whose cost is instead a fixed one of the steps, for S ``spread`` (N, 2n, 2n).
+
+        The gains of regularized passes let noise grow, and so do not tell what it costs.
+        """
+        made, m, linear = copy(self), self.problem.scene.controls, self.problem.linear
+        lin = self.linearized(0, self.problem.steps)[0]
+        counted = slice(None) if linear else slice(self.processes)
+        gz = in_step(lin)[1][:, :, counted]
+        weighted = np.einsum("Nab,Nbkz->Nakz", spread, gz)
+        hessian = np.einsum("Nakz,Naky->Nzy", gz, weighted)
+        made.processes, made.firm = 0, widened(hessian, m) if linear else hessian
+        made._pull(np.einsum("Nakz,Nak->Nz", weighted, lin.G[:, :, counted]))
+        return made
 
     def with_cost_of_controls(self, diagonal: Floats, gradient: Floats | None = None) -> Along:
         """These expansions with a further cost of the changes of decided controls: both (R, m)."""
@@ -243,7 +266,7 @@ class Along:
         """The steps with the control in the state, where controls are linear between nodes."""
         problem, found, lines = self.problem, self.running, self.of_lines
         steps = linear_steps(problem, lines, found, self.rate, self.pull)
-        if problem.processes:
+        if self.processes:
             x = lines.A.shape[1]
             kicked = after_impulse(problem.model_rule, found.hessian, lines.velocity, problem.steps, x, problem.dt)
             if self.within is not None:
@@ -309,7 +332,7 @@ class Along:
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
         lin, velocity = self.linearized(begin, end)
-        G, Gx, Gu, count = lin.G, lin.Gx, lin.Gu, problem.processes
+        G, Gx, Gu, count = lin.G, lin.Gx, lin.Gu, self.processes
         if count < G.shape[2]:
             G, Gx, Gu = (np.ascontiguousarray(array[:, :, :count]) for array in (G, Gx, Gu))
         return core.ExpandedSteps(

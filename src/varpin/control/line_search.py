@@ -63,7 +63,7 @@ class Start(NamedTuple):
         trajectory: The motion that the plan is around.
         shares: The terms of the motion's cost (:meth:`OptimalControlProblem.shares`).
         cost: Their sum.
-        regularization: That of the backward pass.
+        rating: Regularization of the passes that rate motions, :class:`Rated`.
         exact: Whether the pass had second derivatives of the dynamics.
         whole: Whether the pass had the whole gradient of the noise cost.
         extends: Whether full steps that end early are extended.
@@ -74,7 +74,7 @@ class Start(NamedTuple):
     trajectory: Trajectory
     shares: Floats
     cost: float
-    regularization: float
+    rating: float
     exact: bool
     whole: bool
     extends: bool
@@ -82,10 +82,14 @@ class Start(NamedTuple):
 
 
 class Rated(NamedTuple):
-    """A motion's expansions and their plan with the Hessian of the value function held."""
+    """A motion's expansions and the plan that rates it, regularized as little as can be.
+
+    Its noise cost is that of the motion. Under regularized gains noise grows.
+    """
 
     along: Along
     plan: Plan
+    regularization: float
 
 
 class Trial(NamedTuple):
@@ -341,12 +345,12 @@ class LineSearch:
     def _noise_beyond(self, trial: Trajectory, start: Start) -> tuple[float, Rated | None]:
         """Noise cost along a trial with the value function there, minus that with the current plan's."""
         along = Along(self.problem, trial)
-        found = backward(self.problem, trial, start.regularization, along=along)
+        found = backward(self.problem, trial, start.rating, along=along)
         if found is None:
             return np.inf, None
         steered = self.problem.steered
         shares, held = (noise_shares(self.problem, trial, each, steered).sum() for each in (found, start.plan))
-        return float(shares - held), Rated(along, found)
+        return float(shares - held), Rated(along, found, start.rating)
 
 
 def _divides_others(trial: Trial, start: Start) -> bool:

@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.control.linear_controls import at_samples, of_samples
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.within_steps import mean_of_decay, mean_of_decay_slopes
+from varpin.control.within_steps import (
+    damping_at_nodes,
+    decay_of_momenta,
+    mean_of_decay,
+    mean_of_decay_slopes,
+)
 from varpin.integrators.variational import Variational
 from varpin.linearization import Linearization, velocity_at_nodes, velocity_curvature
 from varpin.mechanics.forces import limited_servos
@@ -119,7 +124,8 @@ def exact_gradient(
         for half in range(2):
             to_nodes[1:] += late[s, 4 + 4 * half] * pull[:, half * n : (half + 1) * n]
     if around.beyond is not None:
-        _add_within(problem, around, velocity, to_kicked[:, n:, n:], to_step, to_impulse, to_nodes, weights)
+        pull = to_kicked[:, n:, n:]
+        to_damping = _add_within(problem, trajectory, around, velocity, pull, to_impulse, to_nodes, weights)
     # In the state and the joint forces.
     bends = np.concatenate([to_step[:, :, :x], to_step[:, :, x:] @ scene.transmission.T], axis=2)
     if integrator.holds_noise:
@@ -140,6 +146,9 @@ def exact_gradient(
     at_nodes = _of_velocities(problem, trajectory, to_nodes)
     at_end = _of_terminal_hessian(problem, trajectory, 0.5 * spread @ end.T)
     at_nodes[-1] += end.T @ at_end
+    if around.beyond is not None:
+        of_damping = _of_damping(problem, trajectory, to_damping)
+        at_nodes += of_damping[:, :n] @ np.eye(n, x) + np.einsum("Nix,Ni->Nx", velocity, of_damping[:, n:])
     if len(around.hessian) > 1:
         in_nodes, in_controls = _of_hessians(problem, trajectory, weights)
         at_nodes += in_nodes[:, :n] @ np.eye(n, x) + np.einsum("Nix,Ni->Nx", velocity, in_nodes[:, n:])
@@ -151,33 +160,57 @@ def exact_gradient(
 
 def _add_within(
     problem: OptimalControlProblem,
+    trajectory: Trajectory,
     around: LinearizedSteps,
     velocity: Floats,
     pull: Floats,
-    to_step: Floats,
     to_impulse: Floats,
     to_nodes: Floats,
     weights: Floats,
-) -> None:
-    """Add derivatives through what velocities cost within the steps, ``pull`` (N, n, n) those in its Hessian."""
+) -> list[Floats]:
+    """Add derivatives through what velocities cost within the steps, ``pull`` (N, n, n) those in its Hessian.
+
+    Returns those in the damping (N, n, n) where steps begin and where they end.
+    """
     N, n, _ = pull.shape
     speeds, hw = slice(n, 2 * n), problem.dt * problem.rule[:, 0]
     whole = np.zeros((N, n, n))
     for s, part in enumerate(hw):
         whole += part * of_samples(around.hessian, len(hw), s)[:, speeds, speeds]
     slope, inverse = velocity[:-1, :, n:], np.linalg.inv(around.lin.J[:, n:])
-    rest = np.eye(n) - around.lin.A[:, n:, n:]
-    decay, sampled = rest @ inverse, np.swapaxes(slope, 1, 2) @ whole @ slope
+    decay, sampled = decay_of_momenta(problem, trajectory, velocity), np.swapaxes(slope, 1, 2) @ whole @ slope
     mean = mean_of_decay(decay, sampled)
     to_mean = inverse @ pull @ np.swapaxes(inverse, 1, 2)
     to_decay, to_sampled = mean_of_decay_slopes(decay, sampled, to_mean)
-    to_inverse = 2.0 * mean @ inverse @ pull + np.swapaxes(rest, 1, 2) @ to_decay
     turned = np.swapaxes(inverse, 1, 2)
-    to_impulse[:, n:] -= turned @ to_inverse @ turned
-    to_step[:, n:, speeds] -= to_decay @ turned
+    to_impulse[:, n:] -= turned @ (2.0 * mean @ inverse @ pull) @ turned
     to_nodes[:-1, :, n:] += 2.0 * whole @ slope @ to_sampled
     seen = slope @ to_sampled @ np.swapaxes(slope, 1, 2)
     weights[:, :, speeds, speeds] += hw[:, None, None] * seen[:, None]
+    part, to_damping = 0.5 * problem.dt, []
+    for end, damping in enumerate(damping_at_nodes(problem, trajectory)):
+        to_nodes[end : N + end, :, n:] += part * np.swapaxes(damping, 1, 2) @ to_decay
+        to_damping.append(part * to_decay @ np.swapaxes(velocity[end : N + end, :, n:], 1, 2))
+    return to_damping
+
+
+def _of_damping(problem: OptimalControlProblem, trajectory: Trajectory, pulls: list[Floats]) -> Floats:
+    """Derivatives (N + 1, 2n) in (q, v) at the nodes of sums of pull_ab D_ab, by central differences of the damping."""
+    n, N = problem.scene.robot.dof, problem.steps
+    found = np.zeros((N + 1, 2 * n))
+    for half, name in enumerate(("q", "v")):
+        values = getattr(trajectory, name)
+        for c in range(n):
+            step = _SHIFT * (float(np.abs(values[:, c]).max()) or 1.0)
+            ends = []
+            for sign in (1.0, -1.0):
+                moved = values.copy()
+                moved[:, c] += sign * step
+                ends.append(damping_at_nodes(problem, replace(trajectory, **{name: moved})))
+            for end, pull in enumerate(pulls):
+                change = (ends[0][end] - ends[1][end]) / (2.0 * step)
+                found[end : N + end, half * n + c] += (change * pull).sum(axis=(1, 2))
+    return found
 
 
 def _of_velocities(problem: OptimalControlProblem, trajectory: Trajectory, pull: Floats) -> Floats:

@@ -175,7 +175,7 @@ def one_pass(
     """The plan of one recursion, plain or on square ``roots``, and with ``costates`` those after each step (N, 2n)."""
     problem, running = along.problem, along.running
     scene = problem.scene
-    n, m, k, N, R = scene.robot.dof, scene.controls, problem.processes, problem.steps, problem.decisions
+    n, m, k, N, R = scene.robot.dof, scene.controls, along.processes, problem.steps, problem.decisions
     _, D, by_state, by_states = along.terminal
     if curvature is not None and problem.integrator.variational:
         pull = along.terminal.cost.gradient[:, n:]
@@ -262,7 +262,7 @@ def _one_pass_on_lines(
     end_gradient, end_hessian = np.zeros(X), np.zeros((X, X))
     end_gradient[:x], end_hessian[:x, :x] = by_state, by_states
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
-    line, k = along.line, problem.processes
+    line, k = along.line, along.processes
     spread, costate = np.empty((R if k else 0, X, X)), np.empty((R if costates else 0, X))
     of_states = costate[1:, :x]
     limits = without_limits(m, X) if limits is None else limits

@@ -11,6 +11,7 @@ import functools
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -77,6 +78,8 @@ _LOSSY = 1e-8
 PATIENCE = 15
 # Expected decrease, as a share of the cost at stake, from which a search takes the whole gradient of the noise cost.
 _NEAR = 1e-4
+# Iterations in a row without a lower expected cost, after which it takes that gradient, too.
+_RISES = 2
 # Iterations by whose decrease a search that may end early is judged.
 _SLOW = 8
 # Share of the first motion's cost at stake that is added to the current one: an optimum of cost zero has none.
@@ -671,7 +674,9 @@ class _Search:
         # The noise cost of exact passes is another.
         if not self.wants_whole or self.whole or self.second_order:
             return False
-        return ends or self._decrease_at_most(self._share(_NEAR))
+        # With the noise held, steps may lead to where it costs more than they save.
+        rises = len(self.gains) >= _RISES and not any(self.gains[-_RISES:])
+        return ends or rises or self._decrease_at_most(self._share(_NEAR))
 
     def _take_whole(self) -> None:
         """Use the whole gradient of the noise cost from now on, starting at the best motion so far."""
@@ -681,19 +686,40 @@ class _Search:
         self.whole, self.best, self.best_cost, self.best_noise, self.above = True, None, np.inf, np.inf, 0.0
         self.gains, self._around, self.regularization, self.growth = [], None, 0.0, 1.0
 
-    def _differentiate_noise(self, regularization: float) -> int:
-        """Add the whole gradient of the noise cost to passes along the motion; returns the passes that took."""
+    def _differentiate_noise(self) -> int:
+        """Rate the motion and add the whole gradient of its noise cost to passes; returns the passes that took."""
         if not self.whole or self.along.noise_differentiated:
             return 0
-        rated, self.rated = self.rated, None
-        plan: Plan | None
-        if rated is not None and rated.along is self.along:
-            plan, passes = rated.plan, 0
-        else:
-            plan, passes = backward(self.problem, self.trajectory, regularization, along=self.along), 1
-        if plan is not None:
+        passes = 0
+        if self.rated is None or self.rated.along is not self.along:
+            self.rated = None
+            for regularization in sorted({0.0, self.regularization}):
+                plan, passes = backward(self.problem, self.trajectory, regularization, along=self.along), passes + 1
+                if plan is not None:
+                    self.rated = Rated(self.along, plan, regularization)
+                    break
+        if self.rated is not None:
+            plan = self.rated.plan
             self.along.differentiate_noise(Feedback(plan.feedback, plan.previous), plan.spread, self.steered)
         return passes
+
+    def _pass(self, regularization: float, *, exact: bool, demands: bool = False, clipped: bool = False) -> Plan | None:
+        """A backward pass along the motion; under regularization the noise costs what it does without."""
+        along, rated = self.along, self.rated
+        held = self.whole and rated is not None and rated.along is along and regularization > rated.regularization
+        plan = backward(
+            self.problem,
+            self.trajectory,
+            regularization,
+            exact,
+            along=along.with_noise_held(rated.plan.spread) if held and rated is not None and not exact else along,
+            demands=demands,
+            clipped=clipped,
+            rows=self.rows,
+        )
+        if plan is None or rated is None or not held:
+            return plan
+        return replace(plan, noise=rated.plan.noise, jumps=rated.plan.jumps, spread=rated.plan.spread)
 
     def _compare_with_best(self, plan: Plan) -> None:
         noise = self._noise(plan)
@@ -853,17 +879,8 @@ class _Search:
             self._take_saturation()
         self.exact = self.second_order if exact is None else exact
         while True:
-            passes += 1 + self._differentiate_noise(self.regularization)
-            self.plan = backward(
-                self.problem,
-                self.trajectory,
-                self.regularization,
-                self.exact,
-                along=self.along,
-                demands=self.saturated,
-                clipped=self.clipping,
-                rows=self.rows,
-            )
+            passes += 1 + self._differentiate_noise()
+            self.plan = self._pass(self.regularization, exact=self.exact, demands=self.saturated, clipped=self.clipping)
             if self.plan is not None:
                 self.rows = self.plan.rows
                 self.planned = self.trajectory, self.regularization, self.exact
@@ -892,11 +909,9 @@ class _Search:
     def _least_regularized(self) -> tuple[Plan | None, float]:
         """The plan with the least regularization that gives the model a minimum, and that regularization."""
         for regularization in (0.0, *10.0 ** np.arange(-6, 11, 2)):
-            self._differentiate_noise(float(regularization))
+            self._differentiate_noise()
             for exact in (True, False) if self.second_order and regularization == 0.0 else (False,):
-                plan = backward(
-                    self.problem, self.trajectory, float(regularization), exact, along=self.along, rows=self.rows
-                )
+                plan = self._pass(float(regularization), exact=exact)
                 if plan is not None:
                     return plan, float(regularization)
         return None, np.inf
@@ -915,7 +930,7 @@ class _Search:
                 trajectory=self.trajectory,
                 shares=self.shares,
                 cost=self.cost,
-                regularization=self.regularization,
+                rating=0.0 if self.rated is None else self.rated.regularization,
                 exact=self.exact,
                 whole=self.whole,
                 extends=self._extends(),

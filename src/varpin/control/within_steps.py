@@ -11,6 +11,7 @@ from varpin.control.linear_controls import after_impulse, of_samples
 from varpin.control.problem import OptimalControlProblem
 from varpin.errors import LinearizationError
 from varpin.linearization import Linearization, velocity_at_nodes
+from varpin.simulation.friction import damping_matrices
 from varpin.trajectory import Trajectory
 
 # Terms of the series for a short part of a step, and the decay over it up to which its error is a rounding error.
@@ -24,10 +25,10 @@ def beyond_samples(
 
     It is added to that of the samples, :func:`after_impulse`, for the exact mean over the step of the cost of the
     velocity by white noise that begins with the step. Without the step's springs a momentum decays as exp(-Z s) over a
-    unit step, with 1 - A = Z J for the derivatives of the step's end in the momentum, A, and in the held impulse, J.
-    So an impulse f adds f' B f / 2, with B the integral of (1 - s) exp(-Z s)' l_pp exp(-Z s). None where there is
-    nothing to add: without noise or costs of velocities, for impulses, for sums over nodes (``sampling="start"``), and
-    under constraints of the scene.
+    unit step, see :func:`decay_of_momenta`. So an impulse f adds f' B f / 2, with B the integral of
+    (1 - s) exp(-Z s)' l_pp exp(-Z s), and the jump after the step is J f. None where there is nothing to add: without
+    noise or costs of velocities, for impulses, for sums over nodes (``sampling="start"``), and under constraints of the
+    scene.
 
     Args:
         problem: The problem.
@@ -50,16 +51,46 @@ def beyond_samples(
     found = -after_impulse(rule, of_speeds.reshape(-1, 2 * n, 2 * n), velocity, N, 2 * n, h)
     slope, to_impulse = velocity[:-1, :, n:], np.linalg.pinv(lin.J[:, n:])
     whole = np.einsum("s,Nsab->Nab", h * rule[:, 0], of_speeds[:, :, speeds, speeds])
-    decay = (np.eye(n) - lin.A[:, n:, n:]) @ to_impulse
+    decay = decay_of_momenta(problem, motion, velocity)
     # A step in which velocities grow without bound, as in a trial that runs away, has no mean.
     with np.errstate(over="ignore", invalid="ignore"):
         mean = mean_of_decay(decay, np.swapaxes(slope, 1, 2) @ whole @ slope)
-    lost = ~np.isfinite(mean).all(axis=(1, 2))
+        found[:, n:, n:] += np.swapaxes(to_impulse, 1, 2) @ mean @ to_impulse
+    lost = ~np.isfinite(found).all(axis=(1, 2))
     if lost.any():
         step = int(lost.argmax())
         raise LinearizationError(step, step * h, "what noise adds to velocities grows without bound within the step")
-    found[:, n:, n:] += np.swapaxes(to_impulse, 1, 2) @ mean @ to_impulse
     return found
+
+
+def decay_of_momenta(problem: OptimalControlProblem, motion: Trajectory, velocity: Floats) -> Floats:
+    """Z (N, n, n) of momenta that decay as exp(-Z s) over a unit step: h D M^-1 for the damping D, mean of both ends.
+
+    The derivatives of a step do not tell Z: in motion they also have what inertias change.
+
+    Args:
+        problem: The problem.
+        motion: Nodes and controls of the steps.
+        velocity: dv/dx (N + 1, n, 2n) at the nodes.
+    """
+    n, N = problem.scene.robot.dof, len(motion.u)
+    D = damping_at_nodes(problem, motion)
+    rates = [D[end] @ velocity[end : N + end, :, n:] for end in range(2)]
+    found: Floats = 0.5 * problem.dt * (rates[0] + rates[1])
+    return found
+
+
+def damping_at_nodes(problem: OptimalControlProblem, motion: Trajectory) -> tuple[Floats, Floats]:
+    """The damping (N, n, n) where steps begin and where they end, under their controls."""
+    scene = problem.scene
+    forces = motion.u @ scene.actuation.T
+    begin, end = (
+        damping_matrices(scene, motion.q[part], motion.v[part], forces) for part in (slice(None, -1), slice(1, None))
+    )
+    if scene.custom is None:
+        return begin, end
+    own = np.array([-scene.custom(q, v, True)[2] for q, v in zip(motion.q, motion.v, strict=True)])
+    return begin + own[:-1], end + own[1:]
 
 
 def mean_of_decay(Z: Floats, H: Floats) -> Floats:

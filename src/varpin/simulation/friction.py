@@ -89,6 +89,20 @@ def rate_at_rest(scene: Scene, q: Floats) -> float:
     return float(fastest_damping(scene.core, np.ascontiguousarray(q[None]), still, force, _SLOWEST))
 
 
+def damping_matrices(scene: Scene, q: Floats, v: Floats, forces: Floats) -> Floats:
+    """D (K, n, n) of M w' = -D w, of what acts at joints and between links, without custom forces.
+
+    At states q, v (K, n) under constant forces (K, n); symmetric.
+    """
+    q, v = np.ascontiguousarray(q), np.ascontiguousarray(v)
+    dampers = -np.minimum(scene.core.forces(q, v, np.ascontiguousarray(forces))[2], 0.0)
+    D: Floats = dampers[:, :, None] * np.eye(q.shape[1])
+    if scene.couplings:
+        slopes = scene.core.coupled_forces(q, v)[2]
+        D -= 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
+    return D
+
+
 class JointRates(NamedTuple):
     """Rates of damping at K states [1/s].
 
@@ -109,12 +123,7 @@ def joint_rates(scene: Scene, q: Floats, v: Floats, forces: Floats) -> JointRate
     The modes of M w' = -D w, D the damping, are orthogonal in M and in D. What a mode loses is the sum of what it
     loses at each joint.
     """
-    q, v = np.ascontiguousarray(q), np.ascontiguousarray(v)
-    dampers = -np.minimum(scene.core.forces(q, v, forces)[2], 0.0)
-    D = dampers[:, :, None] * np.eye(q.shape[1])
-    if scene.couplings:
-        slopes = scene.core.coupled_forces(q, v)[2]
-        D -= 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
+    D = damping_matrices(scene, q, v, forces)
     own, fastest, leading = np.zeros(q.shape), np.zeros(len(q)), np.zeros(len(q), dtype=np.int64)
     for k, M in enumerate(masses(scene, q)):
         rates, modes = scipy.linalg.eigh(D[k], M)
