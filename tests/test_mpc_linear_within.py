@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from refusals import naming, unnamed
+from refusals import naming, refused, unnamed
 
 import varpin as vp
 from varpin.control import box, mpc
@@ -97,8 +97,10 @@ def test_loops_of_linear_controls_do_not_run_away(build, duration, most, iterati
     # Beside the ball, with one iteration a tick, 1.2 and 1.28.
     assert fastest["linear"] <= 1.4 * fastest["held"]
     assert costs["linear"] <= 1.4 * costs["held"]
-    # At control limits the interior-point method has passes of its own.
-    assert np.mean(np.array(ticks) <= 8 * iterations) > 0.9
+    # Most rows are known from the tick before. Where they are not, the interior-point method has passes of its own.
+    assert np.median(ticks) <= 3 * iterations
+    assert np.mean(np.array(ticks) <= 8 * iterations) > 0.7
+    assert max(ticks) <= 60 * iterations
 
 
 def test_penalties_of_ticks_are_not_stiffer_than_one_iteration_can_follow():
@@ -227,6 +229,27 @@ def test_plans_of_ticks_are_saved_with_their_rows(tmp_path):
     assert saved.violation == plan.violation
     assert len(saved.constraints[0].t) == 2 * 16
     np.testing.assert_array_equal(saved.multipliers.values, plan.multipliers.values)
+    np.testing.assert_array_equal(saved.multipliers.active, plan.multipliers.active)
+    kept = dict(np.load(tmp_path / "plan.npz", allow_pickle=False))
+    kept["multipliers.active"] = kept["multipliers.active"][:-1]
+    np.savez(tmp_path / "short.npz", **kept)
+    with refused(vp.FileError, "multipliers.active", "shape"):
+        vp.Solution.load(tmp_path / "short.npz", plan.problem)
+
+
+def test_ticks_within_speeds_are_close_to_their_optimum():
+    """Of a UR3 most of whose joints are at their limits all the time, with one iteration a tick and with three."""
+    robot, begin = vp.load_robot("ur3"), np.array([0.0, -1.2, 1.2, -0.5, -1.0, 0.0])
+    scene = vp.Scene(robot, damping=0.1)
+    cost = vp.TrackingCost(lambda t: begin + 0.35 * np.sin(2.0 * t) * np.cos(np.arange(6)), 100.0)
+    cost += vp.VelocityCost(0.05) + vp.ControlCost(1e-4, scene.holding_torque(begin))
+    problem = vp.OptimalControlProblem(
+        scene, cost, begin, np.zeros(6), dt=0.02, steps=25, constraints=[vp.WithinVelocityLimits(robot, (-0.3, 0.3))]
+    )
+    one, three = (vp.Mpc(problem, iterations=count).run(duration=0.6) for count in (1, 3))
+    costs = [np.mean([plan.cost for plan in run.plans]) for run in (one, three)]
+    assert costs[0] <= 1.05 * costs[1]
+    assert one.constraints[0].worst <= 3e-3
 
 
 def test_loops_that_blow_up_are_called_unstable():

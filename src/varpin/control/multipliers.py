@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats, Integers
+from varpin.arrays import Floats, Integers, Mask
 from varpin.control.between_nodes import NOWHERE, Instants, enforced
 from varpin.control.constraints import BoundConstraint
 from varpin.control.penalties import split
@@ -47,6 +47,7 @@ class Multipliers(Frozen):
         added: What is added to margins of the rows at nodes, as motions under noise were counted; None where margins of
             the linear model suffice.
         counts: How often margins have become wider for that reason.
+        active: Active rows of the penalties in the last pass of a controller's tick (M,), else None.
         cubic: Whether these rows are on the cubics through the steps, as in a controller's ticks, not of steps
             integrated in parts.
     """
@@ -66,10 +67,11 @@ class Multipliers(Frozen):
     cubic: bool = False
     added: Annotated[Floats, Axes("node_rows", finite=True)] | None = None
     counts: int = 0
+    active: Annotated[Mask, Axes("active_rows")] | None = None
 
     def __post_init__(self) -> None:
         arrays = (self.values, self.backoff, self.begun, self.weights, self.first_weights, self.worst)
-        for array in (*arrays, self.instants, self.offsets, self.added):
+        for array in (*arrays, self.instants, self.offsets, self.added, self.active):
             if array is not None:
                 array.setflags(write=False)
 

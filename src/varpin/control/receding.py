@@ -19,7 +19,7 @@ from varpin.control.between_nodes import Instants, carried, enforced, middles
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Iteration, Status
 from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers, at_nodes, reports_of
-from varpin.control.penalties import flat, penalized, split, weights_for
+from varpin.control.penalties import T, flat, penalized, split, weights_for
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.support.frozen import Frozen
@@ -28,9 +28,8 @@ from varpin.trajectory import Trajectory
 # A penalty's weight grows by _GROWTH after a tick that leaves more than _ENOUGH of its constraint's violation, up to
 # _HEAVIEST times its first weight: stiffer penalties take more iterations than a tick has.
 _GROWTH, _ENOUGH, _HEAVIEST = 10.0, 0.5, 100.0
-# Greatest number of backward passes that determine an iteration's active rows; most are known from the tick before.
-_PASSES = 8
-# The share of the time left that these passes take at most; the rest is for the linearization and trials.
+# The share of the time left that passes which look for active rows take at most; the rest is for the linearization and
+# trials.
 _SHARE = 0.5
 # Bound on multipliers, times the first weight and the constraint's scale: those of an infeasible constraint wind up.
 _LARGEST = 1e3
@@ -54,10 +53,10 @@ def replan(
     """:func:`varpin.control.search.replan` for problems with or without constraints.
 
     With constraints each iteration is one of the augmented Lagrangian, followed by an update of the multipliers. They
-    start from those of the previous plan, shifted with the horizon. Where controls are linear, constraints of states
-    hold at the middles of the steps, too, and multipliers and weights stay after short steps. Margins are those of the
-    first plan. A tick is INFEASIBLE where it violates a constraint by more than a thousandth of its range and several
-    ticks in a row have not lowered the violation.
+    start from those of the previous plan, shifted with the horizon, and so do the active rows of the first pass. Where
+    controls are linear, constraints of states hold at the middles of the steps, too, and multipliers and weights stay
+    after short steps. Margins are those of the first plan. A tick is INFEASIBLE where it violates a constraint by more
+    than a thousandth of its range and several ticks in a row have not lowered the violation.
     """
     known = previous.multipliers
     if not problem.constraints or known is None:
@@ -68,7 +67,7 @@ def replan(
             tolerance=tolerance,
             max_iterations=max_iterations,
             deadline=deadline,
-        )
+        )[0]
     instants = middles(problem)
     hold, known = problem.hold, _at(previous.problem, known, instants)
     whole = enforced(problem, instants)
@@ -79,6 +78,11 @@ def replan(
     backoff = [_shifted_to(*parts, 0, hold) for parts in zip(old, new, split(old, known.backoff), strict=True)]
     first_weights = np.maximum(known.first_weights, weights_for(abs(previous.cost), new))
     weights = np.clip(known.weights, first_weights, _HEAVIEST * first_weights)
+    rows = None
+    if known.active is not None:
+        rows = flat(
+            [_shifted_to(*parts, decisions, hold) for parts in zip(old, new, split(old, known.active), strict=True)]
+        )
     begun = flat(multipliers)
     found = kept = previous
     history: list[Iteration] = []
@@ -86,14 +90,15 @@ def replan(
     for k in range(max_iterations):
         started = time.perf_counter()
         until = started + _SHARE * (deadline - started)
-        goal = penalized(whole, multipliers, weights, backoff, passes=_PASSES, until=until)
-        found = search.replan(
+        goal = penalized(whole, multipliers, weights, backoff, until=until)
+        found, rows = search.replan(
             goal,
             found,
             decisions if k == 0 else 0,
             tolerance=tolerance,
             max_iterations=1,
             deadline=deadline,
+            rows=rows,
         )
         history += [replace(item, index=len(history)) for item in found.history]
         motion = found.trajectory
@@ -113,6 +118,7 @@ def replan(
             weights=weights,
             first_weights=first_weights,
             iterations=0,
+            active=rows,
         )
         kept = replace(
             found, problem=problem, cost=problem.cost_of(motion), history=tuple(history), search=None, multipliers=state
@@ -154,6 +160,7 @@ def _at(problem: OptimalControlProblem, known: Multipliers, instants: Instants) 
         # As at the end of the step.
         backoff=flat([*backoff, *(backoff[i][instants.of(i)[:, 0]] for i in source)]),
         begun=kept(known.begun),
+        active=None if known.active is None else kept(known.active.astype(np.float64)) > 0.0,
         weights=of_constraints(known.weights),
         first_weights=of_constraints(known.first_weights),
         worst=of_constraints(known.worst),
@@ -163,12 +170,13 @@ def _at(problem: OptimalControlProblem, known: Multipliers, instants: Instants) 
     )
 
 
-def _shifted_to(old: BoundConstraint, new: BoundConstraint, values: Floats, decisions: int, hold: int) -> Floats:
+def _shifted_to(
+    old: BoundConstraint, new: BoundConstraint, values: NDArray[T], decisions: int, hold: int
+) -> NDArray[T]:
     """Values at a constraint's places (K, rows), shifted by ``decisions``; the last is repeated, a goal's stays."""
     by = decisions if new.of_controls else decisions * hold
     rows = np.minimum(np.searchsorted(old.places, new.places + by), len(old.places) - 1)
-    shifted: Floats = values[rows]
-    return shifted
+    return values[rows]
 
 
 def _judged(plan: Solution, before: Multipliers) -> Solution:

@@ -336,20 +336,23 @@ def replan(
     tolerance: float,
     max_iterations: int,
     deadline: float,
-) -> Solution:
+    rows: Mask | None = None,
+) -> tuple[Solution, Mask | None]:
     """Replan from the plan made ``decisions`` ago, with one backward pass per iteration: a controller's tick.
 
     Where iterations or time end the search, the gains are those of its last step, without a further backward pass at
     the final motion. The finished plan is not checked. No iteration begins that would end after ``deadline`` (of
-    ``time.perf_counter``) if it took as long as the longest before. Other arguments and errors are as in :func:`solve`.
+    ``time.perf_counter``) if it took as long as the longest before. The backward pass begins with active ``rows`` of
+    penalties; those of the last pass are returned beside the plan. Other arguments and errors are as in :func:`solve`.
     """
     search = _Search(problem, second_order=False, anew=False)
+    search.rows = rows
     search.begin(shifted_commands(problem, previous, decisions))
     try:
         status = search.run(tolerance, max_iterations, deadline, lambda *_: None)
     except KeyboardInterrupt:
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
-    return search.solution(status)
+    return search.solution(status), search.rows
 
 
 def _search_of(problem: OptimalControlProblem, controls: object, resume: Solution) -> SearchState:

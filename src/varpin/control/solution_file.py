@@ -195,6 +195,7 @@ def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalContro
         ("values", multipliers.values, sum(sizes)),
         ("weights", multipliers.weights, len(sizes)),
         ("added", multipliers.added, at_nodes),
+        ("active", multipliers.active, sum(sizes)),
     ):
         if found is not None and found.size != expected:
             raise FileError(f"{source}: multipliers.{name} has shape ({found.size},), where ({expected},) belongs")
