@@ -22,6 +22,7 @@ from varpin.control.linear_controls import (
     derivatives,
     in_step,
     linear_steps,
+    model_samples,
     noisy,
     size,
     widened,
@@ -265,7 +266,7 @@ class Along:
     def line(self) -> LinearSteps:
         """The steps with the control in the state, where controls are linear between nodes."""
         problem, found, lines = self.problem, self.running, self.of_lines
-        steps = linear_steps(problem, lines, found, self.rate, self.pull)
+        steps = linear_steps(problem, lines, self.sampled, found, self.rate, self.pull)
         if self.processes:
             x = lines.A.shape[1]
             kicked = after_impulse(problem.model_rule, found.hessian, lines.velocity, problem.steps, x, problem.dt)
@@ -278,6 +279,11 @@ class Along:
     def of_lines(self) -> Derivatives:
         """Derivatives of the steps whose controls are linear between nodes."""
         return derivatives(*self.linearized(0, self.problem.steps))
+
+    @cached_property
+    def sampled(self) -> list[Floats]:
+        """Derivatives of the model's samples in steps whose controls are linear between nodes."""
+        return model_samples(self.problem, self.of_lines)
 
     @cached_property
     def demands(self) -> Floats:

@@ -172,6 +172,8 @@ class Box:
         """
         low, high, box, changed = self.lower, self.upper, self, math.inf
         for done in range(_ACTIVE_SETS):
+            if done > 0 and time.perf_counter() > self.until:
+                return None
             found = box._fixed(held)
             if found is None:
                 return None

@@ -94,7 +94,7 @@ class ClosedLoop:
         lin, rule, N = self._linear, goal.model_rule, problem.steps
         rate = self._expand_rate(of_rates)
         if problem.linear:
-            steps = linear_steps(goal, self._along.of_lines, expansion, rate[1], rate[0])
+            steps = linear_steps(goal, self._along.of_lines, self._along.sampled, expansion, rate[1], rate[0])
             self._A, self._B = steps.A, steps.B
             self._steps = problem.dt * steps.gradient, problem.dt * steps.hessian
             R, m = problem.decisions, problem.scene.controls

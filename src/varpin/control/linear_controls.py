@@ -90,14 +90,26 @@ def size(problem: OptimalControlProblem) -> int:
     return states + states % 2
 
 
+def model_samples(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]:
+    """Derivatives (N, 2n + m, 2n + 2m) of (q, v, u) in (x, w, u), for each sample of the model in a step."""
+    after = np.concatenate([found.A, found.begin, found.end], axis=2)
+    return on_lines(problem.model_rule, problem.model_places, after, found.velocity, problem.scene.controls)
+
+
 def linear_steps(
-    problem: OptimalControlProblem, found: Derivatives, running: Expansion, rate: Floats, pull: Floats
+    problem: OptimalControlProblem,
+    found: Derivatives,
+    sampled: list[Floats],
+    running: Expansion,
+    rate: Floats,
+    pull: Floats,
 ) -> LinearSteps:
     """The steps of a plan with linear controls, (O11).
 
     Args:
         problem: The problem.
         found: Derivatives along the motion.
+        sampled: :func:`model_samples`.
         running: Expansion of the running cost at its samples.
         rate: Hessian of the cost of control changes (N + 1, m, m), or (0, m, m) without one.
         pull: Its gradient (N + 1, m).
@@ -110,8 +122,7 @@ def linear_steps(
     B[:, x : x + m] = np.eye(m)
     # In (x, w, u); X may have a zero state between w and u.
     g, H = np.zeros((N + 1, x + 2 * m)), np.zeros((N + 1, x + 2 * m, x + 2 * m))
-    samples, after = len(problem.model_rule), np.concatenate([found.A, found.begin, found.end], axis=2)
-    sampled = on_lines(problem.model_rule, problem.model_places, after, found.velocity, m)
+    samples = len(sampled)
     for s, (D, weight) in enumerate(zip(sampled, problem.model_rule[:, 0], strict=True)):
         across = weight * np.swapaxes(D, 1, 2)
         g[1:] += (across @ running.gradient[s::samples, :, None])[:, :, 0]
