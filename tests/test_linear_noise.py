@@ -177,7 +177,7 @@ def test_the_noise_cost_in_halves_is_that_of_each_impulse(rate: float) -> None:
     noise = vp.AdditiveNoise(0.3)
     scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=1.0, stiffness=3.0, noise=noise)
     cost = vp.ControlCost(1e-2) + vp.TrackingCost([0.5], 1.0)
-    cost += vp.Terminal(vp.TrackingCost([0.5], 10.0) + vp.VelocityCost(3.0))
+    cost += vp.Terminal(vp.TrackingCost([0.5], 10.0))
     task = {"q0": [0.0], "v0": [0.0], "dt": 0.1, "steps": 8, "controls": "linear"}
     problem = vp.OptimalControlProblem(scene, cost + vp.ControlRateCost(rate) if rate else cost, **task)
     plan = vp.solve(problem)

@@ -179,7 +179,7 @@ def test_steps_in_which_noise_grows_without_bound_have_no_cost(recwarn):
     hessian = damped.expand_running(motion).hessian
     driven = problem(vp.CustomForce(lambda q, v: 1e5 * v))
     with pytest.raises(vp.LinearizationError, match="without bound"):
-        beyond_samples(driven, motion, lin, hessian, len(driven.rule))
+        beyond_samples(driven, motion, lin, hessian, len(driven.rule), None)
     assert not recwarn.list
 
 
@@ -200,3 +200,18 @@ def test_in_fast_motions_of_arms_it_is_that_of_fine_steps(damping):
     there = noise_cost(fine, fine.simulate(np.repeat(plan.controls, 16, axis=0)), feedback)
     assert noisy.integrator.kick == "held"
     assert noise_cost(noisy, plan.trajectory, feedback) == pytest.approx(there, rel=0.05)
+
+
+@pytest.mark.parametrize("integrator", [None, vp.Gauss(2, kick="held"), vp.Radau(3, kick="held")])
+@pytest.mark.parametrize("damping", [0.0, 0.05, 1.5, 30.0])
+def test_what_the_last_step_leaves_of_the_last_velocity(damping, integrator):
+    """The exact variance of white noise over a step, of which a force held over it leaves less."""
+    level, dt = 0.3, 0.1
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, noise=vp.AdditiveNoise(level))
+    cost = vp.ControlCost(1.0) + vp.Terminal(vp.VelocityCost(2.0))
+    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=dt, steps=1, integrator=integrator)
+    found = noise_cost(problem, problem.simulate(np.zeros((1, 1))), Feedback(np.zeros((1, 1, 2)), None))
+    inertia = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
+    rate = damping / inertia
+    left = -np.expm1(-2.0 * rate * dt) / (2.0 * rate) if damping else dt
+    assert found == pytest.approx(2.0 * (level / inertia) ** 2 * left, rel=1e-5)

@@ -224,12 +224,14 @@ class Along:
         if not (problem.processes and problem.integrator.holds_noise):
             return None
         found: list[Floats] = []
+        n = problem.scene.robot.dof
         for begin, end in [(0, problem.steps)] if problem.linear else self.blocks:
             part, points = self.trajectory.part(begin, end), slice(begin * samples, end * samples)
             own = hessian[points] if len(hessian) > 1 else hessian
             lin = self.linearized(begin, end)[0]
+            last = self.terminal.cost.hessian[0, n:, n:] if end == problem.steps else None
             try:
-                more = beyond_samples(problem, part, lin, own, samples)
+                more = beyond_samples(problem, part, lin, own, samples, last)
             except LinearizationError as error:
                 raise _in_whole(error, begin, problem.dt) from None
             if more is None:

@@ -223,7 +223,8 @@ def _steps_of(
     for s, whole in enumerate(wholes):
         cost += h * rule[s, 0] * np.swapaxes(whole, 1, 2) @ of_samples(hessian, samples, s) @ whole
     kicked = after_impulse(rule, hessian, velocity, N, x, h)
-    beyond = beyond_samples(problem, trajectory, lin, hessian, samples)
+    end = problem.expand_terminal(trajectory).hessian[0, n:x, n:x]
+    beyond = beyond_samples(problem, trajectory, lin, hessian, samples, end)
     if beyond is not None:
         kicked = kicked + beyond
     return LinearizedSteps(J, lin.G[:, :, processes], gz[:, :, processes], cost, kicked, beyond, lin, velocity, hessian)

@@ -18,6 +18,8 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.within_steps import (
     damping_at_nodes,
     decay_of_momenta,
+    left_at_end,
+    left_at_end_slopes,
     mean_of_decay,
     mean_of_decay_slopes,
 )
@@ -123,9 +125,10 @@ def exact_gradient(
         pull = 2.0 * part * (seen * of_samples(around.hessian, samples, s)[:, :x, :x]) @ spread
         for half in range(2):
             to_nodes[1:] += late[s, 4 + 4 * half] * pull[:, half * n : (half + 1) * n]
+    to_last: Floats = np.zeros((n, n))
     if around.beyond is not None:
         pull = to_kicked[:, n:, n:]
-        to_damping = _add_within(problem, trajectory, around, velocity, pull, to_impulse, to_nodes, weights)
+        to_damping, to_last = _add_within(problem, trajectory, around, velocity, pull, to_impulse, to_nodes, weights)
     # In the state and the joint forces.
     bends = np.concatenate([to_step[:, :, :x], to_step[:, :, x:] @ scene.transmission.T], axis=2)
     if integrator.holds_noise:
@@ -144,7 +147,9 @@ def exact_gradient(
     spread = end @ covariances[-1, :x, :x]
     to_nodes[-1] += problem.expand_terminal(trajectory).hessian[0, n:x, :x] @ spread
     at_nodes = _of_velocities(problem, trajectory, to_nodes)
-    at_end = _of_terminal_hessian(problem, trajectory, 0.5 * spread @ end.T)
+    to_terminal = 0.5 * spread @ end.T
+    to_terminal[n:, n:] += to_last
+    at_end = _of_terminal_hessian(problem, trajectory, to_terminal)
     at_nodes[-1] += end.T @ at_end
     if around.beyond is not None:
         of_damping = _of_damping(problem, trajectory, to_damping)
@@ -167,10 +172,11 @@ def _add_within(
     to_impulse: Floats,
     to_nodes: Floats,
     weights: Floats,
-) -> list[Floats]:
+) -> tuple[list[Floats], Floats]:
     """Add derivatives through what velocities cost within the steps, ``pull`` (N, n, n) those in its Hessian.
 
-    Returns those in the damping (N, n, n) where steps begin and where they end.
+    Returns those in the damping (N, n, n) where steps begin and where they end, and in the terminal cost's Hessian in
+    the last velocity (n, n).
     """
     N, n, _ = pull.shape
     speeds, hw = slice(n, 2 * n), problem.dt * problem.rule[:, 0]
@@ -179,9 +185,15 @@ def _add_within(
         whole += part * of_samples(around.hessian, len(hw), s)[:, speeds, speeds]
     slope, inverse = velocity[:-1, :, n:], np.linalg.inv(around.lin.J[:, n:])
     decay, sampled = decay_of_momenta(problem, trajectory, velocity), np.swapaxes(slope, 1, 2) @ whole @ slope
+    end_slope, end_cost = velocity[-1, :, n:], problem.expand_terminal(trajectory).hessian[0, speeds, speeds]
+    of_end = end_slope.T @ end_cost @ end_slope
     mean = mean_of_decay(decay, sampled)
+    mean[-1] += left_at_end(problem, decay[-1], of_end)
     to_mean = inverse @ pull @ np.swapaxes(inverse, 1, 2)
     to_decay, to_sampled = mean_of_decay_slopes(decay, sampled, to_mean)
+    of_last, to_end = left_at_end_slopes(problem, decay[-1], of_end, to_mean[-1])
+    to_decay[-1] += of_last
+    to_nodes[-1, :, n:] += 2.0 * end_cost @ end_slope @ to_end
     turned = np.swapaxes(inverse, 1, 2)
     to_impulse[:, n:] -= turned @ (2.0 * mean @ inverse @ pull) @ turned
     to_nodes[:-1, :, n:] += 2.0 * whole @ slope @ to_sampled
@@ -191,7 +203,7 @@ def _add_within(
     for end, damping in enumerate(damping_at_nodes(problem, trajectory)):
         to_nodes[end : N + end, :, n:] += part * np.swapaxes(damping, 1, 2) @ to_decay
         to_damping.append(part * to_decay @ np.swapaxes(velocity[end : N + end, :, n:], 1, 2))
-    return to_damping
+    return to_damping, end_slope @ to_end @ end_slope.T
 
 
 def _of_damping(problem: OptimalControlProblem, trajectory: Trajectory, pulls: list[Floats]) -> Floats:

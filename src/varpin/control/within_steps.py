@@ -10,6 +10,7 @@ from varpin.arrays import Floats
 from varpin.control.linear_controls import after_impulse, of_samples
 from varpin.control.problem import OptimalControlProblem
 from varpin.errors import LinearizationError
+from varpin.integrators.collocation import Collocation
 from varpin.linearization import Linearization, velocity_at_nodes
 from varpin.simulation.friction import damping_matrices
 from varpin.trajectory import Trajectory
@@ -19,16 +20,22 @@ _TERMS, _SHORT = 11, 0.125
 
 
 def beyond_samples(
-    problem: OptimalControlProblem, motion: Trajectory, lin: Linearization, hessian: Floats, samples: int
+    problem: OptimalControlProblem,
+    motion: Trajectory,
+    lin: Linearization,
+    hessian: Floats,
+    samples: int,
+    end: Floats | None,
 ) -> Floats | None:
     """The Hessian (N, 2n, 2n), in the noise's jump of the state after a step, of what velocities cost within the step.
 
     It is added to that of the samples, :func:`after_impulse`, for the exact mean over the step of the cost of the
     velocity by white noise that begins with the step. Without the step's springs a momentum decays as exp(-Z s) over a
     unit step, see :func:`decay_of_momenta`. So an impulse f adds f' B f / 2, with B the integral of
-    (1 - s) exp(-Z s)' l_pp exp(-Z s), and the jump after the step is J f. None where there is nothing to add: without
-    noise or costs of velocities, for impulses, for sums over nodes (``sampling="start"``), and under constraints of the
-    scene.
+    (1 - s) exp(-Z s)' l_pp exp(-Z s), and the jump after the step is J f. What the last step's noise leaves of the last
+    velocity is more than that of a force held over the step, by :func:`left_at_end`. None where there is nothing to
+    add: without noise or costs of velocities, for impulses, for sums over nodes (``sampling="start"``), and under
+    constraints of the scene.
 
     Args:
         problem: The problem.
@@ -36,13 +43,15 @@ def beyond_samples(
         lin: The linearized steps.
         hessian: Hessians of the running cost at the samples of each step, first those of the problem's rule.
         samples: Number of samples of a step.
+        end: Hessian of the terminal cost in the last velocity (n, n); None where the motion goes on.
 
     Raises:
         LinearizationError: Velocities grow without bound within a step.
     """
     n, h, rule, N = problem.scene.robot.dof, problem.dt, problem.rule, lin.steps
     speeds, held = slice(n, 2 * n), problem.integrator.holds_noise and problem.sampling != "start"
-    if not (held and problem.scene.processes and hessian[:, speeds, speeds].any()) or problem.scene.constraints:
+    costs = hessian[:, speeds, speeds].any() or (end is not None and end.any())
+    if not (held and problem.scene.processes and costs) or problem.scene.constraints:
         return None
     of_speeds = np.zeros((N, len(rule), 2 * n, 2 * n))
     for s in range(len(rule)):
@@ -55,6 +64,8 @@ def beyond_samples(
     # A step in which velocities grow without bound, as in a trial that runs away, has no mean.
     with np.errstate(over="ignore", invalid="ignore"):
         mean = mean_of_decay(decay, np.swapaxes(slope, 1, 2) @ whole @ slope)
+        if end is not None:
+            mean[-1] += left_at_end(problem, decay[-1], velocity[-1, :, n:].T @ end @ velocity[-1, :, n:])
         found[:, n:, n:] += np.swapaxes(to_impulse, 1, 2) @ mean @ to_impulse
     lost = ~np.isfinite(found).all(axis=(1, 2))
     if lost.any():
@@ -93,8 +104,39 @@ def damping_at_nodes(problem: OptimalControlProblem, motion: Trajectory) -> tupl
     return begin + own[:-1], end + own[1:]
 
 
+def left_at_end(problem: OptimalControlProblem, Z: Floats, P: Floats) -> Floats:
+    """The integral of E' P E over s from 0 to 1, E(s) = exp(-Z s), less H' P H for a held impulse's effect H (n, n).
+
+    Zero for the midpoint rule, whose velocities have their exact covariance anyway once they have settled.
+    """
+    method = problem.integrator
+    if not isinstance(method, Collocation) or method.stages == 1:
+        return np.zeros(Z.shape)
+    H = method.after_held(Z)
+    late, early = _means_of_decay(Z[None], P[None])
+    found: Floats = late[0] + early[0] - H.T @ P @ H
+    return found
+
+
+def left_at_end_slopes(problem: OptimalControlProblem, Z: Floats, P: Floats, pull: Floats) -> tuple[Floats, Floats]:
+    """Derivatives of tr(pull B) in Z and P, with B of :func:`left_at_end`, for symmetric P and ``pull`` (n, n)."""
+    method = problem.integrator
+    if not isinstance(method, Collocation) or method.stages == 1:
+        return np.zeros(Z.shape), np.zeros(Z.shape)
+    H = method.after_held(Z)
+    to_Z = _slopes_of_means(Z[None], P[None], pull[None], np.zeros((1, *pull.shape)))[0]
+    to_Z -= method.after_held_slopes(Z, 2.0 * P @ H @ pull)
+    late, early = _means_of_decay(Z.T[None], pull[None])
+    return to_Z, late[0] + early[0] - H @ pull @ H.T
+
+
 def mean_of_decay(Z: Floats, H: Floats) -> Floats:
     """The integral of (1 - s) exp(-Z s)' H exp(-Z s) over s from 0 to 1, for matrices (N, n, n)."""
+    return _means_of_decay(Z, H)[0]
+
+
+def _means_of_decay(Z: Floats, H: Floats) -> tuple[Floats, Floats]:
+    """The integrals of (1 - s) and of s times exp(-Z s)' H exp(-Z s)."""
     size = float(np.linalg.norm(Z, axis=(1, 2)).max())
     doublings = max(0, math.ceil(math.log2(size / _SHORT))) if size > 0.0 else 0
     part = 0.5**doublings
@@ -111,14 +153,19 @@ def mean_of_decay(Z: Floats, H: Floats) -> Floats:
         later = np.swapaxes(flow, 1, 2)
         total, first = total + later @ total @ flow, first + later @ (first + part * total) @ flow
         flow, part = flow @ flow, 2.0 * part
-    return total - first
+    return total - first, first
 
 
 def mean_of_decay_slopes(Z: Floats, H: Floats, pull: Floats) -> tuple[Floats, Floats]:
-    """Derivatives of tr(pull B) in Z and H, with B of :func:`mean_of_decay`, for symmetric H and ``pull`` (N, n, n).
+    """Derivatives of tr(pull B) in Z and H, with B of :func:`mean_of_decay`, for symmetric H and ``pull`` (N, n, n)."""
+    return _slopes_of_means(Z, H, pull, -pull), mean_of_decay(np.swapaxes(Z, 1, 2), pull)
 
-    The doublings of the step are followed backward. Over its first part a, with E(s) = exp(-Z s), derivatives are
-    integrals of E(s - t)' R E(t)' over t < s, by Gauss's rule of order 10.
+
+def _slopes_of_means(Z: Floats, H: Floats, to_total: Floats, to_first: Floats) -> Floats:
+    """Derivatives in Z of the integrals of E' H E and of s E' H E over s, E(s) = exp(-Z s), each times a pull.
+
+    The doublings of the step are followed backward. Over its first part a, derivatives are integrals of
+    E(s - t)' R E(t)' over t < s, by Gauss's rule of order 10.
     """
     size = float(np.linalg.norm(Z, axis=(1, 2)).max())
     doublings = max(0, math.ceil(math.log2(size / _SHORT))) if size > 0.0 else 0
@@ -155,7 +202,7 @@ def mean_of_decay_slopes(Z: Floats, H: Floats, pull: Floats) -> tuple[Floats, Fl
         later = turned(E)
         total, first = total + later @ total @ E, first + later @ (first + part * total) @ E
         E, part = E @ E, 2.0 * part
-    to_total, to_first, to_flow = pull, -pull, np.zeros(Z.shape)
+    to_flow = np.zeros(Z.shape)
     for total, first, E, part in reversed(levels):
         later = turned(E)
         to_flow = to_flow @ later + later @ to_flow
@@ -163,5 +210,6 @@ def mean_of_decay_slopes(Z: Floats, H: Floats, pull: Floats) -> tuple[Floats, Fl
         to_total = to_total + E @ (to_total + part * to_first) @ later
         to_first = to_first + E @ to_first @ later
     pulls = H @ at_times @ (to_total + times[:, None, None, None] * to_first)
-    to_Z = -between(np.array([short]), to_flow[None])[0] - 2.0 * np.tensordot(shares, between(times, pulls), axes=1)
-    return to_Z, mean_of_decay(turned(Z), pull)
+    found: Floats = -between(np.array([short]), to_flow[None])[0]
+    found -= 2.0 * np.tensordot(shares, between(times, pulls), axes=1)
+    return found

@@ -50,3 +50,27 @@ class Collocation(Variational):
         """See :meth:`Integrator.amplification`."""
         a, b, _ = self._coefficients()
         return stability(a, b, z)
+
+    def after_held(self, Z: Floats) -> Floats:
+        """Derivatives (n, n) of momenta after a step in an impulse that is held over it.
+
+        Without it they decay as exp(-Z s) over the step, for Z (n, n).
+        """
+        _, inner = self._held(Z)
+        found: Floats = np.eye(len(Z)) - Z @ np.tensordot(self._coefficients()[1], inner, axes=1)
+        return found
+
+    def after_held_slopes(self, Z: Floats, pull: Floats) -> Floats:
+        """Derivatives (n, n) in Z of the sum of ``pull`` (n, n) times :meth:`after_held`."""
+        (a, b, _), n = self._coefficients(), len(Z)
+        matrix, inner = self._held(Z)
+        to_stages = -np.multiply.outer(b, Z.T @ pull)
+        back = np.linalg.solve(matrix.T, to_stages.reshape(-1, n)).reshape(-1, n, n)
+        found: Floats = -pull @ np.tensordot(b, inner, axes=1).T - np.einsum("ij,iac,jbc->ab", a, back, inner)
+        return found
+
+    def _held(self, Z: Floats) -> tuple[Floats, Floats]:
+        """The matrix (s n, s n) of the stages' momenta, and these (s, n, n) for an impulse of one."""
+        (a, _, c), n = self._coefficients(), len(Z)
+        matrix = np.eye(len(c) * n) + np.kron(a, Z)
+        return matrix, np.linalg.solve(matrix, np.kron(c[:, None], np.eye(n))).reshape(-1, n, n)
