@@ -8,7 +8,7 @@ import pytest
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control import box, mpc
+from varpin.control import box, mpc, piecewise
 from varpin.control.active_rows import Rows
 from varpin.control.along import Along
 from varpin.control.backward import backward
@@ -264,3 +264,29 @@ def test_loops_that_blow_up_are_called_unstable():
     fast = replace(run.motion, v=run.motion.v * [1e3, 1.0])
     (found,) = mpc._blown_up(run.plans, fast)
     assert not unnamed(found.sentence, "joint1", f"{1e3 * np.abs(run.motion.v[:, 0]).max():.3g} rad/s")
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+@pytest.mark.parametrize("first", [0, 1])
+def test_ticks_know_the_rows_of_the_tick_before(controls, first, monkeypatch):
+    """Whatever the order of the constraints; passes have the rows of control rates last."""
+    wrong, run_of = [], piecewise._Steps.run
+
+    def watched(steps, likely):
+        run_of(steps, likely)
+        if likely is not None:
+            expected = zip(steps.rows.split(likely), steps.met, strict=True)
+            wrong.append(sum(int((one != other).sum()) for one, other in expected))
+
+    both = [vp.WithinControlRate([150.0, np.inf]), vp.WithinVelocityLimits(CHAIN, (-0.8, 0.8))]
+    mpc = vp.Mpc(chain(controls, both[::-1] if first else both), iterations=1)
+    first_plan = mpc.run(duration=0.09).plans[0]
+    assert first_plan.status.converged
+    monkeypatch.setattr(piecewise._Steps, "run", watched)
+    plan = first_plan
+    for tick in range(1, 13):
+        wrong.clear()
+        at = plan.trajectory
+        plan = mpc.plan(0.03 * tick, at.q[1], at.v[1], plan)
+    assert plan.multipliers.active.sum() > 10
+    assert sum(wrong) <= 4

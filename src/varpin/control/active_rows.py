@@ -25,10 +25,9 @@ class Rows:
     def __init__(self, along: Along, problem: PenalizedProblem) -> None:
         self.whole, self.problem, motion = along, problem, along.trajectory
         # Linearized once, before the expansions are copied for each pass.
+        velocity = along.of_lines.velocity if problem.linear else along.linearized(0, problem.steps)[1]
         if problem.linear:
-            _, velocity = along.sampled, along.of_lines.velocity
-        else:
-            velocity = along.linearized(0, problem.steps)[1]
+            _ = along.sampled
         q, v, u = motion.q, motion.v, problem.control_rows(motion)
         self.of_nodes = problem.penalties
         self.of_rate = tuple(item for item in problem.all_penalties if item.bound.of_controls)

@@ -22,8 +22,8 @@ from varpin.control.linear_controls import (
     derivatives,
     in_step,
     linear_steps,
-    model_samples,
     noisy,
+    sample_slopes,
     size,
     widened,
     with_pull,
@@ -111,7 +111,7 @@ class Along:
         self.noise_differentiated = False
         # Hessians of a further cost, added to those of steps (N, 2n + m, 2n + m).
         self.firm: Floats | None = None
-        self.processes = problem.processes  # number of those that passes see as noise
+        self.processes = problem.processes  # number of Wiener processes that passes take into account
 
     @cached_property
     def running(self) -> Expansion:
@@ -285,7 +285,7 @@ class Along:
     @cached_property
     def sampled(self) -> list[Floats]:
         """Derivatives of the model's samples in steps whose controls are linear between nodes."""
-        return model_samples(self.problem, self.of_lines)
+        return sample_slopes(self.problem, self.of_lines)
 
     @cached_property
     def demands(self) -> Floats:

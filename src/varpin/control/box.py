@@ -123,8 +123,8 @@ class Box:
     steps are passes, too. ``proximal`` (R, m) regularizes: the Hessian of a further cost of the changes.
 
     With ``rows`` the model is piecewise quadratic: the rows of the penalties that are active at its minimum are found
-    together with the controls at limits. Around a point it has the rows ``active``. The interior-point method has no
-    step that begins after the time ``until`` (of ``time.perf_counter``).
+    together with the controls at limits. Around a point it has the rows ``active``. No further step begins after the
+    time ``until`` (of ``time.perf_counter``).
     """
 
     def __init__(

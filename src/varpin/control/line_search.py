@@ -82,9 +82,9 @@ class Start(NamedTuple):
 
 
 class Rated(NamedTuple):
-    """A motion's expansions and the plan that rates it, regularized as little as can be.
+    """A motion's expansions, and the plan along it whose noise cost counts as that of the motion.
 
-    Its noise cost is that of the motion. Under regularized gains noise grows.
+    Noise grows under regularized gains. So the plan has no regularization where the model has a minimum without.
     """
 
     along: Along

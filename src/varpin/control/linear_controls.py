@@ -90,7 +90,7 @@ def size(problem: OptimalControlProblem) -> int:
     return states + states % 2
 
 
-def model_samples(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]:
+def sample_slopes(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]:
     """Derivatives (N, 2n + m, 2n + 2m) of (q, v, u) in (x, w, u), for each sample of the model in a step."""
     after = np.concatenate([found.A, found.begin, found.end], axis=2)
     return on_lines(problem.model_rule, problem.model_places, after, found.velocity, problem.scene.controls)
@@ -109,7 +109,7 @@ def linear_steps(
     Args:
         problem: The problem.
         found: Derivatives along the motion.
-        sampled: :func:`model_samples`.
+        sampled: :func:`sample_slopes`.
         running: Expansion of the running cost at its samples.
         rate: Hessian of the cost of control changes (N + 1, m, m), or (0, m, m) without one.
         pull: Its gradient (N + 1, m).

@@ -183,8 +183,9 @@ def _add_within(
     whole = np.zeros((N, n, n))
     for s, part in enumerate(hw):
         whole += part * of_samples(around.hessian, len(hw), s)[:, speeds, speeds]
-    slope, inverse = velocity[:-1, :, n:], np.linalg.inv(around.lin.J[:, n:])
-    decay, sampled = decay_of_momenta(problem, trajectory, velocity), np.swapaxes(slope, 1, 2) @ whole @ slope
+    slope, inverse = velocity[:-1, :, n:], np.linalg.pinv(around.lin.J[:, n:])
+    dampings = damping_at_nodes(problem, trajectory)
+    decay, sampled = decay_of_momenta(problem.dt, dampings, velocity), np.swapaxes(slope, 1, 2) @ whole @ slope
     end_slope, end_cost = velocity[-1, :, n:], problem.expand_terminal(trajectory).hessian[0, speeds, speeds]
     of_end = end_slope.T @ end_cost @ end_slope
     mean = mean_of_decay(decay, sampled)
@@ -200,7 +201,7 @@ def _add_within(
     seen = slope @ to_sampled @ np.swapaxes(slope, 1, 2)
     weights[:, :, speeds, speeds] += hw[:, None, None] * seen[:, None]
     part, to_damping = 0.5 * problem.dt, []
-    for end, damping in enumerate(damping_at_nodes(problem, trajectory)):
+    for end, damping in enumerate(dampings):
         to_nodes[end : N + end, :, n:] += part * np.swapaxes(damping, 1, 2) @ to_decay
         to_damping.append(part * to_decay @ np.swapaxes(velocity[end : N + end, :, n:], 1, 2))
     return to_damping, end_slope @ to_end @ end_slope.T

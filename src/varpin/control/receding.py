@@ -78,11 +78,13 @@ def replan(
     backoff = [_shifted_to(*parts, 0, hold) for parts in zip(old, new, split(old, known.backoff), strict=True)]
     first_weights = np.maximum(known.first_weights, weights_for(abs(previous.cost), new))
     weights = np.clip(known.weights, first_weights, _HEAVIEST * first_weights)
-    rows = None
+    active = None
     if known.active is not None:
-        rows = flat(
-            [_shifted_to(*parts, decisions, hold) for parts in zip(old, new, split(old, known.active), strict=True)]
-        )
+        active = [
+            _shifted_to(*parts, decisions, hold) for parts in zip(old, new, split(old, known.active), strict=True)
+        ]
+    # Passes have the rows of control rates last.
+    order = sorted(range(len(new)), key=lambda i: new[i].of_controls)
     begun = flat(multipliers)
     found = kept = previous
     history: list[Iteration] = []
@@ -98,8 +100,12 @@ def replan(
             tolerance=tolerance,
             max_iterations=1,
             deadline=deadline,
-            rows=rows,
+            rows=None if active is None else flat([active[i] for i in order]),
         )
+        active = None
+        if rows is not None:
+            by_pass = dict(zip(order, split([new[i] for i in order], rows), strict=True))
+            active = [by_pass[i] for i in range(len(new))]
         history += [replace(item, index=len(history)) for item in found.history]
         motion = found.trajectory
         u = problem.control_rows(motion)
@@ -118,7 +124,7 @@ def replan(
             weights=weights,
             first_weights=first_weights,
             iterations=0,
-            active=rows,
+            active=None if active is None else flat(active),
         )
         kept = replace(
             found, problem=problem, cost=problem.cost_of(motion), history=tuple(history), search=None, multipliers=state
@@ -160,7 +166,8 @@ def _at(problem: OptimalControlProblem, known: Multipliers, instants: Instants) 
         # As at the end of the step.
         backoff=flat([*backoff, *(backoff[i][instants.of(i)[:, 0]] for i in source)]),
         begun=kept(known.begun),
-        active=None if known.active is None else kept(known.active.astype(np.float64)) > 0.0,
+        # Only ticks have them, all at the same instants.
+        active=None,
         weights=of_constraints(known.weights),
         first_weights=of_constraints(known.first_weights),
         worst=of_constraints(known.worst),

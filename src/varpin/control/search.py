@@ -78,7 +78,7 @@ _LOSSY = 1e-8
 PATIENCE = 15
 # Expected decrease, as a share of the cost at stake, from which a search takes the whole gradient of the noise cost.
 _NEAR = 1e-4
-# Iterations in a row without a lower expected cost, after which it takes that gradient, too.
+# Iterations in a row without a lower expected cost, after which it takes that gradient, too, if it has it exactly.
 _RISES = 2
 # Iterations by whose decrease a search that may end early is judged.
 _SLOW = 8
@@ -677,9 +677,9 @@ class _Search:
         # The noise cost of exact passes is another.
         if not self.wants_whole or self.whole or self.second_order:
             return False
-        # With the noise held, steps may lead to where it costs more than they save.
-        rises = len(self.gains) >= _RISES and not any(self.gains[-_RISES:])
-        return ends or rises or self._decrease_at_most(self._share(_NEAR))
+        # With the noise held, steps may lead to where it costs more than they save. The first gain is of no iteration.
+        rises = len(self.gains) > _RISES and not any(self.gains[-_RISES:])
+        return ends or (rises and is_exact(self.problem)) or self._decrease_at_most(self._share(_NEAR))
 
     def _take_whole(self) -> None:
         """Use the whole gradient of the noise cost from now on, starting at the best motion so far."""
@@ -690,7 +690,11 @@ class _Search:
         self.gains, self._around, self.regularization, self.growth = [], None, 0.0, 1.0
 
     def _differentiate_noise(self) -> int:
-        """Rate the motion and add the whole gradient of its noise cost to passes; returns the passes that took."""
+        """Rate the motion, and add the whole gradient of its noise cost to backward passes along it.
+
+        Returns the number of backward passes that took. Where the model has no minimum without regularization, the
+        motion is rated with that of the search.
+        """
         if not self.whole or self.along.noise_differentiated:
             return 0
         passes = 0
@@ -707,20 +711,21 @@ class _Search:
         return passes
 
     def _pass(self, regularization: float, *, exact: bool, demands: bool = False, clipped: bool = False) -> Plan | None:
-        """A backward pass along the motion; under regularization the noise costs what it does without."""
+        """A backward pass along the motion; with the whole gradient, regularization does not change the noise cost."""
         along, rated = self.along, self.rated
-        held = self.whole and rated is not None and rated.along is along and regularization > rated.regularization
+        if not (self.whole and rated is not None and rated.along is along and regularization > rated.regularization):
+            rated = None
         plan = backward(
             self.problem,
             self.trajectory,
             regularization,
             exact,
-            along=along.with_noise_held(rated.plan.spread) if held and rated is not None and not exact else along,
+            along=along if rated is None else along.with_noise_held(rated.plan.spread),
             demands=demands,
             clipped=clipped,
             rows=self.rows,
         )
-        if plan is None or rated is None or not held:
+        if plan is None or rated is None:
             return plan
         return replace(plan, noise=rated.plan.noise, jumps=rated.plan.jumps, spread=rated.plan.spread)
 
@@ -948,7 +953,8 @@ class _Search:
             self.trajectory, self.shares = taken.motion.trajectory(), taken.shares
             if taken.rated is not None:
                 self.trajectory = taken.rated.along.trajectory
-                self._around, self.rated = taken.rated.along, taken.rated
+                # Another motion may need no regularization, whatever this one was rated with.
+                self._around, self.rated = taken.rated.along, None if taken.rated.regularization else taken.rated
             self.cost = float(taken.shares.sum())
             self.above += taken.cost
         return step

@@ -60,7 +60,7 @@ def beyond_samples(
     found = -after_impulse(rule, of_speeds.reshape(-1, 2 * n, 2 * n), velocity, N, 2 * n, h)
     slope, to_impulse = velocity[:-1, :, n:], np.linalg.pinv(lin.J[:, n:])
     whole = np.einsum("s,Nsab->Nab", h * rule[:, 0], of_speeds[:, :, speeds, speeds])
-    decay = decay_of_momenta(problem, motion, velocity)
+    decay = decay_of_momenta(problem.dt, damping_at_nodes(problem, motion), velocity)
     # A step in which velocities grow without bound, as in a trial that runs away, has no mean.
     with np.errstate(over="ignore", invalid="ignore"):
         mean = mean_of_decay(decay, np.swapaxes(slope, 1, 2) @ whole @ slope)
@@ -74,25 +74,27 @@ def beyond_samples(
     return found
 
 
-def decay_of_momenta(problem: OptimalControlProblem, motion: Trajectory, velocity: Floats) -> Floats:
+def decay_of_momenta(dt: float, damping: tuple[Floats, Floats], velocity: Floats) -> Floats:
     """Z (N, n, n) of momenta that decay as exp(-Z s) over a unit step: h D M^-1 for the damping D, mean of both ends.
 
-    The derivatives of a step do not tell Z: in motion they also have what inertias change.
+    The derivatives of a step do not tell Z: in motion they also contain the change of inertias.
 
     Args:
-        problem: The problem.
-        motion: Nodes and controls of the steps.
+        dt: The time step h [s].
+        damping: D (N, n, n) where steps begin and where they end.
         velocity: dv/dx (N + 1, n, 2n) at the nodes.
     """
-    n, N = problem.scene.robot.dof, len(motion.u)
-    D = damping_at_nodes(problem, motion)
-    rates = [D[end] @ velocity[end : N + end, :, n:] for end in range(2)]
-    found: Floats = 0.5 * problem.dt * (rates[0] + rates[1])
+    N, n, _ = damping[0].shape
+    rates = [D @ velocity[end : N + end, :, n:] for end, D in enumerate(damping)]
+    found: Floats = 0.5 * dt * (rates[0] + rates[1])
     return found
 
 
 def damping_at_nodes(problem: OptimalControlProblem, motion: Trajectory) -> tuple[Floats, Floats]:
-    """The damping (N, n, n) where steps begin and where they end, under their controls."""
+    """The damping (N, n, n) where steps begin and where they end, under their controls.
+
+    Joints whose friction falls with the velocity count as undamped, custom forces with what they are.
+    """
     scene = problem.scene
     forces = motion.u @ scene.actuation.T
     begin, end = (
