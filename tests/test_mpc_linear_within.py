@@ -275,7 +275,7 @@ def test_ticks_know_the_rows_of_the_tick_before(controls, first, monkeypatch):
     def watched(steps, likely):
         run_of(steps, likely)
         if likely is not None:
-            expected = zip(steps.rows.split(likely), steps.met, strict=True)
+            expected = zip(steps.rows.from_order(likely), steps.met, strict=True)
             wrong.append(sum(int((one != other).sum()) for one, other in expected))
 
     both = [vp.WithinControlRate([150.0, np.inf]), vp.WithinVelocityLimits(CHAIN, (-0.8, 0.8))]

@@ -71,6 +71,16 @@ class Rows:
         """Values of all rows, in the shapes of the penalties."""
         return split(self.signed, values)
 
+    def in_order(self, held: Sequence[Mask]) -> Mask:
+        """The active rows of all penalties (M,) in the problem's order; here those of control rates are last."""
+        return flat([held[self.penalties.index(item)] for item in self.problem.all_penalties])
+
+    def from_order(self, rows: Mask) -> list[Mask]:
+        """Active rows from those in the problem's order, see :meth:`in_order`."""
+        everything = self.problem.all_penalties
+        parts = split([item.bound for item in everything], rows)
+        return [parts[everything.index(item)] for item in self.penalties]
+
     def along(self, held: Sequence[Mask | Floats], shifted: list[Floats] | None = None) -> Along:
         """Expansions for a pass with the active rows ``held``, or with these shares of the rows' weights.
 

@@ -12,7 +12,7 @@ from varpin.control.active_rows import Rows, same_rows
 from varpin.control.along import Along
 from varpin.control.box import Box, free_pass, to_minimum, within_limits
 from varpin.control.passes import Plan
-from varpin.control.penalties import PenalizedProblem, flat
+from varpin.control.penalties import PenalizedProblem
 
 # Greatest number of passes in a row without a line search, and of those with one before the interior-point method. This
 # begins only if so many passes are left; its own, two for each of its steps, do not count.
@@ -43,7 +43,7 @@ def minimum(along: Along, regularization: float, curvature: Floats | None, likel
     steps.run(likely)
     if steps.best is None:
         return within_limits(along, regularization, curvature)
-    return replace(steps.best, model=along.model, rows=flat(steps.met))
+    return replace(steps.best, model=along.model, rows=steps.rows.in_order(steps.met))
 
 
 class _Steps:
@@ -76,7 +76,7 @@ class _Steps:
                 return
             rows.proximal = self.regularization * np.abs(stiffness)
         if likely is not None and likely.size == rows.weights.size:
-            self._settle(rows.split(likely))
+            self._settle(rows.from_order(likely))
         self._descend(self.done + _SEARCHED)
         left = problem.passes - self.done
         if not self.ended and self.together and left >= _INTERIOR and self.plan is not None:

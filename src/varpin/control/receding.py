@@ -78,13 +78,11 @@ def replan(
     backoff = [_shifted_to(*parts, 0, hold) for parts in zip(old, new, split(old, known.backoff), strict=True)]
     first_weights = np.maximum(known.first_weights, weights_for(abs(previous.cost), new))
     weights = np.clip(known.weights, first_weights, _HEAVIEST * first_weights)
-    active = None
+    rows = None
     if known.active is not None:
-        active = [
-            _shifted_to(*parts, decisions, hold) for parts in zip(old, new, split(old, known.active), strict=True)
-        ]
-    # Passes have the rows of control rates last.
-    order = sorted(range(len(new)), key=lambda i: new[i].of_controls)
+        rows = flat(
+            [_shifted_to(*parts, decisions, hold) for parts in zip(old, new, split(old, known.active), strict=True)]
+        )
     begun = flat(multipliers)
     found = kept = previous
     history: list[Iteration] = []
@@ -100,12 +98,8 @@ def replan(
             tolerance=tolerance,
             max_iterations=1,
             deadline=deadline,
-            rows=None if active is None else flat([active[i] for i in order]),
+            rows=rows,
         )
-        active = None
-        if rows is not None:
-            by_pass = dict(zip(order, split([new[i] for i in order], rows), strict=True))
-            active = [by_pass[i] for i in range(len(new))]
         history += [replace(item, index=len(history)) for item in found.history]
         motion = found.trajectory
         u = problem.control_rows(motion)
@@ -124,7 +118,7 @@ def replan(
             weights=weights,
             first_weights=first_weights,
             iterations=0,
-            active=None if active is None else flat(active),
+            active=rows,
         )
         kept = replace(
             found, problem=problem, cost=problem.cost_of(motion), history=tuple(history), search=None, multipliers=state
