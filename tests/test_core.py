@@ -72,6 +72,26 @@ def test_arrays_of_a_wrong_shape_are_refused(scene):
         scene.core.jet(q, np.zeros((n, n)))
 
 
+@pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Midpoint(), vp.RungeKutta4()], ids=repr)
+@pytest.mark.parametrize("line", [False, True])
+def test_paths_with_controls_of_their_own(integrator, line):
+    """Each is the path alone, to the last bit."""
+    scene, P, R = vp.Scene(vp.planar_chain(2), damping=0.1), 3, 2
+    q, v, before = rng.normal(size=(3, P, 2))
+    u, options = rng.normal(size=(P, R, 2)), {"hold": 4}
+    if line:
+        options["stage_times"] = np.array(integrator.stage_times or (0.5,))
+    own = open_loop(u.reshape(-1, 2))._replace(own=R, before=before, **options)
+    found = integrator.motions(scene, q, v, own, scene.no_drift, 0.01)
+    for k in range(P):
+        part = slice(k, k + 1)
+        alone = open_loop(u[k])._replace(before=before[part], **options)
+        expected = integrator.motions(scene, q[part], v[part], alone, scene.no_drift, 0.01)
+        assert all(a[k].tobytes() == b[0].tobytes() for a, b in zip(found, expected, strict=True))
+    with pytest.raises(ValueError, match="u has"):
+        integrator.motions(scene, q, v, own._replace(u=own.u[1:].copy()), scene.no_drift, 0.01)
+
+
 @pytest.mark.parametrize(
     ("field", "value", "facts"),
     [

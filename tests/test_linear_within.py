@@ -6,7 +6,7 @@ from findings import about
 from scipy.optimize import lsq_linear, minimize
 
 import varpin as vp
-from varpin.control.between_nodes import Instants, enforced
+from varpin.control.between_nodes import NOWHERE, Instants, enforced, seen, updated
 from varpin.control.closed_loop import ClosedLoop
 from varpin.control.multipliers import at_nodes
 from varpin.control.spread import Feedback, covariances
@@ -232,12 +232,14 @@ def test_scipy_finds_no_less_within_speeds_between_nodes():
 @pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.RungeKutta4()], ids=repr)
 @pytest.mark.parametrize("controls", ["held", "linear"])
 def test_derivatives_of_rows_between_nodes(controls, integrator):
-    """Beside central differences of the rows, which are those of a motion of the step in eighths."""
+    """Beside central differences of the rows, which are those of a motion of the step in eighths, or on parabolas."""
     robot, rng = vp.planar_chain(2), np.random.default_rng(0)
     problem = reach(robot, 0.6, dt=0.1, steps=4, controls=controls, integrator=integrator)
-    rows = np.array([[0, 0, 0], [0, 1, 3], [0, 1, 6], [0, 3, 2]])
-    offsets = np.zeros(16)
-    bound = enforced(problem, Instants(rows, offsets)).bound_constraints[1]
+    rows = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 3, 0]])
+    moments = np.repeat([0.02, 0.5, 0.875, 0.4], 4)
+    moments[-4:-2] = 0.97, -1.0
+    bends = np.where((moments < 0.1) | (moments > 0.9), 0.5, 0.0)
+    bound = enforced(problem, Instants(rows, moments, bends)).bound_constraints[1]
     shape = (5, 2), (5, 2), (5 if problem.linear else 4, 2)
     at, way = ([rng.normal(size=size) for size in shape] for _ in range(2))
     q, v, u = at
@@ -245,7 +247,14 @@ def test_derivatives_of_rows_between_nodes(controls, integrator):
     given = {"dt": 0.1 / 8, "steps": 8, "controls": lines, "integrator": integrator, "check": False}
     motion = vp.simulate(problem.scene, q[1], v[1], **given)
     speeds = np.abs(motion.v[[4, 7]])
-    np.testing.assert_allclose(bound.value(*at)[1:3].reshape(2, 2, 2).max(axis=1), speeds - 0.6, atol=1e-12)
+    found = bound.value(*at)
+    np.testing.assert_allclose(found[1:3].reshape(2, 2, 2).max(axis=1), speeds - 0.6, atol=1e-12)
+    assert found[3, 1] == -bound.scale
+    # Of a row at 0.4 steps, between the ends of the second, third and fourth part.
+    given |= {"controls": vp.FirstOrderHold(u[3:5]).refined(8) if problem.linear else np.tile(u[3], (8, 1))}
+    inside = vp.simulate(problem.scene, q[3], v[3], **given).v[2:5, 0]
+    on_parabola = np.polyval(np.polyfit([2.0, 3.0, 4.0], inside, 2), 3.2)
+    assert found[3, 2] == pytest.approx(-on_parabola - 0.6, abs=1e-10)
     after, before = (bound.value(*(x + size * dx for x, dx in zip(at, way, strict=True))) for size in (1e-5, -1e-5))
     slopes = bound.slopes(*at)
     dq, dv, du = way
@@ -253,6 +262,44 @@ def test_derivatives_of_rows_between_nodes(controls, integrator):
     moved = np.concatenate([dq[slopes.nodes], dv[slopes.nodes], *ends], axis=1)
     found = np.einsum("krz,kz->kr", slopes.in_step(), moved)
     np.testing.assert_allclose(found, (after - before) / 2e-5, rtol=1e-6, atol=1e-7)
+
+
+def test_rows_follow_sliding_peaks():
+    """Their values are the largest speeds in 64 parts of a step, at their motion and, as peaks slide, at others."""
+    problem = reach(vp.planar_chain(2), 0.6, dt=0.125, steps=N, integrator=vp.RungeKutta4())
+    free, way = reach(vp.planar_chain(2), 50.0, dt=0.125, steps=N), np.random.default_rng(0).normal(size=(N + 1, 2))
+    u = vp.solve(free, check=False).controls + 8.0 * (-1.0) ** np.arange(N + 1)[:, None]
+
+    def largest(u):
+        """In each step and joint, and whether that is well within the step."""
+        motion, found = moved(problem, u), []
+        for k in range(N):
+            lines = {"dt": 0.125 / 64, "steps": 64, "controls": vp.FirstOrderHold(u[k : k + 2]).refined(64)}
+            options = {"integrator": vp.RungeKutta4(), "check": False}
+            found.append(np.abs(vp.simulate(problem.scene, motion.q[k], motion.v[k], **lines, **options).v))
+        places = np.argmax(found, axis=1)
+        return np.max(found, axis=1), (places > 8) & (places < 56)
+
+    motion = moved(problem, u)
+    bound = problem.bound_constraints[0]
+    instants = updated(problem, NOWHERE, seen(problem, motion), [np.zeros(bound.shape)], -0.6)
+
+    def of_rows(u, bends):
+        rows = enforced(problem, Instants(instants.rows, instants.moments, bends)).bound_constraints[1]
+        motion = moved(problem, u)
+        found = np.full((N, 4), -np.inf)
+        np.maximum.at(found, rows.begins, rows.value(motion.q, motion.v, motion.u_nodes))
+        return 0.6 + found.reshape(N, 2, 2).max(axis=1)
+
+    (speeds, inside), (after, still) = (largest(controls) for controls in (u, u + way))
+    inside &= still
+    assert inside.sum() > N // 2
+    np.testing.assert_allclose(of_rows(u, instants.bends)[inside], speeds[inside], rtol=1e-3)
+    sliding, fixed = (
+        np.abs(of_rows(u + way, bends) - of_rows(u, bends) - after + speeds)[inside].max()
+        for bends in (instants.bends, np.zeros(instants.bends.shape))
+    )
+    assert sliding < 0.1 * fixed, (sliding, fixed)
 
 
 def test_rounds_with_rows_between_nodes_go_on_where_they_stopped(tmp_path):
@@ -300,7 +347,7 @@ def test_files_with_other_rows_between_nodes_are_refused(tmp_path):
         members = dict(file)
     wrong = {
         "instants": members["multipliers.instants"] + [0, N, 0],
-        "offsets": members["multipliers.offsets"][1:],
+        "moments": members["multipliers.moments"][1:],
         "weights": members["multipliers.weights"][:1],
     }
     for name, array in wrong.items():

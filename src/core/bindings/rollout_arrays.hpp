@@ -89,12 +89,13 @@ class CommandArrays {
           before(field<In<2>>(commands, "before")),
           within(field<In<3>>(commands, "within")),
           stage_times(field<In<1>>(commands, "stage_times")),
-          hold(nb::cast<int>(commands.attr("hold"))) {
+          hold(nb::cast<int>(commands.attr("hold"))),
+          own(nb::cast<std::size_t>(commands.attr("own"))) {
         const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
-        const std::size_t decisions = u.shape(0), width = gains.shape(2);
+        const std::size_t decisions = own > 0 ? own : u.shape(0), width = gains.shape(2);
         if (hold < 1 || decisions * static_cast<std::size_t>(hold) != steps)
             throw std::invalid_argument("commands and nodes have different numbers of steps");
-        require(u, "u", {decisions, m});
+        require(u, "u", {own > 0 ? paths * own : decisions, m});
         feedback = given(gains, "gains", {decisions, m, width}) && decisions > 0;
         if (feedback) {
             if (width != 2 * n && width != 2 * n + m)
@@ -129,7 +130,8 @@ class CommandArrays {
                 limits.data() + m,
                 earlier ? before.data() : nullptr,
                 changing ? within.data() : nullptr,
-                linear ? stage_times.data() : nullptr};
+                linear ? stage_times.data() : nullptr,
+                static_cast<std::ptrdiff_t>(own)};
     }
 
   private:
@@ -139,6 +141,7 @@ class CommandArrays {
     In<3> within;
     In<1> stage_times;
     int hold;
+    std::size_t own;        // decisions of each path where it has controls of its own, else 0
     bool feedback = false;  // whether there are gains
     bool earlier = false;   // whether the controls before the first step are known
     bool changing = false;  // whether controls change within steps

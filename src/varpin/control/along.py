@@ -116,11 +116,18 @@ class Along:
     @cached_property
     def running(self) -> Expansion:
         """The running cost at its samples."""
-        problem, found = self.problem, self.problem.expand_running(self.trajectory)
-        for name, array in (("gradient", found.gradient), ("Hessian", found.hessian)):
+        return self.finite(self.problem.expand_running(self.trajectory))
+
+    def finite(self, running: Expansion) -> Expansion:
+        """The expansion of a running cost, if it is finite.
+
+        Raises:
+            CostError: It is not.
+        """
+        for name, array in (("gradient", running.gradient), ("Hessian", running.hessian)):
             if not np.isfinite(array).all():
-                raise CostError(repr(problem.cost), f"its {name} along the motion is not finite")
-        return found
+                raise CostError(repr(self.problem.cost), f"its {name} along the motion is not finite")
+        return running
 
     def differentiate_noise(self, feedback: Feedback, spread: Floats, processes: NDArray[np.bool_]) -> None:
         """Add the whole gradient of the noise cost to later passes.

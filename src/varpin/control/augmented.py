@@ -30,7 +30,7 @@ from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.margins import widened
 from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, in_between, reports_of
 from varpin.control.penalties import PenalizedProblem, flat, penalized, split, weights_for
-from varpin.control.polish import least_slope, polished
+from varpin.control.polish import judged, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import SUFFICIENT
 from varpin.control.refinement_within import Warm, refine_within
@@ -49,8 +49,9 @@ logger = logging.getLogger(__name__)
 
 # Default tolerance.
 _TOLERANCE = 1e-7
-# Greatest number of iterations in a round, and of rounds.
-_OF_ROUND = 40
+# Greatest number of iterations in a round, and in one with rows between nodes, which follow their peaks after it.
+_OF_ROUND, _BEFORE_PEAKS = 40, 20
+# Greatest number of rounds.
 _ROUNDS = 40
 # Tolerance of the search in the first round, and its factor from round to round.
 _LOOSE, _TIGHTER = 1e-3, 0.1
@@ -79,11 +80,11 @@ _HOPELESS = 5
 # Expected decrease, relative to the cost with penalties, with which a stalled search has not shown infeasibility.
 _MUCH = 1e-2
 # Greatest number of last steps, each with the rows between nodes of the motion before.
-_LOOKS = 4
+_LOOKS = 8
 # Number of rounds from which on none is added for the sake of what is between nodes.
 _BETWEEN = 40
-# Number of rounds from which on offsets between nodes are wide.
-_WIDE = 16
+# First round after which there may be rows between nodes.
+_SOON = 1
 # Violation between nodes that is left to the last steps.
 _CLOSE = 1e-6
 # Violation at which penalties stop growing; the last step removes the rest.
@@ -202,7 +203,8 @@ class _Rounds:
             self.whole = enforced(self.problem, begun.between)
             known = len(self.history)
             done = 0 if resume is None or resume.search is None else len(resume.search.history)
-            left = min(last - known, _OF_ROUND - done)
+            longest = _BEFORE_PEAKS if len(begun.between.rows) else _OF_ROUND
+            left = min(last - known, longest - done)
             problem = penalized(self.whole, begun.multipliers, begun.weights, begun.backoff, until=self.until)
             options: dict[str, Any] = dict(self.options)
             if resume is None:
@@ -360,7 +362,7 @@ class _Rounds:
         known = resumed.multipliers
         if resumed.search is None or known is None:
             raise InputError("resume: the solution does not hold the state of its search; give it as controls")
-        self.whole = enforced(self.problem, known.between)
+        self.whole = enforced(self.problem, known.begun_between)
         self.state = _State(
             split(self.bound, known.begun),
             known.weights,
@@ -370,7 +372,7 @@ class _Rounds:
             known.tolerance,
             known.round,
             known.stuck,
-            known.between,
+            known.begun_between,
             None if known.added is None else split(self.problem.bound_constraints, known.added),
             known.counts,
         )
@@ -413,6 +415,7 @@ class _Rounds:
             added=None if begun.added is None else flat(begun.added),
             counts=begun.counts,
             **_of_instants(begun.between),
+            **_of_instants(begun.between, "begun_"),
         )
         search = found.search
         if search is not None:
@@ -467,7 +470,8 @@ class _Rounds:
             return Status.INFEASIBLE, self._infeasible(kept, begun, worst, constraints.index(worst))
         if feasible and begun.round + 1 >= _ROUNDS:
             return found.status, found.reason
-        more = (violation > np.maximum(_AIM, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
+        aim = _CLOSE if len(begun.between.rows) else _AIM
+        more = (violation > np.maximum(aim, _ENOUGH * begun.worst)) & (begun.weights < _HEAVIEST * begun.first_weights)
         weights = np.where(more, _GROWTH * begun.weights, begun.weights)
         self.state = _State(
             multipliers=values,
@@ -499,29 +503,28 @@ class _Rounds:
                 said += ", which is as wide as motions under noise need"
         return f"{said}, whatever its penalty"
 
-    def _looked_between(
-        self, motion: Trajectory, between: Instants, backoff: list[Floats], least: float, rounds: int
-    ) -> Instants:
-        """Rows between nodes with the offsets of a motion, and those that it violates by more than ``least``."""
+    def _looked_between(self, motion: Trajectory, between: Instants, backoff: list[Floats], least: float) -> Instants:
+        """Rows between nodes at the peaks of a motion, with those that it violates by more than ``least``."""
         values = seen(self.problem, motion)
         if values is None:
             return between
-        margins = backoff[: len(self.problem.bound_constraints)]
-        return updated(self.problem, between, motion, values, margins, least, wide=rounds >= _WIDE)
+        return updated(self.problem, between, values, backoff[: len(self.problem.bound_constraints)], least)
 
     def _goes_between(self, kept: Solution, begun: _State, ended: Status | None) -> bool:
         """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
 
         Only linear controls lead around the nodes, and held ones have such rows where the problem asks for them. There
-        are none until the rounds have ended with a motion that violates a constraint, by more than a thousandth of its
-        range if the problem does not ask. From then on each round has the offsets of the motion before, and the rows
-        that it violates. The weights of penalties are the first ones again when there are rows for the first time.
+        are none until the motion of a round, not that of the first, violates a constraint by more than a thousandth of
+        its range; or at the end of the rounds by more than 1e-6 of its unit, if the problem asks for them. From then on
+        the rows of each round follow the peaks of the motion before, with further ones that it violates. The weights of
+        penalties are the first ones again when there are rows for the first time.
         """
         before, base, known = begun.between, self.state, kept.multipliers
         assert known is not None
         values = split(self.bound, known.values)
         asked = self.problem.between_nodes
-        if not (self.problem.linear or asked) or (ended is None and not len(before.rows)):
+        first = not len(before.rows)
+        if not (self.problem.linear or asked) or (ended is None and first and begun.round < _SOON):
             return False
         if ended is not None:
             if begun.round + 1 >= _BETWEEN or ended not in (Status.CONVERGED, Status.STALLED):
@@ -529,7 +532,7 @@ class _Rounds:
             if kept.violation > FEASIBLE:
                 return False
             base = replace(begun, multipliers=values, round=begun.round + 1, stuck=0)
-        between = self._looked_between(kept.trajectory, before, begun.backoff, FEASIBLE, begun.round)
+        between = self._looked_between(kept.trajectory, before, begun.backoff, FEASIBLE)
         if not len(between.rows):
             return False
         parts = (carried(self.problem, before, between, array) for array in (base.multipliers, base.backoff))
@@ -538,8 +541,8 @@ class _Rounds:
         weights, first_weights, worst = (_of_all(array, before, between) for array in arrays)
         whole = enforced(self.problem, between)
         told = reports_of(whole, kept.trajectory, multipliers, backoff)
-        if ended is not None:
-            close = asked or len(before.rows) > 0
+        if ended is not None or first:
+            close = ended is not None and (asked or not first)
             bounds = [_CLOSE if close else REPORTED * item.scale for item in self.problem.bound_constraints]
             if (self._beyond(kept.trajectory, begun.backoff) <= bounds).all():
                 return False
@@ -557,7 +560,7 @@ class _Rounds:
             worst=worst,
             between=between,
         )
-        if not len(before.rows):
+        if first:
             self.state = replace(self.state, weights=first_weights, worst=np.full(len(worst), np.inf), tolerance=_LOOSE)
         return True
 
@@ -622,44 +625,35 @@ class _Rounds:
     def _polished(self, kept: Solution) -> tuple[Solution, str]:
         """The plan moved onto its constraints and to its optimum, with matching gains, and its residuals in words.
 
-        The motion then has other offsets of its rows between nodes, so that the last step is made again. With such
-        rows, the plan stays where it is if that does not lead closer.
+        Peaks between nodes then are elsewhere, so that the last step is made again. With such rows, the plan stays as
+        it is if that does not lead closer.
         """
         known = kept.multipliers
         assert known is not None
         values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
-        motion, between, found, dense = kept.trajectory, known.between, None, len(known.between.rows) > 0
-        least, bound = np.inf, np.inf
-        if dense:
-            least = self._left(motion, backoff)
-            if least > FEASIBLE:
-                between = self._looked_between(motion, between, backoff, np.inf, known.round)
-                kept = replace(kept, multipliers=replace(known, **_of_instants(between)))
+        motion, between, dense = kept.trajectory, known.between, len(known.between.rows) > 0
+        found, bound = None, np.inf
+        least = max(self._left(motion, backoff), FEASIBLE) if dense else np.inf
+        first = 0.0 if kept.search is None else kept.search.first
         try:
-            for _ in range(_LOOKS):
+            for look in range(_LOOKS if dense else 1):
+                if dense:
+                    between = self._looked_between(motion, between, backoff, np.inf)
                 self.whole = enforced(self.problem, between)
                 after = polished(self.whole, motion, values, known.weights, backoff, self.until)
-                bound = self.tolerance * (after.stake + NOTHING * (0.0 if kept.search is None else kept.search.first))
-                told = between
-                if dense:
-                    left = self._left(after.motion, backoff)
-                    if left > max(least, FEASIBLE) or after.decrease > bound:
+                motion, values = after.motion, after.multipliers
+                bound = self.tolerance * (after.stake + NOTHING * first)
+                left = self._left(motion, backoff) if dense else 0.0
+                if not dense or (after.decrease <= bound and left <= least):
+                    found, least, known = after, left, replace(known, values=flat(values), **_of_instants(between))
+                    if look and left <= FEASIBLE:
                         break
-                    least = left
-                    if left > FEASIBLE:
-                        told = self._looked_between(after.motion, between, backoff, np.inf, known.round)
-                found, between = after, told
-                motion, values = found.motion, found.multipliers
-                if not dense or least <= FEASIBLE:
-                    break
         except (CostError, NoiseFieldError, LinearizationError):
             pass
-        self.whole = enforced(self.problem, between)
+        self.whole = enforced(self.problem, known.between)
         if found is None:
-            closing = f"constraints hold to {kept.violation:.1e}"
-            kept = self._with_least_slope(kept)
-            return replace(kept, status=Status.STALLED) if self._clearly_beyond(kept) else kept, closing
-        plan = self._along(kept, found.motion, replace(known, values=flat(values), **_of_instants(between)))
+            return self._judged(kept, bound)
+        plan = self._along(kept, found.motion, known)
         closing = (
             f"constraints hold to {plan.violation:.1e}, and within them the cost would fall by {found.decrease:.1e}"
         )
@@ -670,16 +664,24 @@ class _Rounds:
             plan = replace(plan, status=Status.CONVERGED if there else stopped)
         return plan, closing
 
-    def _with_least_slope(self, kept: Solution) -> Solution:
-        """The plan as it is, with the multipliers of the Lagrangian's least slope where that has derivatives."""
-        known = kept.multipliers
+    def _judged(self, kept: Solution, bound: float) -> tuple[Solution, str]:
+        """The plan as it is, with the multipliers of the Lagrangian's least slope where that has derivatives.
+
+        It is not CONVERGED if the cost would fall by more than ``bound`` within the constraints.
+        """
+        known, closing = kept.multipliers, f"constraints hold to {kept.violation:.1e}"
         assert known is not None
         values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
+        stalled = self._clearly_beyond(kept)
         try:
-            values = least_slope(self.whole, kept.trajectory, values, known.weights, backoff)
+            found = judged(self.whole, kept.trajectory, values, known.weights, backoff)
         except (CostError, NoiseFieldError, LinearizationError):
-            return kept
-        return replace(kept, multipliers=replace(known, values=flat(values)))
+            pass
+        else:
+            kept = replace(kept, multipliers=replace(known, values=flat(found.multipliers)))
+            stalled = stalled or (kept.status is Status.CONVERGED and found.decrease > bound)
+            closing += f", and within them the cost would fall by {found.decrease:.1e}"
+        return replace(kept, status=Status.STALLED) if stalled else kept, closing
 
     def _clearly_beyond(self, plan: Solution) -> bool:
         """Whether the motion violates a constraint by more than a thousandth of its range."""
@@ -777,9 +779,12 @@ def _steadier(margins: Floats) -> Floats:
     return found
 
 
-def _of_instants(between: Instants) -> dict[str, Any]:
-    """The rows between nodes as fields of :class:`Multipliers`."""
-    return {"instants": between.rows, "offsets": between.offsets} if len(between.rows) else {}
+def _of_instants(between: Instants, prefix: str = "") -> dict[str, Any]:
+    """The rows between nodes as fields of :class:`Multipliers`; with the prefix ``begun_`` those of the round."""
+    if not len(between.rows):
+        return {}
+    found = {f"{prefix}moments": between.moments, f"{prefix}bends": between.bends}
+    return found if prefix else found | {"instants": between.rows}
 
 
 def _of_all(values: Floats, old: Instants, new: Instants) -> Floats:

@@ -44,7 +44,7 @@ class ClosedLoop:
         problem: OptimalControlProblem,
         motion: Trajectory,
         weights: Floats,
-        active: list[Mask],
+        multipliers: list[Floats],
     ) -> None:
         """Expand the cost along a motion.
 
@@ -52,14 +52,15 @@ class ClosedLoop:
             problem: The problem with its constraints.
             motion: The motion.
             weights: Weights of the penalties (C,).
-            active: The rows whose penalties count, for each constraint (K, rows).
+            multipliers: For each constraint (K, rows). Penalties count, and second derivatives where rows have them, in
+                rows whose multiplier is not zero.
         """
         self.problem, self.motion = problem, motion
         zeros = [np.zeros(item.shape) for item in problem.bound_constraints]
         goal = penalized(problem, zeros, weights, zeros)
         self._along = Along(goal, motion)
         self._linear, self._velocity = self._along.linearized(0, problem.steps)
-        self._active = active
+        self._multipliers, self._active = multipliers, [values != 0.0 for values in multipliers]
         self._goal = goal
         # By the identity of the constraint.
         self._known: dict[int, Slopes] = {}
@@ -76,8 +77,8 @@ class ClosedLoop:
         """Gradients (N, 2n + m) and Hessians of the steps' costs in (x, u)."""
         problem, motion, goal = self.problem, self.motion, self._goal
         of_nodes = [
-            (item, rows)
-            for item, rows in zip(problem.bound_constraints, self._active, strict=True)
+            (item, rows, values)
+            for item, rows, values in zip(problem.bound_constraints, self._active, self._multipliers, strict=True)
             if not item.of_controls
         ]
         of_rates = [
@@ -87,9 +88,10 @@ class ClosedLoop:
         self._model = Model(costs, self._along.terminal.cost)
         expansion = goal.with_held(
             costs,
-            [np.zeros(item.shape) for item, _ in of_nodes],
-            [self._slopes_of(item) if rows.any() else None for item, rows in of_nodes],
-            [rows for _, rows in of_nodes],
+            [np.zeros(item.shape) for item, _, _ in of_nodes],
+            [self._slopes_of(item) if rows.any() else None for item, rows, _ in of_nodes],
+            [rows for _, rows, _ in of_nodes],
+            [values for _, _, values in of_nodes],
         )
         lin, rule, N = self._linear, goal.model_rule, problem.steps
         rate = self._expand_rate(of_rates)

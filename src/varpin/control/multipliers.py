@@ -41,9 +41,12 @@ class Multipliers(Frozen):
         round: Number of the last round, from 0.
         iterations: Iterations of all rounds before.
         stuck: Number of successive rounds that have hardly lowered the worst violation.
-        instants: Constraint, step and instant (I, 3) of each instant between nodes at which a constraint has rows; None
+        instants: Constraint, step and number (I, 3) of each instant between nodes at which a constraint has rows; None
             where all hold there without.
-        offsets: What is added to the values of these rows (O,), where the motion has a peak between two instants.
+        moments: Where these rows are in a step of unit length (O,); negative for rows that are not enforced.
+        bends: Minus the second derivatives of their values in time where they follow peaks (O,), else zero.
+        begun_moments: The ``moments`` in the last round (O,).
+        begun_bends: The ``bends`` in the last round (O,).
         added: What is added to margins of the rows at nodes, as motions under noise were counted; None where margins of
             the linear model suffice.
         counts: How often margins have become wider for that reason.
@@ -63,7 +66,10 @@ class Multipliers(Frozen):
     iterations: int
     stuck: int
     instants: Annotated[Integers, Axes("instants", 3)] | None = None
-    offsets: Annotated[Floats, Axes("offsets", finite=True)] | None = None
+    moments: Annotated[Floats, Axes("moments", finite=True)] | None = None
+    bends: Annotated[Floats, Axes("moments", finite=True)] | None = None
+    begun_moments: Annotated[Floats, Axes("moments", finite=True)] | None = None
+    begun_bends: Annotated[Floats, Axes("moments", finite=True)] | None = None
     cubic: bool = False
     added: Annotated[Floats, Axes("node_rows", finite=True)] | None = None
     counts: int = 0
@@ -71,16 +77,24 @@ class Multipliers(Frozen):
 
     def __post_init__(self) -> None:
         arrays = (self.values, self.backoff, self.begun, self.weights, self.first_weights, self.worst)
-        for array in (*arrays, self.instants, self.offsets, self.added, self.active):
+        between = self.instants, self.moments, self.bends, self.begun_moments, self.begun_bends
+        for array in (*arrays, *between, self.added, self.active):
             if array is not None:
                 array.setflags(write=False)
 
     @property
     def between(self) -> Instants:
         """The rows between nodes."""
-        if self.instants is None or self.offsets is None:
+        if self.instants is None or self.moments is None or self.bends is None:
             return NOWHERE
-        return Instants(self.instants, self.offsets, self.cubic)
+        return Instants(self.instants, self.moments, self.bends, self.cubic)
+
+    @property
+    def begun_between(self) -> Instants:
+        """The rows between nodes in the last round; the last step onto the constraints has others."""
+        if self.instants is None or self.begun_moments is None or self.begun_bends is None:
+            return self.between
+        return Instants(self.instants, self.begun_moments, self.begun_bends, self.cubic)
 
 
 @dataclass(frozen=True, eq=False)

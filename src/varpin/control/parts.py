@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from varpin.arrays import Floats, Integers
+from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
-from varpin.integrators.base import Failure, open_line, open_loop
+from varpin.integrators.base import Lines, Segment, open_loop
 from varpin.linearization import linearize_steps, velocity_at_nodes
-from varpin.mechanics.forces import limited_servos
+from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
-from varpin.simulation.record import rollout
+from varpin.simulation.record import trajectory_of
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory, joined
 
@@ -47,66 +47,64 @@ class Parts(Frozen):
         return np.concatenate([u[steps], u[steps + 1]], axis=1) if self.linear else u[steps]
 
     def states(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats] | None:
-        """The q and v (K, count - 1, n) between the parts of K steps; None where one fails.
+        """The q and v (K, count + 1, n) at the ends of the parts of K steps; None where one fails.
 
         Args:
             q: Configurations at their begin (K, n).
             v: Velocities at their begin (K, n).
             u: Their controls.
         """
-        scene, dt = self.scene, self.dt / self.count
-        if not (self.linear or scene.inputs or scene.custom or limited_servos(scene.elements)):
-            commands = open_loop(np.zeros((1, scene.controls)))._replace(hold=self.count)
-            forces = np.repeat((u @ scene.actuation.T)[:, None], self.count, axis=1)
-            found = self.integrator.motions(scene, q.copy(), v.copy(), commands, forces, dt)
-            return None if found is None else (found[0][:, :-1], found[1][:, :-1])
-        within = np.empty((2, len(q), self.count - 1, scene.robot.dof))
-        for k in range(len(q)):
-            part, failure = self._motion(q[k], v[k], u[k])
-            if failure is not None:
-                return None
-            within[:, k] = part.q[1:-1], part.v[1:-1]
-        return within[0], within[1]
+        own, dt = self._commands(u), self.dt / self.count
+        try:
+            found = self.integrator.motions(self.scene, q.copy(), v.copy(), own, self.scene.no_drift, dt)
+        except CustomForceError:
+            return None
+        if found is None:
+            return None
+        return np.concatenate([q[:, None], found[0]], axis=1), np.concatenate([v[:, None], found[1]], axis=1)
 
-    def _motion(self, q: Floats, v: Floats, u: Floats) -> tuple[Trajectory, Failure | None]:
-        """The parts of one step, and why one failed."""
-        own = open_line(u.reshape(2, -1), self.integrator.stage_times) if self.linear else open_loop(u[None])
-        return rollout(self.scene, self.integrator, q, v, own._replace(hold=self.count), self.dt / self.count)
+    def _commands(self, u: Floats) -> Commands:
+        """The controls of steps as one decision of each of K motions."""
+        m = self.scene.controls
+        found = open_loop(u[:, -m:])._replace(hold=self.count, own=1)
+        if not self.linear:
+            return found
+        times = np.array(self.integrator.stage_times or (0.5,))
+        return found._replace(before=np.ascontiguousarray(u[:, :m]), stage_times=times)
 
     def slopes(self, q: Floats, v: Floats, u: Floats) -> tuple[tuple[Floats, Floats], Floats]:
-        """The states as :meth:`states`, and their derivatives (K, count - 1, 2n, 2n + c) in (q, v, controls).
+        """The states as :meth:`states`, and their derivatives (K, count + 1, 2n, 2n + c) in (q, v, controls).
 
         Raises:
-            LinearizationError: A part has no derivative.
+            LinearizationError: A part fails, or has no derivative.
         """
-        motions = []
-        for k in range(len(q)):
-            motion, failure = self._motion(q[k], v[k], u[k])
-            if failure is not None:
-                raise LinearizationError(motion.steps, float(motion.t[-1]), "a step fails in parts")
-            motions.append(motion)
-        states = np.array([motion.q[1:-1] for motion in motions]), np.array([motion.v[1:-1] for motion in motions])
         if self.scene.inputs:
-            found = np.array([self._by_differences(*step) for step in zip(motions, u, strict=True)])
-        else:
-            found = self._chained(_one_after_another(motions), u)
-        return states, found
+            return self._states(q, v, u), self._by_differences(q, v, u)
+        motion, states = self._one_after_another(q, v, u)
+        return states, self._chained(motion, states, u)
 
-    def _chained(self, motion: Trajectory, u: Floats) -> Floats:
-        """The derivatives in each step of :func:`_one_after_another`, those of its parts one after another."""
+    def _states(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats]:
+        found = self.states(q, v, u)
+        if found is None:
+            raise LinearizationError(0, 0.0, "a step fails in parts")
+        return found
+
+    def _chained(self, motion: Trajectory, states: tuple[Floats, Floats], u: Floats) -> Floats:
+        """The derivatives in each step of :meth:`_one_after_another`, those of its parts one after another."""
         scene, n, K = self.scene, self.scene.robot.dof, len(u)
         lin = linearize_steps(scene, motion, self.integrator, motion.q[0], ramps=self.linear)
         A, B = (array.reshape(K, self.count, *array.shape[1:]) for array in (lin.A, lin.B))
         ramp = None if lin.ramp is None else lin.ramp.reshape(B.shape)
-        slopes = np.tile(np.eye(2 * n), (K, self.count, 1, 1))
+        slopes = np.tile(np.eye(2 * n), (K, self.count + 1, 1, 1))
         if self.integrator.variational:
-            at = velocity_at_nodes(scene, motion.q[:-1], motion.v[:-1])
-            slopes[:, :, n:] = at.reshape(K, self.count, n, 2 * n)
-        found = np.empty((K, self.count - 1, 2 * n, 2 * n + u.shape[1]))
+            at = velocity_at_nodes(scene, *(x.reshape(-1, n) for x in states))
+            slopes[:, :, n:] = at.reshape(K, self.count + 1, n, 2 * n)
+        found = np.empty((K, self.count + 1, 2 * n, 2 * n + u.shape[1]))
         # In (x, controls).
-        after = np.tile(np.eye(2 * n, 2 * n + u.shape[1]), (K, 1, 1))
+        after = np.tile(np.eye(2 * n, found.shape[3]), (K, 1, 1))
+        found[:, 0] = after
         after[:, :, : 2 * n] = np.linalg.inv(slopes[:, 0])
-        for j in range(self.count - 1):
+        for j in range(self.count):
             after = A[:, j] @ after
             if ramp is None:
                 after[:, :, 2 * n :] += B[:, j]
@@ -115,31 +113,67 @@ class Parts(Frozen):
                 rise = ramp[:, j] / self.count
                 after[:, :, 2 * n : 2 * n + m] += (1.0 - share) * B[:, j] - rise
                 after[:, :, 2 * n + m :] += share * B[:, j] + rise
-            found[:, j] = slopes[:, j + 1] @ after
+            found[:, j + 1] = slopes[:, j + 1] @ after
         return found
 
-    def _by_differences(self, motion: Trajectory, u: Floats) -> Floats:
-        """The derivatives in one step by central differences: joints of kinematic inputs are on their way over it."""
-        z, n = np.concatenate([motion.q[0], motion.v[0], u]), self.scene.robot.dof
-        near = np.concatenate([z + _SHIFT * np.eye(len(z)), z - _SHIFT * np.eye(len(z))])
-        parted = self.states(near[:, :n].copy(), near[:, n : 2 * n].copy(), near[:, 2 * n :].copy())
-        if parted is None:
-            raise LinearizationError(0, 0.0, "a step fails in parts")
-        after, before = np.split(np.concatenate(parted, axis=2), 2)
-        found: Floats = np.moveaxis((after - before) / (2.0 * _SHIFT), 0, -1)
+    def _by_differences(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """The derivatives by central differences: joints of kinematic inputs are on their way over a step."""
+        z, n = np.concatenate([q, v, u], axis=1), self.scene.robot.dof
+        K, Z = z.shape
+        shifts = _SHIFT * np.concatenate([np.eye(Z), -np.eye(Z)])
+        near = (z[:, None] + shifts).reshape(-1, Z)
+        states = np.concatenate(self._states(near[:, :n], near[:, n : 2 * n], near[:, 2 * n :]), axis=2)
+        after, before = states.reshape(K, 2, Z, self.count + 1, 2 * n).swapaxes(0, 1)
+        found: Floats = np.moveaxis((after - before) / (2.0 * _SHIFT), 1, -1)
         return found
 
+    def _one_after_another(self, q: Floats, v: Floats, u: Floats) -> tuple[Trajectory, tuple[Floats, Floats]]:
+        """The parts of K steps as one motion, for its linearization, and their states (K, count + 1, n).
 
-def _one_after_another(motions: list[Trajectory]) -> Trajectory:
-    """Motions as one, for its linearization: each without its last node, in whose place the next one begins.
+        In the place of each step's end is the begin of the next one: the linearization takes every step again from the
+        node at its begin; that at its end is a first guess only.
+        """
+        scene, integrator, dt, no_noise = self.scene, self.integrator, self.dt / self.count, self.scene.silence
+        state, first = integrator.start(scene, q.copy(), v.copy())
+        try:
+            segments = integrator.rollout_compiled(scene, state, self._commands(u), no_noise, scene.no_drift, dt)
+        except CustomForceError as error:
+            raise LinearizationError(0, 0.0, str(error)) from error
+        for segment in segments:
+            if segment.failure is not None:
+                raise LinearizationError(len(segment.q), dt * len(segment.q), "a step fails in parts")
+        ends: dict[str, Floats] = {}
+        states: dict[str, Floats] = {}
+        for name in ("q", "p", "v", "energy"):
+            begins = np.array([getattr(segment, name) for segment in first])
+            within = np.array([getattr(segment, name) for segment in segments])
+            states[name] = np.concatenate([begins, within], axis=1)
+            within[:-1, -1] = begins[1:, 0]
+            ends[name] = within.reshape(-1, *within.shape[2:])
+        impulses = [segment.impulses for segment in segments if segment.impulses is not None]
+        steps = Segment(
+            q=ends["q"],
+            p=ends["p"],
+            v=ends["v"],
+            energy=ends["energy"],
+            u=np.concatenate([segment.u for segment in segments]),
+            statistics=joined([segment.statistics for segment in segments]),
+            impulses=np.concatenate(impulses) if impulses else None,
+        )
+        motion = trajectory_of(scene, integrator, dt, first[0], [steps], None, None)
+        if self.linear:
+            mean, stages, nodes = self._lines(u)
+            motion = replace(motion, u=mean, u_stages=stages, u_nodes=nodes)
+        return motion, (states["q"], states["v"])
 
-    The linearization takes every step again from the node at its begin; that at its end is a first guess only.
-    """
-    first, last = motions[0], motions[-1]
-    of_nodes, of_steps = ("q", "v", "p", "energy", "u_nodes"), ("u", "u_stages", "dw", "constraint_forces")
-    arrays: dict[str, Any]
-    arrays = {name: np.concatenate([*(getattr(x, name)[:-1] for x in motions), getattr(last, name)[-1:]])
-              for name in of_nodes}  # fmt: skip
-    arrays |= {name: np.concatenate([getattr(x, name) for x in motions]) for name in of_steps}
-    times = first.dt * np.arange(len(arrays["q"]), dtype=np.float64)
-    return replace(first, t=times, **arrays, statistics=joined([x.statistics for x in motions]))
+    def _lines(self, u: Floats) -> Lines:
+        """The controls within the parts of K steps, one after another."""
+        m, count, K = self.scene.controls, self.count, len(u)
+
+        def at(times: tuple[float, ...]) -> Floats:
+            share = ((np.arange(count)[:, None] + times) / count)[..., None]
+            found: Floats = (1.0 - share) * u[:, None, None, :m] + share * u[:, None, None, m:]
+            return found.reshape(K * count, len(times), m)
+
+        nodes = np.concatenate([at((0.0,))[:, 0], u[-1:, m:]])
+        return Lines(at((0.5,))[:, 0], at(self.integrator.stage_times), nodes)

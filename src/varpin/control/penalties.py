@@ -283,19 +283,22 @@ class PenalizedProblem(OptimalControlProblem):
         shifted: Sequence[Floats],
         slopes: Sequence[Slopes | None],
         held: Sequence[Mask | Floats],
+        multipliers: Sequence[Floats] | None = None,
     ) -> Expansion:
         """The running costs' expansion plus the penalties of the rows in ``held``, each (K, rows).
 
         ``held`` has either flags or shares of the rows' weights.
         ``shifted`` are the values whose squares are penalized (:meth:`Penalty.signed`), ``slopes`` their derivatives,
-        None where no row is in ``held``.
+        None where no row is in ``held``. With ``multipliers`` second derivatives of rows count; by default those that
+        follow from ``shifted``.
         """
         N, size, x, m = self.steps, expansion.gradient.shape[1], 2 * self.scene.robot.dof, self.scene.controls
         ends = np.zeros((N, size)), np.zeros((N, size, size))
         wide = x + 2 * m if self.linear else size
         begins = np.zeros((N, wide)), np.zeros((N, wide, wide))
         middles = np.zeros((N, size)), np.zeros((N, size, size))
-        for penalty, s, found, rows in zip(self.penalties, shifted, slopes, held, strict=True):
+        pushes = [None] * len(self.penalties) if multipliers is None else multipliers
+        for penalty, s, found, rows, push in zip(self.penalties, shifted, slopes, held, pushes, strict=True):
             if found is None or not rows.any():
                 continue
             within, counted = isinstance(penalty.bound, BoundBetween), rows.astype(float)
@@ -305,8 +308,14 @@ class PenalizedProblem(OptimalControlProblem):
                 gradient, hessian = middles
             # A step may have several places within it.
             steps = found.nodes if within else found.nodes - 1
-            np.add.at(gradient[:, z], steps, penalty.weight * np.einsum("kr,krx->kx", s * counted, J))
-            np.add.at(hessian[:, z, z], steps, penalty.weight * (np.swapaxes(J, 1, 2) @ (counted[:, :, None] * J)))
+            slope = penalty.weight * np.einsum("kr,krx->kx", s * counted, J)
+            second = penalty.weight * (np.swapaxes(J, 1, 2) @ (counted[:, :, None] * J))
+            if found.curved is not None:
+                pushed = counted * (penalty.weight * np.maximum(s, 0.0) if push is None else push)
+                second += np.swapaxes(found.curved, 1, 2) @ (pushed[:, :, None] * found.curved)
+            own, first = np.unique(steps, return_index=True)
+            gradient[own, z] += np.add.reduceat(slope, first)
+            hessian[own, z, z] += np.add.reduceat(second, first)
         # All samples of the model have the same weight.
         weight = self.dt * float(self.rule[0, 0])
         there = np.broadcast_to(expansion.hessian, (len(expansion.gradient), size, size)).reshape(N, -1, size, size)

@@ -121,18 +121,19 @@ def polished(
     return replace(step.found, multipliers=step.least_slope())
 
 
-def least_slope(
+def judged(
     problem: OptimalControlProblem,
     motion: Trajectory,
     multipliers: list[Floats],
     weights: Floats,
     backoff: list[Floats],
-) -> list[Floats]:
-    """Multipliers (K, rows) of the Lagrangian's least slope in the controls along a motion as it is.
+) -> Polished:
+    """A motion as it is, and how far it is from the KKT conditions.
 
     See :func:`polished`.
     """
-    return _first(problem, motion, multipliers, weights, backoff).least_slope()
+    step = _first(problem, motion, multipliers, weights, backoff)
+    return replace(step.found, multipliers=step.least_slope())
 
 
 def _first(
@@ -190,7 +191,7 @@ class _Step:
             rows | item.source.equality | (c > -_NEAR * item.scale)
             for item, rows, c in zip(self.bound, active, self.c, strict=True)
         ]
-        self.loop = ClosedLoop(problem, motion, weights, active)
+        self.loop = ClosedLoop(problem, motion, weights, multipliers)
         self.loop.close(free)
         self.found = self._judged()
 

@@ -166,7 +166,10 @@ def _at(problem: OptimalControlProblem, known: Multipliers, instants: Instants) 
         first_weights=of_constraints(known.first_weights),
         worst=of_constraints(known.worst),
         instants=instants.rows if some else None,
-        offsets=instants.offsets if some else None,
+        moments=instants.moments if some else None,
+        bends=instants.bends if some else None,
+        begun_moments=None,
+        begun_bends=None,
         cubic=instants.cubic,
     )
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Mask
-from varpin.control.between_nodes import SHARES, enforced, watched
+from varpin.control.between_nodes import MOST_INSTANTS, enforced, watched
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.multipliers import Multipliers
 from varpin.control.problem import OptimalControlProblem
@@ -181,14 +181,14 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
 def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalControlProblem) -> None:
     """Refuse multipliers of another number of rows, or of instants that the problem does not have."""
     between = multipliers.between
-    most = len(problem.constraints), problem.steps, len(SHARES)
+    most = len(problem.constraints), problem.steps, MOST_INSTANTS
     inside = ((between.rows >= 0) & (between.rows < most)).all()
     known = inside and np.array_equal(between.rows, np.unique(between.rows, axis=0))
     if not known or any(not watched(problem)[i] for i in between.constraints):
         raise FileError(f"{source}: multipliers.instants are not in the problem's steps")
     own = [problem.bound_constraints[i] for i in between.rows[:, 0]]
-    if sum(len(item.rows) for item in own) != between.offsets.size:
-        raise FileError(f"{source}: multipliers.offsets do not belong to multipliers.instants")
+    if sum(len(item.rows) for item in own) != between.moments.size:
+        raise FileError(f"{source}: multipliers.moments do not belong to multipliers.instants")
     sizes = [item.size for item in enforced(problem, between).bound_constraints]
     at_nodes = sum(item.size for item in problem.bound_constraints)
     for name, found, expected in (

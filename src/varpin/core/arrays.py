@@ -132,6 +132,8 @@ class Commands(NamedTuple):
     # (s,) stages in a step of unit length: controls are then linear in time over each decision's steps, from the
     # previous control to u at their end; empty for held controls
     stage_times: Floats = _NO_TIMES
+    # R where each path has controls of its own, u (P R, m), one path after another; 0 where all share u
+    own: int = 0
 
 
 class RolloutArrays(NamedTuple):

@@ -614,8 +614,8 @@ def contiguous(commands: Commands) -> Commands:
 
 
 def steps_of(commands: Commands) -> int:
-    """Number of steps of the commands."""
-    return len(commands.u) * commands.hold
+    """Number of steps of the commands, for each path."""
+    return (commands.own or len(commands.u)) * commands.hold
 
 
 def rows(commands: Commands, begin: int, end: int, before: Floats | None = None) -> Commands:

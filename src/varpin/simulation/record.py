@@ -71,7 +71,7 @@ class MotionRecord:
         dw = self.dw[: self.steps] if len(self.dw) else None
         within = np.concatenate(self._within) if self._within else None
         parts = [*self._joined, *self._parts]
-        made = _trajectory(self.scene, self.integrator, self.dt, self._first, parts, dw, within, self._line)
+        made = trajectory_of(self.scene, self.integrator, self.dt, self._first, parts, dw, within, self._line)
         if not self._on_way:
             return made
         q, v, nodes = made.q, made.v, made.u_nodes
@@ -83,7 +83,7 @@ class MotionRecord:
         )
 
 
-def _trajectory(
+def trajectory_of(
     scene: Scene,
     integrator: Integrator,
     dt: float,
@@ -222,7 +222,7 @@ class Motions:
         dw = None if increments is None else increments[:done]
         within = commands.within[:done] if len(commands.within) else None
         line = commands if len(commands.stage_times) else None
-        made = _trajectory(self.scene, self.integrator, self.dt, self._first, [segment], dw, within, line)
+        made = trajectory_of(self.scene, self.integrator, self.dt, self._first, [segment], dw, within, line)
         return made, segment.failure
 
 

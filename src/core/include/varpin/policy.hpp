@@ -27,6 +27,7 @@ struct Commands {
     const double* before = nullptr;       // (P, m) control of each path before its first, or null for the reference
     const double* within = nullptr;       // (N, s, m) controls at the stages of each step, or null for constant ones
     const double* stage_times = nullptr;  // (s) times of the stages for linear controls, which need `before`; or null
+    std::ptrdiff_t own = 0;               // R where u has rows for each path, (P R, m); 0 where paths share them
     bool sloped = false;                  // whether steps have increments for the slopes of linear controls as well
 };
 
@@ -49,7 +50,7 @@ inline void apply_policy(const Commands& commands, std::ptrdiff_t path, std::ptr
     }
     const std::ptrdiff_t r = s / commands.hold;
     for (int c = 0; c < m; ++c) {
-        double total = commands.u[r * m + c];
+        double total = commands.u[(path * commands.own + r) * m + c];
         if (commands.gains) {
             const double* gains = commands.gains + (r * m + c) * commands.width;
             const double* reference = commands.reference + r * commands.width;

@@ -15,43 +15,65 @@ from varpin.control.parts import Parts
 class BoundBetween(BoundConstraint):
     """A constraint at instants within steps, each integrated in parts from the node at its begin.
 
-    The places are the nodes at the ends of the steps; several instants may be in one step.
+    The value at an instant is that of the parabola through the ends of parts next to it. A row that follows a peak has
+    the value at the peak of that parabola, which has the second derivative of an earlier motion: it goes on without a
+    kink as the peak slides. The places are the nodes at the ends of the steps; several instants may be in one step.
+    The times are means of those of the rows.
 
     Attributes:
-        inner: The constraint, bound to a grid whose nodes after the first are the instants.
-        parts: The steps in parts, whose ends are the instants.
-        samples: Which end of a part each instant is (K,), from 0.
-        offset: What is added to the values (K, rows), for peaks between instants.
+        of_nodes: The constraint at the nodes, all after the first.
+        parts: The steps in parts.
+        steps: The steps with instants (S,), ascending.
+        samples: Index in ``steps`` and end of a part (U, 2) of each state at which the constraint is evaluated.
+        inner: The constraint, bound to a grid whose nodes after the first are these states.
+        near: Which of them are the ends of parts of an instant's step (K, parts + 1); any where the weights are zero.
+        weights: Their weights in each row (K, rows, parts + 1); all zero in rows that are not enforced.
+        rates: Their weights in the row's derivative in time, in parts of a step (K, rows, parts + 1).
+        bends: Minus the second derivatives of peaks (K, rows); zero where a row does not follow one.
+        reach: How far from an instant its peak may be, in parts of a step; beyond, values grow linearly.
     """
 
-    inner: BoundConstraint
+    of_nodes: BoundConstraint
     parts: Parts
+    steps: Integers
     samples: Integers
-    offset: Floats
+    inner: BoundConstraint
+    near: Integers
+    weights: Floats
+    rates: Floats
+    bends: Floats
+    reach: float
 
     @property
     def begins(self) -> Integers:
         """Indices of the nodes at the begin of the steps (K,)."""
         return self.places - 1
 
-    def _steps(self, q: Floats, v: Floats, u: Floats) -> tuple[Integers, tuple[Floats, Floats, Floats]]:
-        """The index (K,) of each instant's step in the steps that have any, and q, v and controls of these."""
-        steps, index = np.unique(self.begins, return_inverse=True)
-        return index, (q[steps], v[steps], self.parts.controls(u, steps))
+    def _within(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
+        """q, v and controls of the steps with instants."""
+        return q[self.steps], v[self.steps], self.parts.controls(u, self.steps)
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """See :meth:`BoundConstraint.value`; for one motion. Infinite where a step fails in parts."""
-        index, steps = self._steps(q, v, u)
-        within = self.parts.states(*steps)
+        within = self.parts.states(*self._within(q, v, u))
         if within is None:
             return np.full(self.shape, np.inf)
-        q, v = (x[index, self.samples] for x in within)
-        found: Floats = self.inner.value(_after_first(q), _after_first(v), u) + self.offset
+        q, v = (_after_first(x[tuple(self.samples.T)]) for x in within)
+        c = self.inner.value(q, v, u)[self.near]
+        found = np.einsum("krs,ksr->kr", self.weights, c)
+        slide = self._slide(c)
+        found += slide * (np.einsum("krs,ksr->kr", self.rates, c) - 0.5 * self.bends * slide)
+        return np.where(self.weights.any(axis=2), found, -self.scale)
+
+    def _slide(self, c: Floats) -> Floats:
+        """How far peaks of values ``c`` (K, parts + 1, rows) are from the instants (K, rows), in parts of a step."""
+        bends = np.where(self.bends > 0.0, self.bends, np.inf)
+        found: Floats = np.clip(np.einsum("krs,ksr->kr", self.rates, c) / bends, -self.reach, self.reach)
         return found
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         """dc/d(q, v) (K, rows, 2n) as at the ends of the steps."""
-        return self.inner.jacobian(_after_first(q[self.places]), _after_first(v[self.places]))
+        return self.of_nodes.jacobian(q, v)[self.begins]
 
     def slopes(self, q: Floats, v: Floats, u: Floats) -> Slopes:
         """See :meth:`BoundConstraint.slopes`.
@@ -59,12 +81,16 @@ class BoundBetween(BoundConstraint):
         Raises:
             LinearizationError: A part of a step has no derivative.
         """
-        index, steps = self._steps(q, v, u)
-        inner, D = self.parts.slopes(*steps)
-        q, v = (x[index, self.samples] for x in inner)
-        J = self.inner.jacobian(_after_first(q), _after_first(v)) @ D[index, self.samples]
-        x = 2 * q.shape[1]
-        return Slopes(self.begins, J[:, :, :x], J[:, :, x:])
+        within, D = self.parts.slopes(*self._within(q, v, u))
+        q, v = (_after_first(x[tuple(self.samples.T)]) for x in within)
+        slide = self._slide(self.inner.value(q, v, u)[self.near])
+        J = (self.inner.jacobian(q, v) @ D[tuple(self.samples.T)])[self.near]
+        sliding = np.einsum("krs,ksrz->krz", self.rates, J)
+        found = np.einsum("krs,ksrz->krz", self.weights, J) + slide[:, :, None] * sliding
+        inside = (self.bends > 0.0) & (np.abs(slide) < self.reach)
+        bends = np.where(inside, self.bends, np.inf)
+        x = D.shape[2]
+        return Slopes(self.begins, found[:, :, :x], found[:, :, x:], sliding / np.sqrt(bends)[:, :, None])
 
 
 @dataclass(frozen=True, eq=False)
