@@ -63,6 +63,8 @@ LINEAR = {
     "UR10 within 1.2 rad/s, 20 ms": on_lines("ur10", 1.2, dt=0.02, steps=50),
     "UR5 within 0.8 rad/s, 50 ms": on_lines("ur5", 0.8, dt=0.05, steps=20),
     "two links within 0.6 rad/s, 100 ms": on_lines("two links", 0.6, dt=0.1, steps=10),
+    "UR3 within 0.6 rad/s, 50 ms": on_lines("ur3", 0.6, dt=0.05, steps=20),
+    "UR3 within 0.6 rad/s, 20 ms": on_lines("ur3", 0.6, dt=0.02, steps=50),
 }
 
 

@@ -16,9 +16,9 @@ class BoundBetween(BoundConstraint):
     """A constraint at instants within steps, each integrated in parts from the node at its begin.
 
     The value at an instant is that of the parabola through the ends of parts next to it. A row that follows a peak has
-    the value at the peak of that parabola, which has the second derivative of an earlier motion: it goes on without a
-    kink as the peak slides. The places are the nodes at the ends of the steps; several instants may be in one step.
-    The times are means of those of the rows.
+    the value at the peak of that parabola, which has the second derivative of an earlier motion, (P6) of
+    docs/plan-constraints.md: it goes on without a kink as the peak slides. The places are the nodes at the ends of the
+    steps; several instants may be in one step. The times are means of those of the rows.
 
     Attributes:
         of_nodes: The constraint at the nodes, all after the first.
