@@ -44,6 +44,7 @@ def test_what_robots_know_goes_along(arms):
     assert len(both.ties) == 1
 
 
+@pytest.mark.slow
 def test_shapes_stand_where_the_parts_put_them(arms):
     both = vp.combine(*arms, placements=[None, PLACE])
     q = np.random.default_rng(1).normal(size=both.dof)

@@ -619,6 +619,7 @@ def test_a_double_pendulum_swings_up_by_its_elbow():
     np.testing.assert_allclose(sol.trajectory.v[-1], 0.0, atol=2e-2)
 
 
+@pytest.mark.slow
 def test_a_control_with_equal_limits_within_constraints():
     """The cost does not fall along a control that cannot move; limits just apart give the same plan."""
     scene = vp.Scene(vp.planar_chain(2), damping=0.1)

@@ -37,7 +37,12 @@ def problem(name, N, **options):
 # Steps at which the second-order error is in its asymptotic range: the finger's motion has a boundary layer of 0.2 ms
 # where it does not start on the reference.
 @pytest.mark.parametrize(
-    ("name", "N", "bound"), [("finger", 1500, 1e-6), ("panda", 200, 1e-6), ("finger_off_reference", 7500, 1e-3)]
+    ("name", "N", "bound"),
+    [
+        ("finger", 1500, 1e-6),
+        ("panda", 200, 1e-6),
+        pytest.param("finger_off_reference", 7500, 1e-3, marks=pytest.mark.slow),
+    ],
 )
 def test_the_same_optimum_as_dt_goes_to_zero(name, N, bound):
     costs = [vp.solve(problem(name, steps), tolerance=1e-10).cost for steps in (N, 2 * N)]

@@ -35,7 +35,7 @@ NEEDS = {
     "mujoco.md": "mujoco",
 }
 # Pages that run in less than 3 s of processor time; the site runs most others while it is built.
-QUICK = ("drake.md", "many-machines.md", "mujoco.md", "notebooks.md", "plan-constraints.md", "robots.md")
+QUICK = ("drake.md", "mujoco.md", "notebooks.md", "robots.md")
 WIDEST = 96
 
 

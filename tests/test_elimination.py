@@ -395,7 +395,7 @@ def test_derivatives_of_long_chains_are_those_of_differences():
         assert np.abs(difference[half] - expected[half]).max() <= 1e-5 * np.abs(expected[half]).max()
 
 
-@pytest.mark.parametrize("links", [200, 1000])
+@pytest.mark.parametrize("links", [200, pytest.param(1000, marks=pytest.mark.slow)])
 def test_long_chains_move_and_keep_their_energy(links):
     scene = vp.Scene(vp.planar_chain(links))
     motion = vp.simulate(scene, np.full(links, 0.01), np.zeros(links), dt=1e-3, steps=10)

@@ -328,6 +328,7 @@ def test_friction_brings_a_pendulum_to_rest():
         np.testing.assert_allclose(motion.q[:: steps // 20, 0], exact[:, 0], atol=error)
 
 
+@pytest.mark.slow
 def test_a_stop_throws_back():
     """An arm that falls onto its stops and bounces, against SciPy; what it comes back with is less."""
     forces = [vp.JointStop(2e3, 10.0, lower=-0.2, upper={"joint1": 1.0, "joint2": 0.4}, width=0.02), vp.Armature(0.05)]

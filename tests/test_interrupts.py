@@ -99,6 +99,7 @@ def test_the_first_is_answered_at_once_even_within_the_core(tmp_path):
     assert f"varpin: interrupted after {kept.steps} of 60000 steps, which are kept" in command.lines
 
 
+@pytest.mark.slow
 def test_the_second_does_not_lose_what_is_being_written(tmp_path):
     path, page = tmp_path / "a.npz", tmp_path / "a.html"
     command = Command(*LONG, "--save", str(path), "--html", str(page), run=0.1, save=2.0)
@@ -153,6 +154,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 def test_three_within_one_call_end_it_too(tmp_path):
     path = tmp_path / "a.npz"
     command = Command(*LONG, "--save", str(path), run=3.0, save=60.0)

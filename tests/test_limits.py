@@ -124,7 +124,7 @@ def test_mass_ratio_of_a_million(up, integrator):
     assert work.residual.max() < 10.0
 
 
-@pytest.mark.parametrize("product", [1e-3, 0.1, 1.0, 2.4, 10.0, 1e2, 1e3, 1e4])
+@pytest.mark.parametrize("product", [1e-3, 0.1, 1.0, 2.4, 10.0, 1e2, pytest.param(1e3, marks=pytest.mark.slow), 1e4])
 @pytest.mark.parametrize("how", ["springs", "dampers", "both"])
 def test_stiff_finger_is_solved_or_refused(how, product):
     robot, q, dt = vp.load_robot("finger"), np.array([0.5, 0.3, 0.2]), 1e-3

@@ -91,7 +91,7 @@ def test_karush_kuhn_tucker(name, limited, nodes_alone):
             assert np.abs(report.multipliers * report.values).max() <= 1e-8 * abs(plan.cost)
 
 
-@pytest.mark.parametrize("name", ["speeds", "given begin"])
+@pytest.mark.parametrize("name", ["speeds", pytest.param("given begin", marks=pytest.mark.slow)])
 def test_scipy_finds_no_less(name, nodes_alone):
     problem = links(name)
     plan = vp.solve(problem, check=False)

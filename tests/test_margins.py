@@ -128,6 +128,7 @@ def test_chance_constraints_of_arms_hold(name, begin, travel):
     assert (values(problem, plan) > 0.0).mean(axis=0).max() <= allowed()
 
 
+@pytest.mark.slow
 def test_noise_that_leaves_no_room_is_told_of():
     """With the linear model's margins, four motions in ten were above the lid."""
     plan = vp.solve(under_a_lid(vp.AdditiveNoise(1.5)))
@@ -156,7 +157,7 @@ def test_margins_that_suffice_stay():
         pytest.param("before the count", marks=pytest.mark.slow),
         pytest.param("at the count", marks=pytest.mark.slow),
         pytest.param("after it", marks=pytest.mark.slow),
-        "while counting",
+        pytest.param("while counting", marks=pytest.mark.slow),
     ],
 )
 def test_counted_margins_are_resumed_to_the_bit(when, tmp_path, monkeypatch):
@@ -203,6 +204,7 @@ def test_a_start_near_a_bound_needs_no_later_margin():
     assert (values(problem, plan) > 0.0).mean(axis=0).max() <= allowed()
 
 
+@pytest.mark.slow
 def test_a_bound_that_the_linear_model_sees_no_motion_towards_is_counted():
     """At rest at the bottom, the tip moves sideways to first order, and up to second order alone."""
     bottom = np.array([np.pi / 2, 0.0])

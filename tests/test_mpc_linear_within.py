@@ -121,6 +121,7 @@ def test_penalties_of_ticks_are_not_stiffer_than_one_iteration_can_follow():
     assert costs[1] == pytest.approx(costs[0], rel=1e-2)
 
 
+@pytest.mark.slow
 def test_multipliers_do_not_wind_up_after_short_steps():
     """From this start they did, up to 3e4, and the arm moved at 17 rad/s."""
     problem = beside_a_ball("linear")

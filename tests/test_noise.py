@@ -364,7 +364,9 @@ def test_python_and_compiled_fields_give_the_same_motion(kick, feedback):
     assert one.statistics.split_steps == 0
 
 
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Midpoint(kick="split")], ids=str)
+@pytest.mark.parametrize(
+    "integrator", [vp.Midpoint(), pytest.param(vp.Midpoint(kick="split"), marks=pytest.mark.slow)], ids=str
+)
 def test_strong_order(integrator):
     """1, and 1/2 where the field depends on the velocity: the same paths at steps sixteen times as long."""
     M = vp.lagrangian_jet(vp.Scene(vp.planar_chain(1)), [0.0], [0.0]).Lvv[0, 0]

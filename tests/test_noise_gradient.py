@@ -187,6 +187,7 @@ def bump(height: float) -> vp.CustomCost:
     return vp.CustomCost(value, derivatives)
 
 
+@pytest.mark.slow
 def test_motions_that_need_regularization_do_not_change_how_others_are_rated() -> None:
     """A search over a hill, and the same one resumed."""
     cost = vp.ControlCost(0.1) + bump(50.0) + vp.Terminal(vp.TrackingCost([0.5, -0.5], 20.0) + vp.VelocityCost(1.0))

@@ -137,6 +137,7 @@ def test_ill_conditioned_passes_keep_their_square_roots():
         assert backward(augmented(problem, 1e10), motion, regularization).loss < 1e-8
 
 
+@pytest.mark.slow
 def test_rows_of_a_round_are_read_where_the_next_one_has_others(tmp_path):
     """Rows between nodes change from round to round."""
     problem = reach("linear", steps=8)

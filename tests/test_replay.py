@@ -55,7 +55,9 @@ def test_page_plays_offline_and_shows_the_finger_large(browser, finger, motion, 
     assert [url for url in fetched if not url.startswith(("data:", "blob:"))] == []
 
 
-@pytest.mark.parametrize("name", ["finger", "ur5", "kinova", pytest.param("panda", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["finger", "ur5", *(pytest.param(name, marks=pytest.mark.slow) for name in ("kinova", "panda"))]
+)
 def test_page_poses_every_shape_as_pinocchio_does(browser, tmp_path, name):
     robot = vp.load_robot(name)
     rng = np.random.default_rng(5)
@@ -234,6 +236,7 @@ def test_ghost_follows_its_own_motion(browser, tmp_path, name):
     assert errors == []
 
 
+@pytest.mark.slow
 def test_ghost_is_translucent_and_hides_where_the_robot_is(browser, finger, tmp_path):
     def blue(page):
         visit(browser, page)

@@ -374,6 +374,7 @@ def test_torques_of_a_plan_are_held_against_its_control_limits(ur5):
         np.testing.assert_allclose(half, np.abs(motion.u) / 1e3, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_torque_colours_are_seen(browser, ur5, tmp_path):
     def red(seconds):
         seek(browser, seconds)
@@ -413,6 +414,7 @@ def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_pat
     np.testing.assert_allclose(second[0], placements(ur5, sweep[-1], TIP)[0, :3, 3] + step, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_each_of_several_robots_has_its_ghost_and_its_torques(browser, ur5, sweep, tmp_path):
     finger = vp.load_robot("finger")
     bend = np.linspace([0.0, 0.0, 0.0], [0.5, 0.6, 0.7], 21)

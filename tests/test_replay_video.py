@@ -28,6 +28,7 @@ def frames(path):
     )
 
 
+@pytest.mark.slow
 def test_a_gif_has_a_frame_for_each_moment_and_they_differ(browser, chain, tmp_path):
     path = tmp_path / "chain.gif"
     size = (320, 240)
@@ -100,6 +101,7 @@ def test_refuses_other_formats_and_sizes(chain, tmp_path):
             replay(chain, Q, dt=0.1, video=tmp_path / name, size=size)
 
 
+@pytest.mark.slow
 def test_the_command_line_films_with_traces(browser, tmp_path, capsys):
     path = tmp_path / "finger.gif"
     start = ["simulate", "finger", "--no-gravity", "--v0", "2", "1", "1", "--dt", "1e-2", "--steps", "10"]

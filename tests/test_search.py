@@ -360,6 +360,7 @@ def test_an_iteration_linearizes_once_and_integrates_each_trial_once(monkeypatch
     assert calls["attempt"] == 1 + trials
 
 
+@pytest.mark.slow
 def test_trials_that_are_cut_to_pieces_are_given_up(monkeypatch):
     problem = tool_reach()
     sol, parts = work(monkeypatch, problem, max_iterations=12)
