@@ -6,7 +6,7 @@ from findings import about
 from scipy.optimize import lsq_linear, minimize
 
 import varpin as vp
-from varpin.control.between_nodes import NOWHERE, Instants, enforced, seen, updated
+from varpin.control.between_nodes import NOWHERE, Instants, beyond, enforced, seen, updated
 from varpin.control.closed_loop import ClosedLoop
 from varpin.control.multipliers import at_nodes
 from varpin.control.spread import Feedback, covariances
@@ -215,6 +215,34 @@ def test_speeds_hold_between_nodes(name):
     assert fastest(problem, plan.controls, 32).max() <= limit * (1.0 + 1e-5)
 
 
+@pytest.mark.parametrize(
+    ("limit", "dt", "steps"),
+    [(0.3, 0.05, 20), (0.4, 0.05, 20), pytest.param(0.4, 0.1, 10, marks=pytest.mark.slow)],
+)
+def test_tight_speeds_end_at_an_optimum_without_a_peak_beyond(limit, dt, steps):
+    """The last step of these leads to peaks of its own, or away from the optimum at first."""
+    problem = reach(vp.planar_chain(2), limit, dt=dt, steps=steps)
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged, plan.reason
+    values = seen(problem, plan.trajectory)
+    assert beyond(values, [np.zeros(problem.bound_constraints[0].shape)]).max() <= 1e-6
+    assert fastest(problem, plan.controls, 64).max() <= limit * (1.0 + 3e-4)
+
+
+def test_margins_wider_than_a_tenth_of_the_range_hold_between_nodes():
+    """Rows without a peak at an instant have no margin, which nothing could keep."""
+    robot = vp.planar_chain(2)
+    scene = vp.Scene(robot, damping=0.1, noise=vp.AdditiveNoise(0.02 * np.eye(2)))
+    problem = reach(robot, 0.8, scene, dt=0.1, steps=10)
+    within = [vp.WithinVelocityLimits(robot, (-0.8, 0.8), margin=2.0)]
+    given = {"dt": 0.1, "steps": 10, "controls": "linear", "constraints": within}
+    plan = vp.solve(vp.OptimalControlProblem(scene, problem.cost, problem.q0, problem.v0, **given), check=False)
+    assert plan.status.converged, plan.reason
+    assert plan.violation <= 1e-6
+    assert len(plan.constraints[0].t) > 10
+    assert plan.multipliers.backoff.max() > 0.1 * 1.6
+
+
 def test_scipy_finds_no_less_within_speeds_between_nodes():
     """SLSQP with the limits at 16 instants of each step."""
     problem = reach(vp.planar_chain(2), 0.6, dt=0.125, steps=N)
@@ -282,7 +310,7 @@ def test_rows_follow_sliding_peaks():
 
     motion = moved(problem, u)
     bound = problem.bound_constraints[0]
-    instants = updated(problem, NOWHERE, seen(problem, motion), [np.zeros(bound.shape)], -0.6)
+    instants = updated(problem, NOWHERE, seen(problem, motion), [np.full(bound.shape, 0.6)])
 
     def of_rows(u, bends):
         rows = enforced(problem, Instants(instants.rows, instants.moments, bends)).bound_constraints[1]
@@ -348,6 +376,8 @@ def test_files_with_other_rows_between_nodes_are_refused(tmp_path):
     wrong = {
         "instants": members["multipliers.instants"] + [0, N, 0],
         "moments": members["multipliers.moments"][1:],
+        "bends": members["multipliers.bends"] - 1.0,
+        "begun_moments": members["multipliers.begun_moments"] + 1.0,
         "weights": members["multipliers.weights"][:1],
     }
     for name, array in wrong.items():

@@ -462,7 +462,7 @@ def test_a_last_step_ends_with_the_time(monkeypatch):
     problem, solved = two_links(FAMILIES["velocities"]), []
     plan = vp.solve(problem, tolerance=1e-3, check=False)
     solve = polish._Step.solve
-    monkeypatch.setattr(polish._Step, "solve", lambda step: solved.append(step) or solve(step))
+    monkeypatch.setattr(polish._Step, "solve", lambda step, until: solved.append(step) or solve(step, until))
     bound = problem.bound_constraints
     zeros, weights = [np.zeros(item.shape) for item in bound], plan.multipliers.weights
     motion = problem.simulate(plan.controls * 1.01)

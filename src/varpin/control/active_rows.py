@@ -36,11 +36,8 @@ class Rows:
         self.signed = [item.signed(item.bound.value(q, v, u)) for item in self.penalties]
         self.begun = [item.held(s) for item, s in zip(self.penalties, self.signed, strict=True)]
         self.slopes = [item.bound.slopes(q, v, u) for item in self.of_nodes]
-        if "running" not in vars(along):
-            # What the cached property would compute again, derivatives of rows included.
-            count = len(self.of_nodes)
-            running = problem.with_held(self.unpenalized, self.signed[:count], self.slopes, self.begun[:count])
-            along.running = along.finite(running)
+        count = len(self.of_nodes)
+        along.expanded(problem.with_held(self.unpenalized, self.signed[:count], self.slopes, self.begun[:count]))
         # Of all rows.
         self.weights = flat(
             [np.full(s.shape, item.weight) for item, s in zip(self.penalties, self.signed, strict=True)]

@@ -116,9 +116,17 @@ class Along:
     @cached_property
     def running(self) -> Expansion:
         """The running cost at its samples."""
-        return self.finite(self.problem.expand_running(self.trajectory))
+        return self._finite(self.problem.expand_running(self.trajectory))
 
-    def finite(self, running: Expansion) -> Expansion:
+    def expanded(self, running: Expansion) -> None:
+        """Take over the expansion of the running cost from who has it.
+
+        Raises:
+            CostError: It is not finite.
+        """
+        self.running = self._finite(running)
+
+    def _finite(self, running: Expansion) -> Expansion:
         """The expansion of a running cost, if it is finite.
 
         Raises:

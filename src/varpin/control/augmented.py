@@ -21,8 +21,8 @@ from scipy import ndimage
 
 from varpin.arrays import Floats
 from varpin.control.backward import backward
-from varpin.control.between_nodes import NOWHERE, Instants, beyond, carried, enforced, seen, updated, watched
-from varpin.control.constraints import BoundConstraint
+from varpin.control.between_nodes import NOWHERE, Instants, beyond, carried, enforced, in_force, seen, updated, watched
+from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.examination import foreseen, looked_at
 from varpin.control.first_node import out_of_reach
@@ -30,7 +30,7 @@ from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.margins import widened
 from varpin.control.multipliers import FEASIBLE, REPORTED, ConstraintReport, Multipliers, in_between, reports_of
 from varpin.control.penalties import PenalizedProblem, flat, penalized, split, weights_for
-from varpin.control.polish import judged, polished
+from varpin.control.polish import Polished, judged, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import SUFFICIENT
 from varpin.control.refinement_within import Warm, refine_within
@@ -246,8 +246,11 @@ class _Rounds:
                         rest = f"{told.where} stays violated by {told.violation:.1e} {told.unit}"
                         status, reason = Status.STALLED, f"{found.reason}; {told.label}: {rest}"
                 elif kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
-                    kept, closing = self._polished(replace(kept, status=status))
-                    status, reason = kept.status, f"{reason}; {closing}"
+                    closed, closing = self._polished(replace(kept, status=status))
+                    missed = status is Status.CONVERGED and closed.status is Status.STALLED
+                    if missed and self._goes_between(kept, begun, status, again=True):
+                        continue
+                    kept, status, reason = closed, closed.status, f"{reason}; {closing}"
                 goes_on, counted = self._counts(kept, begun, status)
                 if goes_on:
                     continue
@@ -503,21 +506,24 @@ class _Rounds:
                 said += ", which is as wide as motions under noise need"
         return f"{said}, whatever its penalty"
 
-    def _looked_between(self, motion: Trajectory, between: Instants, backoff: list[Floats], least: float) -> Instants:
-        """Rows between nodes at the peaks of a motion, with those that it violates by more than ``least``."""
+    def _looked_between(
+        self, motion: Trajectory, between: Instants, backoff: list[Floats], *, anew: bool = True
+    ) -> Instants:
+        """Rows between nodes at the peaks of a motion; ``anew``: with those that it violates or comes close to."""
         values = seen(self.problem, motion)
         if values is None:
             return between
-        return updated(self.problem, between, values, backoff[: len(self.problem.bound_constraints)], least)
+        return updated(self.problem, between, values, backoff[: len(self.problem.bound_constraints)], anew=anew)
 
-    def _goes_between(self, kept: Solution, begun: _State, ended: Status | None) -> bool:
+    def _goes_between(self, kept: Solution, begun: _State, ended: Status | None, *, again: bool = False) -> bool:
         """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
 
         Only linear controls lead around the nodes, and held ones have such rows where the problem asks for them. There
         are none until the motion of a round, not that of the first, violates a constraint by more than a thousandth of
         its range; or at the end of the rounds by more than 1e-6 of its unit, if the problem asks for them. From then on
-        the rows of each round follow the peaks of the motion before, with further ones that it violates. The weights of
-        penalties are the first ones again when there are rows for the first time.
+        the rows of each round follow the peaks of the motion before, with further ones that it violates or comes close
+        to. The weights of penalties are the first ones again when there are rows for the first time. They are heavier
+        in a round that is made ``again``, because the last step did not lead to an optimum.
         """
         before, base, known = begun.between, self.state, kept.multipliers
         assert known is not None
@@ -532,7 +538,10 @@ class _Rounds:
             if kept.violation > FEASIBLE:
                 return False
             base = replace(begun, multipliers=values, round=begun.round + 1, stuck=0)
-        between = self._looked_between(kept.trajectory, before, begun.backoff, FEASIBLE)
+            if again:
+                heavier = np.minimum(_GROWTH * begun.weights, _HEAVIEST * begun.first_weights)
+                base = replace(base, weights=np.maximum(begun.weights, heavier))
+        between = self._looked_between(kept.trajectory, before, begun.backoff)
         if not len(between.rows):
             return False
         parts = (carried(self.problem, before, between, array) for array in (base.multipliers, base.backoff))
@@ -541,7 +550,7 @@ class _Rounds:
         weights, first_weights, worst = (_of_all(array, before, between) for array in arrays)
         whole = enforced(self.problem, between)
         told = reports_of(whole, kept.trajectory, multipliers, backoff)
-        if ended is not None or first:
+        if (ended is not None or first) and not again:
             close = ended is not None and (asked or not first)
             bounds = [_CLOSE if close else REPORTED * item.scale for item in self.problem.bound_constraints]
             if (self._beyond(kept.trajectory, begun.backoff) <= bounds).all():
@@ -617,71 +626,80 @@ class _Rounds:
         return max(at_nodes, float(self._beyond(motion, backoff).max()))
 
     def _margins(self, backoff: list[Floats], between: Instants) -> list[Floats]:
-        """The margins of all rows, those between nodes as at the end of their step."""
+        """The margins of all rows, those between nodes as at the end of their step; none of rows not enforced."""
         count = len(self.problem.bound_constraints)
-        of_instants = [backoff[i][between.of(i)[:, 0]] for i in between.constraints]
+        enforced_rows = zip(between.constraints, in_force(self.problem, between), strict=True)
+        of_instants = [np.where(rows, backoff[i][between.of(i)[:, 0]], 0.0) for i, rows in enforced_rows]
         return [*backoff[:count], *of_instants]
 
     def _polished(self, kept: Solution) -> tuple[Solution, str]:
         """The plan moved onto its constraints and to its optimum, with matching gains, and its residuals in words.
 
         Peaks between nodes then are elsewhere, so that the last step is made again. With such rows, the plan stays as
-        it is if that does not lead closer.
+        it is if that does not lead closer, or to a peak that has no row.
         """
         known = kept.multipliers
         assert known is not None
         values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
         motion, between, dense = kept.trajectory, known.between, len(known.between.rows) > 0
-        found, bound = None, np.inf
+        found: Polished | None = None
         least = max(self._left(motion, backoff), FEASIBLE) if dense else np.inf
-        first = 0.0 if kept.search is None else kept.search.first
         try:
             for look in range(_LOOKS if dense else 1):
                 if dense:
-                    between = self._looked_between(motion, between, backoff, np.inf)
+                    between = self._looked_between(motion, between, backoff, anew=False)
                 self.whole = enforced(self.problem, between)
                 after = polished(self.whole, motion, values, known.weights, backoff, self.until)
                 motion, values = after.motion, after.multipliers
-                bound = self.tolerance * (after.stake + NOTHING * first)
                 left = self._left(motion, backoff) if dense else 0.0
-                if not dense or (after.decrease <= bound and left <= least):
+                if not dense or (after.decrease <= self._bound(kept, after) and left <= least):
                     found, least, known = after, left, replace(known, values=flat(values), **_of_instants(between))
                     if look and left <= FEASIBLE:
                         break
+                if time.perf_counter() > self.until:
+                    break
         except (CostError, NoiseFieldError, LinearizationError):
             pass
         self.whole = enforced(self.problem, known.between)
         if found is None:
-            return self._judged(kept, bound)
+            return self._judged(kept)
         plan = self._along(kept, found.motion, known)
         closing = (
             f"constraints hold to {plan.violation:.1e}, and within them the cost would fall by {found.decrease:.1e}"
         )
         if kept.status in (Status.CONVERGED, Status.STALLED):
             # The decrease is a bound, whatever the multipliers, and the search may have stalled at a finer tolerance.
-            there = found.decrease <= bound and not self._clearly_beyond(plan)
-            stopped = Status.OUT_OF_TIME if time.perf_counter() > self.until else Status.STALLED
-            plan = replace(plan, status=Status.CONVERGED if there else stopped)
+            there = found.decrease <= self._bound(kept, found) and not self._clearly_beyond(plan)
+            plan = replace(plan, status=Status.CONVERGED if there else self._stopped())
         return plan, closing
 
-    def _judged(self, kept: Solution, bound: float) -> tuple[Solution, str]:
+    def _judged(self, kept: Solution) -> tuple[Solution, str]:
         """The plan as it is, with the multipliers of the Lagrangian's least slope where that has derivatives.
 
-        It is not CONVERGED if the cost would fall by more than ``bound`` within the constraints.
+        It is not CONVERGED if the cost would fall by more than the tolerance within the constraints.
         """
         known, closing = kept.multipliers, f"constraints hold to {kept.violation:.1e}"
         assert known is not None
         values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
-        stalled = self._clearly_beyond(kept)
+        there = not self._clearly_beyond(kept)
         try:
             found = judged(self.whole, kept.trajectory, values, known.weights, backoff)
         except (CostError, NoiseFieldError, LinearizationError):
             pass
         else:
             kept = replace(kept, multipliers=replace(known, values=flat(found.multipliers)))
-            stalled = stalled or (kept.status is Status.CONVERGED and found.decrease > bound)
+            there = there and (kept.status is not Status.CONVERGED or found.decrease <= self._bound(kept, found))
             closing += f", and within them the cost would fall by {found.decrease:.1e}"
-        return replace(kept, status=Status.STALLED) if stalled else kept, closing
+        return kept if there else replace(kept, status=self._stopped()), closing
+
+    def _bound(self, kept: Solution, found: Polished) -> float:
+        """Greatest decrease of the cost within the constraints that counts as none."""
+        first = 0.0 if kept.search is None else kept.search.first
+        return float(self.tolerance * (found.stake + NOTHING * first))
+
+    def _stopped(self) -> Status:
+        """The status of a plan that a last step has not led to an optimum."""
+        return Status.OUT_OF_TIME if time.perf_counter() > self.until else Status.STALLED
 
     def _clearly_beyond(self, plan: Solution) -> bool:
         """Whether the motion violates a constraint by more than a thousandth of its range."""
@@ -737,11 +755,15 @@ class _Rounds:
         added = (
             self._margins(begun.added, begun.between) if begun.added else [np.zeros(item.shape) for item in self.bound]
         )
-        return [
+        found = [
             item.source.margin * deviations(self.problem, kept.trajectory, feedback, item) + more
             if item.source.margin > 0.0
             else np.zeros(item.shape)
             for item, more in zip(self.bound, added, strict=True)
+        ]
+        return [
+            np.where(item.in_force, part, 0.0) if isinstance(item, BoundBetween) else part
+            for item, part in zip(self.bound, found, strict=True)
         ]
 
     def _next_backoff(self, kept: Solution, begun: _State) -> list[Floats]:

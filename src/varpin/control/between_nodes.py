@@ -33,8 +33,10 @@ _OUTSIDE = 1e-6
 _REACH = 1.5 / _PARTS
 # How far the parabola of a peak goes on as it slides, in parts of a step; beyond, values are linear.
 _SLIDE = 2.0
+# Distance of a peak from its bound up to which it gets a row, too, relative to the constraint's scale.
+_NEAR = 1e-3
 # Marks a row that is not enforced, in the place of its moment.
-_UNUSED = -1.0
+UNUSED = -1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,11 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
     # The dataclass is frozen: attributes are set in its dictionary.
     vars(made).update(vars(problem) | {"bound_constraints": tuple(found)})
     return made
+
+
+def in_force(problem: OptimalControlProblem, instants: Instants) -> list[Mask]:
+    """Which rows at ``instants`` are enforced (K, rows), for each constraint with such rows."""
+    return [moments >= 0.0 for moments, _ in _of_constraints(problem, instants).values()]
 
 
 def _of_constraints(problem: OptimalControlProblem, instants: Instants) -> dict[int, tuple[Floats, Floats]]:
@@ -212,16 +219,17 @@ def updated(
     instants: Instants,
     values: list[Floats | None],
     backoff: list[Floats],
-    least: float,
+    *,
+    anew: bool = True,
 ) -> Instants:
-    """The instants at the peaks of a motion, and further ones where it violates a constraint by > ``least``.
+    """The instants at the peaks of a motion, and further ones where a constraint is violated or close to its bound.
 
     Args:
         problem: The problem, without rows between nodes.
         instants: Those so far.
         values: Values of the motion of :func:`seen`.
         backoff: Margins of all constraints at the nodes (K, rows).
-        least: In the unit of each constraint.
+        anew: Whether there may be further ones.
     """
     rows, moments, bends = [], [], []
     former = _of_constraints(problem, instants)
@@ -229,7 +237,8 @@ def updated(
         if near is None:
             continue
         peaks = _peaks(near)
-        wanted = peaks.there & (peaks.values + margin[:, None] > least)
+        close = -_NEAR * problem.bound_constraints[i].scale
+        wanted = peaks.there & (peaks.values + margin[:, None] > close) & anew
         known, none = instants.of(i), np.zeros((0, near.shape[2]))
         old_moments, old_bends = former.get(i, (none, none))
         for step in np.union1d(np.flatnonzero(wanted.any(axis=(1, 2))), known[:, 0]):
@@ -251,9 +260,9 @@ def _followed(moments: Floats, bends: Floats, peaks: _Peaks, wanted: Mask) -> tu
     followed get the first instants whose row is not enforced.
     """
     found = [*np.stack([moments, np.zeros(bends.shape)], axis=2)]
-    for row in range(wanted.shape[1]):
+    for row in np.flatnonzero(wanted.any(axis=0) | (moments >= 0.0).any(axis=0)):
         places, sharp, left = peaks.places[:, row], peaks.bends[:, row], [*np.flatnonzero(peaks.there[:, row])]
-        used = [own[row] for own in found if own[row, 0] != _UNUSED]
+        used = [own[row] for own in found if own[row, 0] >= 0.0]
         pairs = sorted((abs(places[k] - own[0]), s, k) for s, own in enumerate(used) for k in left)
         moved: set[int] = set()
         for distance, s, k in pairs:
@@ -262,9 +271,9 @@ def _followed(moments: Floats, bends: Floats, peaks: _Peaks, wanted: Mask) -> tu
                 moved.add(s)
                 left.remove(k)
         for k in sorted((k for k in left if wanted[k, row]), key=lambda k: -float(peaks.values[k, row])):
-            free = next((own for own in found if own[row, 0] == _UNUSED), None)
+            free = next((own for own in found if own[row, 0] < 0.0), None)
             if free is None and len(found) < MOST_INSTANTS:
-                free = np.tile([_UNUSED, 0.0], (wanted.shape[1], 1))
+                free = np.tile([UNUSED, 0.0], (wanted.shape[1], 1))
                 found.append(free)
             if free is not None:
                 free[row] = places[k], sharp[k]

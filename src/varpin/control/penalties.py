@@ -263,7 +263,10 @@ class PenalizedProblem(OptimalControlProblem):
         return np.concatenate([shares, *(penalty.shares(q, v, u) for penalty in self.penalties)])
 
     def expand_running(self, trajectory: Trajectory) -> Expansion:
-        """See :meth:`OptimalControlProblem.expand_running`; penalties have Gauss-Newton Hessians."""
+        """See :meth:`OptimalControlProblem.expand_running`; penalties have Gauss-Newton Hessians.
+
+        Those of rows that follow peaks between nodes have their second derivatives, too.
+        """
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
         s = [penalty.signed(penalty.bound.value(q, v, u)) for penalty in self.penalties]
         held = [penalty.held(signed) for penalty, signed in zip(self.penalties, s, strict=True)]

@@ -34,7 +34,7 @@ _PASSES = 12
 # Violation that counts as rounding error, and decrease of the cost, relative to the cost at stake, that does.
 _DONE, _FLAT = 1e-12, 1e-13
 # Lengths of the part of a step along the constraints: its model is without second derivatives of the dynamics and of
-# the constraints. The part onto the constraints is whole.
+# the constraints, but for those of sliding peaks. The part onto the constraints is whole.
 _LENGTHS = (1.0, 0.5, 0.25, 0.0)
 # Greatest number of steps onto the constraints that follow one along them.
 _CORRECTIONS = 2
@@ -104,14 +104,14 @@ def polished(
         there = step.found.violation <= _DONE and step.found.decrease <= _FLAT * step.found.stake
         if there or time.perf_counter() > until:
             break
-        step.solve()
+        step.solve(until)
         # Where the model's curvature is too small, it is so in the next step, too.
         for length in (item for item in _LENGTHS if item <= (longest if left >= _LAST else 0.0)):
             after = step.after(trials, length)
             for _ in range(_CORRECTIONS if length > 0.0 else 0):
                 if after is None or after.found.violation <= max(step.found.violation, _TRANSIENT):
                     break
-                after.solve()
+                after.solve(until)
                 after = after.after(trials, 0.0)
             if after is not None and _closer(after.found, step.found, length):
                 step, longest = after, length or longest
@@ -269,8 +269,8 @@ class _Step:
         active = [lam[own] != 0.0 for lam, own in zip(self.multipliers, rows, strict=True)]
         return np.concatenate(equal), np.concatenate(active)
 
-    def solve(self) -> None:
-        """Solve for the step, its active rows and the controls that it brings to their limits."""
+    def solve(self, until: float) -> None:
+        """Solve for the step, its active rows and the controls that it brings to their limits, until a time at most."""
         problem, loop = self.problem, self.loop
         lower, upper = problem.control_limits
         u = problem.decided(self.motion)
@@ -294,7 +294,7 @@ class _Step:
                 rows | (c > _DONE)
                 for rows, c in zip(self.rows, loop.values_after(self.c, response, change), strict=True)
             ]
-            if same_rows(met, self.rows) or self._crowded(met):
+            if same_rows(met, self.rows) or self._crowded(met) or time.perf_counter() > until:
                 break
             self.rows = met
         # The least step onto the constraints alone.

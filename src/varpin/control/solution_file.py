@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Mask
-from varpin.control.between_nodes import MOST_INSTANTS, enforced, watched
+from varpin.control.between_nodes import MOST_INSTANTS, UNUSED, enforced, in_force, watched
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.multipliers import Multipliers
 from varpin.control.problem import OptimalControlProblem
@@ -189,6 +189,12 @@ def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalContro
     own = [problem.bound_constraints[i] for i in between.rows[:, 0]]
     if sum(len(item.rows) for item in own) != between.moments.size:
         raise FileError(f"{source}: multipliers.moments do not belong to multipliers.instants")
+    for told in (between, multipliers.begun_between):
+        inside = (told.moments == UNUSED) | ((told.moments >= 0.0) & (told.moments <= 1.0))
+        if not (inside.all() and (told.bends >= 0.0).all()):
+            raise FileError(f"{source}: multipliers.moments are not within steps, or multipliers.bends are negative")
+        if not all(rows.any(axis=1).all() for rows in in_force(problem, told)):
+            raise FileError(f"{source}: multipliers.moments enforce no row at an instant")
     sizes = [item.size for item in enforced(problem, between).bound_constraints]
     at_nodes = sum(item.size for item in problem.bound_constraints)
     for name, found, expected in (

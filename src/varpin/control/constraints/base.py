@@ -67,7 +67,7 @@ class BoundConstraint(Frozen, ABC):
 
     Attributes:
         source: The constraint.
-        places: Indices of nodes (K,), or of decisions where ``of_controls``.
+        places: Indices of nodes (K,), or of decisions where ``of_controls``, in ascending order.
         times: Times of the places (K,) [s].
         rows: Description of each row of c.
         unit: Unit of c.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from varpin.arrays import Floats, Integers
+from varpin.arrays import Floats, Integers, Mask
 from varpin.control.constraints.base import BoundConstraint, Slopes
 from varpin.control.parts import Parts
 
@@ -30,7 +30,7 @@ class BoundBetween(BoundConstraint):
         weights: Their weights in each row (K, rows, parts + 1); all zero in rows that are not enforced.
         rates: Their weights in the row's derivative in time, in parts of a step (K, rows, parts + 1).
         bends: Minus the second derivatives of peaks (K, rows); zero where a row does not follow one.
-        reach: How far from an instant its peak may be, in parts of a step; beyond, values grow linearly.
+        slide: How far from an instant its peak may be, in parts of a step; beyond, values grow linearly.
     """
 
     of_nodes: BoundConstraint
@@ -42,7 +42,12 @@ class BoundBetween(BoundConstraint):
     weights: Floats
     rates: Floats
     bends: Floats
-    reach: float
+    slide: float
+
+    @property
+    def in_force(self) -> Mask:
+        """Which rows are enforced (K, rows); others have minus the scale for a value."""
+        return np.asarray(self.weights.any(axis=2))
 
     @property
     def begins(self) -> Integers:
@@ -63,12 +68,12 @@ class BoundBetween(BoundConstraint):
         found = np.einsum("krs,ksr->kr", self.weights, c)
         slide = self._slide(c)
         found += slide * (np.einsum("krs,ksr->kr", self.rates, c) - 0.5 * self.bends * slide)
-        return np.where(self.weights.any(axis=2), found, -self.scale)
+        return np.where(self.in_force, found, -self.scale)
 
     def _slide(self, c: Floats) -> Floats:
         """How far peaks of values ``c`` (K, parts + 1, rows) are from the instants (K, rows), in parts of a step."""
         bends = np.where(self.bends > 0.0, self.bends, np.inf)
-        found: Floats = np.clip(np.einsum("krs,ksr->kr", self.rates, c) / bends, -self.reach, self.reach)
+        found: Floats = np.clip(np.einsum("krs,ksr->kr", self.rates, c) / bends, -self.slide, self.slide)
         return found
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
@@ -87,7 +92,7 @@ class BoundBetween(BoundConstraint):
         J = (self.inner.jacobian(q, v) @ D[tuple(self.samples.T)])[self.near]
         sliding = np.einsum("krs,ksrz->krz", self.rates, J)
         found = np.einsum("krs,ksrz->krz", self.weights, J) + slide[:, :, None] * sliding
-        inside = (self.bends > 0.0) & (np.abs(slide) < self.reach)
+        inside = (self.bends > 0.0) & (np.abs(slide) < self.slide)
         bends = np.where(inside, self.bends, np.inf)
         x = D.shape[2]
         return Slopes(self.begins, found[:, :, :x], found[:, :, x:], sliding / np.sqrt(bends)[:, :, None])
