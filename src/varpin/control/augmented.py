@@ -506,14 +506,12 @@ class _Rounds:
                 said += ", which is as wide as motions under noise need"
         return f"{said}, whatever its penalty"
 
-    def _looked_between(
-        self, motion: Trajectory, between: Instants, backoff: list[Floats], *, anew: bool = True
-    ) -> Instants:
-        """Rows between nodes at the peaks of a motion; ``anew``: with those that it violates or comes close to."""
+    def _followed(self, motion: Trajectory, between: Instants, backoff: list[Floats]) -> Instants:
+        """The rows between nodes at the peaks of a motion."""
         values = seen(self.problem, motion)
         if values is None:
             return between
-        return updated(self.problem, between, values, backoff[: len(self.problem.bound_constraints)], anew=anew)
+        return updated(self.problem, between, values, backoff[: len(self.problem.bound_constraints)], anew=False)
 
     def _goes_between(self, kept: Solution, begun: _State, ended: Status | None, *, again: bool = False) -> bool:
         """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
@@ -541,20 +539,21 @@ class _Rounds:
             if again:
                 heavier = np.minimum(_GROWTH * begun.weights, _HEAVIEST * begun.first_weights)
                 base = replace(base, weights=np.maximum(begun.weights, heavier))
-        between = self._looked_between(kept.trajectory, before, begun.backoff)
+        margins, looked = begun.backoff[: len(self.problem.bound_constraints)], seen(self.problem, kept.trajectory)
+        between = before if looked is None else updated(self.problem, before, looked, margins)
         if not len(between.rows):
             return False
+        if looked is not None and (ended is not None or first) and not again:
+            close = ended is not None and (asked or not first)
+            bounds = [_CLOSE if close else REPORTED * item.scale for item in self.problem.bound_constraints]
+            if (beyond(looked, margins) <= bounds).all():
+                return False
         parts = (carried(self.problem, before, between, array) for array in (base.multipliers, base.backoff))
         multipliers, backoff = next(parts), self._margins(next(parts), between)
         arrays = (base.weights, base.first_weights, base.worst)
         weights, first_weights, worst = (_of_all(array, before, between) for array in arrays)
         whole = enforced(self.problem, between)
         told = reports_of(whole, kept.trajectory, multipliers, backoff)
-        if (ended is not None or first) and not again:
-            close = ended is not None and (asked or not first)
-            bounds = [_CLOSE if close else REPORTED * item.scale for item in self.problem.bound_constraints]
-            if (self._beyond(kept.trajectory, begun.backoff) <= bounds).all():
-                return False
         most = max(told, key=lambda item: item.violation)
         logger.info(
             "%s: between nodes %s is violated by %.1e %s: rows at %d instants from now on",
@@ -647,7 +646,7 @@ class _Rounds:
         try:
             for look in range(_LOOKS if dense else 1):
                 if dense:
-                    between = self._looked_between(motion, between, backoff, anew=False)
+                    between = self._followed(motion, between, backoff)
                 self.whole = enforced(self.problem, between)
                 after = polished(self.whole, motion, values, known.weights, backoff, self.until)
                 motion, values = after.motion, after.multipliers

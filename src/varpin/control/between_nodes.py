@@ -239,12 +239,11 @@ def updated(
         peaks = _peaks(near)
         close = -_NEAR * problem.bound_constraints[i].scale
         wanted = peaks.there & (peaks.values + margin[:, None] > close) & anew
-        known, none = instants.of(i), np.zeros((0, near.shape[2]))
-        old_moments, old_bends = former.get(i, (none, none))
+        known = instants.of(i)
+        old = former[i][0] if i in former else np.zeros((0, near.shape[2]))
         for step in np.union1d(np.flatnonzero(wanted.any(axis=(1, 2))), known[:, 0]):
-            own = known[:, 0] == step
             of_step = _Peaks(*(array[step] for array in peaks))
-            new = _followed(old_moments[own], old_bends[own], of_step, wanted[step])
+            new = _followed(old[known[:, 0] == step], of_step, wanted[step])
             rows += [(i, int(step), number) for number in range(len(new[0]))]
             moments.append(new[0].ravel())
             bends.append(new[1].ravel())
@@ -253,13 +252,13 @@ def updated(
     return Instants(np.array(rows), np.concatenate(moments), np.concatenate(bends))
 
 
-def _followed(moments: Floats, bends: Floats, peaks: _Peaks, wanted: Mask) -> tuple[Floats, Floats]:
-    """The moments and bends (S, rows) of one step's instants, of which the first had those given (s, rows).
+def _followed(moments: Floats, peaks: _Peaks, wanted: Mask) -> tuple[Floats, Floats]:
+    """The moments and bends (S, rows) of one step's instants, of which the first were at ``moments`` (s, rows).
 
     Each row of an instant follows the nearest peak within reach. Peaks that are ``wanted`` (parts - 1, rows) and not
     followed get the first instants whose row is not enforced.
     """
-    found = [*np.stack([moments, np.zeros(bends.shape)], axis=2)]
+    found = [*np.stack([moments, np.zeros(moments.shape)], axis=2)]
     for row in np.flatnonzero(wanted.any(axis=0) | (moments >= 0.0).any(axis=0)):
         places, sharp, left = peaks.places[:, row], peaks.bends[:, row], [*np.flatnonzero(peaks.there[:, row])]
         used = [own[row] for own in found if own[row, 0] >= 0.0]
