@@ -81,8 +81,6 @@ _HOPELESS = 5
 _MUCH = 1e-2
 # Greatest number of last steps, each with the rows between nodes of the motion before.
 _LOOKS = 8
-# Number of rounds from which on none is added for the sake of what is between nodes.
-_BETWEEN = 40
 # First round after which there may be rows between nodes.
 _SOON = 1
 # Violation between nodes that is left to the last steps.
@@ -531,7 +529,7 @@ class _Rounds:
         if not (self.problem.linear or asked) or (ended is None and first and begun.round < _SOON):
             return False
         if ended is not None:
-            if begun.round + 1 >= _BETWEEN or ended not in (Status.CONVERGED, Status.STALLED):
+            if begun.round + 1 >= _ROUNDS or ended not in (Status.CONVERGED, Status.STALLED):
                 return False
             if kept.violation > FEASIBLE:
                 return False
