@@ -9,6 +9,7 @@ import varpin as vp
 from varpin.control.between_nodes import NOWHERE, Instants, beyond, enforced, seen, updated
 from varpin.control.closed_loop import ClosedLoop
 from varpin.control.multipliers import at_nodes
+from varpin.control.penalties import split
 from varpin.control.spread import Feedback, covariances
 from varpin.errors import LinearizationError
 
@@ -213,6 +214,32 @@ def test_speeds_hold_between_nodes(name):
     limit = problem.constraints[0].limits[1].max()
     assert plan.violation <= 1e-6
     assert fastest(problem, plan.controls, 32).max() <= limit * (1.0 + 1e-5)
+
+
+def test_karush_kuhn_tucker_with_rows_between_nodes():
+    """The Lagrangian's slopes by differences, of the rows at nodes and of those that follow peaks."""
+    problem = reach(vp.planar_chain(2), 0.6, dt=0.125, steps=N)
+    plan = vp.solve(problem, check=False)
+    known = plan.multipliers
+    bound = enforced(problem, known.between).bound_constraints
+    multipliers = split(bound, known.values)
+    assert all((lam >= 0.0).all() for lam in multipliers)
+    assert (multipliers[1] > 0.1).sum() > 5
+
+    def parts(u):
+        motion = moved(problem, u)
+        pulls = (
+            lam * item.value(motion.q, motion.v, motion.u_nodes) for lam, item in zip(multipliers, bound, strict=True)
+        )
+        return np.concatenate([problem.shares(motion), *(pull.ravel() for pull in pulls)])
+
+    u, slopes, sizes = plan.controls, np.zeros(plan.controls.shape), np.zeros(plan.controls.shape)
+    for i in np.ndindex(*u.shape):
+        w = np.zeros(u.shape)
+        w[i] = 1e-4
+        change = (parts(u + w) - parts(u - w)) / 2e-4
+        slopes[i], sizes[i] = change.sum(), np.abs(change).sum()
+    assert np.abs(slopes).max() <= 1e-5 * sizes.max()
 
 
 @pytest.mark.parametrize(
