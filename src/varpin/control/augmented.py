@@ -14,7 +14,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ParamSpec
+from typing import Any, ParamSpec, TypeAlias
 
 import numpy as np
 from scipy import ndimage
@@ -44,6 +44,8 @@ from varpin.support.checks import count, flag, positive
 from varpin.trajectory import Trajectory
 
 P = ParamSpec("P")
+# Values of a motion within steps, as of between_nodes.seen.
+Looked: TypeAlias = list[Floats | None] | None
 
 logger = logging.getLogger(__name__)
 
@@ -504,13 +506,6 @@ class _Rounds:
                 said += ", which is as wide as motions under noise need"
         return f"{said}, whatever its penalty"
 
-    def _followed(self, motion: Trajectory, between: Instants, backoff: list[Floats]) -> Instants:
-        """The rows between nodes at the peaks of a motion."""
-        values = seen(self.problem, motion)
-        if values is None:
-            return between
-        return updated(self.problem, between, values, backoff[: len(self.problem.bound_constraints)], anew=False)
-
     def _goes_between(self, kept: Solution, begun: _State, ended: Status | None, *, again: bool = False) -> bool:
         """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
 
@@ -537,14 +532,14 @@ class _Rounds:
             if again:
                 heavier = np.minimum(_GROWTH * begun.weights, _HEAVIEST * begun.first_weights)
                 base = replace(base, weights=np.maximum(begun.weights, heavier))
-        margins, looked = begun.backoff[: len(self.problem.bound_constraints)], seen(self.problem, kept.trajectory)
-        between = before if looked is None else updated(self.problem, before, looked, margins)
+        looked = seen(self.problem, kept.trajectory)
+        between = self._followed(before, looked, begun.backoff, anew=True)
         if not len(between.rows):
             return False
-        if looked is not None and (ended is not None or first) and not again:
+        if (ended is not None or first) and not again:
             close = ended is not None and (asked or not first)
             bounds = [_CLOSE if close else REPORTED * item.scale for item in self.problem.bound_constraints]
-            if (beyond(looked, margins) <= bounds).all():
+            if (self._beyond(looked, begun.backoff) <= bounds).all():
                 return False
         parts = (carried(self.problem, before, between, array) for array in (base.multipliers, base.backoff))
         multipliers, backoff = next(parts), self._margins(next(parts), between)
@@ -593,11 +588,15 @@ class _Rounds:
         self.state = replace(begun, backoff=self._backoff(kept, begun))
         return True, ""
 
-    def _beyond(self, motion: Trajectory, backoff: list[Floats]) -> Floats:
-        """By how much a motion violates each constraint between its nodes."""
-        values = seen(self.problem, motion)
+    def _followed(self, between: Instants, looked: Looked, backoff: list[Floats], *, anew: bool) -> Instants:
+        """The rows between nodes at the peaks of a motion of values ``looked``; see :func:`updated`."""
+        margins = backoff[: len(self.problem.bound_constraints)]
+        return between if looked is None else updated(self.problem, between, looked, margins, anew=anew)
+
+    def _beyond(self, looked: Looked, backoff: list[Floats]) -> Floats:
+        """By how much a motion of values ``looked`` violates each constraint between its nodes."""
         count = len(self.problem.bound_constraints)
-        return np.full(count, np.inf) if values is None else beyond(values, backoff[:count])
+        return np.full(count, np.inf) if looked is None else beyond(looked, backoff[:count])
 
     def _told_between(self, plan: Solution) -> Solution:
         """The plan, which is not CONVERGED and says so where it violates constraints between nodes against the wish."""
@@ -605,7 +604,7 @@ class _Rounds:
         if not self.problem.between_nodes or known is None or not any(watched(self.problem)):
             return plan
         bound = enforced(self.problem, known.between).bound_constraints
-        left = self._beyond(plan.trajectory, split(bound, known.backoff))
+        left = self._beyond(seen(self.problem, plan.trajectory), split(bound, known.backoff))
         worst = int((left / [item.scale for item in self.problem.bound_constraints]).argmax())
         if (left <= FEASIBLE).all():
             return plan
@@ -616,11 +615,11 @@ class _Rounds:
         status = Status.STALLED if plan.status.converged else plan.status
         return replace(plan, status=status, reason=f"{plan.reason}; {told}")
 
-    def _left(self, motion: Trajectory, backoff: list[Floats]) -> float:
-        """The largest violation of a motion, at the nodes and between them."""
+    def _left(self, motion: Trajectory, looked: Looked, backoff: list[Floats]) -> float:
+        """The largest violation of a motion, at the nodes and between them, where its values are ``looked``."""
         margins = backoff[: len(self.problem.bound_constraints)]
         at_nodes = max(told.violation for told in reports_of(self.problem, motion, margins, margins))
-        return max(at_nodes, float(self._beyond(motion, backoff).max()))
+        return max(at_nodes, float(self._beyond(looked, backoff).max()))
 
     def _margins(self, backoff: list[Floats], between: Instants) -> list[Floats]:
         """The margins of all rows, those between nodes as at the end of their step; none of rows not enforced."""
@@ -640,15 +639,17 @@ class _Rounds:
         values, backoff = split(self.bound, known.values), split(self.bound, known.backoff)
         motion, between, dense = kept.trajectory, known.between, len(known.between.rows) > 0
         found: Polished | None = None
-        least = max(self._left(motion, backoff), FEASIBLE) if dense else np.inf
+        looked = seen(self.problem, motion) if dense else None
+        least = max(self._left(motion, looked, backoff), FEASIBLE) if dense else np.inf
         try:
             for look in range(_LOOKS if dense else 1):
                 if dense:
-                    between = self._followed(motion, between, backoff)
+                    between = self._followed(between, looked, backoff, anew=False)
                 self.whole = enforced(self.problem, between)
                 after = polished(self.whole, motion, values, known.weights, backoff, self.until)
                 motion, values = after.motion, after.multipliers
-                left = self._left(motion, backoff) if dense else 0.0
+                looked = seen(self.problem, motion) if dense else None
+                left = self._left(motion, looked, backoff) if dense else 0.0
                 if not dense or (after.decrease <= self._bound(kept, after) and left <= least):
                     found, least, known = after, left, replace(known, values=flat(values), **_of_instants(between))
                     if look and left <= FEASIBLE:

@@ -10,7 +10,7 @@ from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
-from varpin.integrators.base import Lines, Segment, open_loop
+from varpin.integrators.base import Lines, Segment, on_lines, open_loop
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
@@ -168,12 +168,7 @@ class Parts(Frozen):
 
     def _lines(self, u: Floats) -> Lines:
         """The controls within the parts of K steps, one after another."""
-        m, count, K = self.scene.controls, self.count, len(u)
-
-        def at(times: tuple[float, ...]) -> Floats:
-            share = ((np.arange(count)[:, None] + times) / count)[..., None]
-            found: Floats = (1.0 - share) * u[:, None, None, :m] + share * u[:, None, None, m:]
-            return found.reshape(K * count, len(times), m)
-
-        nodes = np.concatenate([at((0.0,))[:, 0], u[-1:, m:]])
-        return Lines(at((0.5,))[:, 0], at(self.integrator.stage_times), nodes)
+        begins, ends = np.split(np.repeat(u, self.count, axis=0), 2, axis=1)
+        before, mean = on_lines(begins, ends, self.count, (0.0, 0.5)).swapaxes(0, 1)
+        stages = on_lines(begins, ends, self.count, self.integrator.stage_times)
+        return Lines(mean.copy(), stages, np.concatenate([before, ends[-1:]]))

@@ -556,13 +556,18 @@ def lines(commands: Commands, ends: Floats, times: Sequence[float]) -> Lines:
     steps = np.arange(len(ends))
     begins = np.vstack([commands.before[:1], ends])[steps - steps % commands.hold]
 
-    def at(stage_times: Floats) -> Floats:
-        share = ((steps % commands.hold)[:, None] + stage_times)[:, :, None] / commands.hold
-        found: Floats = (1.0 - share) * begins[:, None] + share * ends[:, None]
-        return found
+    mean, after = on_lines(begins, ends, commands.hold, (0.5, 1.0)).swapaxes(0, 1)
+    return Lines(mean.copy(), on_lines(begins, ends, commands.hold, times), np.vstack([commands.before[:1], after]))
 
-    mean, after = at(np.array([0.5, 1.0])).swapaxes(0, 1)
-    return Lines(mean.copy(), at(np.array(times)), np.vstack([commands.before[:1], after]))
+
+def on_lines(begins: Floats, ends: Floats, hold: int, times: Sequence[float]) -> Floats:
+    """Controls (N, s, m) at ``times`` (s,) in N steps of unit length, every ``hold`` of which are on one line.
+
+    ``begins`` and ``ends`` (N, m) are those of each step's line.
+    """
+    share = ((np.arange(len(ends)) % hold)[:, None] + np.array(times))[:, :, None] / hold
+    found: Floats = (1.0 - share) * begins[:, None] + share * ends[:, None]
+    return found
 
 
 def _rest_of_line(end: Commands, first: Floats, taken: int, commands: Commands) -> Commands:
