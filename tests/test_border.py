@@ -1,7 +1,7 @@
 """The core's border to Python: an array that does not fit is refused, whichever it is and along whichever axis.
 
-Below the border nothing is checked. Run on a build with sanitizers, as ``.ci/thorough`` does, the calls that fit are held
-against reading and writing past an array's end, too.
+Below the border nothing is checked. Run on a build with sanitizers, as ``.ci/thorough`` does, the calls that fit are
+held against reading and writing past an array's end, too.
 """
 
 import numpy as np
