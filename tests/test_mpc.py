@@ -556,6 +556,23 @@ def test_a_late_plan_of_linear_controls_leaves_the_one_before_to_act():
     np.testing.assert_allclose(run.motion.u, alone.u, rtol=0, atol=1e-7)
 
 
+@pytest.mark.parametrize("name", ["ur5", "xarm7"])
+def test_beyond_the_last_horizon_linear_controls_bring_the_robot_to_rest_where_the_plan_ends(name):
+    robot = vp.load_robot(name)
+    lower, upper = robot.position_limits
+    begin = np.clip(0.5 * (lower + upper), -1.0, 1.0)
+    goal = np.clip(begin + 0.5 * np.cos(np.arange(robot.dof)), lower, upper)
+    cost = vp.TrackingCost(goal, 10.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-4)
+    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost(10.0))
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping=0.1), cost, begin, np.zeros(robot.dof), dt=0.02, steps=25, controls="linear"
+    )
+    run = vp.Mpc(problem, budget=1e-9).run(duration=2.0)
+    assert run.late[1:].all()
+    np.testing.assert_allclose(run.motion.q[-1], run.plans[0].trajectory.q[-1], rtol=0, atol=1e-3)
+    assert np.abs(run.motion.v[-1]).max() < 1e-3
+
+
 def test_an_arm_follows_as_closely_with_linear_controls_as_with_held_ones():
     """An arm with a payload, friction and noise that its controller does not know, at a tick of 50 ms."""
     robot = vp.load_robot("z1")

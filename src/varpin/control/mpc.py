@@ -551,17 +551,17 @@ def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | N
     Where controls are linear between nodes it is the control at the end of the tick, and ``before`` that at its begin.
     """
     policy, last, x = plan.policy_on("velocity"), len(plan.gains) - 1, np.concatenate([q, v])
-    if plan.problem.linear:
+    beyond = age >= last if plan.problem.linear else age > last
+    rest = _at_rest(plan, q, v) if beyond else None
+    if rest is not None:
+        u = rest
+    elif plan.problem.linear:
         u = rest_of(plan, policy, min(age, last)).control(0, x, before)
+    elif beyond and before is not None and policy.previous is not None:
+        # The last decision is repeated, with itself as the previous control.
+        u = policy.control(last, x, before - policy.u[last] + policy.previous[last])
     else:
-        held = _at_rest(plan, q, v) if age > last else None
-        if held is not None:
-            u = held
-        elif age > last and before is not None and policy.previous is not None:
-            # The last decision is repeated, with itself as the previous control.
-            u = policy.control(last, x, before - policy.u[last] + policy.previous[last])
-        else:
-            u = policy.control(min(age, last), x, before)
+        u = policy.control(min(age, last), x, before)
     return u if before is None else _within_rates(plan, u, before)
 
 
