@@ -13,6 +13,8 @@ from varpin.model.example_robot_data import FIXED_BASE
 
 # example-robot-data 6.0.0 dropped the Bravo 7 that 5.0.0 has.
 ROBOTS = [name for name in FIXED_BASE if not name.startswith("bravo7_")] + ["finger"]
+# Tests of more than a second that others of the same function, which are quicker, stand for: slow ones, too.
+SLOW = frozenset((Path(__file__).parent / "slow.txt").read_text(encoding="utf-8").splitlines())
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -23,7 +25,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if config.getoption("--slow"):
         return
     for item in items:
-        if "slow" in item.keywords:
+        if "slow" in item.keywords or item.nodeid in SLOW:
             item.add_marker(pytest.mark.skip(reason="slow: give --slow to run it"))
 
 
