@@ -204,13 +204,13 @@ def test_motions_that_need_regularization_do_not_change_how_others_are_rated() -
 
 def test_it_is_turned_to_after_two_iterations_that_raise_the_expected_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Here the first steps do; what the first motion costs is no gain."""
-    turns, take = [], search._Search._take_whole
+    turns, take = [], search.Search._take_whole
 
-    def watched(one: search._Search) -> None:
+    def watched(one: search.Search) -> None:
         turns.append((len(one.history), tuple(one.gains)))
         take(one)
 
-    monkeypatch.setattr(search._Search, "_take_whole", watched)
+    monkeypatch.setattr(search.Search, "_take_whole", watched)
     goal = np.array([0.4, 2.6, 1.0, -1.9, 1.2, 0.3])
     scene = vp.Scene(vp.load_robot("kinova"), damping=0.1, noise=vp.ControlNoise(0.5))
     cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)

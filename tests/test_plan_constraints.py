@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import lsq_linear, minimize, nnls
 
 import varpin as vp
-from varpin.control import ViolationOnRobot, polish, search
+from varpin.control import ViolationOnRobot, polish, unconstrained
 from varpin.control.augmented import within_constraints
 from varpin.control.backward import backward
 from varpin.control.hints import hints
@@ -244,9 +244,9 @@ def test_conditions_of_an_optimum_hold_after_the_last_step():
 def test_a_search_that_ends_off_the_optimum_is_not_believed(monkeypatch):
     """Where the conditions of an optimum do not hold, no plan is converged, whatever its last search says."""
 
-    @functools.wraps(search.solve)
+    @functools.wraps(unconstrained.solve)
     def careless(problem, controls=None, *, tolerance=1e-7, **options):
-        return search.solve(problem, controls, tolerance=max(tolerance, 1e-3), **options)
+        return unconstrained.solve(problem, controls, tolerance=max(tolerance, 1e-3), **options)
 
     monkeypatch.setattr(polish, "_STEPS", 0)
     wide = two_links([vp.WithinVelocityLimits(ROBOT, (-50.0, 50.0))])

@@ -533,8 +533,8 @@ def test_a_watchdog_that_finds_nothing_returns_to_the_motion_that_it_left(monkey
         return line_search.Step() if away() else own(self, start, shortest)
 
     searches = []
-    begin = search._Search.begin
-    monkeypatch.setattr(search._Search, "begin", lambda self, *args: (searches.append(self), begin(self, *args))[1])
+    begin = search.Search.begin
+    monkeypatch.setattr(search.Search, "begin", lambda self, *args: (searches.append(self), begin(self, *args))[1])
     away = lambda: searches[-1].watchdog.away > 0  # noqa: E731
     monkeypatch.setattr(LineSearch, "run", stuck)
     plan = vp.solve(valley(), check=False, max_iterations=60)

@@ -34,9 +34,10 @@ from varpin.control.polish import Polished, judged, polished
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import SUFFICIENT
 from varpin.control.refinement_within import Warm, refine_within
-from varpin.control.search import NOTHING, PATIENCE, checked_time, closing_of, require_reports
+from varpin.control.search import NOTHING, PATIENCE
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, deviations
+from varpin.control.unconstrained import checked_time, closing_of, require_reports
 from varpin.errors import InputError, LinearizationError, VarpinError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.simulation.soundness import announce

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
-from varpin.control import search
+from varpin.control import unconstrained
 from varpin.control.between_nodes import Instants, carried, enforced, middles
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Iteration, Status
@@ -50,7 +50,7 @@ def replan(
     max_iterations: int,
     deadline: float,
 ) -> Solution:
-    """:func:`varpin.control.search.replan` for problems with or without constraints.
+    """:func:`varpin.control.unconstrained.replan` for problems with or without constraints.
 
     With constraints each iteration is one of the augmented Lagrangian, followed by an update of the multipliers. They
     start from those of the previous plan, shifted with the horizon, and so do the active rows of the first pass. Where
@@ -60,7 +60,7 @@ def replan(
     """
     known = previous.multipliers
     if not problem.constraints or known is None:
-        return search.replan(
+        return unconstrained.replan(
             problem,
             previous,
             decisions,
@@ -91,7 +91,7 @@ def replan(
         started = time.perf_counter()
         until = started + _SHARE * (deadline - started)
         goal = penalized(whole, multipliers, weights, backoff, until=until)
-        found, rows = search.replan(
+        found, rows = unconstrained.replan(
             goal,
             found,
             decisions if k == 0 else 0,
