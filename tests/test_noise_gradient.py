@@ -277,3 +277,15 @@ def test_the_cost_that_a_plan_reports_has_no_slope_at_the_plan(integrator: vp.In
     ways = 1e-3 * np.random.default_rng(0).normal(size=(6, *plan.controls.shape))
     slopes, others = ([abs(slope(u, way)) for way in ways] for u in (plan.controls, 0.99 * plan.controls))
     assert max(slopes) < 1e-3 * max(others)
+
+
+def test_rounding_does_not_grow_over_many_steps_of_held_decisions() -> None:
+    """A finger under stiff gains: errors of the value function that were not symmetric grew by a tenth each step."""
+    scene, begin = vp.load_scene("finger_noise").scene, np.array([1.0, 0.3, 0.2])
+    path = lambda t: begin + 0.25 * np.sin(4.0 * np.pi * np.asarray(t))[..., None] * np.array([1.0, 0.4, 0.0])  # noqa: E731
+    cost = vp.TrackingCost(path, 10.0) + vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost(begin, 1.0))
+    problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(3), dt=1e-3, steps=1200, hold=2)
+    plan = vp.solve(problem, check=False, max_iterations=5)
+    assert plan.status.converged
+    held = vp.solve(problem, check=False, noise="held")
+    assert plan.cost + plan.noise_cost <= held.cost + held.noise_cost

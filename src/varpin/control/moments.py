@@ -265,12 +265,12 @@ def _values(
     for k in range(N - 1, -1, -1):
         Y = _hessian(problem, steps, W[k + 1], k)
         T = decided(problem, feedback, k, x)
-        if T is None:
-            W[k] = Y
-            continue
-        W[k] = T.T @ Y @ T
-        if len(rate):
+        if T is not None:
+            Y = T.T @ Y @ T
+        if T is not None and len(rate):
             change = T[-m:].copy()
             change[:, x:] -= np.eye(m)
-            W[k] += change.T @ rate[k + 1 if problem.linear else k // problem.hold] @ change
+            Y += change.T @ rate[k + 1 if problem.linear else k // problem.hold] @ change
+        # Rounding errors that are not symmetric may grow from step to step.
+        W[k] = 0.5 * (Y + Y.T)
     return W
