@@ -13,7 +13,7 @@ from varpin.model.example_robot_data import FIXED_BASE
 
 # example-robot-data 6.0.0 dropped the Bravo 7 that 5.0.0 has.
 ROBOTS = [name for name in FIXED_BASE if not name.startswith("bravo7_")] + ["finger"]
-# Tests of more than a second that others of the same function, which are quicker, stand for: slow ones, too.
+# Slow, too: cases of more than a second, most of them in functions that quicker cases run.
 SLOW = frozenset((Path(__file__).parent / "slow.txt").read_text(encoding="utf-8").splitlines())
 
 

@@ -573,6 +573,24 @@ def test_beyond_the_last_horizon_linear_controls_bring_the_robot_to_rest_where_t
     assert np.abs(run.motion.v[-1]).max() < 1e-3
 
 
+@pytest.mark.parametrize(
+    ("period", "frequency", "damping"), [(0.02, 70.0, 0.0), (0.02, 130.0, 0.0), (0.05, 40.0, 0.02)]
+)
+def test_lines_beyond_the_last_horizon_do_not_drive_springs(period, frequency, damping):
+    """A stiff joint swings by more than a radian in a tick. A line ends a tick after the state that decides it."""
+    robot, still = vp.planar_chain(1), (0.0, 0.0, 0.0)
+    inertia = vp.lagrangian_jet(vp.Scene(robot, gravity=still), np.zeros(1), np.zeros(1)).Lvv[0, 0]
+    forces = [vp.JointSpring(inertia * frequency**2, 0.0), vp.JointDamper(2.0 * damping * frequency * inertia)]
+    goal = vp.TrackingCost([0.5], 10.0) + vp.VelocityCost(0.1)
+    cost = goal + vp.ControlCost(1e-6) + vp.Terminal(10.0 * goal)
+    scene = vp.Scene(robot, gravity=still, forces=forces)
+    problem = vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=period, steps=15, controls="linear")
+    run = vp.Mpc(problem, budget=1e-9).run(duration=3.0)
+    assert run.late[1:].all()
+    assert np.abs(run.motion.v[-100:]).max() < 1e-3
+    np.testing.assert_allclose(run.motion.q[-1], run.plans[0].trajectory.q[-1], rtol=0, atol=1e-4)
+
+
 def test_an_arm_follows_as_closely_with_linear_controls_as_with_held_ones():
     """An arm with a payload, friction and noise that its controller does not know, at a tick of 50 ms."""
     robot = vp.load_robot("z1")

@@ -575,7 +575,11 @@ def _at_rest(plan: Solution, q: Floats, v: Floats) -> Floats | None:
     gains = end.holding_feedback("velocity", slower=True)
     if gains is None:
         return None
-    u = closest_controls(end.scene, end.q0) + gains @ np.concatenate([q - end.q0, v])
+    away = np.concatenate([q - end.q0, v])
+    if end.linear:
+        # A line ends a tick later, and the next begins there: without a look ahead springs would be driven.
+        away = end.coasting(end.period) @ away
+    u = closest_controls(end.scene, end.q0) + gains @ away
     return np.asarray(np.clip(u, *end.control_limits), dtype=np.float64)
 
 

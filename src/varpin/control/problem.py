@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint, BoundRate, Horizon, PlanConstraint
@@ -38,7 +39,7 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
 from varpin.simulation.choice import usual_kick
-from varpin.simulation.friction import rate_at_rest
+from varpin.simulation.friction import damping_matrices, rate_at_rest
 from varpin.simulation.run import simulate
 from varpin.simulation.soundness import announce
 from varpin.simulation.start import on_constraints
@@ -580,6 +581,20 @@ class OptimalControlProblem(Frozen):
         wanted = np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
         gains: Floats = -np.linalg.pinv(driven) @ (along.T @ wanted)
         return gains
+
+    def coasting(self, time: float) -> Floats:
+        """The flow (2n, 2n) in (q, v) over a time [s] of small motions about rest at q0, while controls stay."""
+        scene, n = self.scene, self.scene.robot.dof
+        rest = np.zeros(n)
+        jet = lagrangian_jet(scene, self.q0, rest)
+        forces = (scene.actuation @ self.holding_controls())[None]
+        (damping,) = damping_matrices(scene, self.q0[None], rest[None], forces)
+        along = tangent_basis(scene, self.q0)
+        pull = np.hstack([self._static_curvature(jet.Lqq), -damping])
+        rates = np.eye(2 * n, k=n)
+        rates[n:] = along @ np.linalg.solve(along.T @ jet.Lvv @ along, along.T @ pull)
+        found: Floats = expm(time * rates)
+        return found
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""
