@@ -299,6 +299,21 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
         assert isinstance(caught.value.__cause__, vp.StepFailure if how == "step" else vp.LinearizationError)
 
 
+def test_a_search_that_fails_too_late_to_act_leaves_the_plan_before_to_act(monkeypatch):
+    mpc = vp.Mpc(tracking(), budget=1e-9)
+    whole = mpc.run(duration=0.1)
+
+    def failing(*given, **options):
+        raise vp.LinearizationError(2, 0.04, "the solver stopped")
+
+    monkeypatch.setattr(varpin.control.mpc, "replan", failing)
+    run = mpc.run(duration=0.1)
+    np.testing.assert_array_equal(run.motion.q, whole.motion.q)
+    assert run.late[1:].all()
+    assert run.misses == 4
+    assert not run.iterations.any()
+
+
 def test_constraints_between_nodes_that_ticks_leave_out_are_told_of():
     limits = vp.WithinVelocityLimits(cart().scene.robot, (-0.4, 0.4))
     for asked in (True, False):

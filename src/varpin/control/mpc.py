@@ -199,10 +199,11 @@ class Mpc:
         tolerance: Tolerance of S-DDP; see :func:`varpin.solve`.
         first_iterations: Greatest number of iterations in the first tick, which has no plan to start from.
         budget: Time for planning in a tick [s]. No iteration begins that would exceed it if it took as long as the
-            longest one of the tick. A late plan is discarded: the previous plan acts with its feedback, and
-            ``MpcRun.late`` marks the tick; more than one late tick in twenty gives a warning. Beyond that plan's
-            horizon the robot is brought to rest where the plan ends, if every joint can be driven; else the last
-            decision is repeated. Results then depend on the machine. With an infinite budget they do not.
+            longest one of the tick. A late plan is discarded, and so is a failure to find one by then: the previous
+            plan acts with its feedback, and ``MpcRun.late`` marks the tick; more than one late tick in twenty gives a
+            warning. Beyond that plan's horizon the robot is brought to rest where the plan ends, if every joint can be
+            driven; else the last decision is repeated. Results then depend on the machine. With an infinite budget they
+            do not.
     """
 
     problem: OptimalControlProblem
@@ -364,19 +365,22 @@ class Mpc:
             for tick in range(ticks):
                 if tick > 0:
                     begin = time.perf_counter()
+                    fresh: Solution | None = None
                     try:
                         fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1, before)
                     except (StepFailure, LinearizationError, NoiseFieldError) as failure:
-                        raise _unplanned(failure, _so_far(plant, method, parts)) from failure
+                        # A late plan does not act, whether or not there is one.
+                        if time.perf_counter() - begin <= self.budget:
+                            raise _unplanned(failure, _so_far(plant, method, parts)) from failure
                     except CostError as error:
                         raise CostError(error.cost, error.problem, _so_far(plant, method, parts)) from error
-                    if fresh.status is Status.INTERRUPTED:
+                    if fresh is not None and fresh.status is Status.INTERRUPTED:
                         # A search keeps its best plan and returns; the run is what Ctrl-C is to end.
                         raise KeyboardInterrupt
                     seconds[tick] = time.perf_counter() - begin
-                    iterations[tick] = fresh.iterations
-                    late[tick] = seconds[tick] > self.budget
-                    active, age = (active, age + 1) if late[tick] else (fresh, 0)
+                    iterations[tick] = 0 if fresh is None else fresh.iterations
+                    late[tick] = fresh is None or seconds[tick] > self.budget
+                    active, age = (active, age + 1) if fresh is None or late[tick] else (fresh, 0)
                 plans.append(active)
                 begun = None
                 if problem.linear:
