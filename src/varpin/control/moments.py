@@ -267,10 +267,10 @@ def _values(
         T = decided(problem, feedback, k, x)
         if T is not None:
             Y = T.T @ Y @ T
-        if T is not None and len(rate):
-            change = T[-m:].copy()
-            change[:, x:] -= np.eye(m)
-            Y += change.T @ rate[k + 1 if problem.linear else k // problem.hold] @ change
+            if len(rate):
+                change = T[-m:].copy()
+                change[:, x:] -= np.eye(m)
+                Y += change.T @ rate[k + 1 if problem.linear else k // problem.hold] @ change
         # Rounding errors that are not symmetric may grow from step to step.
         W[k] = 0.5 * (Y + Y.T)
     return W

@@ -379,7 +379,7 @@ class Mpc:
                         raise KeyboardInterrupt
                     seconds[tick] = time.perf_counter() - begin
                     iterations[tick] = 0 if fresh is None else fresh.iterations
-                    late[tick] = fresh is None or seconds[tick] > self.budget
+                    late[tick] = seconds[tick] > self.budget
                     active, age = (active, age + 1) if fresh is None or late[tick] else (fresh, 0)
                 plans.append(active)
                 begun = None

@@ -564,11 +564,9 @@ class OptimalControlProblem(Frozen):
         None where not every joint can be driven, or where controls are held too long for them. With ``slower`` they are
         then as fast as that allows, and None only where the robot would still fall over.
         """
-        n = self.scene.robot.dof
-        jet = lagrangian_jet(self.scene, self.q0, np.zeros(n))
-        along = tangent_basis(self.scene, self.q0)
+        mass, curvature, along = self._at_rest()
         driven = along.T @ self.scene.actuation
-        inertia, bend = (along.T @ x @ along for x in (jet.Lvv, self._static_curvature(jet.Lqq)))
+        inertia, bend = (along.T @ x @ along for x in (mass, curvature))
         squares = np.linalg.eigvals(np.linalg.solve(inertia, bend))
         omega = 2.0 * float(np.sqrt(np.abs(squares).max(initial=0.0))) + 1.0 / self.duration
         fastest = 0.25 / (self.dt * self.hold)
@@ -577,24 +575,27 @@ class OptimalControlProblem(Frozen):
         falls = float(squares.real.max(initial=0.0)) >= omega**2
         if np.linalg.matrix_rank(driven) < len(driven) or falls or omega > fastest:
             return None
-        in_v = np.eye(n) if on == "momentum" else jet.Lvv
-        wanted = np.hstack([omega**2 * jet.Lvv, 2.0 * omega * in_v])
+        in_v = np.eye(len(mass)) if on == "momentum" else mass
+        wanted = np.hstack([omega**2 * mass, 2.0 * omega * in_v])
         gains: Floats = -np.linalg.pinv(driven) @ (along.T @ wanted)
         return gains
 
     def coasting(self, time: float) -> Floats:
         """The flow (2n, 2n) in (q, v) over a time [s] of small motions about rest at q0, while controls stay."""
         scene, n = self.scene, self.scene.robot.dof
-        rest = np.zeros(n)
-        jet = lagrangian_jet(scene, self.q0, rest)
+        mass, curvature, along = self._at_rest()
         forces = (scene.actuation @ self.holding_controls())[None]
-        (damping,) = damping_matrices(scene, self.q0[None], rest[None], forces)
-        along = tangent_basis(scene, self.q0)
-        pull = np.hstack([self._static_curvature(jet.Lqq), -damping])
+        (damping,) = damping_matrices(scene, self.q0[None], np.zeros((1, n)), forces)
+        pull = np.hstack([curvature, -damping])
         rates = np.eye(2 * n, k=n)
-        rates[n:] = along @ np.linalg.solve(along.T @ jet.Lvv @ along, along.T @ pull)
+        rates[n:] = along @ np.linalg.solve(along.T @ mass @ along, along.T @ pull)
         found: Floats = expm(time * rates)
         return found
+
+    def _at_rest(self) -> tuple[Floats, Floats, Floats]:
+        """M and L_qq less that of the constraint forces (n, n), at rest at q0, and a basis of the motions (n, t)."""
+        jet = lagrangian_jet(self.scene, self.q0, np.zeros(self.scene.robot.dof))
+        return jet.Lvv, self._static_curvature(jet.Lqq), tangent_basis(self.scene, self.q0)
 
     def decided(self, trajectory: Trajectory) -> Floats:
         """The controls (R, m) of a motion on the problem's grid, one row per decision."""
