@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from mechanisms import slider
 from scipy.integrate import solve_ivp
@@ -98,3 +99,33 @@ def test_nothing_is_looked_for_where_forces_are_smooth():
     found = kinks(scene, motion)
     assert found.causes == ()
     assert len(found.steps) == 0
+
+
+def test_a_step_over_a_drives_limit_is_the_root_of_its_equation():
+    """Undivided: halving where Newton's plain iteration turns back and forth would make the map of the step jump."""
+    chain, h, rng = vp.planar_chain(2), 0.02, np.random.default_rng(0)
+    model, data = chain.model, chain.model.createData()
+    stiffness, damping, effort = np.array([4e4, 1e4]), np.array([600.0, 200.0]), np.array([30.0, 10.0])
+    scene = vp.Scene(chain, gravity=False, forces=[vp.PositionServo(stiffness, damping, effort)])
+    over = []
+    for _ in range(200):
+        q, v = rng.normal(size=2), 3.0 * rng.normal(size=2)
+        goal = q + 0.1 * rng.normal(size=2)
+        options = {"dt": h, "steps": 1, "integrator": vp.Midpoint(), "check": False}
+        step = vp.simulate(scene, q, v, controls=goal[None], **options)
+        if step.statistics.substeps[0] > 1:
+            continue
+        V = (step.q[1] - q) / h
+        Q = q + 0.5 * h * V
+        demand = stiffness * (goal - Q) - damping * V
+        past = np.clip(np.abs(demand) / effort - 0.9, 0.0, 0.2)
+        drive = np.sign(demand) * np.where(past > 0.0, effort * (0.9 + past - 2.5 * past**2), np.abs(demand))
+        M = pin.crba(model, data, Q).copy()
+        slope = pin.computeCoriolisMatrix(model, data, Q, V).T @ V + drive
+        start = pin.crba(model, data, q) @ v
+        scale = np.abs(start) + np.abs(M) @ np.abs(V) + 0.5 * h * (np.abs(slope) + np.abs(stiffness * (goal - Q)))
+        np.testing.assert_array_less(np.abs(start + 0.5 * h * slope - M @ V), 1e-13 * scale.max())
+        begun = stiffness * (goal - q) - damping * v
+        over.append(np.any((np.abs(demand) < effort) & (np.abs(begun) > 10.0 * effort)))
+    assert len(over) >= 195
+    assert sum(over) >= 20

@@ -76,7 +76,8 @@ class Collocation {
           acting(stages * n),
           weight(stages, 1.0),
           residual(stages * n),
-          delta(stages * n) {
+          delta(stages * n),
+          next(stages * n) {
         for (Jet<double, Size>& jet : stage) mechanism.couplings.fit(jet.couplings);
         measure_turning();
         if (mechanism.couplings.pushes()) {
@@ -135,43 +136,19 @@ class Collocation {
     // to first order. The estimate follows from the contraction, or after a first correction from the nonlinearity of
     // the equation. A guess within the tolerance is corrected too: extrapolated guesses have a similar error in every
     // step, and energy would drift. With `jets_wanted`, the iteration ends with the jets at the root.
+    //
+    // Where drives come to their limits, the equation bends within a fraction of a correction. If the iteration fails
+    // there, it begins again where shortened corrections have led.
     Outcome solve(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
-        double before = infinity, worst = infinity;
-        bool fresh = true;
-        for (int iteration = 0; iteration < most_corrections + 2; ++iteration) {
-            sweep(h, start, fresh, effort);
-            worst = residuals(h, start);
-            const bool first = iteration == 0 && !jets_wanted && worst > 0.0;
-            if (worst <= tolerance && !first) {
-                if (fresh || !jets_wanted) break;
-                fresh = true;
-                continue;
-            }
-            if (!(worst < infinity)) return Outcome::not_finite;
-            if (fresh && !factor(h)) return Outcome::fold;
-            solve_factored(residual.data(), delta.data());
-            const double size = kinetic_size(delta.data());
-            if (iteration >= most_corrections) break;
-            if (!(size <= 0.25 * before)) {
-                // The factors may be the cause, if they are from another iterate.
-                if (fresh) break;
-                fresh = true;
-                continue;
-            }
-            take_correction();
-            ++effort.newton_iterations;
-            const double contraction = contraction_of(before, size);
-            if (!jets_wanted && certainly_last(h, fresh, contraction, tolerance, worst)) {
-                correct_slopes(h);
-                break;
-            }
-            fresh = before < infinity && !(worst * contraction * contraction * contraction <= tolerance);
-            before = size;
+        if (!mechanism.forces.limits()) return iterate(h, start, tolerance, jets_wanted, effort);
+        guess = V;
+        Outcome outcome = iterate(h, start, tolerance, jets_wanted, effort);
+        if (outcome == Outcome::diverged) V = guess;
+        for (int again = 0; again < most_approaches && outcome == Outcome::diverged; ++again) {
+            outcome = approach(h, start, effort);
+            if (outcome == Outcome::solved) outcome = iterate(h, start, tolerance, jets_wanted, effort);
         }
-        if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
-        if (jets_wanted && eliminated()) write_jets();
-        effort.residual = std::max(effort.residual, worst);
-        return Outcome::solved;
+        return outcome;
     }
 
     bool eliminated() const { return !known && (elimination || stage_elimination); }
@@ -301,6 +278,10 @@ class Collocation {
     }
 
     static constexpr int most_corrections = 10;
+    // Of shortened corrections: how often they begin, how many there are each time, and how short they may be.
+    static constexpr int most_approaches = 4;
+    static constexpr int most_shortened = 40;
+    static constexpr double least_share = 1.0 / 256.0;
     // Number of columns of a block up to which solving them together with the block's matrix is faster than elimination
     // column by column. Measured.
     static constexpr int few_columns = 45;
@@ -311,15 +292,81 @@ class Collocation {
     // Safety factor of the estimate in left_by_bending; measured ratios of residual and estimate are below 1.
     static constexpr double bending = 10.0;
 
-    std::vector<double> residual, delta;  // (s, n)
-    std::vector<double> lu;               // the factors of each block, one after another
-    std::vector<int> order;               // permutation of their rows
+    std::vector<double> residual, delta;    // (s, n)
+    std::vector<double> guess, from, next;  // (s, n) of `approach`
+    std::vector<double> lu;                 // the factors of each block, one after another
+    std::vector<int> order;                 // permutation of their rows
     std::vector<double> change, local, columns, gain;
     bool eliminated_columns = false;  // of derivatives
     std::vector<double> turning;      // (n) rotation of bodies per unit of a coordinate; infinite for a coordinate that
                                       // translates a body on a rotating one, where its product is NaN without motion
     std::vector<double> element_curvature;  // (s, n) of the elements' potentials, if there is an elimination
     std::vector<double> diagonal;           // (s, s, n) of N, without the contributions of bodies in an elimination
+
+    Outcome iterate(double h, const Start& start, double tolerance, bool jets_wanted, Effort& effort) {
+        double before = infinity, worst = infinity;
+        bool fresh = true;
+        for (int iteration = 0; iteration < most_corrections + 2; ++iteration) {
+            sweep(h, start, fresh, effort);
+            worst = residuals(h, start);
+            const bool first = iteration == 0 && !jets_wanted && worst > 0.0;
+            if (worst <= tolerance && !first) {
+                if (fresh || !jets_wanted) break;
+                fresh = true;
+                continue;
+            }
+            if (!(worst < infinity)) return Outcome::not_finite;
+            if (fresh && !factor(h)) return Outcome::fold;
+            solve_factored(residual.data(), delta.data());
+            const double size = kinetic_size(delta.data());
+            if (iteration >= most_corrections) break;
+            if (!(size <= 0.25 * before)) {
+                // The factors may be the cause, if they are from another iterate.
+                if (fresh) break;
+                fresh = true;
+                continue;
+            }
+            take_correction();
+            ++effort.newton_iterations;
+            const double contraction = contraction_of(before, size);
+            if (!jets_wanted && certainly_last(h, fresh, contraction, tolerance, worst)) {
+                correct_slopes(h);
+                break;
+            }
+            fresh = before < infinity && !(worst * contraction * contraction * contraction <= tolerance);
+            before = size;
+        }
+        if (!(worst <= std::max(stagnation, tolerance))) return Outcome::diverged;
+        if (jets_wanted && eliminated()) write_jets();
+        effort.residual = std::max(effort.residual, worst);
+        return Outcome::solved;
+    }
+
+    // Corrections with fresh factors, each shortened until the one after it, with the same factors, is smaller (natural
+    // monotonicity test, Deuflhard 2004, section 3.3); until a whole one leaves a hundredth.
+    Outcome approach(double h, const Start& start, Effort& effort) {
+        double share = 1.0;
+        for (int iteration = 0; iteration < most_shortened; ++iteration) {
+            sweep(h, start, true, effort);
+            if (!(residuals(h, start) < infinity)) return Outcome::not_finite;
+            if (!factor(h)) return Outcome::fold;
+            solve_factored(residual.data(), delta.data());
+            const double size = kinetic_size(delta.data());
+            from = V;
+            for (share = std::min(1.0, 4.0 * share);; share *= 0.5) {
+                if (share < least_share) return Outcome::diverged;
+                for (int k = 0; k < stages * n; ++k) V[k] = from[k] + share * delta[k];
+                sweep(h, start, false, effort);
+                residuals(h, start);
+                solve_factored(residual.data(), next.data());
+                const double left = kinetic_size(next.data());
+                if (share == 1.0 && left <= 1e-4 * size) return Outcome::solved;
+                if (left <= (1.0 - 0.5 * share) * size) break;
+            }
+            ++effort.newton_iterations;
+        }
+        return Outcome::diverged;
+    }
 
     void take_correction() {
         for (int k = 0; k < stages * n; ++k) V[k] += delta[k];
