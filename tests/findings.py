@@ -33,6 +33,7 @@ MARKS = {
     "unchecked": "was not checked",
     "look interrupted": "interrupted before the plan was replayed",
     "late plans": "planning took",
+    "failed ticks": "no plan was found, and",
     "nodes alone": "hold at the nodes alone",
     "two goals": "two goals",
     "goal out of reach": "from there at most",

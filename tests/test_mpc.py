@@ -271,8 +271,9 @@ def test_a_plant_that_fails_keeps_the_motion():
 
 @pytest.mark.parametrize(("whose", "how"), [("simulated", "step"), ("replan", "step"), ("replan", "derivative")])
 def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whose, how, monkeypatch):
-    """In the third tick's simulation, or in the search of the fourth."""
+    """In the third tick's simulation, or in the search of the fourth and all after it, which outlast the plan."""
     mpc, calls, real = vp.Mpc(tracking(), iterations=1), [], getattr(varpin.control.mpc, whose)
+    horizon = mpc.problem.decisions
     harsh = vp.Scene(mpc.problem.scene.robot, gravity=(0, 0, -1e6))
 
     def failing(*given, **options):
@@ -288,15 +289,46 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
     whole = mpc.run(duration=0.1).motion
     monkeypatch.setattr(varpin.control.mpc, whose, failing)
     with pytest.raises(vp.StepFailure) as caught:
-        mpc.run(duration=0.1)
+        mpc.run(duration=0.02 * (horizon + 4))
     part = caught.value.trajectory
-    ticks = 2 if whose == "simulated" else 3
-    np.testing.assert_array_equal(part.q[: 10 * ticks + 1], whole.q[: 10 * ticks + 1])
+    same, ticks = (2, 2) if whose == "simulated" else (3, horizon + 2)
+    np.testing.assert_array_equal(part.q[: 10 * same + 1], whole.q[: 10 * same + 1])
     assert (caught.value.step, caught.value.time) == (part.steps, pytest.approx(0.02 * ticks))
     if whose == "replan":
         assert part.steps == 10 * ticks
         assert about(str(caught.value), "no plan from here")
         assert isinstance(caught.value.__cause__, vp.StepFailure if how == "step" else vp.LinearizationError)
+
+
+def test_a_plan_acts_on_where_the_next_searches_fail(monkeypatch):
+    """Two in the middle of a run, one of them without gains: the plan before them goes on with its feedback."""
+    mpc, calls, real = vp.Mpc(tracking(), iterations=1), [], varpin.control.mpc.replan
+
+    def failing(*given, **options):
+        calls.append(given)
+        if len(calls) == 3:
+            raise vp.LinearizationError(2, 0.04, "the solver stopped")
+        found = real(*given, **options)
+        return (
+            found
+            if len(calls) != 4
+            else dataclasses.replace(found, status=vp.Status.INDEFINITE, gains=0.0 * found.gains)
+        )
+
+    whole = mpc.run(duration=0.2)
+    monkeypatch.setattr(varpin.control.mpc, "replan", failing)
+    run = mpc.run(duration=0.2)
+    assert run.failed.tolist() == [tick in (3, 4) for tick in range(10)]
+    assert run.failures == 2
+    assert run.misses == 0
+    assert run.plans[2] is run.plans[3] is run.plans[4] is not run.plans[5]
+    (told,) = about(run.warnings, "failed ticks")
+    assert "2 of 9 ticks" in told
+    assert "t = 0.06 s" in told
+    assert "the solver stopped" in told
+    assert "2 failed" in str(run)
+    # Nothing disturbs the plant, so the older plan is almost as good.
+    assert 0.0 < np.abs(run.motion.q - whole.motion.q).max() < 1e-2
 
 
 def test_a_search_that_fails_too_late_to_act_leaves_the_plan_before_to_act(monkeypatch):

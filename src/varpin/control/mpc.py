@@ -46,6 +46,8 @@ _FEW = 0.05
 # Violation by the plant, in scales of a constraint (a tenth of its range), from which on no narrower bound is advised:
 # it would leave less than half of the range.
 _NARROWED = 2.5
+# How searches end that have no plan.
+_WITHOUT_GAINS = (Status.INDEFINITE, Status.NOT_DIFFERENTIABLE)
 # Speeds of plans or motions, as multiples of those that the first plan foresaw, above which a loop is unstable.
 _FAR_FASTER = 20.0
 
@@ -83,14 +85,15 @@ class MpcRun(Frozen):
         seconds: Planning time of each tick (K,) [s]; 0 in the first, whose plan is made before the run.
         iterations: Iterations of S-DDP in each tick (K,); 0 in the first.
         late: Ticks whose plan exceeded the budget (K,); the previous plan acted instead.
+        failed: Ticks whose search found no plan in time (K,); the previous plan acted instead.
         period: Time of a tick [s].
         budget: Time for planning in a tick [s]; infinite without a budget.
         constraints: How well plans and motion satisfied each of the problem's constraints.
         warnings: Warnings about the first plan that do not recur in the plant's motion; about the motion, as in
             :attr:`Trajectory.warnings`, and its velocities from tick to tick; about planning that took longer than the
-            period, or than the budget, in more than one tick of twenty, which depends on the machine; about constraints
-            that the motion violated; about ticks without a feasible plan; and about speeds, of plans or of the motion,
-            that are many times those of the first plan.
+            period, or than the budget, in more than one tick of twenty, which depends on the machine; about failed
+            ticks; about constraints that the motion violated; about ticks without a feasible plan; and about speeds, of
+            plans or of the motion, that are many times those of the first plan.
     """
 
     motion: Trajectory
@@ -98,6 +101,7 @@ class MpcRun(Frozen):
     seconds: Floats
     iterations: NDArray[np.int64]
     late: NDArray[np.bool_]
+    failed: NDArray[np.bool_]
     period: float
     budget: float
     constraints: tuple[Kept, ...] = ()
@@ -136,6 +140,11 @@ class MpcRun(Frozen):
         """Number of late plans."""
         return int(self.late.sum())
 
+    @property
+    def failures(self) -> int:
+        """Number of ticks whose search failed."""
+        return int(self.failed.sum())
+
     def __repr__(self) -> str:
         return f"MpcRun({str(self).splitlines()[0]}{warning_count(self.warnings)})"
 
@@ -159,6 +168,7 @@ class MpcRun(Frozen):
             ("ticks", f"{len(self.plans)} of {1e3 * self.period:.3g} ms"),
             ("planning took", self._planning),
             ("late", self._within),
+            *([("failed", self.failures)] if self.failed.any() else []),
             ("plant", self.motion),
             *(("constraint", report) for report in self.constraints),
             *(("warning", sentence) for sentence in self.warnings),
@@ -167,7 +177,8 @@ class MpcRun(Frozen):
 
     def __str__(self) -> str:
         ticks = f"{len(self.plans)} ticks of {1e3 * self.period:.3g} ms"
-        summary = f"{ticks}: planning took {self._planning}; {self._within}"
+        failed = f"; {self.failures} failed" if self.failed.any() else ""
+        summary = f"{ticks}: planning took {self._planning}; {self._within}{failed}"
         warned = (f"warning: {sentence}" for sentence in self.warnings)
         return "\n".join([summary, *map(str, self.constraints), *warned])
 
@@ -302,7 +313,8 @@ class Mpc:
         """Control a simulated plant from the problem's initial state.
 
         In each tick the first decision of the plan made from the state at its beginning acts, or, where controls are
-        linear between nodes, the line between its first two. The first plan is made before the run.
+        linear between nodes, the line between its first two. The first plan is made before the run. Where a search
+        finds no plan, the one before acts on with its feedback, up to its end, and a warning says so.
 
         Main args:
             plant: None for the problem's own scene, integrated more finely.
@@ -316,9 +328,9 @@ class Mpc:
 
         Raises:
             InputError: A plant with other controls or joints.
-            StepFailure: The plant's motion, or the first motion of a search, cannot be integrated, or a plan's motion
-                cannot be linearized. It holds the plant's motion so far; after a search, its cause is the search's
-                error.
+            StepFailure: The plant's motion cannot be integrated. Or no search has found a plan for the whole horizon of
+                the last one, since their first motions cannot be integrated or plans not be linearized; its cause is
+                the last search's error. It holds the plant's motion so far.
             CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far. In the first plan, a plain KeyboardInterrupt.
         """
@@ -360,18 +372,18 @@ class Mpc:
         watched = plant.integrator is None and not noisy and changes_along(plant.scene)
         unfit: tuple[Finding, ...] = ()
         parts: list[Trajectory] = []
-        plans, seconds, iterations, late = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64), np.zeros(ticks, bool)
+        plans, seconds, iterations = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64)
+        late, failed, reasons = np.zeros(ticks, bool), np.zeros(ticks, bool), list[str]()
         try:
             for tick in range(ticks):
                 if tick > 0:
                     begin = time.perf_counter()
                     fresh: Solution | None = None
+                    failure: VarpinError | None = None
                     try:
                         fresh = self.plan(problem.t0 + tick * self.period, q, v, active, age + 1, before)
-                    except (StepFailure, LinearizationError, NoiseFieldError) as failure:
-                        # A late plan does not act, whether or not there is one.
-                        if time.perf_counter() - begin <= self.budget:
-                            raise _unplanned(failure, _so_far(plant, method, parts)) from failure
+                    except (StepFailure, LinearizationError, NoiseFieldError) as error:
+                        failure = error
                     except CostError as error:
                         raise CostError(error.cost, error.problem, _so_far(plant, method, parts)) from error
                     if fresh is not None and fresh.status is Status.INTERRUPTED:
@@ -379,8 +391,14 @@ class Mpc:
                         raise KeyboardInterrupt
                     seconds[tick] = time.perf_counter() - begin
                     iterations[tick] = 0 if fresh is None else fresh.iterations
+                    # A late plan does not act, whether or not there is one.
                     late[tick] = seconds[tick] > self.budget
-                    active, age = (active, age + 1) if fresh is None or late[tick] else (fresh, 0)
+                    failed[tick] = not late[tick] and (fresh is None or fresh.status in _WITHOUT_GAINS)
+                    if failed[tick]:
+                        reasons.append(_why(failure) if fresh is None else fresh.reason)
+                        if age + 1 >= len(active.gains):
+                            raise _unplanned(reasons[-1], failure, _so_far(plant, method, parts)) from failure
+                    active, age = (active, age + 1) if fresh is None or late[tick] or failed[tick] else (fresh, 0)
                 plans.append(active)
                 begun = None
                 if problem.linear:
@@ -403,6 +421,7 @@ class Mpc:
         motion, found = examined_in_loop(plant.scene, method, chained(parts), plant.substeps, corrected=True)
         found = (*noise_forgotten(plant.scene, rng), *unfit, *found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
+        found = (*found, *_failed(failed, reasons, self.period))
         found = (*found, *_whole_ticks(duration, ticks, self.period), *_at_nodes_alone(problem))
         held = kept(problem, tuple(plans), motion, plant.substeps)
         found = (*found, *_outside(held, noisy=bool(motion.dw.any())), *_blown_up(plans, motion))
@@ -415,6 +434,7 @@ class Mpc:
             seconds,
             iterations,
             late,
+            failed,
             self.period,
             self.budget,
             constraints=held,
@@ -510,6 +530,19 @@ def _late(late: NDArray[np.bool_], budget: float) -> tuple[Finding, ...]:
     return (Finding("late plans", sentence),)
 
 
+def _failed(failed: NDArray[np.bool_], reasons: Sequence[str], period: float) -> tuple[Finding, ...]:
+    """A finding if the searches of ticks failed, for these reasons."""
+    if not failed.any():
+        return ()
+    tick = int(np.argmax(failed))
+    sentence = (
+        f"in {int(failed.sum())} of {len(failed) - 1} ticks no plan was found, and the feedback of an older one acted "
+        f"in its place; at t = {tick * period:.4g} s: {reasons[0]}. A smaller dt, or greater weights on velocities and "
+        "controls, may help"
+    )
+    return (Finding("failed ticks", sentence),)
+
+
 def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
     """A finding if the plant's velocities alternate from tick to tick."""
     found = None if motion.dw.any() else alternation(motion.v[::substeps])
@@ -596,13 +629,18 @@ def _within_rates(plan: Solution, u: Floats, before: Floats) -> Floats:
     return u
 
 
-def _unplanned(failure: VarpinError, motion: Trajectory) -> StepFailure:
-    """The failure of a run whose next plan cannot be made; it holds the plant's motion so far."""
-    residual, reason = np.nan, f"no plan can be made from here: {failure}"
+def _why(failure: VarpinError | None) -> str:
+    """Why a search has no plan, in words."""
     if isinstance(failure, StepFailure):
-        residual = failure.residual
-        reason = f"no plan can be made from here, as step {failure.step} of its first motion fails: {failure.reason}"
-    return StepFailure(motion.steps, motion.t[-1], Failure(reason, residual), motion)
+        return f"step {failure.step} of its first motion fails: {failure.reason}"
+    return str(failure)
+
+
+def _unplanned(reason: str, failure: VarpinError | None, motion: Trajectory) -> StepFailure:
+    """The failure of a run that has no plan left; it holds the plant's motion so far."""
+    residual = failure.residual if isinstance(failure, StepFailure) else np.nan
+    told = f"no plan can be made from here, and the last one ends: {reason}"
+    return StepFailure(motion.steps, motion.t[-1], Failure(told, residual), motion)
 
 
 def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integrator:
