@@ -6,11 +6,14 @@ from findings import about
 from scipy.optimize import lsq_linear, minimize
 
 import varpin as vp
+from varpin.control.active_rows import Pushes
 from varpin.control.between_nodes import NOWHERE, Instants, beyond, enforced, seen, updated
 from varpin.control.closed_loop import ClosedLoop
 from varpin.control.multipliers import at_nodes
 from varpin.control.penalties import split
+from varpin.control.polish import _first as first_step
 from varpin.control.spread import Feedback, covariances
+from varpin.control.trials import Trials
 from varpin.errors import LinearizationError
 
 N = 8
@@ -495,3 +498,84 @@ def test_margins_of_plans_with_rows_between_nodes():
     P = covariances(problem, plan.trajectory, feedback)[1:, 1, 1]
     np.testing.assert_allclose(margins[0], np.tile(2.0 * np.sqrt(P)[:, None] / moment, 2), rtol=1e-2)
     assert len(vp.Mpc(problem).run(duration=0.1, rng=0).plans) == 2
+
+
+def test_interior_point_steps_end_where_rounding_errors_keep_the_gap(monkeypatch):
+    """Penalties are so heavy that some gaps stay above the bound; all 60 steps were taken then."""
+    steps: list[int] = []
+    begin, move = Pushes.__init__, Pushes.move
+
+    def begun(self, *given):
+        steps.append(0)
+        begin(self, *given)
+
+    def moved_on(self, length):
+        steps[-1] += 1
+        move(self, length)
+
+    monkeypatch.setattr(Pushes, "__init__", begun)
+    monkeypatch.setattr(Pushes, "move", moved_on)
+    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([0.7, -0.7], 1e2) + vp.VelocityCost(1.0))
+    problem = vp.OptimalControlProblem(
+        vp.Scene(ROBOT, damping=0.1),
+        cost,
+        [0.1, 0.1],
+        [0.0, 0.0],
+        dt=0.05,
+        steps=20,
+        controls="linear",
+        constraints=[vp.WithinVelocityLimits(ROBOT, (-0.6, 0.6))],
+    )
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    assert plan.iterations <= 35
+    assert len(steps) > 3
+    assert max(steps) <= 25
+
+
+def test_trials_of_the_last_step_that_leave_are_given_up():
+    """Under stiff feedback and changes of the controls a million times too large, a trial took thousands of parts."""
+    problem = links("speeds")
+    plan = vp.solve(problem, check=False)
+    known = plan.multipliers
+    whole = enforced(problem, known.between)
+    values, backoff = (split(whole.bound_constraints, part) for part in (known.values, known.backoff))
+    step = first_step(whole, plan.trajectory, values, known.weights, backoff)
+    step.solve(np.inf)
+    seen_parts = []
+
+    class Counted(Trials):
+        def attempt(self, *given, **options):
+            found = super().attempt(*given, **options)
+            seen_parts.append(int(found.written.tally[0, :, 3].sum()))
+            return found
+
+    assert step.after(Counted(whole), 1.0) is not None
+    step.ahead = np.full_like(step.ahead, 1e4)
+    assert step.after(Counted(whole), 1.0) is None
+    assert max(seen_parts) <= 4 * N
+
+
+def test_penalties_between_nodes_weigh_as_the_cost_of_the_plan_does():
+    """The first motion, an arm held where it is, costs thousands of times as much: under its weights 201 iterations."""
+    robot = vp.load_robot("z1")
+    begin = np.array([0.06, 0.1, -0.1, 0.05, -0.27, 0.18, -0.2])
+    goal = begin + 0.7 * np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost(goal, 1e2) + vp.VelocityCost(1.0))
+    problem = vp.OptimalControlProblem(
+        vp.Scene(robot, damping="robot"),
+        cost,
+        begin,
+        np.zeros(7),
+        dt=0.04,
+        steps=25,
+        controls="linear",
+        constraints=[vp.WithinVelocityLimits(robot, (-0.8, 0.8))],
+    )
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    assert plan.violation <= 1e-9
+    assert plan.history[0].cost > 1e3 * plan.cost
+    assert plan.iterations <= 50

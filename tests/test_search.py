@@ -365,7 +365,7 @@ def test_trials_that_are_cut_to_pieces_are_given_up(monkeypatch):
     problem = tool_reach()
     sol, parts = work(monkeypatch, problem, max_iterations=12)
     with monkeypatch.context() as patch:
-        patch.setattr(line_search, "_HALVINGS", problem.integrator.guard.max_halvings)
+        patch.setattr("varpin.control.trials.HALVINGS", problem.integrator.guard.max_halvings)
         patch.setattr(line_search, "_PARTS", np.inf)
         unbounded, all_parts = work(monkeypatch, problem, max_iterations=12)
     assert parts < 0.4 * all_parts
@@ -376,7 +376,8 @@ def test_trials_that_are_cut_to_pieces_are_given_up(monkeypatch):
 def test_what_was_given_up_is_tried_again_where_nothing_else_helps(steps, monkeypatch):
     """With no halvings to begin with, motions that need them are found all the same."""
     free = vp.solve(swing(steps))
-    monkeypatch.setattr(line_search, "_HALVINGS", 0)
+    monkeypatch.setattr("varpin.control.trials.HALVINGS", 0)
+    monkeypatch.setattr(line_search, "HALVINGS", 0)
     monkeypatch.setattr(line_search, "_MORE_HALVINGS", 0)
     bounded = vp.solve(swing(steps))
     assert bounded.trajectory.statistics.substeps.max() > 1

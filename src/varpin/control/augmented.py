@@ -84,8 +84,6 @@ _HOPELESS = 5
 _MUCH = 1e-2
 # Greatest number of last steps, each with the rows between nodes of the motion before.
 _LOOKS = 8
-# First round after which there may be rows between nodes.
-_SOON = 1
 # Violation between nodes that is left to the last steps.
 _CLOSE = 1e-6
 # Violation at which penalties stop growing; the last step removes the rest.
@@ -204,7 +202,9 @@ class _Rounds:
             self.whole = enforced(self.problem, begun.between)
             known = len(self.history)
             done = 0 if resume is None or resume.search is None else len(resume.search.history)
-            longest = _BEFORE_PEAKS if len(begun.between.rows) else _OF_ROUND
+            # Linear controls lead around the nodes until there are such rows.
+            around = self.problem.linear and any(watched(self.problem))
+            longest = _BEFORE_PEAKS if around or len(begun.between.rows) else _OF_ROUND
             left = min(last - known, longest - done)
             problem = penalized(self.whole, begun.multipliers, begun.weights, begun.backoff, until=self.until)
             options: dict[str, Any] = dict(self.options)
@@ -511,18 +511,21 @@ class _Rounds:
         """Whether a round follows with other rows between nodes, because the motion violates a constraint there.
 
         Only linear controls lead around the nodes, and held ones have such rows where the problem asks for them. There
-        are none until the motion of a round, not that of the first, violates a constraint by more than a thousandth of
-        its range; or at the end of the rounds by more than 1e-6 of its unit, if the problem asks for them. From then on
-        the rows of each round follow the peaks of the motion before, with further ones that it violates or comes close
-        to. The weights of penalties are the first ones again when there are rows for the first time. They are heavier
-        in a round that is made ``again``, because the last step did not lead to an optimum.
+        are none until the motion of a round, with held controls not that of the first, violates a constraint by more
+        than a thousandth of its range; or at the end of the rounds by more than 1e-6 of its unit, if the problem asks
+        for them. From then on the rows of each round follow the peaks of the motion before, with further ones that it
+        violates or comes close to. When there are rows for the first time, penalties have their first weights again, or
+        before the rounds have ended those for the present cost, where it is less. They are heavier in a round that is
+        made ``again``, because the last step did not lead to an optimum.
         """
         before, base, known = begun.between, self.state, kept.multipliers
         assert known is not None
         values = split(self.bound, known.values)
         asked = self.problem.between_nodes
         first = not len(before.rows)
-        if not (self.problem.linear or asked) or (ended is None and first and begun.round < _SOON):
+        # Held controls hardly lead around the nodes: their first round may only be far from its end.
+        early = ended is None and first and begun.round == 0
+        if not (self.problem.linear or asked) or (early and not self.problem.linear):
             return False
         if ended is not None:
             if begun.round + 1 >= _ROUNDS or ended not in (Status.CONVERGED, Status.STALLED):
@@ -563,7 +566,19 @@ class _Rounds:
             between=between,
         )
         if first:
-            self.state = replace(self.state, weights=first_weights, worst=np.full(len(worst), np.inf), tolerance=_LOOSE)
+            lighter = first_weights
+            if ended is None and kept.cost:
+                # The first motion may have cost many times as much as this one. The heavier penalties are beside their
+                # multipliers, the shorter are the steps along which constraints are linear enough.
+                of_cost = weights_for(abs(kept.cost), self.bound)
+                lighter = np.minimum(first_weights, _of_all(of_cost, before, between))
+            self.state = replace(
+                self.state,
+                weights=lighter,
+                first_weights=lighter,
+                worst=np.full(len(worst), np.inf),
+                tolerance=_LOOSE,
+            )
         return True
 
     def _counts(self, kept: Solution, begun: _State, status: Status) -> tuple[bool, str]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import is_dataclass, replace
+from dataclasses import is_dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ from varpin.control.costs import CostError
 from varpin.control.descent import rounding
 from varpin.control.passes import Plan, noise_shares
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.trials import Attempt, Trials
+from varpin.control.trials import HALVINGS, Attempt, Trials, cut_less, few_halvings
 from varpin.core import Watch
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
@@ -43,10 +42,10 @@ _POOR = 0.3
 _EARLY, _EXTENSION = 0.85, 4.0
 # Approximate shortest step of a line search, its greatest number of trials, and the least factor between two of them.
 _SHORTEST, _TRIALS, _SHARPEST = 1e-6, 40, 0.25
-# Bounds on the substeps of a trial. A trial stops where a step needs more than _HALVINGS halvings and more than the
+# Bounds on the substeps of a trial. A trial stops where a step needs more than HALVINGS halvings and more than the
 # current motion, or where the total exceeds _PARTS times that of the current motion. If no other trial leads far, the
 # stopped ones are repeated with larger bounds, then with none. A search that stalls continues without bounds.
-_HALVINGS, _MORE_HALVINGS = 2, 3
+_MORE_HALVINGS = 3
 _PARTS = 3
 # Increase of the cost at which a trial stops, in units of what the slope gives: the next lengths do not depend on what
 # is beyond that. A relative margin well above rounding errors.
@@ -286,14 +285,12 @@ class LineSearch:
         if not (start.bounded and self._divides and isinstance(integrator, Variational)):
             yield _Bounds(integrator, np.inf, watched=False)
             return
-        # A step cut into s substeps has taken at most s - 1 halvings.
-        statistics = start.trajectory.statistics
-        few = max(_HALVINGS, int(statistics.substeps.max()) - 1) if statistics.halvings.size else _HALVINGS
+        few = few_halvings(start.trajectory)
         for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
             less = self._less.get(halvings)
             if less is None:
-                less = self._less[halvings] = _cut_less(integrator, halvings)
-            yield _Bounds(less, parts, watched=halvings > _HALVINGS)
+                less = self._less[halvings] = cut_less(integrator, halvings)
+            yield _Bounds(less, parts, watched=halvings > HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
     def _try(self, step: float, start: Start, here: _Here, bounds: _Bounds) -> Trial:
@@ -374,12 +371,3 @@ def _onto_limits(u: Floats, limits: Floats, rounding: Floats) -> Floats:
     for limit, onto in zip(limits, close, strict=True):
         u = np.where(onto, limit, u)
     return u
-
-
-@functools.lru_cache(maxsize=256)
-def _cut_less(integrator: Variational, halvings: int) -> Variational:
-    """The integrator with at most ``halvings`` halvings of a step; itself where it has no guard."""
-    guard = integrator.guard
-    if guard is None or not is_dataclass(integrator):
-        return integrator
-    return replace(integrator, guard=replace(guard, max_halvings=min(halvings, guard.max_halvings)))

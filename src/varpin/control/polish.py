@@ -21,7 +21,7 @@ from varpin.control.closed_loop import ClosedLoop
 from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.trials import Trials
+from varpin.control.trials import Trials, cut_less, few_halvings
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.integrators.base import open_line, open_loop
@@ -155,7 +155,7 @@ def _first(
 def _closer(after: Polished, before: Polished, length: float) -> bool:
     """Whether a motion is closer to the KKT conditions than another one, from which it is a step of given length."""
     if length == 0.0:
-        return after.violation < before.violation
+        return before.violation > _DONE and after.violation < before.violation
     return after.decrease < before.decrease and after.violation <= max(before.violation, _TRANSIENT)
 
 
@@ -311,7 +311,9 @@ class _Step:
 
         None where the motion fails, or has no derivative.
         """
-        attempt = trials.attempt(self._commands(length))
+        # Under stiff feedback a motion that leaves the neighbourhood may need any number of parts.
+        near = cut_less(self.problem.integrator, few_halvings(self.motion))
+        attempt = trials.attempt(self._commands(length), integrator=near)
         if not attempt.whole:
             return None
         try:
