@@ -300,6 +300,24 @@ def test_a_failure_of_plant_or_planner_keeps_the_motion_of_all_ticks_before(whos
         assert isinstance(caught.value.__cause__, vp.StepFailure if how == "step" else vp.LinearizationError)
 
 
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_a_run_ends_where_its_last_plan_does(controls, monkeypatch):
+    """If no search finds another one: with all of the plan's decisions, or lines, behind it."""
+    usual = cart(steps=8)
+    problem = vp.OptimalControlProblem(
+        usual.scene, usual.cost, usual.q0, usual.v0, dt=usual.dt, steps=8, controls=controls
+    )
+
+    def failing(*given, **options):
+        raise vp.LinearizationError(2, 0.04, "the solver stopped")
+
+    monkeypatch.setattr(varpin.control.mpc, "replan", failing)
+    with pytest.raises(vp.StepFailure) as caught:
+        vp.Mpc(problem).run(duration=2.0)
+    assert about(str(caught.value), "no plan from here")
+    assert caught.value.trajectory.t[-1] == pytest.approx(8 * usual.dt)
+
+
 def test_a_plan_acts_on_where_the_next_searches_fail(monkeypatch):
     """Two in the middle of a run, one of them without gains: the plan before them goes on with its feedback."""
     mpc, calls, real = vp.Mpc(tracking(), iterations=1), [], varpin.control.mpc.replan
@@ -309,11 +327,10 @@ def test_a_plan_acts_on_where_the_next_searches_fail(monkeypatch):
         if len(calls) == 3:
             raise vp.LinearizationError(2, 0.04, "the solver stopped")
         found = real(*given, **options)
-        return (
-            found
-            if len(calls) != 4
-            else dataclasses.replace(found, status=vp.Status.INDEFINITE, gains=0.0 * found.gains)
-        )
+        if len(calls) != 4:
+            return found
+        blank = np.full_like(found.gradient, np.nan)
+        return dataclasses.replace(found, status=vp.Status.INDEFINITE, gains=0.0 * found.gains, gradient=blank)
 
     whole = mpc.run(duration=0.2)
     monkeypatch.setattr(varpin.control.mpc, "replan", failing)

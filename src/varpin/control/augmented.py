@@ -67,6 +67,8 @@ _HEAVIEST = 1e9
 # First penalties are light if the model would remove less than _LIGHT of them. They are made heavier until that is no
 # longer so, by at most _HEAVIER at a time, in at most _LIFTS times. Shares up to _ROUNDED may be rounding errors.
 _LIGHT, _HEAVIER, _LIFTS, _ROUNDED = 1e-2, 1e8, 8, 1e-9
+# Least weights of penalties when rows between nodes begin, relative to those of the first motion's cost.
+_LIGHTEST = 1e-5
 # Violation of the first motion, relative to the constraint's scale, up to which its penalties are not made heavier.
 _FAR = 1e-2
 # Rounds in which margins are updated, and the relative change below which they have settled.
@@ -570,8 +572,9 @@ class _Rounds:
             if ended is None and kept.cost:
                 # The first motion may have cost many times as much as this one. The heavier penalties are beside their
                 # multipliers, the shorter are the steps along which constraints are linear enough.
-                of_cost = weights_for(abs(kept.cost), self.bound)
-                lighter = np.minimum(first_weights, _of_all(of_cost, before, between))
+                of_cost = _of_all(weights_for(abs(kept.cost), self.bound), before, between)
+                equality = [item.source.equality for item in whole.bound_constraints]
+                lighter = np.where(equality, first_weights, np.clip(of_cost, _LIGHTEST * first_weights, first_weights))
             self.state = replace(
                 self.state,
                 weights=lighter,

@@ -32,8 +32,8 @@ _FIRM = 1e300
 
 
 # With rows of penalties: the greatest number of interior-point steps, the gap, relative to the model's change and to
-# the cost at stake, and the first gap, relative to the latter. They end, too, where so many of them leave more than a
-# share of a gap that is small beside the first: rounding errors keep it up.
+# the cost at stake, and the first gap, relative to the latter. They end, too, where the last _STILL of them have left
+# more than _STANDS of the gap, and it is below _SMALL of that after the first: then rounding errors keep it up.
 _STEPS_WITH_ROWS, _CLOSE, _NOTHING, _LARGE = 60, 1e-9, 1e-12, 1e3
 _STILL, _STANDS, _SMALL = 4, 0.3, 1e-3
 

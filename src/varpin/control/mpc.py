@@ -46,8 +46,6 @@ _FEW = 0.05
 # Violation by the plant, in scales of a constraint (a tenth of its range), from which on no narrower bound is advised:
 # it would leave less than half of the range.
 _NARROWED = 2.5
-# How searches end that have no plan.
-_WITHOUT_GAINS = (Status.INDEFINITE, Status.NOT_DIFFERENTIABLE)
 # Speeds of plans or motions, as multiples of those that the first plan foresaw, above which a loop is unstable.
 _FAR_FASTER = 20.0
 
@@ -85,7 +83,7 @@ class MpcRun(Frozen):
         seconds: Planning time of each tick (K,) [s]; 0 in the first, whose plan is made before the run.
         iterations: Iterations of S-DDP in each tick (K,); 0 in the first.
         late: Ticks whose plan exceeded the budget (K,); the previous plan acted instead.
-        failed: Ticks whose search found no plan in time (K,); the previous plan acted instead.
+        failed: Ticks whose search ended within the budget without a plan (K,); the previous plan acted instead.
         period: Time of a tick [s].
         budget: Time for planning in a tick [s]; infinite without a budget.
         constraints: How well plans and motion satisfied each of the problem's constraints.
@@ -329,8 +327,8 @@ class Mpc:
         Raises:
             InputError: A plant with other controls or joints.
             StepFailure: The plant's motion cannot be integrated. Or no search has found a plan for the whole horizon of
-                the last one, since their first motions cannot be integrated or plans not be linearized; its cause is
-                the last search's error. It holds the plant's motion so far.
+                the last one: first motions cannot be integrated, plans not be linearized, or their models have no
+                minimum. Its cause is the last search's error, if that raised one. It holds the plant's motion so far.
             CostError: A custom cost fails; from the second tick on it holds the plant's motion so far.
             Interrupted: Ctrl-C; holds the plant's motion so far. In the first plan, a plain KeyboardInterrupt.
         """
@@ -393,10 +391,10 @@ class Mpc:
                     iterations[tick] = 0 if fresh is None else fresh.iterations
                     # A late plan does not act, whether or not there is one.
                     late[tick] = seconds[tick] > self.budget
-                    failed[tick] = not late[tick] and (fresh is None or fresh.status in _WITHOUT_GAINS)
+                    failed[tick] = not late[tick] and (fresh is None or _is_blank(fresh))
                     if failed[tick]:
                         reasons.append(_why(failure) if fresh is None else fresh.reason)
-                        if age + 1 >= len(active.gains):
+                        if age + 1 >= len(active.gains) - problem.linear:
                             raise _unplanned(reasons[-1], failure, _so_far(plant, method, parts)) from failure
                     active, age = (active, age + 1) if fresh is None or late[tick] or failed[tick] else (fresh, 0)
                 plans.append(active)
@@ -537,8 +535,7 @@ def _failed(failed: NDArray[np.bool_], reasons: Sequence[str], period: float) ->
     tick = int(np.argmax(failed))
     sentence = (
         f"in {int(failed.sum())} of {len(failed) - 1} ticks no plan was found, and the feedback of an older one acted "
-        f"in its place; at t = {tick * period:.4g} s: {reasons[0]}. A smaller dt, or greater weights on velocities and "
-        "controls, may help"
+        f"in its place, at t = {tick * period:.4g} s for the first time: {reasons[0]}"
     )
     return (Finding("failed ticks", sentence),)
 
@@ -629,17 +626,22 @@ def _within_rates(plan: Solution, u: Floats, before: Floats) -> Floats:
     return u
 
 
+def _is_blank(plan: Solution) -> bool:
+    """Whether a search found no plan along its motion: the gains are zeros."""
+    return bool(np.isnan(plan.gradient).all())
+
+
 def _why(failure: VarpinError | None) -> str:
     """Why a search has no plan, in words."""
     if isinstance(failure, StepFailure):
-        return f"step {failure.step} of its first motion fails: {failure.reason}"
+        return f"step {failure.step} of the search's first motion fails: {failure.reason}"
     return str(failure)
 
 
 def _unplanned(reason: str, failure: VarpinError | None, motion: Trajectory) -> StepFailure:
     """The failure of a run that has no plan left; it holds the plant's motion so far."""
     residual = failure.residual if isinstance(failure, StepFailure) else np.nan
-    told = f"no plan can be made from here, and the last one ends: {reason}"
+    told = f"no plan can be made from here, and the last plan is at its end; {reason}"
     return StepFailure(motion.steps, motion.t[-1], Failure(told, residual), motion)
 
 

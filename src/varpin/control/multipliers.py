@@ -35,7 +35,7 @@ class Multipliers(Frozen):
         backoff: ``margin`` standard deviations (M,), and what is ``added`` to them, in the constraint's unit.
         begun: Multipliers at the beginning of the last round (M,).
         weights: Weight of each constraint's penalty in the last round (C,) [cost / unit^2].
-        first_weights: The same in the first round (C,).
+        first_weights: The same in the first round (C,), or in the first one with rows between nodes.
         worst: Violation of each constraint after the round before (C,); infinite in the first round.
         tolerance: Tolerance of the search in the last round.
         round: Number of the last round, from 0.

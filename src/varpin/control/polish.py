@@ -50,6 +50,8 @@ _LITTLE, _ROUNDED = 1e-13, 1e-12
 _SMALL = 1e-3
 # Growth of changes of the controls without feedback, beside those with that of the cost, from which on they have it.
 _UNSTABLE = 1e3
+# Further halvings of a step that a motion may need beside the one before.
+_MORE_HALVINGS = 3
 # Pivots of the dual problem: of whole blocks without progress, and greatest number of single ones for each row.
 _TRIES, _PIVOTS = 4, 10
 
@@ -312,7 +314,7 @@ class _Step:
         None where the motion fails, or has no derivative.
         """
         # Under stiff feedback a motion that leaves the neighbourhood may need any number of parts.
-        near = cut_less(self.problem.integrator, few_halvings(self.motion))
+        near = cut_less(self.problem.integrator, few_halvings(self.motion) + _MORE_HALVINGS)
         attempt = trials.attempt(self._commands(length), integrator=near)
         if not attempt.whole:
             return None

@@ -136,7 +136,9 @@ def _is_close(problem: OptimalControlProblem, found: Solution) -> bool:
     After short steps violations are large, and multipliers would wind up by heavy weights times these. Held controls,
     which respond at once, do as well without this.
     """
-    return not problem.linear or found.status is Status.CONVERGED or found.history[-1].step >= _LONG
+    if not problem.linear or found.status is Status.CONVERGED:
+        return True
+    return bool(found.history) and found.history[-1].step >= _LONG
 
 
 def _at(problem: OptimalControlProblem, known: Multipliers, instants: Instants) -> Multipliers:

@@ -146,7 +146,8 @@ class Collocation {
         if (outcome == Outcome::diverged) V = guess;
         for (int again = 0; again < most_approaches && outcome == Outcome::diverged; ++again) {
             outcome = approach(h, start, effort);
-            if (outcome == Outcome::solved) outcome = iterate(h, start, tolerance, jets_wanted, effort);
+            if (outcome != Outcome::solved) break;
+            outcome = iterate(h, start, tolerance, jets_wanted, effort);
         }
         return outcome;
     }
@@ -351,6 +352,7 @@ class Collocation {
             if (!(residuals(h, start) < infinity)) return Outcome::not_finite;
             if (!factor(h)) return Outcome::fold;
             solve_factored(residual.data(), delta.data());
+            ++effort.newton_iterations;
             const double size = kinetic_size(delta.data());
             from = V;
             for (share = std::min(1.0, 4.0 * share);; share *= 0.5) {
@@ -363,7 +365,6 @@ class Collocation {
                 if (share == 1.0 && left <= 1e-4 * size) return Outcome::solved;
                 if (left <= (1.0 - 0.5 * share) * size) break;
             }
-            ++effort.newton_iterations;
         }
         return Outcome::diverged;
     }
