@@ -166,14 +166,15 @@ def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
     np.testing.assert_allclose(ends[1:, 0], ends[:-1, 1], atol=1e-4)
 
 
-def reach(robot, limit, scene=None, **options):
+def reach(robot, limit, scene=None, begin=None, goal=None, **options):
     n = robot.dof
+    begin, goal = np.zeros(n) if begin is None else begin, np.linspace(0.6, -0.6, n) if goal is None else goal
     cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
-    cost += vp.Terminal(vp.TrackingCost(np.linspace(0.6, -0.6, n), 1e2) + vp.VelocityCost(1.0))
+    cost += vp.Terminal(vp.TrackingCost(goal, 1e2) + vp.VelocityCost(1.0))
     given = {"dt": 0.05, "steps": 20, "controls": "linear"} | options
     within = [vp.WithinVelocityLimits(robot, (-limit, limit))]
     return vp.OptimalControlProblem(
-        scene or vp.Scene(robot, damping=0.1), cost, np.zeros(n), np.zeros(n), constraints=within, **given
+        scene or vp.Scene(robot, damping=0.1), cost, begin, np.zeros(n), constraints=within, **given
     )
 
 
@@ -515,18 +516,7 @@ def test_interior_point_steps_end_where_rounding_errors_keep_the_gap(monkeypatch
 
     monkeypatch.setattr(Pushes, "__init__", begun)
     monkeypatch.setattr(Pushes, "move", moved_on)
-    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
-    cost += vp.Terminal(vp.TrackingCost([0.7, -0.7], 1e2) + vp.VelocityCost(1.0))
-    problem = vp.OptimalControlProblem(
-        vp.Scene(ROBOT, damping=0.1),
-        cost,
-        [0.1, 0.1],
-        [0.0, 0.0],
-        dt=0.05,
-        steps=20,
-        controls="linear",
-        constraints=[vp.WithinVelocityLimits(ROBOT, (-0.6, 0.6))],
-    )
+    problem = reach(ROBOT, 0.6, begin=[0.1, 0.1], goal=[0.7, -0.7])
     plan = vp.solve(problem, check=False)
     assert plan.status.converged
     assert plan.iterations <= 35
@@ -562,18 +552,8 @@ def test_penalties_between_nodes_weigh_as_the_cost_of_the_plan_does():
     robot = vp.load_robot("z1")
     begin = np.array([0.06, 0.1, -0.1, 0.05, -0.27, 0.18, -0.2])
     goal = begin + 0.7 * np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
-    cost += vp.Terminal(vp.TrackingCost(goal, 1e2) + vp.VelocityCost(1.0))
-    problem = vp.OptimalControlProblem(
-        vp.Scene(robot, damping="robot"),
-        cost,
-        begin,
-        np.zeros(7),
-        dt=0.04,
-        steps=25,
-        controls="linear",
-        constraints=[vp.WithinVelocityLimits(robot, (-0.8, 0.8))],
-    )
+    scene = vp.Scene(robot, damping="robot")
+    problem = reach(robot, 0.8, scene, begin, goal, dt=0.04, steps=25)
     plan = vp.solve(problem, check=False)
     assert plan.status.converged
     assert plan.violation <= 1e-9
