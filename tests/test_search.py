@@ -378,7 +378,7 @@ def test_what_was_given_up_is_tried_again_where_nothing_else_helps(steps, monkey
     free = vp.solve(swing(steps))
     monkeypatch.setattr("varpin.control.trials.HALVINGS", 0)
     monkeypatch.setattr(line_search, "HALVINGS", 0)
-    monkeypatch.setattr(line_search, "_MORE_HALVINGS", 0)
+    monkeypatch.setattr(line_search, "MORE_HALVINGS", 0)
     bounded = vp.solve(swing(steps))
     assert bounded.trajectory.statistics.substeps.max() > 1
     assert bounded.cost <= 1.05 * free.cost

@@ -18,7 +18,7 @@ from varpin.control.costs import CostError
 from varpin.control.descent import rounding
 from varpin.control.passes import Plan, noise_shares
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.trials import HALVINGS, Attempt, Trials, cut_less, few_halvings
+from varpin.control.trials import HALVINGS, MORE_HALVINGS, Attempt, Trials, cut_less, few_halvings
 from varpin.core import Watch
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
@@ -45,7 +45,6 @@ _SHORTEST, _TRIALS, _SHARPEST = 1e-6, 40, 0.25
 # Bounds on the substeps of a trial. A trial stops where a step needs more than HALVINGS halvings and more than the
 # current motion, or where the total exceeds _PARTS times that of the current motion. If no other trial leads far, the
 # stopped ones are repeated with larger bounds, then with none. A search that stalls continues without bounds.
-_MORE_HALVINGS = 3
 _PARTS = 3
 # Increase of the cost at which a trial stops, in units of what the slope gives: the next lengths do not depend on what
 # is beyond that. A relative margin well above rounding errors.
@@ -211,11 +210,10 @@ class LineSearch:
         self.armijo, self.backtracking, self.closed = armijo, backtracking, closed
         self._rounding = _at_rounding(problem.control_limits)
         integrator = problem.integrator
-        # Whether steps may be divided, and the integrator with fewer halvings, by their greatest number.
+        # Whether steps may be divided.
         self._divides = (
             isinstance(integrator, Variational) and integrator.guard is not None and is_dataclass(integrator)
         )
-        self._less: dict[int, Integrator] = {}
 
     def run(self, start: Start, shortest: float = 0.0) -> Step:
         """Find the first trial along the plan with sufficient decrease of the expected cost, (O13)."""
@@ -286,11 +284,8 @@ class LineSearch:
             yield _Bounds(integrator, np.inf, watched=False)
             return
         few = few_halvings(start.trajectory)
-        for halvings, parts in ((few, _PARTS), (few + _MORE_HALVINGS, _PARTS**2)):
-            less = self._less.get(halvings)
-            if less is None:
-                less = self._less[halvings] = cut_less(integrator, halvings)
-            yield _Bounds(less, parts, watched=halvings > HALVINGS)
+        for halvings, parts in ((few, _PARTS), (few + MORE_HALVINGS, _PARTS**2)):
+            yield _Bounds(cut_less(integrator, halvings), parts, watched=halvings > HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
     def _try(self, step: float, start: Start, here: _Here, bounds: _Bounds) -> Trial:

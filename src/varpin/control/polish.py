@@ -21,7 +21,7 @@ from varpin.control.closed_loop import ClosedLoop
 from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.trials import Trials, cut_less, few_halvings
+from varpin.control.trials import MORE_HALVINGS, Trials, cut_less, few_halvings
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.integrators.base import open_line, open_loop
@@ -50,8 +50,6 @@ _LITTLE, _ROUNDED = 1e-13, 1e-12
 _SMALL = 1e-3
 # Growth of changes of the controls without feedback, beside those with that of the cost, from which on they have it.
 _UNSTABLE = 1e3
-# Further halvings of a step that a motion may need beside the one before.
-_MORE_HALVINGS = 3
 # Pivots of the dual problem: of whole blocks without progress, and greatest number of single ones for each row.
 _TRIES, _PIVOTS = 4, 10
 
@@ -314,7 +312,7 @@ class _Step:
         None where the motion fails, or has no derivative.
         """
         # Under stiff feedback a motion that leaves the neighbourhood may need any number of parts.
-        near = cut_less(self.problem.integrator, few_halvings(self.motion) + _MORE_HALVINGS)
+        near = cut_less(self.problem.integrator, few_halvings(self.motion) + MORE_HALVINGS)
         attempt = trials.attempt(self._commands(length), integrator=near)
         if not attempt.whole:
             return None

@@ -22,8 +22,9 @@ from varpin.integrators.variational import Variational
 from varpin.mechanics.inputs import with_ends
 from varpin.trajectory import Trajectory
 
-# Halvings that a step of a trial may take, if the motion it is near has no more.
-HALVINGS = 2
+# Halvings that a step of a trial may take, if the motion it is near has no more, and further ones where it may take
+# more.
+HALVINGS, MORE_HALVINGS = 2, 3
 # Arrays that are the same for all whole motions of a problem under held controls, without constraints.
 _SHARED = ("t", "dw", "masses", "u_stages", "u_nodes", "constraint_forces")
 
