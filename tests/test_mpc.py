@@ -316,6 +316,9 @@ def test_a_run_ends_where_its_last_plan_does(controls, monkeypatch):
         vp.Mpc(problem).run(duration=2.0)
     assert about(str(caught.value), "no plan from here")
     assert caught.value.trajectory.t[-1] == pytest.approx(8 * usual.dt)
+    # The motion tells of all ticks before, which acted on the first plan.
+    (told,) = about(caught.value.trajectory.warnings, "failed ticks")
+    assert "in 8 of 8 ticks" in told
 
 
 def test_a_plan_acts_on_where_the_next_searches_fail(monkeypatch):

@@ -84,8 +84,9 @@ _STUCK, _LOWERED = 3, 0.9
 _HOPELESS = 5
 # Expected decrease, relative to the cost with penalties, with which a stalled search has not shown infeasibility.
 _MUCH = 1e-2
-# Greatest number of last steps, each with the rows between nodes of the motion before.
-_LOOKS = 8
+# Greatest number of last steps, each with the rows between nodes of the motion before. As long as peaks move, a
+# violation of _ROUGH and this share of the tolerance are enough.
+_LOOKS, _ROUGH, _SHARE = 8, 1e-8, 0.1
 # Violation between nodes that is left to the last steps.
 _CLOSE = 1e-6
 # Violation at which penalties stop growing; the last step removes the rest.
@@ -660,19 +661,25 @@ class _Rounds:
         found: Polished | None = None
         looked = seen(self.problem, motion) if dense else None
         least = max(self._left(motion, looked, backoff), FEASIBLE) if dense else np.inf
+        rough = dense
         try:
             for look in range(_LOOKS if dense else 1):
                 if dense:
                     between = self._followed(between, looked, backoff, anew=False)
                 self.whole = enforced(self.problem, between)
-                after = polished(self.whole, motion, values, known.weights, backoff, self.until)
+                rough = rough and look + 1 < _LOOKS
+                enough = (_ROUGH, _SHARE * self.tolerance) if rough else None
+                after = polished(self.whole, motion, values, known.weights, backoff, self.until, enough)
                 motion, values = after.motion, after.multipliers
                 looked = seen(self.problem, motion) if dense else None
                 left = self._left(motion, looked, backoff) if dense else 0.0
                 if not dense or (after.decrease <= self._bound(kept, after) and left <= least):
-                    found, least, known = after, left, replace(known, values=flat(values), **_of_instants(between))
+                    found, least = after, max(left, FEASIBLE)
+                    known = replace(known, values=flat(values), **_of_instants(between))
                     if look and left <= FEASIBLE:
-                        break
+                        if not rough:
+                            break
+                        rough = False
                 if time.perf_counter() > self.until:
                     break
         except (CostError, NoiseFieldError, LinearizationError):

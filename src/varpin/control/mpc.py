@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -338,24 +338,7 @@ class Mpc:
         plant = Plant(problem.scene) if plant is None else plant
         if not isinstance(plant, Plant):
             raise InputError(f"plant must be a varpin.Plant, for example varpin.Plant(scene), got {plant!r}")
-        joints, controls = plant.scene.robot.joint_names, plant.scene.controls
-        if joints != problem.scene.robot.joint_names or controls != problem.scene.controls:
-            raise InputError(
-                f"the plant has joints {', '.join(joints)} and {controls} controls; the problem "
-                f"{', '.join(problem.scene.robot.joint_names)} and {problem.scene.controls}"
-            )
-        if plant.scene.servo_joints != problem.scene.servo_joints:
-            raise InputError(
-                f"the plant has servos on {', '.join(plant.scene.servo_joints) or 'no joints'}; the problem on "
-                f"{', '.join(problem.scene.servo_joints) or 'no joints'}"
-            )
-        for kind in ("linear", "cubic"):
-            inputs = [_inputs(scene, cubic=kind == "cubic") for scene in (plant.scene, problem.scene)]
-            if inputs[0] != inputs[1]:
-                names_of = (", ".join(names) or "no joints" for names in inputs)
-                raise InputError(
-                    f"the plant has {kind} KinematicInputs on {next(names_of)}; the problem on {next(names_of)}"
-                )
+        _require_fit(plant, problem)
         ticks = max(1, round(positive("duration", duration, "s") / self.period))
         dt = self.period / plant.substeps
         drawn_by = None if rng is None else generator(rng)
@@ -372,6 +355,11 @@ class Mpc:
         parts: list[Trajectory] = []
         plans, seconds, iterations = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64)
         late, failed, reasons = np.zeros(ticks, bool), np.zeros(ticks, bool), list[str]()
+
+        def so_far(*last: Trajectory) -> Trajectory:
+            planned = failed[: len(parts) + 1]
+            return _so_far(plant, method, [*parts, *last], _failed(planned, reasons, self.period))
+
         try:
             for tick in range(ticks):
                 if tick > 0:
@@ -383,7 +371,7 @@ class Mpc:
                     except (StepFailure, LinearizationError, NoiseFieldError) as error:
                         failure = error
                     except CostError as error:
-                        raise CostError(error.cost, error.problem, _so_far(plant, method, parts)) from error
+                        raise CostError(error.cost, error.problem, so_far()) from error
                     if fresh is not None and fresh.status is Status.INTERRUPTED:
                         # A search keeps its best plan and returns; the run is what Ctrl-C is to end.
                         raise KeyboardInterrupt
@@ -395,7 +383,7 @@ class Mpc:
                     if failed[tick]:
                         reasons.append(_why(failure) if fresh is None else fresh.reason)
                         if age + 1 >= len(active.gains) - problem.linear:
-                            raise _unplanned(reasons[-1], failure, _so_far(plant, method, parts)) from failure
+                            raise _unplanned(reasons[-1], failure, so_far()) from failure
                     active, age = (active, age + 1) if fresh is None or late[tick] or failed[tick] else (fresh, 0)
                 plans.append(active)
                 begun = None
@@ -403,7 +391,7 @@ class Mpc:
                     # A fresh plan begins at the measured state; one that acts on, where the line before ended.
                     begun = active.controls[0] if age == 0 or applied is None else applied
                 applied = _decision(active, age, q, v, before if begun is None else begun)
-                parts.append(_simulated(plant, method, dt, q, v, applied, drawn_by, parts, begun))
+                parts.append(_simulated(plant, method, dt, q, v, applied, drawn_by, begun, so_far))
                 if watched and not unfit:
                     unfit = _unfit(plant.scene, method, parts[-1], tick * self.period)
                 q, v = parts[-1].q[-1], parts[-1].v[-1]
@@ -415,7 +403,7 @@ class Mpc:
         except KeyboardInterrupt:
             if not parts:
                 raise
-            raise Interrupted(_so_far(plant, method, parts)) from None
+            raise Interrupted(so_far()) from None
         motion, found = examined_in_loop(plant.scene, method, chained(parts), plant.substeps, corrected=True)
         found = (*noise_forgotten(plant.scene, rng), *unfit, *found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
@@ -441,6 +429,28 @@ class Mpc:
                 *(finding.sentence for finding in found),
             ),
         )
+
+
+def _require_fit(plant: Plant, problem: OptimalControlProblem) -> None:
+    """Raise an InputError unless the plant has the joints, servos and inputs of the problem."""
+    joints, controls = plant.scene.robot.joint_names, plant.scene.controls
+    if joints != problem.scene.robot.joint_names or controls != problem.scene.controls:
+        raise InputError(
+            f"the plant has joints {', '.join(joints)} and {controls} controls; the problem "
+            f"{', '.join(problem.scene.robot.joint_names)} and {problem.scene.controls}"
+        )
+    if plant.scene.servo_joints != problem.scene.servo_joints:
+        raise InputError(
+            f"the plant has servos on {', '.join(plant.scene.servo_joints) or 'no joints'}; the problem on "
+            f"{', '.join(problem.scene.servo_joints) or 'no joints'}"
+        )
+    for kind in ("linear", "cubic"):
+        inputs = [_inputs(scene, cubic=kind == "cubic") for scene in (plant.scene, problem.scene)]
+        if inputs[0] != inputs[1]:
+            names_of = (", ".join(names) or "no joints" for names in inputs)
+            raise InputError(
+                f"the plant has {kind} KinematicInputs on {next(names_of)}; the problem on {next(names_of)}"
+            )
 
 
 def _outside(held: Sequence[Kept], *, noisy: bool) -> tuple[Finding, ...]:
@@ -496,10 +506,10 @@ def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, .
     return (Finding("rounded duration", sentence),)
 
 
-def _so_far(plant: Plant, method: Integrator, parts: Sequence[Trajectory]) -> Trajectory:
-    """The plant's motion so far, with its warnings."""
+def _so_far(plant: Plant, method: Integrator, parts: Sequence[Trajectory], found: tuple[Finding, ...]) -> Trajectory:
+    """The plant's motion so far, with its warnings and those of ``found``."""
     motion = chained(parts)
-    return with_warnings(motion, findings_from_record(plant.scene, method, motion))
+    return with_warnings(motion, (*findings_from_record(plant.scene, method, motion), *found))
 
 
 def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:
@@ -683,10 +693,10 @@ def _simulated(
     v: Floats,
     u: Floats,
     rng: np.random.Generator | None,
-    before: Sequence[Trajectory],
     begun: Floats | None,
+    joined: Callable[[Trajectory], Trajectory],
 ) -> Trajectory:
-    """The plant's motion in one tick; a failure holds the motion ``before``, too.
+    """The plant's motion in one tick; a failure holds the motion that is ``joined`` with that of the ticks before.
 
     Controls are linear in time from ``begun`` to ``u``, or hold ``u`` where ``begun`` is None.
     """
@@ -706,5 +716,5 @@ def _simulated(
         # The whole run is examined, and its findings logged, at the end.
         return simulated(plant.scene, q, v, **options, check=False)[0]
     except StepFailure as failure:
-        whole = _so_far(plant, method, [*before, failure.trajectory])
+        whole = joined(failure.trajectory)
         raise StepFailure(whole.steps, whole.t[-1], Failure(failure.reason, failure.residual), whole) from None

@@ -304,21 +304,20 @@ class PenalizedProblem(OptimalControlProblem):
         for penalty, s, found, rows, push in zip(self.penalties, shifted, slopes, held, pushes, strict=True):
             if found is None or not rows.any():
                 continue
-            within, counted = isinstance(penalty.bound, BoundBetween), rows.astype(float)
+            within = isinstance(penalty.bound, BoundBetween)
+            counted: Floats = penalty.weight * rows.astype(np.float64)
             J = found.in_step()
             z, (gradient, hessian) = slice(0, J.shape[2]), begins if within else ends
             if isinstance(penalty.bound, BoundOnCubics):
                 gradient, hessian = middles
-            # A step may have several places within it.
             steps = found.nodes if within else found.nodes - 1
-            slope = penalty.weight * np.einsum("kr,krx->kx", s * counted, J)
-            second = penalty.weight * (np.swapaxes(J, 1, 2) @ (counted[:, :, None] * J))
+            of_step, pull, weighed = _by_step(steps, N, J, counted, s)
+            gradient[:, z] += (of_step @ (weighed * pull)[:, :, None])[:, :, 0]
+            hessian[:, z, z] += of_step @ (weighed[:, :, None] * np.swapaxes(of_step, 1, 2))
             if found.curved is not None:
-                pushed = counted * (penalty.weight * np.maximum(s, 0.0) if push is None else push)
-                second += np.swapaxes(found.curved, 1, 2) @ (pushed[:, :, None] * found.curved)
-            own, first = np.unique(steps, return_index=True)
-            gradient[own, z] += np.add.reduceat(slope, first)
-            hessian[own, z, z] += np.add.reduceat(second, first)
+                pushed = counted * np.maximum(s, 0.0) if push is None else rows.astype(np.float64) * push
+                of_step, _, weighed = _by_step(steps, N, found.curved, pushed, s)
+                hessian[:, z, z] += of_step @ (weighed[:, :, None] * np.swapaxes(of_step, 1, 2))
         # All samples of the model have the same weight.
         weight = self.dt * float(self.rule[0, 0])
         there = np.broadcast_to(expansion.hessian, (len(expansion.gradient), size, size)).reshape(N, -1, size, size)
@@ -329,6 +328,28 @@ class PenalizedProblem(OptimalControlProblem):
         begun = Expansion(begins[0] / self.dt, begins[1] / self.dt) if self.within and self.linear else None
         gradients, hessians = np.concatenate(parts, axis=1), np.concatenate(curved, axis=1)
         return Expansion(gradients.reshape(-1, size), hessians.reshape(-1, size, size), begun)
+
+
+def _by_step(steps: Integers, count: int, J: Floats, weights: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
+    """The rows with a weight, step by step: of derivatives (N, columns, P), values and weights (N, P).
+
+    Args:
+        steps: The step of each place (K,), in ascending order; it may have several.
+        count: Number of steps N.
+        J: Derivatives of the rows (K, rows, columns).
+        weights: Of the rows (K, rows).
+        values: Of the rows (K, rows).
+    """
+    places, rows = np.nonzero(weights)
+    own = steps[places]
+    counts = np.bincount(own, minlength=count)
+    slot = np.arange(len(own)) - np.repeat(np.cumsum(counts) - counts, counts)
+    most = int(counts.max(initial=0))
+    slopes = np.zeros((count, J.shape[2], most))
+    slopes[own, :, slot] = J[places, rows]
+    both = np.zeros((2, count, most))
+    both[0, own, slot], both[1, own, slot] = values[places, rows], weights[places, rows]
+    return slopes, both[0], both[1]
 
 
 def weights_for(cost: float, bound: Sequence[BoundConstraint]) -> Floats:

@@ -81,6 +81,7 @@ def polished(
     weights: Floats,
     backoff: list[Floats],
     until: float = math.inf,
+    enough: tuple[float, float] | None = None,
 ) -> Polished:
     """The motion near a given one that satisfies its constraints, and the conditions of an optimum, most closely.
 
@@ -93,15 +94,18 @@ def polished(
         weights: Weights of the penalties (C,), which count in the feedback along the motion.
         backoff: For each constraint (K, rows).
         until: Time of ``time.perf_counter`` from which on no step begins.
+        enough: Violation, and decrease of the cost relative to the cost at stake, that end the steps; by default those
+            that are rounding errors.
 
     Raises:
         LinearizationError: A step of the given motion has no derivative.
         CostError: An expansion of the cost is not finite along it.
     """
+    closely, flat = (_DONE, _FLAT) if enough is None else enough
     trials, longest = Trials(problem), 1.0
     step = _first(problem, motion, multipliers, weights, backoff)
     for left in reversed(range(_STEPS)):
-        there = step.found.violation <= _DONE and step.found.decrease <= _FLAT * step.found.stake
+        there = step.found.violation <= closely and step.found.decrease <= flat * step.found.stake
         if there or time.perf_counter() > until:
             break
         step.solve(until)
