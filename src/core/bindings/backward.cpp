@@ -218,16 +218,17 @@ void run_gradients(double h, int hold, double regularization, const HeldSteps& g
 }
 
 // The linearized motion under gains from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
-void foresee(int hold, const HeldSteps& given, const HeldGains& held, InOut<1> state, InOut<2> expected,
-             InOut<2> moves) {
+void foresee(int hold, const HeldSteps& given, const HeldGains& held, InOut<1> state, InOut<2> expected, InOut<2> moves,
+             std::optional<InOut<2>> after) {
     const Gains gains = held.fitting(given, hold);
     const auto R = static_cast<std::size_t>(given.steps.steps / hold);
     const auto m = static_cast<std::size_t>(given.steps.controls), size = static_cast<std::size_t>(given.steps.size());
     require(state, "state", {size});
     require(expected, "expected", {R, size});
     require(moves, "moves", {R, m});
+    if (after) require(*after, "after", {static_cast<std::size_t>(given.steps.steps), size - m});
     nb::gil_scoped_release release;
-    predict(hold, given.steps, gains, state.data(), expected.data(), moves.data());
+    predict(hold, given.steps, gains, state.data(), expected.data(), moves.data(), after ? after->data() : nullptr);
 }
 
 template <class Pass>
@@ -283,7 +284,7 @@ void register_backward(nb::module_& m) {
     define_results(root_pass);
     m.def("run_gradients", &run_gradients, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "terminal"_a);
     m.def("foresee", &foresee, "hold"_a, "steps"_a, "gains"_a, "state"_a.noconvert(), "expected"_a.noconvert(),
-          "moves"_a.noconvert());
+          "moves"_a.noconvert(), "after"_a.noconvert() = nb::none());
     m.def("box_minimum", &box_minimum, "H"_a, "g"_a, "limits"_a, "guess"_a);
 }
 

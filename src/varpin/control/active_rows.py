@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats, Integers, Mask
 from varpin.control.along import Along
 from varpin.control.constraints import BoundOnCubics
-from varpin.control.passes import Plan
+from varpin.control.passes import Plan, foreseen
 from varpin.control.penalties import PenalizedProblem, PenalizedRate, T, controls_of_steps, flat, rate_columns, split
 
 # Bisections of the line search between two passes.
@@ -104,20 +104,12 @@ class Rows:
 
         By default ``slack`` (R, 2, m) is that of the control limits.
         """
-        problem, hold = self.problem, self.problem.hold
-        (A, B), x = passing.maps, self.states.shape[1]
-        slack = passing.slack if slack is None else slack
-        states, moves = np.zeros((len(A) + 1, A.shape[1])), np.zeros(plan.feedforward.shape)
-        for j in range(len(A)):
-            k = j // hold
-            if j % hold == 0:
-                move = plan.feedforward[k] + plan.feedback[k] @ states[j, :x]
-                if plan.previous is not None and k > 0:
-                    move = move + plan.previous[k] @ moves[k - 1]
-                moves[k] = np.clip(move, slack[k, 0], slack[k, 1]) if slack.size else move
-            states[j + 1] = A[j] @ states[j] + B[j] @ moves[k]
+        problem, x = self.problem, self.states.shape[1]
+        ((_, steps),) = passing.blocks
+        states = np.zeros((steps + 1, passing.states))
+        _, moves = foreseen(passing, plan, slack, after=states[1:])
         # With linear controls the first step is the one that sets the first control.
-        states = states[len(A) - problem.steps :, :x]
+        states = states[steps - problem.steps :, :x]
         self.ahead_of = states, moves
         found = []
         for s, parts, rows in zip(self.signed[: len(self.of_nodes)], self.by_state, self.slopes, strict=True):

@@ -323,14 +323,6 @@ class Along:
             found += np.einsum("Na,Nb->Nab", row, row) / effort**2
         return widened(found, m) if problem.linear else found
 
-    @property
-    def maps(self) -> tuple[Floats, Floats]:
-        """A and B of all steps of a pass whose motion is one block, with the control in the state if it is linear."""
-        if self.problem.linear:
-            return self.line.A, self.line.B
-        lin, _ = self.linearized(0, self.problem.steps)
-        return lin.A, lin.B
-
     def linearized(self, begin: int, end: int) -> tuple[Linearization, Floats]:
         """A block of steps, and dv/dx at its nodes where they are needed."""
         if self.kept is not None:

@@ -100,11 +100,14 @@ def without_feedback(plan: Plan, moves: Floats) -> Plan:
     return replace(plan, feedforward=moves, feedback=np.zeros(plan.feedback.shape), previous=previous)
 
 
-def foreseen(along: Along, plan: Plan, slack: Floats | None = None) -> tuple[Floats, Floats]:
+def foreseen(
+    along: Along, plan: Plan, slack: Floats | None = None, after: Floats | None = None
+) -> tuple[Floats, Floats]:
     """The linearized motion under a plan whose controls are clipped to their limits, or to ``slack`` (R, 2, m).
 
     Returns the state and the change of the previous control before each decision (R, 2n + m), and the controls' changes
-    (R, m). Where controls are linear between nodes the state is X of :mod:`varpin.control.linear_controls`.
+    (R, m); ``after`` (N, 2n) receives the state after each step. Where controls are linear between nodes the state is X
+    of :mod:`varpin.control.linear_controls`, and there are N + 1 steps.
     """
     problem, (R, m, _), x = along.problem, plan.feedback.shape, along.states
     feedback, previous = gains_on_states(along, plan)
@@ -122,7 +125,8 @@ def foreseen(along: Along, plan: Plan, slack: Floats | None = None) -> tuple[Flo
         )
         within = around_nominal(along.slack if slack is None else slack, x)
         steps = along.steps(begin, end, None, within)
-        core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows])
+        then = None if after is None else after[begin:end]
+        core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows], then)
     return expected, moves
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -210,7 +211,7 @@ class PenalizedProblem(OptimalControlProblem):
         """See :attr:`OptimalControlProblem.steered`."""
         return super().steered & (not self.quiet)
 
-    @property
+    @cached_property
     def model_rule(self) -> Floats:
         """See :attr:`OptimalControlProblem.model_rule`."""
         # Weight, and coefficients that select q and v at the end of the step.
@@ -320,13 +321,17 @@ class PenalizedProblem(OptimalControlProblem):
                 hessian[:, z, z] += of_step @ (weighed[:, :, None] * np.swapaxes(of_step, 1, 2))
         # All samples of the model have the same weight.
         weight = self.dt * float(self.rule[0, 0])
-        there = np.broadcast_to(expansion.hessian, (len(expansion.gradient), size, size)).reshape(N, -1, size, size)
-        samples = [ends, begins] if self._begins else [ends]
-        samples += [] if self.cubic is None else [middles]
-        parts = [expansion.gradient.reshape(N, -1, size), *(gradient[:, None] / weight for gradient, _ in samples)]
-        curved = [there, *(hessian[:, None] / weight for _, hessian in samples)]
+        added = [ends, begins] if self._begins else [ends]
+        added += [] if self.cubic is None else [middles]
+        own = len(expansion.gradient) // N
+        gradients, hessians = np.empty((N, own + len(added), size)), np.empty((N, own + len(added), size, size))
+        gradients[:, :own] = expansion.gradient.reshape(N, own, size)
+        same = len(expansion.hessian) == 1
+        hessians[:, :own] = expansion.hessian if same else expansion.hessian.reshape(N, own, size, size)
+        for sample, (gradient, hessian) in enumerate(added, start=own):
+            np.divide(gradient, weight, out=gradients[:, sample])
+            np.divide(hessian, weight, out=hessians[:, sample])
         begun = Expansion(begins[0] / self.dt, begins[1] / self.dt) if self.within and self.linear else None
-        gradients, hessians = np.concatenate(parts, axis=1), np.concatenate(curved, axis=1)
         return Expansion(gradients.reshape(-1, size), hessians.reshape(-1, size, size), begun)
 
 

@@ -460,12 +460,20 @@ def run_gradients(
     arrays are those of the pass.
     """
 
-def foresee(hold: int, steps: ExpandedSteps, gains: Gains, state: Floats, expected: Floats, moves: Floats) -> None:
+def foresee(
+    hold: int,
+    steps: ExpandedSteps,
+    gains: Gains,
+    state: Floats,
+    expected: Floats,
+    moves: Floats,
+    after: Floats | None = None,
+) -> None:
     """The linearized motion under gains, each control clipped to its limits.
 
     ``state`` (2n + m,) has the deviations of the state and of the previous control at the start, and is overwritten by
     those at the end. ``expected`` (R, 2n + m) receives those before each decision, ``moves`` (R, m) the changes of the
-    controls.
+    controls, and ``after`` (N, 2n) the deviations of the state after each step.
     """
 
 def box_minimum(H: Floats, g: Floats, limits: Floats, guess: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]] | None:

@@ -67,9 +67,10 @@ struct Gains {
 
 // The linearized motion under the gains, each control clipped to its limits, from `state` (2n + m): the deviation of
 // the state and of the previous control at the start, overwritten by those at the end. Writes the deviations before
-// each decision into `expected` (R, 2n + m), and the changes of the controls into `moves` (R, m).
+// each decision into `expected` (R, 2n + m), the changes of the controls into `moves` (R, m), and unless it is null
+// the states after each step into `after` (N, 2n).
 inline void predict(int hold, const ExpandedSteps& steps, const Gains& gains, double* state, double* expected,
-                    double* moves) {
+                    double* moves, double* after) {
     const int x = steps.states(), m = steps.controls, size = steps.size();
     std::vector<double> next(x);
     for (std::ptrdiff_t s = 0; s < steps.steps; ++s) {
@@ -99,6 +100,7 @@ inline void predict(int hold, const ExpandedSteps& steps, const Gains& gains, do
             next[i] = total;
         }
         std::copy_n(next.data(), x, state);
+        if (after) std::copy_n(state, x, after + s * x);
     }
 }
 
