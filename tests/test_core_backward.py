@@ -232,6 +232,37 @@ def test_curvature_and_blocks():
     np.testing.assert_allclose((run.slope, run.curvature, run.noise), sums, rtol=1e-10)
 
 
+@pytest.mark.parametrize("hold", [1, 3])
+@pytest.mark.parametrize("rated", [False, True])
+@pytest.mark.parametrize("limited", [False, True])
+def test_the_linearized_motion_under_gains_is_the_sum_of_its_steps(hold, rated, limited):
+    """With controls that are clipped to their slack, and the states after all steps, also within a decision."""
+    given = random_steps(2, 2, 0, seed=4, hold=hold, rated=rated)
+    A, B, R, rng = given["A"], given["B"], 6 // hold, np.random.default_rng(5)
+    if limited:
+        given["slack"] = np.stack([-rng.uniform(0.1, 1.0, (R, 2)), rng.uniform(0.1, 1.0, (R, 2))], axis=1)
+        given["expected"] = np.zeros((0, 6))
+    gains = {name: rng.normal(size=array.shape) for name, array in gains_for(given, hold).items()}
+    state, expected, moves, after = rng.normal(size=6), np.empty((R, 6)), np.empty((R, 2)), np.empty((6, 4))
+    begin = state.copy()
+    core.foresee(hold, core.ExpandedSteps(**given), core.Gains(**gains), state, expected, moves, after)
+    x, before = begin[:4], begin[4:]
+    for s in range(6):
+        r = s // hold
+        if s % hold == 0:
+            np.testing.assert_allclose(expected[r], [*x, *before], rtol=1e-12)
+            before = (
+                gains["feedforward"][r] + gains["feedback"][r] @ x + (gains["previous"][r] @ before if rated else 0)
+            )
+            before = np.clip(before, *given["slack"][r]) if limited else before
+            np.testing.assert_allclose(moves[r], before, rtol=1e-12)
+        x = A[s] @ x + B[s] @ before
+        np.testing.assert_allclose(after[s], x, rtol=1e-12)
+    np.testing.assert_allclose(state, [*x, *before], rtol=1e-12)
+    with refused(ValueError, ("after", "5", "6")):
+        core.foresee(hold, core.ExpandedSteps(**given), core.Gains(**gains), begin, expected, moves, after[:5])
+
+
 def test_the_decision_without_a_minimum_is_told():
     given = random_steps(2, 2, 0, seed=2)
     given["hessian"][2 * 3 : 2 * 4, 4:, 4:] = -1e6 * np.eye(2)
