@@ -8,6 +8,7 @@ from scipy.optimize import lsq_linear, minimize
 import varpin as vp
 from varpin.control.active_rows import Pushes
 from varpin.control.between_nodes import NOWHERE, Instants, beyond, enforced, seen, updated
+from varpin.control.box import Box
 from varpin.control.closed_loop import ClosedLoop
 from varpin.control.multipliers import at_nodes
 from varpin.control.penalties import split
@@ -522,6 +523,35 @@ def test_interior_point_steps_end_where_rounding_errors_keep_the_gap(monkeypatch
     assert plan.iterations <= 35
     assert len(steps) > 3
     assert max(steps) <= 25
+
+
+def test_interior_point_steps_lead_to_a_plan_where_the_next_pass_fails(monkeypatch):
+    """For rounding errors there is no minimum of its model; the point before it is the result, if its gap is small."""
+    passed, steps, inner, most = Box._passed, [], [], [0]
+
+    def failing(self, limits, stiff=None, pull=None):
+        if stiff is not None and limits.factors is None:
+            steps.append(None)
+            if len(steps) > most[0]:
+                return None
+        return passed(self, limits, stiff, pull)
+
+    real = Box._interior_with_rows
+
+    def noted(self, plan, rows):
+        steps.clear()
+        inner.append(real(self, plan, rows))
+        return inner[-1]
+
+    monkeypatch.setattr(Box, "_passed", failing)
+    monkeypatch.setattr(Box, "_interior_with_rows", noted)
+    problem = reach(ROBOT, 0.6, begin=[0.1, 0.1], goal=[0.7, -0.7])
+    for most[0], finds in ((6, False), (24, True)):
+        inner.clear()
+        plan = vp.solve(problem, check=False, max_iterations=3)
+        assert np.isfinite(plan.cost)
+        assert len(inner) > 0
+        assert all((found is not None) == finds for found in inner)
 
 
 def test_trials_of_the_last_step_that_leave_are_given_up():

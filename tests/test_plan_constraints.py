@@ -10,6 +10,7 @@ from findings import about
 from refusals import naming, refused, unnamed
 from scipy.integrate import solve_ivp
 from scipy.optimize import lsq_linear, minimize, nnls
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import varpin as vp
 from varpin.control import ViolationOnRobot, polish, unconstrained
@@ -1222,3 +1223,18 @@ def test_margins_settle_where_noise_follows_the_controls():
     options = {"controls": plan.policy, "integrator": problem.integrator}
     found = vp.simulate_ensemble(scene, begin, np.zeros(7), paths=1000, rng=1, **grid, **options)
     assert (found.q > goal - 0.1).mean(axis=0).max() < 0.05
+
+
+def test_linear_algebra_has_one_thread_within_constraints():
+    """Of several plans at a time on one machine, each would take many times as long; afterwards it is as before."""
+    problem, seen = two_links(FAMILIES["velocities"], steps=10), []
+
+    def threads():
+        return {item["num_threads"] for item in threadpool_info() if item["user_api"] == "blas"}
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = threads()
+        vp.solve(problem, check=False, callback=lambda *_: seen.append(threads()))
+        assert threads() == before
+    assert len(seen) > 0
+    assert all(each == {1} for each in seen)

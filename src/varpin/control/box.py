@@ -351,6 +351,7 @@ class Box:
         begun = rows.ahead(self.along, without_feedback(plan, z), np.stack([z, z], axis=1))
         pushes = Pushes(rows, flat(begun), mu)
         past: list[float] = []  # gaps after the steps
+        before: tuple[list[Floats], list[Floats]] | None = None
         for _ in range(_STEPS_WITH_ROWS):
             if time.perf_counter() > self.until:
                 return None
@@ -366,7 +367,7 @@ class Box:
                 box = Box(pushes.along(aim), self.curvature).with_proximal(self.proximal)
                 found = box._passed(around_nominal(slack, self.along.states), stiff, pull)
                 if found is None:
-                    return None
+                    break
                 to = foreseen(box.along, found, slack)[1]
                 d = np.where(fixed, 0.0, to - z)
                 after = [(aims[0] - duals[0] * d) / gaps[0], (aims[1] + duals[1] * d) / gaps[1]]
@@ -386,6 +387,8 @@ class Box:
                     np.where(some, center - a * b, 0.0) for some, a, b in zip(bounded, opening, turning, strict=True)
                 ]
                 aim = center - pushes.bent
+            if found is None:
+                break
             z, before = z + length * d, (gaps, duals)
             gaps = self._gaps(z, bounded)
             duals = [dual + length * more for dual, more in zip(duals, turning, strict=True)]
@@ -396,6 +399,9 @@ class Box:
             past.append(left)
             if len(past) > _STILL and _STANDS * past[-1 - _STILL] < left < _SMALL * past[0]:
                 break
+        # Large products and small gaps may leave the pass no minimum but for rounding errors.
+        if before is None or (found is None and past[-1] > _SMALL * past[0]):
+            return None
         # In the last step the gap of a limit that binds fell by more than its multiplier, and that of others by less.
         held = [
             some & (np.where(some, gap, 0.0) * old_dual < dual * np.where(some, old_gap, 0.0))
