@@ -2,7 +2,7 @@
 
     python -m venv croco
     croco/bin/pip install "crocoddyl==3.2.1" "pin==4.0.0" "libpinocchio==4.0.0" \
-        example-robot-data numpy scipy u-msgpack-python meshcat matplotlib rich
+        example-robot-data numpy scipy threadpoolctl u-msgpack-python meshcat matplotlib rich
     PYTHONPATH=src croco/bin/python benchmarks/crocoddyl_reference.py tests/data/crocoddyl.json
 
 An environment of its own, because crocoddyl 3.2.1 was built against Pinocchio 4.0.0: beside pin 4.1.0 it loads, and

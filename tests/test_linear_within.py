@@ -1,11 +1,14 @@
 """Plans within hard constraints whose controls are linear between nodes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from findings import about
 from scipy.optimize import lsq_linear, minimize
 
 import varpin as vp
+from varpin.control import augmented
 from varpin.control.active_rows import Pushes
 from varpin.control.between_nodes import NOWHERE, Instants, beyond, enforced, seen, updated
 from varpin.control.box import Box
@@ -13,6 +16,7 @@ from varpin.control.closed_loop import ClosedLoop
 from varpin.control.multipliers import at_nodes
 from varpin.control.penalties import split
 from varpin.control.polish import _first as first_step
+from varpin.control.polish import judged
 from varpin.control.spread import Feedback, covariances
 from varpin.control.trials import Trials
 from varpin.errors import LinearizationError
@@ -526,13 +530,14 @@ def test_interior_point_steps_end_where_rounding_errors_keep_the_gap(monkeypatch
 
 
 def test_interior_point_steps_lead_to_a_plan_where_the_next_pass_fails(monkeypatch):
-    """For rounding errors there is no minimum of its model; the point before it is the result, if its gap is small."""
-    passed, steps, inner, most = Box._passed, [], [], [0]
+    """Because of rounding errors its model has no minimum: the point before is the result, if its gap is small."""
+    passed, steps, failed, inner, most = Box._passed, [], [], [], [0]
 
     def failing(self, limits, stiff=None, pull=None):
         if stiff is not None and limits.factors is None:
             steps.append(None)
             if len(steps) > most[0]:
+                failed.append(None)
                 return None
         return passed(self, limits, stiff, pull)
 
@@ -546,12 +551,41 @@ def test_interior_point_steps_lead_to_a_plan_where_the_next_pass_fails(monkeypat
     monkeypatch.setattr(Box, "_passed", failing)
     monkeypatch.setattr(Box, "_interior_with_rows", noted)
     problem = reach(ROBOT, 0.6, begin=[0.1, 0.1], goal=[0.7, -0.7])
-    for most[0], finds in ((6, False), (24, True)):
-        inner.clear()
+    # Two passes a step: the first or the second of them fails.
+    for most[0], finds in ((6, False), (18, True), (19, True)):
+        for calls in (inner, failed):
+            calls.clear()
         plan = vp.solve(problem, check=False, max_iterations=3)
         assert np.isfinite(plan.cost)
         assert len(inner) > 0
+        assert len(failed) == len(inner)
         assert all((found is not None) == finds for found in inner)
+
+
+def test_last_steps_are_rough_as_long_as_peaks_move(monkeypatch):
+    """Only the last one goes on to rounding errors; one that does not move the motion is not made again."""
+    enough, real = [], augmented.polished
+
+    def noted(*given):
+        enough.append(given[-1])
+        return real(*given)
+
+    monkeypatch.setattr(augmented, "polished", noted)
+    plan = vp.solve(links("speeds"), check=False)
+    assert plan.status.converged
+    assert len(enough) >= 2
+    assert enough[0] is not None
+    assert enough[-1] is None
+    assert plan.violation <= 1e-11
+
+    def still(problem, motion, multipliers, weights, backoff, *_):
+        enough.append(None)
+        return replace(judged(problem, motion, multipliers, weights, backoff), decrease=np.inf)
+
+    enough.clear()
+    monkeypatch.setattr(augmented, "polished", still)
+    assert vp.solve(links("speeds"), check=False).status in vp.Status
+    assert 1 <= len(enough) <= 2
 
 
 def test_trials_of_the_last_step_that_leave_are_given_up():

@@ -1,6 +1,7 @@
 """Hard constraints of plans: against SciPy on the same grid, KKT conditions by differences, what is refused."""
 
 import functools
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -18,10 +19,11 @@ from varpin.control.augmented import within_constraints
 from varpin.control.backward import backward
 from varpin.control.hints import hints
 from varpin.control.hints import reach as hints_reach
-from varpin.control.penalties import penalized, split
+from varpin.control.penalties import _by_step, penalized, split
 from varpin.control.spread import Feedback, deviations
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
+from varpin.support.one_thread import one_thread
 
 
 def two_links(constraints=(), *, steps=24, cost=None, **options):
@@ -1238,3 +1240,37 @@ def test_linear_algebra_has_one_thread_within_constraints():
         assert threads() == before
     assert len(seen) > 0
     assert all(each == {1} for each in seen)
+
+
+def test_linear_algebra_has_one_thread_until_the_last_of_several_searches_ends():
+    """Searches of one process, side by side: the first to end does not restore what the others need."""
+
+    def threads():
+        return {item["num_threads"] for item in threadpool_info() if item["user_api"] == "blas"}
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        before, first, second = threads(), ExitStack(), ExitStack()
+        first.enter_context(one_thread())
+        second.enter_context(one_thread())
+        first.close()
+        assert threads() == {1}
+        second.close()
+        assert threads() == before
+
+
+def test_rows_are_gathered_by_their_steps():
+    """Several places in a step, steps without any, and rows without weight: the sums over each step are the same."""
+    rng, steps = np.random.default_rng(8), np.array([1, 1, 3, 4])
+    J, values = rng.normal(size=(4, 3, 5)), rng.normal(size=(4, 3))
+    weights = rng.random((4, 3)) * (rng.random((4, 3)) < 0.6)
+    slopes, pull, weighed = _by_step(steps, 6, J, weights, values)
+    gradient, hessian = np.zeros((6, 5)), np.zeros((6, 5, 5))
+    for k, step in enumerate(steps):
+        for row, weight, value in zip(J[k], weights[k], values[k], strict=True):
+            gradient[step] += weight * value * row
+            hessian[step] += weight * np.outer(row, row)
+    assert slopes.shape[2] == np.bincount(steps, (weights > 0.0).sum(axis=1)).max()
+    np.testing.assert_allclose((slopes @ (weighed * pull)[:, :, None])[:, :, 0], gradient, atol=1e-14)
+    np.testing.assert_allclose(slopes @ (weighed[:, :, None] * np.swapaxes(slopes, 1, 2)), hessian, atol=1e-14)
+    none, _, _ = _by_step(steps, 6, J, np.zeros((4, 3)), values)
+    assert none.shape == (6, 5, 0)

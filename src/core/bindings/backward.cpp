@@ -284,7 +284,7 @@ void register_backward(nb::module_& m) {
     define_results(root_pass);
     m.def("run_gradients", &run_gradients, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "terminal"_a);
     m.def("foresee", &foresee, "hold"_a, "steps"_a, "gains"_a, "state"_a.noconvert(), "expected"_a.noconvert(),
-          "moves"_a.noconvert(), "after"_a.noconvert() = nb::none());
+          "moves"_a.noconvert(), "after"_a.noconvert().none() = nb::none());
     m.def("box_minimum", &box_minimum, "H"_a, "g"_a, "limits"_a, "guess"_a);
 }
 

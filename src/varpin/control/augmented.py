@@ -18,7 +18,6 @@ from typing import Any, ParamSpec, TypeAlias
 
 import numpy as np
 from scipy import ndimage
-from threadpoolctl import threadpool_limits
 
 from varpin.arrays import Floats
 from varpin.control.backward import backward
@@ -43,6 +42,7 @@ from varpin.errors import InputError, LinearizationError, VarpinError
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.simulation.soundness import announce
 from varpin.support.checks import count, flag, positive
+from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
 
 P = ParamSpec("P")
@@ -86,7 +86,7 @@ _HOPELESS = 5
 # Expected decrease, relative to the cost with penalties, with which a stalled search has not shown infeasibility.
 _MUCH = 1e-2
 # Greatest number of last steps, each with the rows between nodes of the motion before. As long as peaks move, a
-# violation of _ROUGH and this share of the tolerance are enough.
+# violation of _ROUGH and a decrease of the cost by _SHARE of the tolerance are enough.
 _LOOKS, _ROUGH, _SHARE = 8, 1e-8, 0.1
 # Violation between nodes that is left to the last steps.
 _CLOSE = 1e-6
@@ -109,9 +109,7 @@ def within_constraints(search: Callable[P, Solution]) -> Callable[P, Solution]:
         given = signature.bind(*args, **kwargs)
         options = {name: value for name, value in given.arguments.items() if name not in ("problem", "true_cost")}
         wish = given.arguments.get("true_cost")
-        # A second thread saves a tenth of the time, but threads that wait for each other spin: of two plans at a time
-        # on two cores, each would take ten times as long.
-        with threadpool_limits(limits=1, user_api="blas"):
+        with one_thread():
             if wish is None:
                 return _Rounds(problem, search, options).run()
             return _to_true_cost(problem, search, options, positive("true_cost", wish, "1"))
@@ -656,7 +654,7 @@ class _Rounds:
         """The plan moved onto its constraints and to its optimum, with matching gains, and its residuals in words.
 
         Peaks between nodes then are elsewhere, so that the last step is made again. With such rows, the plan stays as
-        it is if that does not lead closer, or to a peak that has no row.
+        it is if that does not lead closer, or to a peak that has no row. Steps are rough until the peaks stay inside.
         """
         known = kept.multipliers
         assert known is not None
@@ -678,18 +676,16 @@ class _Rounds:
                 motion, values = after.motion, after.multipliers
                 looked = seen(self.problem, motion) if dense else None
                 left = self._left(motion, looked, backoff) if dense else 0.0
-                if not dense or (after.decrease <= self._bound(kept, after) and left <= least):
+                closer = not dense or (after.decrease <= self._bound(kept, after) and left <= least)
+                if closer:
                     found, least = after, max(left, FEASIBLE)
                     known = replace(known, values=flat(values), **_of_instants(between))
-                    if look and left <= FEASIBLE:
-                        if not rough:
-                            break
-                        rough = False
-                elif still:
-                    # Its peaks would stay where they are, too.
+                # The peaks of a motion that does not move stay where they are, too.
+                settled = still or (closer and left <= FEASIBLE)
+                last = (settled and not rough and (look > 0 or still)) or (still and not closer)
+                if last or time.perf_counter() > self.until:
                     break
-                if time.perf_counter() > self.until:
-                    break
+                rough = rough and not settled
         except (CostError, NoiseFieldError, LinearizationError):
             pass
         self.whole = enforced(self.problem, known.between)

@@ -33,7 +33,8 @@ _FIRM = 1e300
 
 # With rows of penalties: the greatest number of interior-point steps, the gap, relative to the model's change and to
 # the cost at stake, and the first gap, relative to the latter. They end, too, where the last _STILL of them have left
-# more than _STANDS of the gap, and it is below _SMALL of that after the first: then rounding errors keep it up.
+# more than _STANDS of the gap, and it is below _SMALL of that after the first: then rounding errors keep it up. After a
+# pass that fails the last point is the result if its gap is below _SMALL of the model's change.
 _STEPS_WITH_ROWS, _CLOSE, _NOTHING, _LARGE = 60, 1e-9, 1e-12, 1e3
 _STILL, _STANDS, _SMALL = 4, 0.3, 1e-3
 
@@ -368,11 +369,12 @@ class Box:
                 found = box._passed(around_nominal(slack, self.along.states), stiff, pull)
                 if found is None:
                     break
-                to = foreseen(box.along, found, slack)[1]
+                towards = rows.ahead(box.along, found, slack)
+                to = rows.ahead_of[1]
                 d = np.where(fixed, 0.0, to - z)
                 after = [(aims[0] - duals[0] * d) / gaps[0], (aims[1] + duals[1] * d) / gaps[1]]
                 value = -found.expected_decrease - float(((0.5 * stiff * to + pull) * to).sum())
-                value += pushes.towards(rows.ahead(box.along, found, slack), aim)
+                value += pushes.towards(towards, aim)
                 turning = after[0] - duals[0], after[1] - duals[1]
                 values, changes = pushes.signs
                 length = min(1.0, _INSIDE * _free_length((*gaps, *duals, *values), (d, -d, *turning, *changes)))
@@ -399,8 +401,8 @@ class Box:
             past.append(left)
             if len(past) > _STILL and _STANDS * past[-1 - _STILL] < left < _SMALL * past[0]:
                 break
-        # Large products and small gaps may leave the pass no minimum but for rounding errors.
-        if before is None or (found is None and past[-1] > _SMALL * past[0]):
+        # Rounding errors of large products and small gaps may leave a pass no minimum.
+        if before is None or (found is None and past[-1] > _SMALL * abs(value)):
             return None
         # In the last step the gap of a limit that binds fell by more than its multiplier, and that of others by less.
         held = [

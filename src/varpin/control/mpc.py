@@ -37,6 +37,7 @@ from varpin.simulation.soundness import Finding, announce, findings_from_record,
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
+from varpin.support.one_thread import one_thread
 from varpin.trajectory import Nodes, Trajectory, chained
 
 logger = logging.getLogger(__name__)
@@ -300,6 +301,7 @@ class Mpc:
         plan = solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations, check=False)
         return looked_at(plan)
 
+    @one_thread()
     def run(
         self,
         plant: Plant | None = None,
@@ -355,9 +357,10 @@ class Mpc:
         parts: list[Trajectory] = []
         plans, seconds, iterations = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64)
         late, failed, reasons = np.zeros(ticks, bool), np.zeros(ticks, bool), list[str]()
+        decided = 1  # ticks whose plan is known
 
         def so_far(*last: Trajectory) -> Trajectory:
-            planned = failed[: len(parts) + 1]
+            planned = failed[:decided]
             return _so_far(plant, method, [*parts, *last], _failed(planned, reasons, self.period))
 
         try:
@@ -380,6 +383,7 @@ class Mpc:
                     # A late plan does not act, whether or not there is one.
                     late[tick] = seconds[tick] > self.budget
                     failed[tick] = not late[tick] and (fresh is None or _is_blank(fresh))
+                    decided = tick + 1
                     if failed[tick]:
                         reasons.append(_why(failure) if fresh is None else fresh.reason)
                         if age + 1 >= len(active.gains) - problem.linear:
@@ -696,7 +700,9 @@ def _simulated(
     begun: Floats | None,
     joined: Callable[[Trajectory], Trajectory],
 ) -> Trajectory:
-    """The plant's motion in one tick; a failure holds the motion that is ``joined`` with that of the ticks before.
+    """The plant's motion in one tick.
+
+    A StepFailure holds the whole motion, which ``joined`` makes from that of this tick.
 
     Controls are linear in time from ``begun`` to ``u``, or hold ``u`` where ``begun`` is None.
     """

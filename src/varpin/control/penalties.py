@@ -221,7 +221,9 @@ class PenalizedProblem(OptimalControlProblem):
         rows: list[Floats | list[float]] = [self.rule, node, begin] if self._begins else [self.rule, node]
         if self.cubic is not None:
             rows.append(np.append(self.rule[0, 0], self.cubic.coefficients))
-        return np.vstack(rows)
+        found = np.vstack(rows)
+        found.setflags(write=False)
+        return found
 
     @property
     def _begins(self) -> bool:
@@ -336,10 +338,13 @@ class PenalizedProblem(OptimalControlProblem):
 
 
 def _by_step(steps: Integers, count: int, J: Floats, weights: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
-    """The rows with a weight, step by step: of derivatives (N, columns, P), values and weights (N, P).
+    """Rows with a weight, gathered by step.
+
+    Returns their derivatives (N, columns, P), values (N, P) and weights (N, P), filled up with zeros; P is the greatest
+    number of such rows in a step.
 
     Args:
-        steps: The step of each place (K,), in ascending order; it may have several.
+        steps: The step of each place (K,), in ascending order as places are; a step may have several.
         count: Number of steps N.
         J: Derivatives of the rows (K, rows, columns).
         weights: Of the rows (K, rows).
@@ -409,4 +414,6 @@ def penalized(
     changes["given"] = problem.begin
     # The dataclass is frozen: attributes are set in its dictionary.
     vars(made).update(vars(problem) | changes)
+    # Other penalties may have other samples.
+    vars(made).pop("model_rule", None)
     return made

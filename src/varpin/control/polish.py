@@ -101,11 +101,11 @@ def polished(
         LinearizationError: A step of the given motion has no derivative.
         CostError: An expansion of the cost is not finite along it.
     """
-    closely, flat = (_DONE, _FLAT) if enough is None else enough
+    closely, level = (_DONE, _FLAT) if enough is None else (enough[0], max(enough[1], _FLAT))
     trials, longest = Trials(problem), 1.0
     step = _first(problem, motion, multipliers, weights, backoff)
     for left in reversed(range(_STEPS)):
-        there = step.found.violation <= closely and step.found.decrease <= flat * step.found.stake
+        there = step.found.violation <= closely and step.found.decrease <= level * step.found.stake
         if there or time.perf_counter() > until:
             break
         step.solve(until)

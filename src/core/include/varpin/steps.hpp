@@ -70,7 +70,7 @@ struct Gains {
 // each decision into `expected` (R, 2n + m), the changes of the controls into `moves` (R, m), and unless it is null
 // the states after each step into `after` (N, 2n).
 inline void predict(int hold, const ExpandedSteps& steps, const Gains& gains, double* state, double* expected,
-                    double* moves, double* after) {
+                    double* moves, double* after = nullptr) {
     const int x = steps.states(), m = steps.controls, size = steps.size();
     std::vector<double> next(x);
     for (std::ptrdiff_t s = 0; s < steps.steps; ++s) {
