@@ -148,6 +148,7 @@ def calls():
     yield "mechanism", core.Mechanism.make, of_mechanism(own)
     yield "jet", own.core.jet, state
     yield "jets", own.core.jets, states
+    yield "inverse dynamics", own.core.inverse_dynamics, {**states, "a": draw(N, n)}
     yield "jets along", own.core.jets_along, {**states, "alpha": draw(N, n), "beta": draw(N, n)}
     yield "tableau", core.Tableau.make, of_tableau()
     yield "begin", variational(own).begin, {"q": draw(P, n), "v": draw(P, n)}

@@ -14,6 +14,7 @@ import varpin as vp
 from varpin.control import line_search, search
 from varpin.control.backward import backward
 from varpin.control.descent import at_stake
+from varpin.control.following import Foresight
 from varpin.control.line_search import LineSearch
 from varpin.control.trials import Trials
 from varpin.control.watchdog import Watchdog
@@ -486,6 +487,13 @@ def test_each_line_of_the_log_names_its_search(caplog):
     assert [record.getMessage() for record in caplog.records] == lines
 
 
+@pytest.fixture
+def in_controls_alone(monkeypatch):
+    """Searches whose trials do not follow foreseen states."""
+    monkeypatch.setattr(Foresight, "possible", False)
+
+
+@pytest.mark.usefixtures("in_controls_alone")
 def test_a_step_is_extended_while_the_cost_falls_on():
     """A swing-up, whose model without second derivatives of the dynamics is too steep."""
     robot = vp.planar_chain(2)
@@ -512,6 +520,7 @@ def valley():
     return vp.OptimalControlProblem(scene, vp.ControlCost(1e-3) + end, np.zeros(4), np.zeros(4), **options)
 
 
+@pytest.mark.usefixtures("in_controls_alone")
 def test_a_watchdog_saves_iterations_and_leads_to_the_same_plan(monkeypatch):
     watched = vp.solve(valley(), check=False)
     monkeypatch.setattr(Watchdog, "departs", lambda *_: False)
@@ -526,6 +535,7 @@ def test_a_watchdog_saves_iterations_and_leads_to_the_same_plan(monkeypatch):
     assert all(row.decrease >= 0.0 for row in plain.history)
 
 
+@pytest.mark.usefixtures("in_controls_alone")
 def test_a_watchdog_that_finds_nothing_returns_to_the_motion_that_it_left(monkeypatch):
     """Where the iterations away lead nowhere: here they may take no step."""
     own = LineSearch.run

@@ -106,7 +106,7 @@ def test_a_search_that_half_the_step_does_not_help_is_finished() -> None:
     """Models of limited controls promise decreases that searches of few iterations do not reach on any grid."""
 
     def creep(problem: vp.OptimalControlProblem, start: object) -> vp.Solution:
-        plan = vp.solve(problem, start, max_iterations=2 if start is None else 0, check=False)
+        plan = vp.solve(problem, start, max_iterations=1 if start is None else 0, check=False)
         last = plan.history[-1]
         if last.expected_decrease > 0.01 * plan.cost:
             last = replace(last, expected_decrease=plan.cost * problem.steps / 100)

@@ -109,6 +109,7 @@ class SearchState:
         whole: Whether the search uses the whole gradient of the noise cost.
         saturated: Whether it takes into account that drives of servos are at their limits.
         clips: Whether plans may leave control limits to the clipping of motions where steps are short.
+        follows: Whether trials may follow the states that plans foresee: none has strayed from them.
         returned: Whether it has just gone back from a motion that cannot be linearized.
         watchdog: Whether it is away from the best motion.
         rows: Active rows of penalties (M,) at the end of the last backward pass, with which the next one begins; None
@@ -132,6 +133,7 @@ class SearchState:
     whole: bool = False
     saturated: bool = False
     clips: bool = True
+    follows: bool = True
     returned: bool = False
     watchdog: Watchdog = field(default_factory=Watchdog)
     rows: Mask | None = None

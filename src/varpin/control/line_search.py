@@ -16,6 +16,7 @@ from varpin.control.backward import backward
 from varpin.control.commands import with_feedback
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
+from varpin.control.following import Foresight
 from varpin.control.passes import Plan, noise_shares
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.trials import HALVINGS, MORE_HALVINGS, Attempt, Trials, cut_less, few_halvings
@@ -35,6 +36,8 @@ _EPS = float(np.finfo(np.float64).eps)
 TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
 # Steps no longer than that are very short.
 VERY_SHORT = 0.01
+# A full step with less than this share of the foreseen decrease is compared with one along foreseen states.
+_AS_FORESEEN = 0.9
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
 # A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
@@ -58,25 +61,32 @@ class Start(NamedTuple):
 
     Attributes:
         plan: The plan it goes along.
-        trajectory: The motion that the plan is around.
+        along: The motion that the plan is around, with its expansions.
         shares: The terms of the motion's cost (:meth:`OptimalControlProblem.shares`).
         cost: Their sum.
         rating: Regularization of the passes that rate motions, :class:`Rated`.
         exact: Whether the pass had second derivatives of the dynamics.
         whole: Whether the pass had the whole gradient of the noise cost.
         extends: Whether full steps that end early are extended.
+        follows: Whether a trial may follow foreseen states.
         bounded: Whether trials stop at a number of substeps.
     """
 
     plan: Plan
-    trajectory: Trajectory
+    along: Along
     shares: Floats
     cost: float
     rating: float
     exact: bool
     whole: bool
     extends: bool
+    follows: bool
     bounded: bool
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion that the plan is around."""
+        return self.along.trajectory
 
 
 class Rated(NamedTuple):
@@ -121,6 +131,7 @@ class Step(NamedTuple):
         taken: The accepted trial.
         cut: Whether trials without an accepted one were stopped for their number of substeps.
         jumps: Whether very short trials were rejected where they divide other steps than the motion.
+        strayed: Whether a trial that was to follow foreseen states was no better than the full step.
     """
 
     length: float = 0.0
@@ -130,6 +141,7 @@ class Step(NamedTuple):
     taken: Trial = Trial()
     cut: bool = False
     jumps: bool = False
+    strayed: bool = False
 
 
 class _Bounds(NamedTuple):
@@ -153,6 +165,10 @@ class _Here(NamedTuple):
     feedback: Commands  # without the feed-forward part
     added: Floats  # noise cost of each step
     total: float  # the expected cost
+
+    def along(self, step: float, plan: Plan) -> Commands:
+        """The commands of a step of this length along the plan."""
+        return Commands(self.controls + step * plan.feedforward, *self.feedback[1:])
 
 
 class _Lengths:
@@ -209,6 +225,7 @@ class LineSearch:
         self.problem, self.trials, self.label = problem, trials, label
         self.armijo, self.backtracking, self.closed = armijo, backtracking, closed
         self._rounding = _at_rounding(problem.control_limits)
+        self._foresight = Foresight(problem)
         integrator = problem.integrator
         # Whether steps may be divided.
         self._divides = (
@@ -218,16 +235,20 @@ class LineSearch:
     def run(self, start: Start, shortest: float = 0.0) -> Step:
         """Find the first trial along the plan with sufficient decrease of the expected cost, (O13)."""
         slope = start.plan.slope
-        taken, length, tried, trials, cuts, jumps = Trial(), 0.0, None, 0, False, False
+        taken, length, tried, trials, cuts, jumps, strayed = Trial(), 0.0, None, 0, False, False, False
         here = self._here(start)
         lengths = _Lengths(self.backtracking, shortest)
         left: Iterable[float] = lengths
         for bounds in self._bounds(start):
             cut = []
-            for step in left:
-                trials += 1
+            for shorter in left:
+                trials, step = trials + 1, shorter
                 trial = self._try(step, start, here, bounds)
                 lengths.learn(step, trial.expected, slope)
+                if trials == 1 and (other := self._following(trial, start, here, bounds)) is not None:
+                    trials += 1
+                    strayed = not other[0].expected < trial.expected
+                    trial, step = (trial, step) if strayed else other
                 if trial.expected <= self.armijo * step * slope and trial.expected < taken.expected:
                     taken, length = trial, step
                     if trial.expected <= _POOR * step * slope:
@@ -252,18 +273,17 @@ class LineSearch:
                 break
             taken, length = trial, _EXTENSION * length
         if length > 0.0:
-            return Step(length, trials, -taken.expected, taken=taken, cut=cuts, jumps=jumps)
+            return Step(length, trials, -taken.expected, taken=taken, cut=cuts, jumps=jumps, strayed=strayed)
         hidden = 0.0
         if tried is not None:
             hidden = rounding(self.problem, start.trajectory, start.shares, tried, start.plan.model)
-        return Step(trials=trials, hidden=hidden, cut=cuts, jumps=jumps)
+        return Step(trials=trials, hidden=hidden, cut=cuts, jumps=jumps, strayed=strayed)
 
     def leap(self, start: Start, most: float) -> Step:
         """Take the longest trial along the plan that raises the expected cost by at most ``most``."""
         here, bounds = self._here(start), next(self._bounds(start))
         for trials, step in enumerate(_LEAPS, start=1):
-            u = here.controls + step * start.plan.feedforward
-            trial = self._run(step, u, start, here, bounds, rise=most)
+            trial = self._run(step, here.along(step, start.plan), start, here, bounds, rise=most)
             if trial.expected <= most:
                 return Step(step, trials, -trial.expected, taken=trial)
         return Step(trials=len(_LEAPS))
@@ -291,10 +311,25 @@ class LineSearch:
     def _try(self, step: float, start: Start, here: _Here, bounds: _Bounds) -> Trial:
         """A trial of length ``step`` along the plan."""
         rise = -_DEAR * step * start.plan.slope
-        return self._run(step, here.controls + step * start.plan.feedforward, start, here, bounds, rise=rise)
+        return self._run(step, here.along(step, start.plan), start, here, bounds, rise=rise)
 
-    def _run(self, step: float, u: Floats, start: Start, here: _Here, bounds: _Bounds, *, rise: float) -> Trial:
-        """A trial of length ``step`` under controls u (R, m).
+    def _following(self, full: Trial, start: Start, here: _Here, bounds: _Bounds) -> tuple[Trial, float] | None:
+        """A trial that follows foreseen states, with its length, if a ``full`` step is less good than foreseen.
+
+        None, too, where these states do not cost clearly less than the full step, or controls cannot follow them.
+        """
+        if not (start.follows and self.closed) or -full.expected >= _AS_FORESEEN * start.plan.expected_decrease:
+            return None
+        found = self._foresight.commands(start.along, start.plan, start.shares, full.cost, here.feedback)
+        if found is None:
+            return None
+        commands, length = found
+        return self._run(length, commands, start, here, bounds, rise=min(full.expected, 0.0)), length
+
+    def _run(
+        self, step: float, commands: Commands, start: Start, here: _Here, bounds: _Bounds, *, rise: float
+    ) -> Trial:
+        """A trial of length ``step`` under commands.
 
         It is stopped early where its substeps exceed bounds, or where the expected cost rises by more than ``rise``.
         """
@@ -306,9 +341,10 @@ class LineSearch:
         if bounds.parts < np.inf and (bounds.watched or step < 1.0):
             # Explicit methods have no substeps.
             parts = bounds.parts * max(1, int(start.trajectory.statistics.substeps[: self.trials.third].sum()))
+        u = commands.u
         if problem.limited:
             u = _onto_limits(u, problem.control_limits, self._rounding)
-        commands = Commands(u, *here.feedback[1:])
+            commands = commands._replace(u=u)
         if problem.linear:
             # The first control has no feedback: its state is given.
             commands = commands._replace(u=u[1:], before=np.clip(u[:1], *problem.control_limits))

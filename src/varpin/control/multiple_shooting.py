@@ -22,6 +22,7 @@ from varpin.arrays import Floats
 from varpin.control.along import Along, states
 from varpin.control.backward import backward
 from varpin.control.costs import CostError, Expansion
+from varpin.control.following import Path, holding_feedback, inverse_dynamics, states_on
 from varpin.control.history import Iteration
 from varpin.control.passes import Plan
 from varpin.control.penalties import PenalizedProblem, PenalizedRate
@@ -30,7 +31,7 @@ from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.inputs import as_moved, with_ends
+from varpin.mechanics.inputs import with_ends
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene, assisted, quiet
@@ -44,8 +45,6 @@ logger = logging.getLogger(__name__)
 
 # Tolerance on the first state against q0, and on position limits [rad or m].
 _SAME = 1e-6
-# Natural frequency of the feedback that holds the first motion on the path, times the decision period.
-_HOLDING_FREQUENCY = 0.25
 # Auxiliary forces count as zero below this fraction of the total joint forces (2-norms over the motion).
 _NO_FORCE = 1e-9
 # Acceptance of a step: least share of an expected decrease, and greatest multiple of an expected increase.
@@ -60,14 +59,6 @@ _WEIGHT_GROWTH, _SETTLED = 4.0, 0.1
 _LONG, _LEAST, _GROWTH, _MOST = 0.25, 1e-6, 10.0, 1e6
 # Errors that reject a trial.
 _TRIAL_ERRORS = (StepFailure, CostError, CustomForceError)
-
-
-@dataclass(frozen=True, eq=False)
-class Path:
-    """States to start from, at the problem's nodes: q (N + 1, n) [rad or m] and v (N + 1, n) [rad/s or m/s]."""
-
-    q: Floats
-    v: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,27 +174,23 @@ class GapClosing:
         self.left = 1.0
         n, m = own.robot.dof, own.controls
         M = lagrangian_jet(own, problem.q0, np.zeros(n)).Lvv
-        omega = _HOLDING_FREQUENCY / problem.period
-        hold = -np.hstack([omega**2 * M, 2.0 * omega * (np.eye(n) if problem.integrator.variational else M)])
+        hold = holding_feedback(self.problem)
         free, moved = own.unprescribed, own.prescribed
         self._free = free
         self._weight = np.linalg.inv(M[np.ix_(free, free)])
         self._motions = Motions(scene, problem.integrator, problem.q0, problem.v0, problem.dt)
-        own_hold = np.linalg.pinv(own.actuation) @ hold
+        own_hold = own.allocation @ hold
         own_hold[moved] = 0.0
         self._gains = np.tile(own_hold, (problem.decisions, 1, 1))
-        u, force = _inverse_dynamics(problem, path, controls)
+        u, force = inverse_dynamics(problem, path, controls)
         gains = np.zeros((problem.decisions, m + len(free), 2 * n))
         gains[:, m:] = hold[free]
-        at = path.q, path.v
-        if problem.integrator.variational:
-            at = path.q, np.array([lagrangian_jet(own, q, v).Lv for q, v in zip(*at, strict=True)])
-        self.motion = self._rolled(np.hstack([u, force[:, free]]), gains, np.hstack(at)[: -1 : problem.hold])
+        self.motion = self._rolled(np.hstack([u, force[:, free]]), gains, states_on(self.problem, path))
         if controls is None:
             # The controls take as much of the holding force as their limits allow.
             full = self.motion.full
             force = full.u @ scene.actuation.T
-            u = np.clip(force @ np.linalg.pinv(own.actuation).T, *problem.control_limits)
+            u = np.clip(force @ own.allocation.T, *problem.control_limits)
             u = with_ends(own, u, full.u)
             self.motion = self._of(replace(full, u=np.hstack([u, (force - u @ own.actuation.T)[:, free]])))
         if not np.isfinite(self.motion.cost):
@@ -527,19 +514,3 @@ def _products(hessian: Floats, z: Floats) -> Floats:
     """H z at each point (K, size)."""
     found: Floats = z @ hessian[0] if len(hessian) == 1 else (hessian @ z[:, :, None])[:, :, 0]
     return found
-
-
-def _inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Floats | None) -> tuple[Floats, Floats]:
-    """Controls (R, m) closest to the inverse dynamics on the path, and the joint forces (R, n) that are missing."""
-    scene, hold = problem.scene, problem.hold
-    q, v = 0.5 * (path.q[:-hold:hold] + path.q[hold::hold]), np.diff(path.q[::hold], axis=0) / problem.period
-    a = np.diff(path.v[::hold], axis=0) / problem.period
-    jets = [lagrangian_jet(scene, *at) for at in zip(q, v, strict=True)]
-    needed = np.array([jet.Lvv @ a[k] + jet.Lvq @ v[k] - jet.Lq for k, jet in enumerate(jets)])
-    # A servo commanded to its present position exerts no spring force.
-    still = q @ scene.holding.T @ scene.actuation.T
-    needed += still - scene.core.forces(q, v, still)[0]
-    if controls is None:
-        controls = needed @ np.linalg.pinv(scene.actuation).T
-        controls = np.clip(as_moved(scene, path.q[hold::hold], path.v[hold::hold], controls), *problem.control_limits)
-    return controls, needed - controls @ scene.actuation.T

@@ -97,6 +97,7 @@ class Search:
         self.saturated = False
         # Whether plans leave out the limits now, and whether they may do so: no step of theirs has been rejected.
         self.clipping, self.clips = False, problem.limited
+        self.follows = True  # whether trials may follow foreseen states: none of them has strayed
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
@@ -187,6 +188,7 @@ class Search:
         self.bounded, self.cut = state.bounded, state.cut
         self.whole = state.whole and self.wants_whole
         self.clips = state.clips and self.clips
+        self.follows = state.follows
         self.returned = state.returned
         self.watchdog, self.rows = state.watchdog, state.rows
         if state.saturated:
@@ -210,6 +212,7 @@ class Search:
             whole=self.whole,
             saturated=self.saturated,
             clips=self.clips,
+            follows=self.follows,
             returned=self.returned,
             watchdog=self.watchdog,
             rows=self.rows,
@@ -642,17 +645,19 @@ class Search:
         step = search(
             Start(
                 plan=self.plan,
-                trajectory=self.trajectory,
+                along=self.along,
                 shares=self.shares,
                 cost=self.cost,
                 rating=0.0 if self.rated is None else self.rated.regularization,
                 exact=self.exact,
                 whole=self.whole,
                 extends=self._extends(),
+                follows=self.anew and self.follows,
                 bounded=self.bounded,
             )
         )
         self.cut = self.cut or step.cut
+        self.follows = self.follows and not step.strayed
         self.jumps = step.length < _LONG and (self.jumps or step.jumps)
         taken = step.taken
         if taken.motion is not None and taken.shares is not None:
@@ -668,8 +673,8 @@ class Search:
 
     def _extends(self) -> bool:
         """Whether full steps that end early are extended: not after a last extension that did not lower the cost."""
-        last = self.history[-1:]
-        return self.anew and not any(item.step == 1.0 and item.rollouts == 2 for item in last)
+        tried = (item for item in self.history[-1:] if item.decrease > item.expected_decrease)
+        return self.anew and not any(item.step == 1.0 and item.rollouts == 2 for item in tried)
 
     def _meets_limits(self, plan: Plan) -> bool:
         """Whether a plan holds controls at their limits, and no control is there on the motion it is around."""

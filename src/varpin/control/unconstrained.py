@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Mask
 from varpin.control.commands import controls_along, first_commands, shifted_commands
 from varpin.control.examination import foreseen, looked_at
+from varpin.control.following import Path
 from varpin.control.history import ITERATIONS, Iteration, SearchState, Status
-from varpin.control.multiple_shooting import GapClosing, Path, path_of
+from varpin.control.multiple_shooting import GapClosing, path_of
 from varpin.control.noise_adjoint import is_exact
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import COMPARISON, SLOW, SUFFICIENT, refine

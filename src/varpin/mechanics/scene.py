@@ -413,6 +413,11 @@ class Scene(Frozen):
         """Whether each control is the force of a joint: :attr:`actuation` is the identity, and :attr:`transmission`."""
         return np.array_equal(self.actuation, np.eye(self.robot.dof))
 
+    @cached_property
+    def allocation(self) -> Floats:
+        """Matrix (m, n) of the smallest controls that give joint forces, or come closest: the pseudoinverse."""
+        return np.asarray(np.linalg.pinv(self.actuation), dtype=np.float64)
+
     @property
     def _gear(self) -> Floats:
         """Force (n,) per unit of a control that drives one joint only: 1, or the stiffness of its servo."""

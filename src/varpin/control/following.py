@@ -1,0 +1,134 @@
+"""Motions that follow given states: the controls of the inverse dynamics, and feedback that holds the motion there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from varpin.arrays import Floats
+from varpin.control.along import Along
+from varpin.control.passes import Plan, foreseen
+from varpin.control.penalties import PenalizedProblem
+from varpin.control.problem import OptimalControlProblem
+from varpin.core.arrays import Commands
+from varpin.linearization import node_jets, velocity_at_nodes
+from varpin.mechanics.inputs import as_moved
+from varpin.mechanics.lagrangian import lagrangian_jet
+
+# Natural frequency of the feedback that holds a motion on a path, times the decision period.
+_HOLDING_FREQUENCY = 0.25
+# Lengths of steps along foreseen states. Their cost must fall by _CLEARLY times as much as with the full step, and by
+# _NEAR of what the model says, and no joint may be moved by more than _FAR [rad or m]: arms that are moved far often
+# reach for a frame in a posture that costs more.
+_LENGTHS, _CLEARLY, _NEAR, _FAR = (1.0, 0.5), 1.1, 0.7, 2.0
+# Controls beyond their limits by more than this share of the largest one cannot follow a path.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """States at the problem's nodes: q (N + 1, n) [rad or m] and v (N + 1, n) [rad/s or m/s]."""
+
+    q: Floats
+    v: Floats
+
+
+def inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Floats | None) -> tuple[Floats, Floats]:
+    """Controls (R, m) closest to the inverse dynamics on the path, and the joint forces (R, n) that are missing.
+
+    With ``controls`` (R, m) these are the controls.
+    """
+    scene, hold = problem.scene, problem.hold
+    q, v = 0.5 * (path.q[:-hold:hold] + path.q[hold::hold]), np.diff(path.q[::hold], axis=0) / problem.period
+    needed = scene.core.inverse_dynamics(q, v, np.diff(path.v[::hold], axis=0) / problem.period)
+    # A servo commanded to its present position exerts no spring force.
+    still = q @ scene.holding.T @ scene.actuation.T
+    needed += still - scene.core.forces(q, v, still)[0]
+    if controls is None:
+        controls = as_moved(scene, path.q[hold::hold], path.v[hold::hold], needed @ scene.allocation.T)
+        controls = np.clip(controls, *problem.control_limits)
+    return controls, needed - controls @ scene.actuation.T
+
+
+def holding_feedback(problem: OptimalControlProblem) -> Floats:
+    """Gains of the joint forces (n, 2n) that hold a motion on states, (q, p) or (q, v)."""
+    n, omega = problem.scene.robot.dof, _HOLDING_FREQUENCY / problem.period
+    M = lagrangian_jet(problem.scene, problem.q0, np.zeros(n)).Lvv
+    return -np.hstack([omega**2 * M, 2.0 * omega * (np.eye(n) if problem.integrator.variational else M)])
+
+
+def states_on(problem: OptimalControlProblem, path: Path) -> Floats:
+    """The states (R, 2n) of a path before each decision, (q, p) or (q, v)."""
+    q, v = path.q[: -1 : problem.hold], path.v[: -1 : problem.hold]
+    if problem.integrator.variational:
+        v = (node_jets(problem.scene, q, v)[0] @ v[:, :, None])[:, :, 0]
+    return np.hstack([q, v])
+
+
+class Foresight:
+    """Trials that follow the states which a plan foresees in place of its controls, (O17) of docs/mathematics.md."""
+
+    def __init__(self, problem: OptimalControlProblem) -> None:
+        self.problem = problem
+
+    @cached_property
+    def possible(self) -> bool:
+        """Whether controls can give every joint the force that the foreseen motion needs, limits apart."""
+        problem, scene = self.problem, self.problem.scene
+        if isinstance(problem, PenalizedProblem):
+            # Measured with constraints, as many searches took more iterations as took fewer.
+            return False
+        if problem.linear or scene.inputs or scene.constraints or scene.custom is not None:
+            return False
+        return scene.direct or int(np.linalg.matrix_rank(scene.actuation)) == scene.robot.dof
+
+    @cached_property
+    def _gains(self) -> Floats:
+        to_controls = self.problem.scene.allocation @ holding_feedback(self.problem)
+        return np.tile(to_controls, (self.problem.decisions, 1, 1))
+
+    def commands(
+        self, along: Along, plan: Plan, shares: Floats, bound: float, feedback: Commands
+    ) -> tuple[Commands, float] | None:
+        """The commands of a motion that follows the plan's foreseen states, and its length; None without a good one.
+
+        Args:
+            along: The motion that the plan is around.
+            plan: The plan.
+            shares: The terms of the motion's cost.
+            bound: Change of the cost by another trial. The foreseen states must cost clearly less.
+            feedback: Commands whose controls, feedback and reference are replaced.
+        """
+        problem, n = self.problem, self.problem.scene.robot.dof
+        if not self.possible or len(along.blocks) > 1:
+            return None
+        q, v = along.trajectory.q, along.trajectory.v
+        change = np.zeros((problem.steps + 1, 2 * n))
+        foreseen(along, plan, after=change[1:])
+        if problem.integrator.variational:
+            slopes = along.linearized(0, problem.steps)[1]
+            slopes = slopes if len(slopes) else velocity_at_nodes(problem.scene, q, v)
+            change[:, n:] = (slopes @ change[:, :, None])[:, :, 0]
+        far = float(np.abs(change[:, :n]).max())
+        best, found = _CLEARLY * min(bound, 0.0), None
+        for length in (each for each in _LENGTHS if each * far <= _FAR):
+            path = Path(q + length * change[:, :n], v + length * change[:, n:])
+            u, missing = inverse_dynamics(problem, path, None)
+            if not np.abs(missing).max(initial=0.0) <= _ROUNDING * np.abs(u).max(initial=1.0):
+                continue
+            cost = float((self._shares(path, u) - shares).sum())
+            model = length * plan.slope + 0.5 * length**2 * plan.curvature
+            if cost < best and cost <= _NEAR * model:
+                best, found = cost, (path, u, length)
+        if found is None:
+            return None
+        path, u, length = found
+        return feedback._replace(u=u, gains=self._gains, reference=states_on(problem, path)), length
+
+    def _shares(self, path: Path, u: Floats) -> Floats:
+        """The terms of the cost of a path under the controls that follow it."""
+        problem, rows = self.problem, np.repeat(u, self.problem.hold, axis=0)
+        compiled = problem.running.compiled.values(*problem.samples(path.q, path.v, rows))
+        return problem.shares_along(path.q, path.v, rows, compiled)

@@ -1,0 +1,157 @@
+"""Trials that follow foreseen states: the inverse dynamics, where a motion goes, and what that saves."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import varpin as vp
+from varpin.control import following
+from varpin.control.commands import first_commands
+from varpin.control.following import Foresight, Path, inverse_dynamics, states_on
+from varpin.control.search import Search
+
+RNG = np.random.default_rng(5)
+
+
+def posture(*, goal=(2.0, -2.0, 2.0), scene=None, torque=1e-3, **options):
+    """Three links far from a posture."""
+    scene = vp.Scene(vp.planar_chain(3)) if scene is None else scene
+    end = vp.Terminal(vp.TrackingCost(goal, 1e3) + vp.VelocityCost(10.0))
+    cost = vp.ControlCost(torque) + vp.VelocityCost(1e-2) + end
+    options = {"dt": 0.02, "steps": 50} | options
+    return vp.OptimalControlProblem(scene, cost, np.zeros(3), np.zeros(3), **options)
+
+
+def planned(problem):
+    """A search with its first plan, and what its line search is given."""
+    search = Search(problem, False)
+    search.begin(first_commands(problem, None))
+    search._plan()
+    return search
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+def test_the_inverse_dynamics_is_that_of_pinocchio(name):
+    robot = vp.load_robot(name)
+    n, model = robot.dof, robot.model
+    q, v, a = RNG.normal(size=(3, 8, n))
+    scene = vp.Scene(robot, stiffness=3.0)
+    found = scene.core.inverse_dynamics(q, v, a)
+    for k in range(8):
+        free = pin.rnea(model, model.createData(), robot.configuration(q[k]), v[k], a[k])
+        np.testing.assert_allclose(found[k], free + 3.0 * q[k], rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4(), vp.Gauss(2)])
+@pytest.mark.parametrize("hold", [1, 2])
+def test_a_motion_goes_along_the_foreseen_states(integrator, hold):
+    """They are those of the linearized motion under the plan, here from products of its matrices."""
+    problem = posture(goal=(0.6, -0.5, 0.4), integrator=integrator, hold=hold)
+    search = planned(problem)
+    plan, along, n = search.plan, search.along, 3
+    found = Foresight(problem).commands(
+        along, plan, search.shares, np.inf, first_commands(problem, search.trajectory.u[::hold])
+    )
+    commands, length = found
+    assert length == 1.0
+    lin, x, foreseen = along.linearized(0, problem.steps)[0], np.zeros(2 * n), [np.zeros(2 * n)]
+    for k in range(problem.steps):
+        if k % hold == 0:
+            du = plan.feedforward[k // hold] + plan.feedback[k // hold] @ x
+        x = lin.A[k] @ x + lin.B[k] @ du
+        foreseen.append(x)
+    wanted = search.trajectory.q + np.array(foreseen)[:, :n]
+    motion = search.trials.attempt(commands).trajectory()
+    moved = np.abs(wanted - search.trajectory.q).max()
+    assert np.abs(motion.q - wanted).max() <= 0.02 * moved
+    # The cost that was foreseen without an integration.
+    u, missing = inverse_dynamics(problem, Path(motion.q, motion.v), None)
+    assert not missing.any()
+    np.testing.assert_allclose(u, motion.u[::hold], atol=0.05 * np.abs(u).max())
+
+
+def test_reference_states_are_those_of_the_integrator():
+    q, v = RNG.normal(size=(2, 51, 3))
+    by_velocity, by_momentum = (posture(integrator=each) for each in (vp.RungeKutta4(), vp.Midpoint()))
+    np.testing.assert_array_equal(states_on(by_velocity, Path(q, v)), np.hstack([q, v])[:-1])
+    p = [vp.lagrangian_jet(by_momentum.scene, *at).Lv for at in zip(q[:-1], v[:-1], strict=True)]
+    np.testing.assert_allclose(states_on(by_momentum, Path(q, v)), np.hstack([q[:-1], p]), rtol=1e-12, atol=1e-12)
+
+
+def of_panda():
+    """A Panda moves each joint by up to 0.8 rad in a second, and a full step along its controls overshoots."""
+    robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})
+    begin = np.array([0.7, -0.4, 0.6, -1.2, 0.2, 1.6, -0.5])
+    goal = begin + np.array([0.6, 0.7, -0.7, -0.5, 0.8, 0.6, -0.8])
+    speed = vp.VelocityCost(1.0)
+    cost = vp.ControlCost(1.0 / robot.effort_limit**2) + speed + vp.Terminal(vp.TrackingCost(goal, 1e4) + 1e3 * speed)
+    return vp.OptimalControlProblem(vp.Scene(robot), cost, begin, np.zeros(7), dt=0.02, steps=50)
+
+
+@pytest.mark.parametrize("task", [of_panda, lambda: posture(torque=0.1, steps=30)])
+def test_steps_along_foreseen_states_save_iterations(monkeypatch, task):
+    """The same optimum with fewer iterations and trials."""
+    found = vp.solve(task(), check=False)
+    monkeypatch.setattr(Foresight, "possible", False)
+    plain = vp.solve(task(), check=False)
+    assert found.status.converged
+    assert found.cost == pytest.approx(plain.cost, rel=1e-6)
+    assert found.iterations < plain.iterations
+    rollouts = [sum(row.rollouts for row in plan.history) for plan in (found, plain)]
+    assert rollouts[0] < rollouts[1]
+
+
+@pytest.mark.parametrize(
+    ("why", "options"),
+    [
+        ("a joint without a drive", {"scene": vp.Scene(vp.planar_chain(3), actuation=["joint1", "joint2"])}),
+        ("linear controls", {"controls": "linear"}),
+    ],
+)
+def test_only_arms_with_a_drive_at_each_joint_follow(why, options):
+    assert Foresight(posture()).possible
+    problem = posture(**options)
+    assert not Foresight(problem).possible, why
+
+
+def test_states_that_need_more_than_the_limits_are_not_followed():
+    for limit, follows in ((1e3, True), (1.0, False)):
+        problem = posture(goal=(0.9, -0.9, 0.9), control_limits=(-limit, limit))
+        search = planned(problem)
+        found = Foresight(problem).commands(
+            search.along, search.plan, search.shares, np.inf, first_commands(problem, search.trajectory.u)
+        )
+        assert (found is not None) == follows
+
+
+def test_states_far_away_are_not_followed(monkeypatch):
+    problem = posture()
+    search = planned(problem)
+    arguments = search.along, search.plan, search.shares, np.inf, first_commands(problem, search.trajectory.u)
+    assert Foresight(problem).commands(*arguments)[1] == 0.5
+    monkeypatch.setattr(following, "_FAR", 0.9)
+    assert Foresight(problem).commands(*arguments) is None
+
+
+def strays():
+    """Coarse steps in which feedback does not hold the motion on the path."""
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([np.pi / 2, 0.0], 1e3) + vp.VelocityCost(1e2))
+    options = {"dt": 0.05, "steps": 40, "integrator": vp.RungeKutta4()}
+    begin = [-np.pi / 2, 0.0], np.zeros(2)
+    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2)), cost, *begin, **options)
+
+
+def test_searches_go_on_as_if_not_interrupted_once_a_trial_has_strayed(tmp_path):
+    whole = vp.solve(strays(), tolerance=1e-4, check=False)
+    assert not whole.search.follows
+    for most in (1, len(whole.history) // 2, len(whole.history) - 2):
+        part = vp.solve(strays(), tolerance=1e-4, max_iterations=most, check=False)
+        part.save(tmp_path / "part.npz")
+        read = vp.Solution.load(tmp_path / "part.npz", part.problem)
+        assert read.search.follows == part.search.follows
+        for known in (part, read):
+            rest = vp.solve(part.problem, resume=known, tolerance=1e-4, check=False)
+            assert [row.step for row in rest.history] == [row.step for row in whole.history]
+            np.testing.assert_array_equal(rest.trajectory.q, whole.trajectory.q)
+            assert rest.cost == whole.cost
