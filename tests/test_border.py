@@ -148,7 +148,6 @@ def calls():
     yield "mechanism", core.Mechanism.make, of_mechanism(own)
     yield "jet", own.core.jet, state
     yield "jets", own.core.jets, states
-    yield "inverse dynamics", own.core.inverse_dynamics, {**states, "a": draw(N, n)}
     yield "jets along", own.core.jets_along, {**states, "alpha": draw(N, n), "beta": draw(N, n)}
     yield "tableau", core.Tableau.make, of_tableau()
     yield "begin", variational(own).begin, {"q": draw(P, n), "v": draw(P, n)}
@@ -162,6 +161,7 @@ def calls():
     yield "curvatures", core.variational_curvatures, {**steps(own), "guess": guess, "z": draw(N, 2 * n)}
     yield "bends", core.variational_bends, {**steps(own), "guess": guess, "weights": draw(N, 2 * n, 3 * n)}
     yield "ends", core.variational_ends, steps(own)
+    yield "inverse dynamics", core.inverse_dynamics, {"mechanism": own.core, **states, "a": draw(N, n)}
     yield "accelerations", core.accelerations, {"mechanism": own.core, **many}
     for method in core.ExplicitMethod:
         fixed = {"mechanism": own.core, "method": method, "dt": 1e-3}

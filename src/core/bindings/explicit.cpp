@@ -96,6 +96,21 @@ std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mecha
     return {values, aq, av, af, s};
 }
 
+// The joint forces (N, n) that accelerations a need at each row of q, v and a (N, n), besides those without a potential.
+Out inverse_dynamics(const Mechanism& mechanism, In<2> q, In<2> v, In<2> a) {
+    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
+    require(q, "q", {rows, n});
+    require(v, "v", {rows, n});
+    require(a, "a", {rows, n});
+    double* force = nullptr;
+    const Out out = array_for(force, {rows, n});
+    nb::gil_scoped_release release;
+    ForwardDynamics dynamics(mechanism, false);
+    for (std::size_t s = 0; s < rows; ++s)
+        dynamics.inverse(q.data() + s * n, v.data() + s * n, a.data() + s * n, force + s * n);
+    return out;
+}
+
 // Derivatives of one step from each row of q and v, in (q, v), (N, 2n, 2n), and in the force, (N, 2n, n), or in one
 // that grows over the step to it as a ramp; how many rows went before one with a mass matrix that is not positive
 // definite. The force (N, r, n) is constant, r = 1, or that at each time of a stage.
@@ -180,6 +195,7 @@ void register_explicit(nb::module_& m) {
         .def("roll", &roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a, "watch"_a.none() = nb::none(),
              "impulses"_a = nb::none());
     m.def("accelerations", &accelerations, "mechanism"_a, "q"_a, "v"_a, "force"_a);
+    m.def("inverse_dynamics", &inverse_dynamics, "mechanism"_a, "q"_a, "v"_a, "a"_a);
     m.def("linearize_explicit", &linearize, "mechanism"_a, "method"_a, "dt"_a, "q"_a, "v"_a, "force"_a,
           "ramp"_a = false);
 }

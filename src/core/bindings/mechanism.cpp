@@ -410,28 +410,6 @@ std::tuple<Out, Out, Out> coupled_forces(const Mechanism& mechanism, In<2> q, In
     return {F, Fq, Fv};
 }
 
-// The joint forces M a + L_vq v - L_q that a motion needs, those of elements and couplings besides L_q among them, at
-// each row of q, v and a (N, n).
-Out inverse_dynamics(const Mechanism& mechanism, In<2> q, In<2> v, In<2> a) {
-    const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
-    require(q, "q", {rows, n});
-    require(v, "v", {rows, n});
-    require(a, "a", {rows, n});
-    double* needed = nullptr;
-    const Out out = array_for(needed, {rows, n});
-    nb::gil_scoped_release release;
-    Jet<double> w(mechanism.tree);
-    for (std::size_t s = 0; s < rows; ++s) {
-        lagrangian_jet(mechanism, q.data() + s * n, v.data() + s * n, w);
-        for (std::size_t r = 0; r < n; ++r) {
-            double total = -w.Lq[r];
-            for (std::size_t c = 0; c < n; ++c) total += w.M[r * n + c] * a(s, c) + w.A[r * n + c] * v(s, c);
-            needed[s * n + r] = total;
-        }
-    }
-    return out;
-}
-
 // Derivatives of M, L_vq and L_qq along (alpha, beta) at each row of q, v, alpha and beta (N, n).
 std::tuple<Out, Out, Out> jets_along(const Mechanism& mechanism, In<2> q, In<2> v, In<2> alpha, In<2> beta) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
@@ -506,7 +484,6 @@ void register_mechanism(nb::module_& m) {
                     "quadratic"_a, "centers"_a)
         .def("jet", &jet, "q"_a, "v"_a)
         .def("jets", &jets, "q"_a, "v"_a)
-        .def("inverse_dynamics", &inverse_dynamics, "q"_a, "v"_a, "a"_a)
         .def("velocity_slopes", &velocity_slopes_at, "q"_a, "v"_a)
         .def("forces", &forces, "q"_a, "v"_a, "f"_a)
         .def("coupled_forces", &coupled_forces, "q"_a, "v"_a)

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from varpin import core
 from varpin.arrays import Floats
 from varpin.control.along import Along
 from varpin.control.passes import Plan, foreseen
@@ -42,13 +43,14 @@ def inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Float
     """
     scene, hold = problem.scene, problem.hold
     q, v = 0.5 * (path.q[:-hold:hold] + path.q[hold::hold]), np.diff(path.q[::hold], axis=0) / problem.period
-    needed = scene.core.inverse_dynamics(q, v, np.diff(path.v[::hold], axis=0) / problem.period)
+    needed = core.inverse_dynamics(scene.core, q, v, np.diff(path.v[::hold], axis=0) / problem.period)
     # A servo commanded to its present position exerts no spring force.
     still = q @ scene.holding.T @ scene.actuation.T
     needed += still - scene.core.forces(q, v, still)[0]
     if controls is None:
         controls = as_moved(scene, path.q[hold::hold], path.v[hold::hold], needed @ scene.allocation.T)
-        controls = np.clip(controls, *problem.control_limits)
+        if problem.limited:
+            controls = np.clip(controls, *problem.control_limits)
     return controls, needed - controls @ scene.actuation.T
 
 

@@ -297,14 +297,14 @@ class Search:
 
     def _step(self) -> tuple[Step, int]:
         """A step along the plan, or along others where that is none or short, and the backward passes it took."""
-        meets = self.plan is not None and self._meets_limits(self.plan)
+        first, motion = self.plan, self.trajectory
         step, passes = self._departure()
         if step.length == 0.0:
             step = _after(step, self._line_search())
         if step.length == 0.0 and self.exact:
             passes += self._plan(exact=False)
             step = _after(step, self._line_search())
-        if step.length <= _SHORT and meets:
+        if step.length <= _SHORT and first is not None and self._meets_limits(first, motion):
             step, more = self._clipped_instead(step)
             passes += more
         return step, passes
@@ -676,14 +676,14 @@ class Search:
         tried = (item for item in self.history[-1:] if item.decrease > item.expected_decrease)
         return self.anew and not any(item.step == 1.0 and item.rollouts == 2 for item in tried)
 
-    def _meets_limits(self, plan: Plan) -> bool:
+    def _meets_limits(self, plan: Plan, motion: Trajectory) -> bool:
         """Whether a plan holds controls at their limits, and no control is there on the motion it is around."""
-        return self.anew and self.clips and not plan.feedback.any(axis=2).all() and self._at_limits() == 0.0
+        return self.anew and self.clips and not plan.feedback.any(axis=2).all() and self._at_limits(motion) == 0.0
 
-    def _at_limits(self) -> float:
-        """Share of the motion's controls that are at a limit."""
+    def _at_limits(self, motion: Trajectory) -> float:
+        """Share of a motion's controls that are at a limit."""
         lower, upper = self.problem.control_limits
-        u = self.problem.decided(self.trajectory)
+        u = self.problem.decided(motion)
         return float(((u <= lower) | (u >= upper)).mean())
 
     def _clipped_instead(self, step: Step) -> tuple[Step, int]:
@@ -698,7 +698,7 @@ class Search:
         passes, self.planned = self._plan(), None
         other, self.clipping = self._line_search(_SHORT), False
         trials = step.trials + other.trials
-        if other.decrease > _MUCH_MORE * step.decrease and self._at_limits() <= _FEW:
+        if other.decrease > _MUCH_MORE * step.decrease and self._at_limits(self.trajectory) <= _FEW:
             return other._replace(trials=trials), passes
         self.clips = False
         self.plan, self.planned, self.trajectory, self.shares, self.cost, self.above, self.before, self.jumps = after

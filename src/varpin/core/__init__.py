@@ -34,6 +34,7 @@ from varpin.core._core import fastest_damping as fastest_damping
 from varpin.core._core import foresee as foresee
 from varpin.core._core import glance as glance
 from varpin.core._core import inside_bounds as inside_bounds
+from varpin.core._core import inverse_dynamics as inverse_dynamics
 from varpin.core._core import linearize_explicit as linearize_explicit
 from varpin.core._core import longest_alternation as longest_alternation
 from varpin.core._core import pulls_fast as pulls_fast

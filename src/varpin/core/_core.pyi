@@ -58,9 +58,6 @@ class Mechanism:
     def jets(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
         """M and L_vq (N, n, n) at each row of q and v (N, n)."""
 
-    def inverse_dynamics(self, q: Floats, v: Floats, a: Floats) -> Floats:
-        """The joint forces M a + L_vq v - L_q (N, n) that a motion needs at rows of q, v and a (N, n)."""
-
     def constraints(self, q: Floats) -> tuple[Floats, Floats, Floats]:
         """G (N, c), the magnitudes of the terms that cancel in it (N, c), and dg/dq (N, c, n), at rows of q (N, n)."""
 
@@ -547,6 +544,9 @@ def accelerations(
 
     Also returns the number of rows before the first whose mass matrix is not positive definite.
     """
+
+def inverse_dynamics(mechanism: Mechanism, q: Floats, v: Floats, a: Floats) -> Floats:
+    """The joint forces M a + L_vq v - L_q (N, n) that a motion needs at rows of q, v and a (N, n)."""
 
 class ExplicitMethod(Enum):
     """See src/core/include/varpin/explicit.hpp."""

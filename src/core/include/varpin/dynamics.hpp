@@ -182,6 +182,28 @@ class ForwardDynamics {
         solve_mass(room_.data(), a);
     }
 
+    // Inverse dynamics at (q, v, a): M a + bias, the forces that are needed besides those without a potential. It
+    // leaves another state than at() for the other calls.
+    void inverse(const double* q, const double* v, const double* a, double* force) {
+        const Tree& tree = mechanism_->tree;
+        add_potentials(q);
+        for (int j = 0; j < tree.size(); ++j) {
+            const Body& link = tree.bodies[j];
+            auto& here = jet_.body[j];
+            detail::place_body(tree, j, q, jet_);
+            detail::move(tree, j, v, jet_);
+            body_[j].inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
+            here.momentum = body_[j].inertia * here.velocity;
+            accelerate(j, v, a);
+        }
+        for (int c = 0; c < jet_.dof; ++c) force[c] = bias_[c] + tree.armature[c] * a[c];
+        for (int j = tree.size() - 1; j >= 0; --j) {
+            const Body& link = tree.bodies[j];
+            force[link.coordinate] += link.ratio * dot(jet_.body[j].axis, body_[j].force);
+            if (link.parent >= 0) body_[link.parent].force += body_[j].force;
+        }
+    }
+
     // The derivatives of inverse dynamics at accelerations a, once after at() with the same v; for the calls below.
     void differentiate(const double* v, const double* a) {
         const Tree& tree = mechanism_->tree;

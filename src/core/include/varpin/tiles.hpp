@@ -42,32 +42,42 @@ struct Range {
 
 namespace detail {
 
-// One tile of out = a'b, or of out += a'b, over `depth` rows.
-template <bool adds>
-[[gnu::always_inline]] inline void find_tile(const double* __restrict a, int a_stride, const double* __restrict b,
-                                             int b_stride, int depth, double* __restrict out, int out_stride) {
-    double sum[tile][tile] = {};
+// `rows` rows and one tile of columns of out = a'b, or of out += a'b, over `depth` rows of a and b.
+template <bool adds, int rows>
+[[gnu::always_inline]] inline void find_block(const double* __restrict a, int a_stride, const double* __restrict b,
+                                              int b_stride, int depth, double* __restrict out, int out_stride) {
+    Quad sum[rows] = {};
     for (int l = 0; l < depth; ++l, a += a_stride, b += b_stride) {
-        for (int r = 0; r < tile; ++r) {
-            for (int c = 0; c < tile; ++c) sum[r][c] += a[r] * b[c];
-        }
+        const Quad& row = quad_at(b);
+        for (int r = 0; r < rows; ++r) sum[r] += Quad{a[r], a[r], a[r], a[r]} * row;
     }
-    for (int r = 0; r < tile; ++r) {
-        for (int c = 0; c < tile; ++c) {
-            double& entry = out[r * out_stride + c];
-            entry = adds ? entry + sum[r][c] : sum[r][c];
-        }
+    for (int r = 0; r < rows; ++r) {
+        Quad& entries = quad_at(out + r * out_stride);
+        entries = adds ? entries + sum[r] : sum[r];
     }
 }
 
-template <bool adds>
+// With `pairs`, two rows of tiles at a time: as many sums as hide the time that an addition takes.
+template <bool adds, bool pairs>
 [[gnu::always_inline]] inline void find_tiles(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out,
                                               int rows, Part part) {
     const int columns = std::min(b.stride(), out.stride()), depth = range.end - range.begin;
     const double *top_a = a[range.begin], *top_b = b[range.begin];
-    for (int i = 0; i < rows; i += tile) {
-        for (int j = part == Part::upper ? i : 0; j < columns; j += tile)
-            find_tile<adds>(top_a + i, a.stride(), top_b + j, b.stride(), depth, out[i] + j, out.stride());
+    const auto one = [&](int i, int j) {
+        find_block<adds, tile>(top_a + i, a.stride(), top_b + j, b.stride(), depth, out[i] + j, out.stride());
+    };
+    int i = 0;
+    for (; pairs && i + tile < rows; i += 2 * tile) {
+        int j = 0;
+        if (part == Part::upper) {
+            one(i, i);
+            j = i + tile;
+        }
+        for (; j < columns; j += tile)
+            find_block<adds, 2 * tile>(top_a + i, a.stride(), top_b + j, b.stride(), depth, out[i] + j, out.stride());
+    }
+    for (; i < rows; i += tile) {
+        for (int j = part == Part::upper ? i : 0; j < columns; j += tile) one(i, j);
     }
 }
 
@@ -76,7 +86,7 @@ template <bool adds>
 template <bool adds>
 [[gnu::target("avx2")]] void find_wide_tiles(const TiledMatrix& a, const TiledMatrix& b, Range range, TiledMatrix& out,
                                              int rows, Part part) {
-    find_tiles<adds>(a, b, range, out, rows, part);
+    find_tiles<adds, true>(a, b, range, out, rows, part);
 }
 #endif
 
@@ -88,7 +98,7 @@ inline void add_transposed_product(const TiledMatrix& a, const TiledMatrix& b, R
 #if defined(__x86_64__) && defined(__GNUC__)
     if (has_wide()) return detail::find_wide_tiles<true>(a, b, range, out, rows, part);
 #endif
-    detail::find_tiles<true>(a, b, range, out, rows, part);
+    detail::find_tiles<true, false>(a, b, range, out, rows, part);
 }
 
 // The same of out = a'b: whatever was there is gone.
@@ -97,7 +107,7 @@ inline void transposed_product(const TiledMatrix& a, const TiledMatrix& b, Range
 #if defined(__x86_64__) && defined(__GNUC__)
     if (has_wide()) return detail::find_wide_tiles<false>(a, b, range, out, rows, part);
 #endif
-    detail::find_tiles<false>(a, b, range, out, rows, part);
+    detail::find_tiles<false, false>(a, b, range, out, rows, part);
 }
 
 namespace detail {
