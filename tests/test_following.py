@@ -65,7 +65,7 @@ def test_a_motion_goes_along_the_foreseen_states(integrator, hold):
     motion = search.trials.attempt(commands).trajectory()
     moved = np.abs(wanted - search.trajectory.q).max()
     assert np.abs(motion.q - wanted).max() <= 0.02 * moved
-    # The cost that was foreseen without an integration.
+    # Its controls are those of the inverse dynamics.
     u, missing = inverse_dynamics(problem, Path(motion.q, motion.v), None)
     assert not missing.any()
     np.testing.assert_allclose(u, motion.u[::hold], atol=0.05 * np.abs(u).max())
@@ -89,7 +89,13 @@ def of_panda():
     return vp.OptimalControlProblem(vp.Scene(robot), cost, begin, np.zeros(7), dt=0.02, steps=50)
 
 
-@pytest.mark.parametrize("task", [of_panda, lambda: posture(torque=0.1, steps=30)])
+def of_two_links():
+    cost = vp.ControlCost(0.1) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([2.5, -2.5], 1e3) + vp.VelocityCost(10.0))
+    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2)), cost, np.zeros(2), np.zeros(2), dt=0.02, steps=50)
+
+
+@pytest.mark.parametrize("task", [of_panda, of_two_links])
 def test_steps_along_foreseen_states_save_iterations(monkeypatch, task):
     """The same optimum with fewer iterations and trials."""
     found = vp.solve(task(), check=False)

@@ -24,8 +24,6 @@ _HOLDING_FREQUENCY = 0.25
 # _NEAR of what the model says, and no joint may be moved by more than _FAR [rad or m]: arms that are moved far often
 # reach for a frame in a posture that costs more.
 _LENGTHS, _CLEARLY, _NEAR, _FAR = (1.0, 0.5), 1.1, 0.7, 2.0
-# Controls beyond their limits by more than this share of the largest one cannot follow a path.
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,16 +39,10 @@ def inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Float
 
     With ``controls`` (R, m) these are the controls.
     """
-    scene, hold = problem.scene, problem.hold
-    q, v = 0.5 * (path.q[:-hold:hold] + path.q[hold::hold]), np.diff(path.q[::hold], axis=0) / problem.period
-    needed = core.inverse_dynamics(scene.core, q, v, np.diff(path.v[::hold], axis=0) / problem.period)
-    # A servo commanded to its present position exerts no spring force.
-    still = q @ scene.holding.T @ scene.actuation.T
-    needed += still - scene.core.forces(q, v, still)[0]
+    scene, hold, needed = problem.scene, problem.hold, _demand(problem, path)
     if controls is None:
         controls = as_moved(scene, path.q[hold::hold], path.v[hold::hold], needed @ scene.allocation.T)
-        if problem.limited:
-            controls = np.clip(controls, *problem.control_limits)
+        controls = np.clip(controls, *problem.control_limits)
     return controls, needed - controls @ scene.actuation.T
 
 
@@ -79,10 +71,10 @@ class Foresight:
     def possible(self) -> bool:
         """Whether controls can give every joint the force that the foreseen motion needs, limits apart."""
         problem, scene = self.problem, self.problem.scene
-        if isinstance(problem, PenalizedProblem):
-            # Measured with constraints, as many searches took more iterations as took fewer.
+        if isinstance(problem, PenalizedProblem) or problem.linear:
+            # Measured, as many of these searches took more iterations as took fewer.
             return False
-        if problem.linear or scene.inputs or scene.constraints or scene.custom is not None:
+        if scene.inputs or scene.constraints or scene.custom is not None:
             return False
         return scene.direct or int(np.linalg.matrix_rank(scene.actuation)) == scene.robot.dof
 
@@ -101,36 +93,54 @@ class Foresight:
             plan: The plan.
             shares: The terms of the motion's cost.
             bound: Change of the cost by another trial. The foreseen states must cost clearly less.
-            feedback: Commands whose controls, feedback and reference are replaced.
+            feedback: Commands of the motion with the plan's feedback.
         """
         problem, n = self.problem, self.problem.scene.robot.dof
         if not self.possible or len(along.blocks) > 1:
             return None
-        q, v = along.trajectory.q, along.trajectory.v
+        here = Path(along.trajectory.q, along.trajectory.v)
+        change = self._foreseen(along, plan, here)
+        u, force, limits = problem.decided(along.trajectory), _demand(problem, here), problem.control_limits[:, None]
+        best, found, far = _CLEARLY * min(bound, 0.0), None, float(np.abs(change[:, :n]).max())
+        for length in (each for each in _LENGTHS if each * far <= _FAR):
+            path = Path(here.q + length * change[:, :n], here.v + length * change[:, n:])
+            # Differences of the inverse dynamics: what it is off by on the motion itself cancels.
+            there = u + (_demand(problem, path) - force) @ problem.scene.allocation.T
+            if problem.limited and not ((limits[0] <= there) & (there <= limits[1])).all():
+                continue
+            cost = float((self._shares(path, there) - shares).sum())
+            model = length * plan.slope + 0.5 * length**2 * plan.curvature
+            if cost < best and cost <= _NEAR * model:
+                best, found = cost, (path, there, length)
+        if found is None:
+            return None
+        path, there, length = found
+        return feedback._replace(u=there, gains=self._gains, reference=states_on(problem, path)), length
+
+    def _foreseen(self, along: Along, plan: Plan, here: Path) -> Floats:
+        """The changes of q and v at the nodes (N + 1, 2n) with a full step, by the linearized motion."""
+        problem, n = self.problem, self.problem.scene.robot.dof
         change = np.zeros((problem.steps + 1, 2 * n))
         foreseen(along, plan, after=change[1:])
         if problem.integrator.variational:
             slopes = along.linearized(0, problem.steps)[1]
-            slopes = slopes if len(slopes) else velocity_at_nodes(problem.scene, q, v)
+            slopes = slopes if len(slopes) else velocity_at_nodes(problem.scene, here.q, here.v)
             change[:, n:] = (slopes @ change[:, :, None])[:, :, 0]
-        far = float(np.abs(change[:, :n]).max())
-        best, found = _CLEARLY * min(bound, 0.0), None
-        for length in (each for each in _LENGTHS if each * far <= _FAR):
-            path = Path(q + length * change[:, :n], v + length * change[:, n:])
-            u, missing = inverse_dynamics(problem, path, None)
-            if not np.abs(missing).max(initial=0.0) <= _ROUNDING * np.abs(u).max(initial=1.0):
-                continue
-            cost = float((self._shares(path, u) - shares).sum())
-            model = length * plan.slope + 0.5 * length**2 * plan.curvature
-            if cost < best and cost <= _NEAR * model:
-                best, found = cost, (path, u, length)
-        if found is None:
-            return None
-        path, u, length = found
-        return feedback._replace(u=u, gains=self._gains, reference=states_on(problem, path)), length
+        return change
 
     def _shares(self, path: Path, u: Floats) -> Floats:
         """The terms of the cost of a path under the controls that follow it."""
         problem, rows = self.problem, np.repeat(u, self.problem.hold, axis=0)
         compiled = problem.running.compiled.values(*problem.samples(path.q, path.v, rows))
         return problem.shares_along(path.q, path.v, rows, compiled)
+
+
+def _demand(problem: OptimalControlProblem, path: Path) -> Floats:
+    """The joint forces (R, n) that controls have to give on a path, over each decision."""
+    q, v = path.q[:: problem.hold], path.v[:: problem.hold]
+    q, v, a = 0.5 * (q[:-1] + q[1:]), np.diff(q, axis=0) / problem.period, np.diff(v, axis=0) / problem.period
+    scene = problem.scene
+    # A servo commanded to its present position exerts no spring force.
+    still = q @ scene.holding.T @ scene.actuation.T
+    needed: Floats = core.inverse_dynamics(scene.core, q, v, a) + still - scene.core.forces(q, v, still)[0]
+    return needed
