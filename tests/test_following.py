@@ -92,7 +92,7 @@ def of_panda():
 def of_two_links():
     cost = vp.ControlCost(0.1) + vp.VelocityCost(1e-2)
     cost += vp.Terminal(vp.TrackingCost([2.5, -2.5], 1e3) + vp.VelocityCost(10.0))
-    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2)), cost, np.zeros(2), np.zeros(2), dt=0.02, steps=50)
+    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2)), cost, np.zeros(2), np.zeros(2), dt=0.02, steps=30)
 
 
 @pytest.mark.parametrize("task", [of_panda, of_two_links])

@@ -37,7 +37,7 @@ TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError
 # Steps no longer than that are very short.
 VERY_SHORT = 0.01
 # A full step with less than this share of the foreseen decrease is compared with one along foreseen states.
-_AS_FORESEEN = 0.9
+_AS_FORESEEN = 0.7
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
 # A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
