@@ -9,6 +9,7 @@ from varpin import core
 from varpin.control import following
 from varpin.control.commands import first_commands
 from varpin.control.following import Foresight, Path, inverse_dynamics, states_on
+from varpin.control.line_search import LineSearch
 from varpin.control.search import Search
 
 RNG = np.random.default_rng(5)
@@ -23,8 +24,13 @@ def posture(*, goal=(2.0, -2.0, 2.0), scene=None, torque=1e-3, **options):
     return vp.OptimalControlProblem(scene, cost, np.zeros(3), np.zeros(3), **options)
 
 
+def eager(**options):
+    """The same with dear torques: full steps along the controls miss what the model says."""
+    return posture(torque=0.1, steps=30, **options)
+
+
 def planned(problem):
-    """A search with its first plan, and what its line search is given."""
+    """A search with its first plan."""
     search = Search(problem, False)
     search.begin(first_commands(problem, None))
     search._plan()
@@ -112,10 +118,12 @@ def test_steps_along_foreseen_states_save_iterations(monkeypatch, task):
     ("why", "options"),
     [
         ("a joint without a drive", {"scene": vp.Scene(vp.planar_chain(3), actuation=["joint1", "joint2"])}),
+        ("more controls than joints", {"scene": vp.Scene(vp.planar_chain(3), actuation=np.eye(3, 4) + 0.1)}),
+        ("drives with a limit", {"scene": vp.Scene(vp.planar_chain(3), forces=vp.PositionServo(100.0, 10.0, 15.0))}),
         ("linear controls", {"controls": "linear"}),
     ],
 )
-def test_only_arms_with_a_drive_at_each_joint_follow(why, options):
+def test_only_arms_with_one_drive_for_each_joint_follow(why, options):
     assert Foresight(posture()).possible
     problem = posture(**options)
     assert not Foresight(problem).possible, why
@@ -162,3 +170,67 @@ def test_searches_go_on_as_if_not_interrupted_once_a_trial_has_strayed(tmp_path)
             assert [row.step for row in rest.history] == [row.step for row in whole.history]
             np.testing.assert_array_equal(rest.trajectory.q, whole.trajectory.q)
             assert rest.cost == whole.cost
+
+
+def fence(angle):
+    """A cost that fails beyond an angle."""
+
+    def value(t, q, v, u):
+        if np.abs(q).max() > angle:
+            raise ValueError("beyond the fence")
+        return np.zeros(len(q))
+
+    return vp.CustomCost(value)
+
+
+@pytest.mark.parametrize("angle", [0.5, 1.0, 1.5])
+def test_a_cost_that_fails_at_foreseen_states_ends_no_search(angle):
+    plain = eager()
+    options = {"dt": plain.dt, "steps": plain.steps}
+    problem = vp.OptimalControlProblem(plain.scene, plain.cost + fence(angle), plain.q0, plain.v0, **options)
+    plan = vp.solve(problem, max_iterations=10, check=False)
+    assert plan.history
+    assert np.abs(plan.trajectory.q).max() <= angle
+
+
+@pytest.mark.parametrize(
+    ("scene", "options"),
+    [
+        (vp.Scene(vp.planar_chain(3)), {"forward": "open"}),
+        (vp.Scene(vp.planar_chain(3), noise=vp.ControlNoise(0.05)), {"noise": "held"}),
+    ],
+    ids=["open loop", "noise of the controls"],
+)
+def test_searches_that_do_not_follow(monkeypatch, scene, options):
+    def fails(*_):
+        raise AssertionError("foreseen states were looked at")
+
+    monkeypatch.setattr(Foresight, "commands", fails)
+    with pytest.raises(AssertionError, match="foreseen"):
+        vp.solve(eager(), check=False)
+    assert vp.solve(eager(scene=scene), max_iterations=5, check=False, **options).history
+
+
+def test_a_trial_that_strays_is_the_last_one(monkeypatch):
+    """And a step along foreseen states is not extended along the controls."""
+    steps, tried = [], []
+    run, following = LineSearch.run, LineSearch._following
+
+    def searched(self, start, shortest=0.0):
+        steps.append(run(self, start, shortest))
+        return steps[-1]
+
+    def followed(self, *arguments):
+        found = following(self, *arguments)
+        if found is not None:
+            tried.append((len(steps), found))
+        return found
+
+    monkeypatch.setattr(LineSearch, "run", searched)
+    monkeypatch.setattr(LineSearch, "_following", followed)
+    vp.solve(strays(), tolerance=1e-4, check=False)
+    assert len(tried) > 1
+    for at, (trial, length) in tried[:-1]:
+        assert steps[at].taken.motion is trial.motion
+        assert (steps[at].length, steps[at].trials) == (length, 2)
+    assert [steps[at].strayed for at, _ in tried] == [False] * (len(tried) - 1) + [True]

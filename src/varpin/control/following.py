@@ -15,15 +15,18 @@ from varpin.control.penalties import PenalizedProblem
 from varpin.control.problem import OptimalControlProblem
 from varpin.core.arrays import Commands
 from varpin.linearization import node_jets, velocity_at_nodes
+from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.inputs import as_moved
 from varpin.mechanics.lagrangian import lagrangian_jet
 
 # Natural frequency of the feedback that holds a motion on a path, times the decision period.
 _HOLDING_FREQUENCY = 0.25
-# Lengths of steps along foreseen states. Their cost must fall by _CLEARLY times as much as with the full step, and by
-# _NEAR of what the model says, and no joint may be moved by more than _FAR [rad or m]: arms that are moved far often
-# reach for a frame in a posture that costs more.
-_LENGTHS, _CLEARLY, _NEAR, _FAR = (1.0, 0.5), 1.1, 0.7, 2.0
+# Share of the decrease that the model says, from which on a step is as foreseen.
+AS_FORESEEN = 0.7
+# Lengths of steps along foreseen states. Their cost must fall by _CLEARLY times as much as with the full step, and no
+# joint may move away from the present motion by more than _FAR [rad or m]: arms that are moved far often reach for a
+# frame in a posture that costs more.
+_LENGTHS, _CLEARLY, _FAR = (1.0, 0.5), 1.1, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +49,10 @@ def inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Float
     return controls, needed - controls @ scene.actuation.T
 
 
-def holding_feedback(problem: OptimalControlProblem) -> Floats:
-    """Gains of the joint forces (n, 2n) that hold a motion on states, (q, p) or (q, v)."""
-    n, omega = problem.scene.robot.dof, _HOLDING_FREQUENCY / problem.period
-    M = lagrangian_jet(problem.scene, problem.q0, np.zeros(n)).Lvv
-    return -np.hstack([omega**2 * M, 2.0 * omega * (np.eye(n) if problem.integrator.variational else M)])
+def holding_feedback(problem: OptimalControlProblem, M: Floats) -> Floats:
+    """Gains of the joint forces (n, 2n) that hold a motion with mass matrix M (n, n) on states, (q, p) or (q, v)."""
+    omega = _HOLDING_FREQUENCY / problem.period
+    return -np.hstack([omega**2 * M, 2.0 * omega * (np.eye(len(M)) if problem.integrator.variational else M)])
 
 
 def states_on(problem: OptimalControlProblem, path: Path) -> Floats:
@@ -69,22 +71,25 @@ class Foresight:
 
     @cached_property
     def possible(self) -> bool:
-        """Whether controls can give every joint the force that the foreseen motion needs, limits apart."""
+        """Whether there are controls, just one for each motion, that give all joints the forces it needs."""
         problem, scene = self.problem, self.problem.scene
         if isinstance(problem, PenalizedProblem) or problem.linear:
             # Measured, as many of these searches took more iterations as took fewer.
             return False
-        if scene.inputs or scene.constraints or scene.custom is not None:
+        if scene.inputs or scene.constraints or scene.custom is not None or limited_servos(scene.elements):
             return False
-        return scene.direct or int(np.linalg.matrix_rank(scene.actuation)) == scene.robot.dof
+        n = scene.robot.dof
+        return scene.direct or (scene.controls == n and int(np.linalg.matrix_rank(scene.actuation)) == n)
 
     @cached_property
     def _gains(self) -> Floats:
-        to_controls = self.problem.scene.allocation @ holding_feedback(self.problem)
+        problem = self.problem
+        M = lagrangian_jet(problem.scene, problem.q0, np.zeros(problem.scene.robot.dof)).Lvv
+        to_controls = problem.scene.allocation @ holding_feedback(problem, M)
         return np.tile(to_controls, (self.problem.decisions, 1, 1))
 
     def commands(
-        self, along: Along, plan: Plan, shares: Floats, bound: float, feedback: Commands
+        self, along: Along, plan: Plan, shares: Floats, full: float, feedback: Commands
     ) -> tuple[Commands, float] | None:
         """The commands of a motion that follows the plan's foreseen states, and its length; None without a good one.
 
@@ -92,8 +97,11 @@ class Foresight:
             along: The motion that the plan is around.
             plan: The plan.
             shares: The terms of the motion's cost.
-            bound: Change of the cost by another trial. The foreseen states must cost clearly less.
+            full: Change of the cost by the full step. The foreseen states must cost clearly less.
             feedback: Commands of the motion with the plan's feedback.
+
+        Raises:
+            CostError: A custom cost fails at the foreseen states.
         """
         problem, n = self.problem, self.problem.scene.robot.dof
         if not self.possible or len(along.blocks) > 1:
@@ -101,7 +109,7 @@ class Foresight:
         here = Path(along.trajectory.q, along.trajectory.v)
         change = self._foreseen(along, plan, here)
         u, force, limits = problem.decided(along.trajectory), _demand(problem, here), problem.control_limits[:, None]
-        best, found, far = _CLEARLY * min(bound, 0.0), None, float(np.abs(change[:, :n]).max())
+        best, found, far = _CLEARLY * min(full, 0.0), None, float(np.abs(change[:, :n]).max())
         for length in (each for each in _LENGTHS if each * far <= _FAR):
             path = Path(here.q + length * change[:, :n], here.v + length * change[:, n:])
             # Differences of the inverse dynamics: what it is off by on the motion itself cancels.
@@ -110,7 +118,7 @@ class Foresight:
                 continue
             cost = float((self._shares(path, there) - shares).sum())
             model = length * plan.slope + 0.5 * length**2 * plan.curvature
-            if cost < best and cost <= _NEAR * model:
+            if cost < best and cost <= AS_FORESEEN * model:
                 best, found = cost, (path, there, length)
         if found is None:
             return None

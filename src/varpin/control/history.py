@@ -56,12 +56,13 @@ class Iteration:
         noise_cost: Cost added by noise to the motion before the iteration.
         expected_decrease: Decrease of the expected cost by the quadratic model with a full step.
         decrease: Actual decrease of the expected cost, with the plan's model of the noise; 0 without a step.
-        step: Length of the accepted step, 0 if there is none; above 1 where the cost falls on beyond.
+        step: Length of the accepted step, 0 if there is none; above 1 where the cost falls on beyond. Of a step along
+            foreseen states it is the share of their changes.
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
         backward_passes: Number of backward passes with different regularizations. Those that determine the controls at
             their limits, on the same derivatives, do not count.
-        rollouts: Number of trials of the line search.
+        rollouts: Number of trials of the line search, one along foreseen states included.
         seconds: Time of the iteration [s].
         second_order: Whether second derivatives of the dynamics were used.
     """
@@ -110,6 +111,7 @@ class SearchState:
         saturated: Whether it takes into account that drives of servos are at their limits.
         clips: Whether plans may leave control limits to the clipping of motions where steps are short.
         follows: Whether trials may follow the states that plans foresee: none has strayed from them.
+        overshot: Whether an extension of the last full step did not lower the cost.
         returned: Whether it has just gone back from a motion that cannot be linearized.
         watchdog: Whether it is away from the best motion.
         rows: Active rows of penalties (M,) at the end of the last backward pass, with which the next one begins; None
@@ -134,6 +136,7 @@ class SearchState:
     saturated: bool = False
     clips: bool = True
     follows: bool = True
+    overshot: bool = False
     returned: bool = False
     watchdog: Watchdog = field(default_factory=Watchdog)
     rows: Mask | None = None

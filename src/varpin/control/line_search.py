@@ -16,7 +16,7 @@ from varpin.control.backward import backward
 from varpin.control.commands import with_feedback
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
-from varpin.control.following import Foresight
+from varpin.control.following import AS_FORESEEN, Foresight
 from varpin.control.passes import Plan, noise_shares
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.trials import HALVINGS, MORE_HALVINGS, Attempt, Trials, cut_less, few_halvings
@@ -36,8 +36,6 @@ _EPS = float(np.finfo(np.float64).eps)
 TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
 # Steps no longer than that are very short.
 VERY_SHORT = 0.01
-# A full step with less than this share of the foreseen decrease is compared with one along foreseen states.
-_AS_FORESEEN = 0.7
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
 # A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
@@ -131,7 +129,8 @@ class Step(NamedTuple):
         taken: The accepted trial.
         cut: Whether trials without an accepted one were stopped for their number of substeps.
         jumps: Whether very short trials were rejected where they divide other steps than the motion.
-        strayed: Whether a trial that was to follow foreseen states was no better than the full step.
+        strayed: Whether a trial that followed foreseen states cost no less than the full step.
+        overshot: Whether an extension of a full step was tried and did not lower the cost further.
     """
 
     length: float = 0.0
@@ -142,6 +141,7 @@ class Step(NamedTuple):
     cut: bool = False
     jumps: bool = False
     strayed: bool = False
+    overshot: bool = False
 
 
 class _Bounds(NamedTuple):
@@ -166,7 +166,7 @@ class _Here(NamedTuple):
     added: Floats  # noise cost of each step
     total: float  # the expected cost
 
-    def along(self, step: float, plan: Plan) -> Commands:
+    def commands(self, step: float, plan: Plan) -> Commands:
         """The commands of a step of this length along the plan."""
         return Commands(self.controls + step * plan.feedforward, *self.feedback[1:])
 
@@ -233,7 +233,10 @@ class LineSearch:
         )
 
     def run(self, start: Start, shortest: float = 0.0) -> Step:
-        """Find the first trial along the plan with sufficient decrease of the expected cost, (O13)."""
+        """Find the first trial along the plan with sufficient decrease of the expected cost, (O13).
+
+        A trial that follows foreseen states, (O17), may take the place of the full step.
+        """
         slope = start.plan.slope
         taken, length, tried, trials, cuts, jumps, strayed = Trial(), 0.0, None, 0, False, False, False
         here = self._here(start)
@@ -241,14 +244,15 @@ class LineSearch:
         left: Iterable[float] = lengths
         for bounds in self._bounds(start):
             cut = []
-            for shorter in left:
-                trials, step = trials + 1, shorter
+            for step in left:
+                trials += 1
                 trial = self._try(step, start, here, bounds)
                 lengths.learn(step, trial.expected, slope)
-                if trials == 1 and (other := self._following(trial, start, here, bounds)) is not None:
-                    trials += 1
-                    strayed = not other[0].expected < trial.expected
-                    trial, step = (trial, step) if strayed else other
+                if trials == 1 and (followed := self._following(trial, start, here, bounds)) is not None:
+                    trials, (other, along) = trials + 1, followed
+                    strayed = not (other.cut or other.expected < trial.expected)
+                    if not strayed and other.expected <= self.armijo * along * slope:
+                        return Step(along, trials, -other.expected, taken=other)
                 if trial.expected <= self.armijo * step * slope and trial.expected < taken.expected:
                     taken, length = trial, step
                     if trial.expected <= _POOR * step * slope:
@@ -266,14 +270,19 @@ class LineSearch:
             left = [step for step in cut if step > length]
             if not left or length > (VERY_SHORT if bounds.parts == _PARTS else 0.0):
                 break
+        overshot = False
         while start.extends and length >= 1.0 and taken.expected <= _EARLY * length * slope:
             trials += 1
             trial = self._try(_EXTENSION * length, start, here, bounds)
             if not trial.expected < taken.expected:
+                overshot = length == 1.0
                 break
             taken, length = trial, _EXTENSION * length
         if length > 0.0:
-            return Step(length, trials, -taken.expected, taken=taken, cut=cuts, jumps=jumps, strayed=strayed)
+            decrease = -taken.expected
+            return Step(
+                length, trials, decrease, taken=taken, cut=cuts, jumps=jumps, strayed=strayed, overshot=overshot
+            )
         hidden = 0.0
         if tried is not None:
             hidden = rounding(self.problem, start.trajectory, start.shares, tried, start.plan.model)
@@ -283,7 +292,7 @@ class LineSearch:
         """Take the longest trial along the plan that raises the expected cost by at most ``most``."""
         here, bounds = self._here(start), next(self._bounds(start))
         for trials, step in enumerate(_LEAPS, start=1):
-            trial = self._run(step, here.along(step, start.plan), start, here, bounds, rise=most)
+            trial = self._run(step, here.commands(step, start.plan), start, here, bounds, rise=most)
             if trial.expected <= most:
                 return Step(step, trials, -trial.expected, taken=trial)
         return Step(trials=len(_LEAPS))
@@ -311,16 +320,20 @@ class LineSearch:
     def _try(self, step: float, start: Start, here: _Here, bounds: _Bounds) -> Trial:
         """A trial of length ``step`` along the plan."""
         rise = -_DEAR * step * start.plan.slope
-        return self._run(step, here.along(step, start.plan), start, here, bounds, rise=rise)
+        return self._run(step, here.commands(step, start.plan), start, here, bounds, rise=rise)
 
     def _following(self, full: Trial, start: Start, here: _Here, bounds: _Bounds) -> tuple[Trial, float] | None:
         """A trial that follows foreseen states, with its length, if a ``full`` step is less good than foreseen.
 
         None, too, where these states do not cost clearly less than the full step, or controls cannot follow them.
         """
-        if not (start.follows and self.closed) or -full.expected >= _AS_FORESEEN * start.plan.expected_decrease:
+        if not (start.follows and self.closed) or -full.expected >= AS_FORESEEN * start.plan.expected_decrease:
             return None
-        found = self._foresight.commands(start.along, start.plan, start.shares, full.cost, here.feedback)
+        try:
+            found = self._foresight.commands(start.along, start.plan, start.shares, full.cost, here.feedback)
+        except TRIAL_ERRORS as error:
+            logger.info("%s: states of the full step: %s", self.label, error)
+            return None
         if found is None:
             return None
         commands, length = found

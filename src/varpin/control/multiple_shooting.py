@@ -174,7 +174,7 @@ class GapClosing:
         self.left = 1.0
         n, m = own.robot.dof, own.controls
         M = lagrangian_jet(own, problem.q0, np.zeros(n)).Lvv
-        hold = holding_feedback(self.problem)
+        hold = holding_feedback(problem, M)
         free, moved = own.unprescribed, own.prescribed
         self._free = free
         self._weight = np.linalg.inv(M[np.ix_(free, free)])

@@ -98,6 +98,7 @@ class Search:
         # Whether plans leave out the limits now, and whether they may do so: no step of theirs has been rejected.
         self.clipping, self.clips = False, problem.limited
         self.follows = True  # whether trials may follow foreseen states: none of them has strayed
+        self.overshot = False  # whether an extension of the last full step did not lower the cost
         self.history: list[Iteration] = []
         self.plan: Plan | None = None
         self.planned: tuple[Trajectory, float, bool] | None = None  # (motion, regularization, exact) of the plan
@@ -188,7 +189,7 @@ class Search:
         self.bounded, self.cut = state.bounded, state.cut
         self.whole = state.whole and self.wants_whole
         self.clips = state.clips and self.clips
-        self.follows = state.follows
+        self.follows, self.overshot = state.follows, state.overshot
         self.returned = state.returned
         self.watchdog, self.rows = state.watchdog, state.rows
         if state.saturated:
@@ -213,6 +214,7 @@ class Search:
             saturated=self.saturated,
             clips=self.clips,
             follows=self.follows,
+            overshot=self.overshot,
             returned=self.returned,
             watchdog=self.watchdog,
             rows=self.rows,
@@ -651,13 +653,13 @@ class Search:
                 rating=0.0 if self.rated is None else self.rated.regularization,
                 exact=self.exact,
                 whole=self.whole,
-                extends=self._extends(),
-                follows=self.anew and self.follows,
+                extends=self.anew and not self.overshot,
+                follows=self.anew and self.follows and not self.any_steered,
                 bounded=self.bounded,
             )
         )
         self.cut = self.cut or step.cut
-        self.follows = self.follows and not step.strayed
+        self.follows, self.overshot = self.follows and not step.strayed, step.overshot
         self.jumps = step.length < _LONG and (self.jumps or step.jumps)
         taken = step.taken
         if taken.motion is not None and taken.shares is not None:
@@ -670,11 +672,6 @@ class Search:
             self.cost = float(taken.shares.sum())
             self.above += taken.cost
         return step
-
-    def _extends(self) -> bool:
-        """Whether full steps that end early are extended: not after a last extension that did not lower the cost."""
-        tried = (item for item in self.history[-1:] if item.decrease > item.expected_decrease)
-        return self.anew and not any(item.step == 1.0 and item.rollouts == 2 for item in tried)
 
     def _meets_limits(self, plan: Plan, motion: Trajectory) -> bool:
         """Whether a plan holds controls at their limits, and no control is there on the motion it is around."""

@@ -32,7 +32,7 @@ _FORMAT = "varpin.solution/2"
 _PROBLEM = ("q0", "v0", "t0", "steps", "hold", "controls", "between_nodes", "sampling", "control_limits")
 _STATUSES = tuple(Status)
 _NUMBERS = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
-_FLAGS = ("bounded", "cut", "whole", "saturated", "clips", "follows", "returned")
+_FLAGS = ("bounded", "cut", "whole", "saturated", "clips", "follows", "overshot", "returned")
 _REFINED = tuple(item.name for item in fields(Refined) if item.name != "status")
 # The columns of a history; the truth values of `second_order` are an entry of their own, which older files do not have.
 _COLUMNS = tuple(item.name for item in fields(Iteration) if item.type != "bool")
@@ -58,6 +58,7 @@ class _Search:
     saturated: int = 0
     clips: int = 1
     follows: int = 1
+    overshot: int = 0
     returned: int = 0
     watchdog: Annotated[Floats, Axes(len(Watchdog._fields), finite=True)] | None = None
     rows: Annotated[Mask, Axes("penalty_rows")] | None = None

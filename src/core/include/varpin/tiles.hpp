@@ -30,7 +30,7 @@ class TiledMatrix {
     std::vector<double> values_;
 };
 
-enum class Part { all, upper };  // upper: the tiles on and above the diagonal
+enum class Part { all, upper };  // upper: the tiles on and above the diagonal, of no more rows than columns
 
 // Rows begin .. end; of a number, that many leading rows.
 struct Range {
