@@ -96,7 +96,8 @@ std::tuple<Out, Out, Out, Out, std::size_t> accelerations(const Mechanism& mecha
     return {values, aq, av, af, s};
 }
 
-// The joint forces (N, n) that accelerations a need at each row of q, v and a (N, n), besides those without a potential.
+// The joint forces (N, n) that accelerations a need at each row of q, v and a (N, n), besides those without a
+// potential.
 Out inverse_dynamics(const Mechanism& mechanism, In<2> q, In<2> v, In<2> a) {
     const std::size_t n = static_cast<std::size_t>(mechanism.dof()), rows = q.shape(0);
     require(q, "q", {rows, n});
