@@ -106,7 +106,7 @@ Out inverse_dynamics(const Mechanism& mechanism, In<2> q, In<2> v, In<2> a) {
     double* force = nullptr;
     const Out out = array_for(force, {rows, n});
     nb::gil_scoped_release release;
-    ForwardDynamics dynamics(mechanism, false);
+    ForwardDynamics dynamics(mechanism, true);
     for (std::size_t s = 0; s < rows; ++s)
         dynamics.inverse(q.data() + s * n, v.data() + s * n, a.data() + s * n, force + s * n);
     return out;

@@ -157,13 +157,8 @@ class ForwardDynamics {
             }
             return kinetic + jet_.total_potential();
         }
-        for (const Block& block : mechanism_->tree.blocks) {
-            for (int i = block.begin; i < block.end; ++i) {
-                p[i] = 0.0;
-                for (int j = block.begin; j < block.end; ++j) p[i] += jet_.M[i * n + j] * v[j];
-                kinetic += 0.5 * v[i] * p[i];
-            }
-        }
+        times_mass(v, p);
+        for (int i = 0; i < n; ++i) kinetic += 0.5 * v[i] * p[i];
         return kinetic + jet_.total_potential();
     }
 
@@ -182,26 +177,12 @@ class ForwardDynamics {
         solve_mass(room_.data(), a);
     }
 
-    // Inverse dynamics at (q, v, a): M a + bias, the forces that are needed besides those without a potential. It
-    // leaves another state than at() for the other calls.
+    // Inverse dynamics at (q, v, a): the forces M a + bias that are needed besides those without a potential. It takes
+    // a mass matrix, as derivatives do.
     void inverse(const double* q, const double* v, const double* a, double* force) {
-        const Tree& tree = mechanism_->tree;
-        add_potentials(q);
-        for (int j = 0; j < tree.size(); ++j) {
-            const Body& link = tree.bodies[j];
-            auto& here = jet_.body[j];
-            detail::place_body(tree, j, q, jet_);
-            detail::move(tree, j, v, jet_);
-            body_[j].inertia = placed(here.rotation, here.position, link.mass, link.center, link.inertia);
-            here.momentum = body_[j].inertia * here.velocity;
-            accelerate(j, v, a);
-        }
-        for (int c = 0; c < jet_.dof; ++c) force[c] = bias_[c] + tree.armature[c] * a[c];
-        for (int j = tree.size() - 1; j >= 0; --j) {
-            const Body& link = tree.bodies[j];
-            force[link.coordinate] += link.ratio * dot(jet_.body[j].axis, body_[j].force);
-            if (link.parent >= 0) body_[link.parent].force += body_[j].force;
-        }
+        at(q, v);
+        times_mass(a, force);
+        for (int i = 0; i < jet_.dof; ++i) force[i] += bias_[i];
     }
 
     // The derivatives of inverse dynamics at accelerations a, once after at() with the same v; for the calls below.
@@ -319,6 +300,17 @@ class ForwardDynamics {
             if (coupled_curvature_.empty()) return;
             Couplings::subtract_curvature(arms, own, jet_.dof, coupled_curvature_.data());
         });
+    }
+
+    // y = M x.
+    void times_mass(const double* x, double* y) const {
+        const int n = jet_.dof;
+        for (const Block& block : mechanism_->tree.blocks) {
+            for (int i = block.begin; i < block.end; ++i) {
+                y[i] = 0.0;
+                for (int j = block.begin; j < block.end; ++j) y[i] += jet_.M[i * n + j] * x[j];
+            }
+        }
     }
 
     bool factor() {
