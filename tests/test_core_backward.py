@@ -239,13 +239,14 @@ def test_the_linearized_motion_under_gains_is_the_sum_of_its_steps(hold, rated, 
     """With controls that are clipped to their slack, and the states after all steps, also within a decision."""
     given = random_steps(2, 2, 0, seed=4, hold=hold, rated=rated)
     A, B, R, rng = given["A"], given["B"], 6 // hold, np.random.default_rng(5)
+    slack = np.zeros((0, 2, 2))
     if limited:
-        given["slack"] = np.stack([-rng.uniform(0.1, 1.0, (R, 2)), rng.uniform(0.1, 1.0, (R, 2))], axis=1)
-        given["expected"] = np.zeros((0, 6))
+        slack = np.stack([-rng.uniform(0.1, 1.0, (R, 2)), rng.uniform(0.1, 1.0, (R, 2))], axis=1)
     gains = {name: rng.normal(size=array.shape) for name, array in gains_for(given, hold).items()}
     state, expected, moves, after = rng.normal(size=6), np.empty((R, 6)), np.empty((R, 2)), np.empty((6, 4))
     begin = state.copy()
-    core.foresee(hold, core.ExpandedSteps(**given), core.Gains(**gains), state, expected, moves, after)
+    plan = (gains["feedforward"], gains["feedback"], gains["previous"], slack)
+    core.foresee(hold, A, B, *plan, state, expected, moves, after)
     x, before = begin[:4], begin[4:]
     for s in range(6):
         r = s // hold
@@ -254,13 +255,15 @@ def test_the_linearized_motion_under_gains_is_the_sum_of_its_steps(hold, rated, 
             before = (
                 gains["feedforward"][r] + gains["feedback"][r] @ x + (gains["previous"][r] @ before if rated else 0)
             )
-            before = np.clip(before, *given["slack"][r]) if limited else before
+            before = np.clip(before, *slack[r]) if limited else before
             np.testing.assert_allclose(moves[r], before, rtol=1e-12)
         x = A[s] @ x + B[s] @ before
         np.testing.assert_allclose(after[s], x, rtol=1e-12)
     np.testing.assert_allclose(state, [*x, *before], rtol=1e-12)
     with refused(ValueError, ("after", "5", "6")):
-        core.foresee(hold, core.ExpandedSteps(**given), core.Gains(**gains), begin, expected, moves, after[:5])
+        core.foresee(hold, A, B, *plan, begin, expected, moves, after[:5])
+    with refused(ValueError, "hold"):
+        core.foresee(4, A, B, *plan, begin, expected, moves)
 
 
 def test_the_decision_without_a_minimum_is_told():

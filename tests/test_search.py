@@ -16,6 +16,7 @@ from varpin.control.backward import backward
 from varpin.control.descent import at_stake
 from varpin.control.following import Foresight
 from varpin.control.line_search import LineSearch
+from varpin.control.search import Search
 from varpin.control.trials import Trials
 from varpin.control.watchdog import Watchdog
 from varpin.core import Watch, stake_of
@@ -493,23 +494,85 @@ def in_controls_alone(monkeypatch):
     monkeypatch.setattr(Foresight, "possible", False)
 
 
-@pytest.mark.usefixtures("in_controls_alone")
-def test_a_step_is_extended_while_the_cost_falls_on():
-    """A swing-up, whose model without second derivatives of the dynamics is too steep."""
-    robot = vp.planar_chain(2)
+def swing_up(*, change=None, **options):
+    """Two links swing up: without second derivatives of the dynamics the model is too steep."""
     swing = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
-    swing += vp.Terminal(vp.TrackingCost([np.pi / 2, 0.0], 1e3) + vp.VelocityCost(1e2))
-    options = {"dt": 0.05, "steps": 40, "integrator": vp.RungeKutta4(), "control_limits": (-20.0, 20.0)}
-    problem = vp.OptimalControlProblem(vp.Scene(robot), swing, [-np.pi / 2, 0.0], np.zeros(2), **options)
+    swing += vp.Terminal(vp.TrackingCost([-np.pi / 2, 0.0], 1e3) + vp.VelocityCost(1e2))
+    if change is not None:
+        swing += vp.ControlRateCost(change)
+    options = {"dt": 0.05, "steps": 40, "integrator": vp.RungeKutta4(), "control_limits": (-20.0, 20.0)} | options
+    return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2)), swing, [np.pi / 2, 0.0], np.zeros(2), **options)
+
+
+def test_a_step_is_extended_while_the_cost_falls_on():
+    plan = vp.solve(swing_up(dt=0.04, steps=50), tolerance=1e-4, check=False)
+    assert plan.status.converged
+    rows = plan.history
+    extended = [k for k, row in enumerate(rows) if row.step > 1.0]
+    assert {rows[k].step for k in extended} == {2.0, 4.0}
+    for k in extended:
+        # More than the full step, which brought 1.7 times what the model expects and more.
+        assert rows[k].decrease > 1.7 * rows[k].expected_decrease
+        # By two along the parabola through the last motions, which are those of full steps.
+        assert (rows[k].step == 2.0) == (rows[k - 1].step == 1.0)
+    costs = [row.cost for row in rows]
+    assert costs == sorted(costs, reverse=True)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"hold": 2}, {"controls": "linear"}, {"change": 1e-4}, {"integrator": vp.Gauss(2)}],
+    ids=["held", "over two steps", "linear", "change of controls", "momenta"],
+)
+def test_longer_steps_go_along_the_parabola_through_the_last_motions(monkeypatch, options):
+    """With the states and controls of the parabola, by NumPy's fit of three motions."""
+    given, bent = [], LineSearch._bent
+
+    def noted(self, behind, ahead, start, here):
+        given.append(([behind, start.trajectory, ahead], bent(self, behind, ahead, start, here)))
+        return given[-1][1]
+
+    monkeypatch.setattr(LineSearch, "_bent", noted)
+    problem = swing_up(**options)
     plan = vp.solve(problem, tolerance=1e-4, check=False)
     assert plan.status.converged
-    extended = [row for row in plan.history if row.step > 1.0]
-    assert extended
-    assert all(row.step in (4.0, 16.0) for row in extended)
-    # More than twice what the model expects.
-    assert all(row.decrease > 2.0 * row.expected_decrease for row in extended)
-    costs = [row.cost for row in plan.history]
-    assert costs == sorted(costs, reverse=True)
+    assert any(row.step == 2.0 for row in plan.history)
+    assert given
+    for motions, commands in given:
+        second = "p" if problem.integrator.variational else "v"
+        states = [np.hstack([motion.q, getattr(motion, second)])[: -1 : problem.hold] for motion in motions]
+        reference = commands.reference[:, :4]
+        for found, through in ((commands.u, map(problem.decided, motions)), (reference, states)):
+            at = np.array([each.ravel() for each in through])
+            wanted = np.array([4.0, 2.0, 1.0]) @ np.polyfit([-1.0, 0.0, 1.0], at, 2)
+            np.testing.assert_allclose(found.ravel(), wanted, rtol=0, atol=1e-12 * np.abs(at).max())
+
+
+def test_the_parabola_through_the_last_motions_saves_iterations(monkeypatch):
+    def iterations():
+        plans = [
+            vp.solve(problem, tolerance=1e-4, check=False)
+            for problem in (swing_up(steps=N, dt=2.0 / N) for N in (28, 30, 32, 36, 40))
+        ]
+        assert all(plan.cost < 1.005 for plan in plans)
+        return sum(plan.iterations for plan in plans)
+
+    found = iterations()
+    monkeypatch.setattr(Search, "_behind", lambda _: None)
+    assert found < 0.97 * iterations()
+
+
+@pytest.mark.parametrize("into", [0, 1])
+def test_a_resumed_search_knows_the_motion_behind(into, tmp_path):
+    problem = swing_up()
+    whole = vp.solve(problem, tolerance=1e-4, check=False)
+    bent = next(k for k, row in enumerate(whole.history) if row.step == 2.0)
+    part = vp.solve(problem, tolerance=1e-4, max_iterations=bent + into, check=False)
+    assert (part.search.behind is None) == (into == 1)
+    part.save(tmp_path / "part.npz")
+    read = vp.Solution.load(tmp_path / "part.npz", problem)
+    for known in (part, read):
+        assert_same_search(whole, vp.solve(problem, resume=known, tolerance=1e-4, check=False))
 
 
 def valley():

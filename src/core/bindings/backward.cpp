@@ -31,6 +31,13 @@ std::vector<Sample> rule_of(In<2> rule) {
     return samples;
 }
 
+// The number of decisions of N steps, with each control held over `hold` of them.
+std::size_t decisions_of(std::size_t N, int hold) {
+    if (hold < 1 || N % static_cast<std::size_t>(hold) != 0)
+        throw std::invalid_argument("hold does not divide the steps");
+    return N / static_cast<std::size_t>(hold);
+}
+
 // Steps with references to their arrays; optional arrays may be empty.
 struct HeldSteps {
     HeldSteps(In<3> A_, In<3> B_, In<3> G_, In<4> Gx_, In<4> Gu_, In<2> rule, In<2> gradient_, In<3> hessian_,
@@ -113,8 +120,7 @@ struct HeldGains {
     // Views, after a check that the arrays fit these steps, with each control held over `hold` of them.
     Gains fitting(const HeldSteps& held, int hold) const {
         const ExpandedSteps& steps = held.steps;
-        if (hold < 1 || steps.steps % hold != 0) throw std::invalid_argument("hold does not divide the steps");
-        const auto N = static_cast<std::size_t>(steps.steps), R = N / static_cast<std::size_t>(hold);
+        const auto N = static_cast<std::size_t>(steps.steps), R = decisions_of(N, hold);
         const auto x = static_cast<std::size_t>(steps.states()), m = static_cast<std::size_t>(steps.controls);
         given(held.slack, "slack", {R, 2, m});
         if (given(held.rate, "rate", {R, m, m})) require(previous, "previous", {R, m, m});
@@ -217,18 +223,31 @@ void run_gradients(double h, int hold, double regularization, const HeldSteps& g
     GradientPass(steps.dof, steps.controls, terminal.data()).run(h, hold, regularization, steps, gains);
 }
 
-// The linearized motion under gains from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
-void foresee(int hold, const HeldSteps& given, const HeldGains& held, InOut<1> state, InOut<2> expected, InOut<2> moves,
-             std::optional<InOut<2>> after) {
-    const Gains gains = held.fitting(given, hold);
-    const auto R = static_cast<std::size_t>(given.steps.steps / hold);
-    const auto m = static_cast<std::size_t>(given.steps.controls), size = static_cast<std::size_t>(given.steps.size());
+// The linearized motion under a plan from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
+void foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3> previous, In<3> slack, InOut<1> state,
+             InOut<2> expected, InOut<2> moves, std::optional<InOut<2>> after) {
+    const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), size = x + m;
+    const std::size_t R = decisions_of(N, hold);
+    require(A, "A", {N, x, x});
+    require(B, "B", {N, x, m});
+    require(feedforward, "feedforward", {R, m});
+    require(feedback, "feedback", {R, m, x});
     require(state, "state", {size});
     require(expected, "expected", {R, size});
     require(moves, "moves", {R, m});
-    if (after) require(*after, "after", {static_cast<std::size_t>(given.steps.steps), size - m});
+    if (after) require(*after, "after", {N, x});
+    const LinearizedPlan plan{.steps = static_cast<std::ptrdiff_t>(N),
+                              .states = static_cast<int>(x),
+                              .controls = static_cast<int>(m),
+                              .hold = hold,
+                              .A = A.data(),
+                              .B = B.data(),
+                              .feedforward = feedforward.data(),
+                              .feedback = feedback.data(),
+                              .previous = given(previous, "previous", {R, m, m}) ? previous.data() : nullptr,
+                              .slack = given(slack, "slack", {R, 2, m}) ? slack.data() : nullptr};
     nb::gil_scoped_release release;
-    predict(hold, given.steps, gains, state.data(), expected.data(), moves.data(), after ? after->data() : nullptr);
+    predict(plan, state.data(), expected.data(), moves.data(), after ? after->data() : nullptr);
 }
 
 template <class Pass>
@@ -283,8 +302,9 @@ void register_backward(nb::module_& m) {
              "change"_a.none() = nb::none(), "within"_a.none() = nb::none());
     define_results(root_pass);
     m.def("run_gradients", &run_gradients, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "terminal"_a);
-    m.def("foresee", &foresee, "hold"_a, "steps"_a, "gains"_a, "state"_a.noconvert(), "expected"_a.noconvert(),
-          "moves"_a.noconvert(), "after"_a.noconvert().none() = nb::none());
+    m.def("foresee", &foresee, "hold"_a, "A"_a, "B"_a, "feedforward"_a, "feedback"_a, "previous"_a, "slack"_a,
+          "state"_a.noconvert(), "expected"_a.noconvert(), "moves"_a.noconvert(),
+          "after"_a.noconvert().none() = nb::none());
     m.def("box_minimum", &box_minimum, "H"_a, "g"_a, "limits"_a, "guess"_a);
 }
 

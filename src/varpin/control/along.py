@@ -337,6 +337,13 @@ class Along:
             self.kept = lin, velocity
         return lin, velocity
 
+    def state_steps(self, begin: int, end: int) -> tuple[Floats, Floats]:
+        """A and B of a block of steps, with linear controls those of the states X."""
+        if self.problem.linear:
+            return self.line.A, self.line.B
+        lin = self.linearized(begin, end)[0]
+        return lin.A, lin.B
+
     def steps(self, begin: int, end: int, curvature: Floats | None, limits: Limits) -> core.ExpandedSteps:
         """The expansions of a block of steps for the core."""
         if self.firm is not None:

@@ -56,8 +56,9 @@ class Iteration:
         noise_cost: Cost added by noise to the motion before the iteration.
         expected_decrease: Decrease of the expected cost by the quadratic model with a full step.
         decrease: Actual decrease of the expected cost, with the plan's model of the noise; 0 without a step.
-        step: Length of the accepted step, 0 if there is none; above 1 where the cost falls on beyond. Of a step along
-            foreseen states it is the share of their changes.
+        step: Length of the accepted step, 0 if there is none; above 1 where the cost falls on beyond, and then 2 of a
+            step along the parabola through the last motions. Of a step along foreseen states it is the share of their
+            changes.
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
         backward_passes: Number of backward passes with different regularizations. Those that determine the controls at
@@ -113,6 +114,7 @@ class SearchState:
         follows: Whether trials may follow the states that plans foresee: none has strayed from them.
         overshot: Whether an extension of the last full step did not lower the cost.
         returned: Whether it has just gone back from a motion that cannot be linearized.
+        behind: The motion from which a full step led to this one; None after another step.
         watchdog: Whether it is away from the best motion.
         rows: Active rows of penalties (M,) at the end of the last backward pass, with which the next one begins; None
             where no rows were looked for.
@@ -138,6 +140,7 @@ class SearchState:
     follows: bool = True
     overshot: bool = False
     returned: bool = False
+    behind: Trajectory | None = None
     watchdog: Watchdog = field(default_factory=Watchdog)
     rows: Mask | None = None
 

@@ -39,8 +39,9 @@ VERY_SHORT = 0.01
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
 # A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
-# half. The step is extended by a factor while that lowers the cost.
-_EARLY, _EXTENSION = 0.85, 4.0
+# half. After another full step one more is tried along the parabola through the last motions, whose length counts as
+# two; otherwise the step is extended by a factor while that lowers the cost.
+_EARLY, _EXTENSION, _BENT = 0.85, 4.0, 2.0
 # Approximate shortest step of a line search, its greatest number of trials, and the least factor between two of them.
 _SHORTEST, _TRIALS, _SHARPEST = 1e-6, 40, 0.25
 # Bounds on the substeps of a trial. A trial stops where a step needs more than HALVINGS halvings and more than the
@@ -68,6 +69,7 @@ class Start(NamedTuple):
         extends: Whether full steps that end early are extended.
         follows: Whether a trial may follow foreseen states.
         bounded: Whether trials stop at a number of substeps.
+        behind: The motion from which a full step led to this one, or None.
     """
 
     plan: Plan
@@ -80,6 +82,7 @@ class Start(NamedTuple):
     extends: bool
     follows: bool
     bounded: bool
+    behind: Trajectory | None
 
     @property
     def trajectory(self) -> Trajectory:
@@ -270,23 +273,47 @@ class LineSearch:
             left = [step for step in cut if step > length]
             if not left or length > (VERY_SHORT if bounds.parts == _PARTS else 0.0):
                 break
-        overshot = False
-        while start.extends and length >= 1.0 and taken.expected <= _EARLY * length * slope:
-            trials += 1
-            trial = self._try(_EXTENSION * length, start, here, bounds)
-            if not trial.expected < taken.expected:
-                overshot = length == 1.0
-                break
-            taken, length = trial, _EXTENSION * length
         if length > 0.0:
-            decrease = -taken.expected
-            return Step(
-                length, trials, decrease, taken=taken, cut=cuts, jumps=jumps, strayed=strayed, overshot=overshot
-            )
+            found = Step(length, trials, -taken.expected, taken=taken, cut=cuts, jumps=jumps, strayed=strayed)
+            return self._extended(found, start, here, bounds) if start.extends and length >= 1.0 else found
         hidden = 0.0
         if tried is not None:
             hidden = rounding(self.problem, start.trajectory, start.shares, tried, start.plan.model)
         return Step(trials=trials, hidden=hidden, cut=cuts, jumps=jumps, strayed=strayed)
+
+    def _extended(self, step: Step, start: Start, here: _Here, bounds: _Bounds) -> Step:
+        """A full step, or a longer one that lowers the cost further, where the full one ends early."""
+        slope, motion = start.plan.slope, step.taken.motion
+        if start.behind is not None and motion is not None and step.decrease >= -_EARLY * slope:
+            commands = self._bent(start.behind, motion.trajectory(), start, here)
+            return self._longer(step, _BENT, commands, start, here, bounds)
+        while step.decrease >= -_EARLY * step.length * slope:
+            before, length = step.length, _EXTENSION * step.length
+            step = self._longer(step, length, here.commands(length, start.plan), start, here, bounds)
+            if step.length == before:
+                break
+        return step
+
+    def _longer(
+        self, step: Step, length: float, commands: Commands, start: Start, here: _Here, bounds: _Bounds
+    ) -> Step:
+        """A step of this length if it lowers the cost by more than ``step`` does, else that one."""
+        trial = self._run(length, commands, start, here, bounds, rise=-step.decrease)
+        step = step._replace(trials=step.trials + 1)
+        if trial.expected < -step.decrease:
+            return step._replace(length=length, decrease=-trial.expected, taken=trial)
+        return step._replace(overshot=step.length == 1.0)
+
+    def _bent(self, behind: Trajectory, ahead: Trajectory, start: Start, here: _Here) -> Commands:
+        """Commands of the next motion on the parabola through three, with the plan's feedback around its states."""
+        problem = self.problem
+        at_behind, at_ahead = (
+            with_feedback(problem, motion, start.plan, closed=self.closed).reference for motion in (behind, ahead)
+        )
+        return here.feedback._replace(
+            u=_on_parabola(problem.decided(behind), here.controls, problem.decided(ahead)),
+            reference=_on_parabola(at_behind, here.feedback.reference, at_ahead),
+        )
 
     def leap(self, start: Start, most: float) -> Step:
         """Take the longest trial along the plan that raises the expected cost by at most ``most``."""
@@ -355,7 +382,7 @@ class LineSearch:
             # Explicit methods have no substeps.
             parts = bounds.parts * max(1, int(start.trajectory.statistics.substeps[: self.trials.third].sum()))
         u = commands.u
-        if problem.limited:
+        if plan.holds:
             u = _onto_limits(u, problem.control_limits, self._rounding)
             commands = commands._replace(u=u)
         if problem.linear:
@@ -392,6 +419,11 @@ class LineSearch:
         steered = self.problem.steered
         shares, held = (noise_shares(self.problem, trial, each, steered).sum() for each in (found, start.plan))
         return float(shares - held), Rated(along, found, start.rating)
+
+
+def _on_parabola(behind: Floats, here: Floats, ahead: Floats) -> Floats:
+    """The next point on the parabola through three at equal distances."""
+    return behind - 3.0 * here + 3.0 * ahead
 
 
 def _divides_others(trial: Trial, start: Start) -> bool:

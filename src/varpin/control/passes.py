@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from varpin import core
 from varpin.arrays import Floats, Mask
-from varpin.control.along import Along, Limits, around_nominal, without_limits
+from varpin.control.along import Along, Limits, without_limits
 from varpin.control.descent import Model
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.square_root import Squares, squares_of
@@ -51,6 +52,11 @@ class Plan:
         # Without limits the step is the model's minimum, where curvature = -slope.
         return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
 
+    @cached_property
+    def holds(self) -> bool:
+        """Whether it holds controls at their limits, where they have no feedback."""
+        return self.limited and not bool(self.feedback.any(axis=2).all())
+
     def followed(self, length: float) -> Plan:
         """The plan after a step of the given length, by the model: the same gains and the rest of the step."""
         left = 1.0 - length
@@ -61,7 +67,10 @@ class Plan:
         if not problem.limited:
             return self.gradient
         u, (lower, upper) = problem.decided(trajectory), problem.control_limits
-        held = ((u <= lower) & (self.gradient > 0.0)) | ((u >= upper) & (self.gradient < 0.0))
+        low, high = u <= lower, u >= upper
+        if not (low | high).any():
+            return self.gradient
+        held = (low & (self.gradient > 0.0)) | (high & (self.gradient < 0.0))
         return np.where(held, 0.0, self.gradient)
 
 
@@ -112,21 +121,13 @@ def foreseen(
     problem, (R, m, _), x = along.problem, plan.feedback.shape, along.states
     feedback, previous = gains_on_states(along, plan)
     expected, moves, state = np.empty((R, x + m)), np.empty((R, m)), np.zeros(x + m)
-    spread = np.zeros((R if plan.spread.size else 0, x, x)) if problem.linear else plan.spread
+    slack = along.slack if slack is None else slack
     for begin, end in along.blocks:
         rows = slice(begin // problem.hold, end // problem.hold)
-        gains = core.Gains(
-            feedforward=plan.feedforward[rows],
-            feedback=feedback[rows],
-            previous=previous[rows],
-            control_gradient=plan.gradient[rows],
-            costate=np.zeros((0, x)),
-            spread=spread[begin:end],
-        )
-        within = around_nominal(along.slack if slack is None else slack, x)
-        steps = along.steps(begin, end, None, within)
+        A, B = along.state_steps(begin, end)
         then = None if after is None else after[begin:end]
-        core.foresee(problem.hold, steps, gains, state, expected[rows], moves[rows], then)
+        own = plan.feedforward[rows], feedback[rows], previous[rows], slack[rows]
+        core.foresee(problem.hold, A, B, *own, state, expected[rows], moves[rows], then)
     return expected, moves
 
 

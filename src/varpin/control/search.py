@@ -116,6 +116,8 @@ class Search:
         self.cut = False  # whether one did
         # The motion before the last step, its shares, cost, and cost above the best one.
         self.before: tuple[Trajectory, Floats, float, float] | None = None
+        # The motion from which the last step led to the current one, and that one, if it was a full step.
+        self.behind: tuple[Trajectory, Trajectory] | None = None
         # Whether the search has just gone back from a motion that cannot be linearized.
         self.returned = False
         self.watchdog = Watchdog()
@@ -191,6 +193,7 @@ class Search:
         self.clips = state.clips and self.clips
         self.follows, self.overshot = state.follows, state.overshot
         self.returned = state.returned
+        self.behind = None if state.behind is None else (state.behind, state.trajectory)
         self.watchdog, self.rows = state.watchdog, state.rows
         if state.saturated:
             self._take_saturation()
@@ -216,6 +219,7 @@ class Search:
             follows=self.follows,
             overshot=self.overshot,
             returned=self.returned,
+            behind=self._behind(),
             watchdog=self.watchdog,
             rows=self.rows,
         )
@@ -656,6 +660,7 @@ class Search:
                 extends=self.anew and not self.overshot,
                 follows=self.anew and self.follows and not self.any_steered,
                 bounded=self.bounded,
+                behind=self._behind(),
             )
         )
         self.cut = self.cut or step.cut
@@ -671,11 +676,16 @@ class Search:
                 self._around, self.rated = taken.rated.along, None if taken.rated.regularization else taken.rated
             self.cost = float(taken.shares.sum())
             self.above += taken.cost
+            self.behind = (self.before[0], self.trajectory) if step.length == 1.0 else None
         return step
+
+    def _behind(self) -> Trajectory | None:
+        """The motion from which a full step led to the current one, if one did."""
+        return self.behind[0] if self.behind is not None and self.behind[1] is self.trajectory else None
 
     def _meets_limits(self, plan: Plan, motion: Trajectory) -> bool:
         """Whether a plan holds controls at their limits, and no control is there on the motion it is around."""
-        return self.anew and self.clips and not plan.feedback.any(axis=2).all() and self._at_limits(motion) == 0.0
+        return self.anew and self.clips and plan.holds and self._at_limits(motion) == 0.0
 
     def _at_limits(self, motion: Trajectory) -> float:
         """Share of a motion's controls that are at a limit."""

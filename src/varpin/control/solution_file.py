@@ -65,8 +65,8 @@ class _Search:
 
 
 @dataclass(frozen=True, eq=False)
-class _Best:
-    """The prefix of the entries of a search's best motion."""
+class _Other:
+    """The prefix of the entries of another motion of a search."""
 
     motion: str
 
@@ -99,7 +99,8 @@ class _Plan:
     refined: Annotated[Floats, Axes("refined", len(_REFINED) + 1)] | None = None
     refinement: _Refinement | None = None
     search: _Search | None = None
-    best: _Best | None = None
+    best: _Other | None = None
+    behind: _Other | None = None
     multipliers: Multipliers | None = None
 
 
@@ -109,14 +110,15 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     state: SearchState | None = solution["search"]
     motions: dict[str, Trajectory] = {"": solution["trajectory"]}
     if state is not None:
-        motions |= {"search.": state.trajectory} | ({} if state.best is None else {"best.": state.best})
+        others = {"best.": state.best, "behind.": state.behind}
+        motions |= {"search.": state.trajectory} | {name: each for name, each in others.items() if each is not None}
     members: dict[str, Any] = {}
     # These motions are often the same object: each is written once, without the scene, which is the problem's.
     prefixes: dict[int, str] = {}
     for prefix, motion in motions.items():
         if prefixes.setdefault(id(motion), prefix) == prefix:
             members |= members_of(replace(motion, scene_values={}), prefix)
-    search, best = None, None
+    search, best, behind = None, None, None
     if state is not None:
         numbers: dict[str, Any] = {name: getattr(state, name) for name in _NUMBERS}
         numbers |= {name: int(getattr(state, name)) for name in _FLAGS} | {"history": len(state.history)}
@@ -126,8 +128,10 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
             "watchdog": np.array(state.watchdog, dtype=np.float64),
         }
         search = _Search(prefixes[id(state.trajectory)], **numbers)
-        best = None if state.best is None else _Best(prefixes[id(state.best)])
-    apart = ("search", "best", "refined", "refinement", "second_order")
+        best, behind = (
+            None if motion is None else _Other(prefixes[id(motion)]) for motion in (state.best, state.behind)
+        )
+    apart = ("search", "best", "behind", "refined", "refinement", "second_order")
     given = {item.name: solution[item.name] for item in fields(_Plan) if item.name not in apart}
     refinement: Refinement | None = solution["refinement"]
     if refinement is not None:
@@ -140,7 +144,9 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
         given["refinement"] = _Refinement(refinement.wish, int(refinement.met), refinement.chosen, refinement.reason)
     given |= {"status": solution["status"].name, "history": _rows(solution["history"])}
     exact = np.array([float(item.second_order) for item in solution["history"]])
-    members |= members_of(_Plan(**given, search=search, best=best, second_order=exact if exact.any() else None))
+    members |= members_of(
+        _Plan(**given, search=search, best=best, behind=behind, second_order=exact if exact.any() else None)
+    )
     members |= {name: getattr(problem, name) for name in _PROBLEM}
     members |= {"problem.integrator": repr(problem.integrator)} | _surroundings(problem)
     if problem.constraints:
@@ -172,7 +178,7 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
         _require_rows(source, plan.multipliers, problem)
     if (problem.rate is not None or problem.linear) and plan.previous_gains is None:
         raise FileError(f"{source}: previous_gains is missing")
-    apart = ("best", "refined", "second_order")
+    apart = ("best", "behind", "refined", "second_order")
     given = {item.name: getattr(plan, item.name) for item in fields(_Plan) if item.name not in apart}
     given["refinement"] = _refinement(source, plan)
     given |= {"status": Status[plan.status], "history": history}
@@ -238,8 +244,8 @@ def _search(
     state = plan.search
     if state is None:
         return None
-    best = None if plan.best is None else plan.best.motion
-    for prefix in (state.motion, best):
+    best, behind = (None if other is None else other.motion for other in (plan.best, plan.behind))
+    for prefix in (state.motion, best, behind):
         if prefix is not None and prefix not in motions:
             motions[prefix] = _motion(source, members, prefix, problem)
     if not 0 <= state.history <= len(history):
@@ -247,6 +253,7 @@ def _search(
     return SearchState(
         trajectory=motions[state.motion],
         best=None if best is None else motions[best],
+        behind=None if behind is None else motions[behind],
         gains=tuple(state.gains.tolist()),
         history=history[: state.history],
         rows=state.rows,

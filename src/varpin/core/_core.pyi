@@ -462,14 +462,22 @@ def run_gradients(
 
 def foresee(
     hold: int,
-    steps: ExpandedSteps,
-    gains: Gains,
+    A: Floats,
+    B: Floats,
+    feedforward: Floats,
+    feedback: Floats,
+    previous: Floats,
+    slack: Floats,
     state: Floats,
     expected: Floats,
     moves: Floats,
     after: Floats | None = None,
 ) -> None:
-    """The linearized motion under gains, each control clipped to its limits.
+    """The motion of N linearized steps under a plan of R decisions.
+
+    Its steps are ``A`` (N, 2n, 2n) and ``B`` (N, 2n, m), its controls change by ``feedforward`` (R, m), ``feedback``
+    (R, m, 2n) of the state, and ``previous`` (R, m, m) of the previous control unless it is empty, clipped to ``slack``
+    (R, 2, m) unless it is empty.
 
     ``state`` (2n + m,) has the deviations of the state and of the previous control at the start, and is overwritten by
     those at the end. ``expected`` (R, 2n + m) receives those before each decision, ``moves`` (R, m) the changes of the

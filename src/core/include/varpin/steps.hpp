@@ -65,34 +65,48 @@ struct Gains {
     double* factors = nullptr;           // (R, m, m) L D L' of the regularized Quu without limits, or null
 };
 
-// The linearized motion under the gains, each control clipped to its limits, from `state` (2n + m): the deviation of
+// A plan on N linearized steps, whose controls are each held over `hold` of them.
+struct LinearizedPlan {
+    std::ptrdiff_t steps = 0;  // N
+    int states = 0;            // 2n
+    int controls = 0;          // m
+    int hold = 1;
+    const double* A = nullptr;            // (N, 2n, 2n)
+    const double* B = nullptr;            // (N, 2n, m)
+    const double* feedforward = nullptr;  // (R, m)
+    const double* feedback = nullptr;     // (R, m, 2n)
+    const double* previous = nullptr;     // (R, m, m) gains on the previous control, or null
+    const double* slack = nullptr;        // (R, 2, m) lower and upper limit of the change of each control, or null
+};
+
+// The linearized motion under a plan, each control clipped to its limits, from `state` (2n + m): the deviation of
 // the state and of the previous control at the start, overwritten by those at the end. Writes the deviations before
 // each decision into `expected` (R, 2n + m), the changes of the controls into `moves` (R, m), and unless it is null
 // the states after each step into `after` (N, 2n).
-inline void predict(int hold, const ExpandedSteps& steps, const Gains& gains, double* state, double* expected,
-                    double* moves, double* after = nullptr) {
-    const int x = steps.states(), m = steps.controls, size = steps.size();
+inline void predict(const LinearizedPlan& plan, double* state, double* expected, double* moves,
+                    double* after = nullptr) {
+    const int x = plan.states, m = plan.controls, size = x + m, hold = plan.hold;
     std::vector<double> next(x);
-    for (std::ptrdiff_t s = 0; s < steps.steps; ++s) {
+    for (std::ptrdiff_t s = 0; s < plan.steps; ++s) {
         const std::ptrdiff_t r = s / hold;
         if (s % hold == 0) {
             std::copy_n(state, size, expected + r * size);
             const double* before = expected + r * size + x;
             for (int i = 0; i < m; ++i) {
-                double move = gains.feedforward[r * m + i];
-                const double* row = gains.feedback + (r * m + i) * x;
+                double move = plan.feedforward[r * m + i];
+                const double* row = plan.feedback + (r * m + i) * x;
                 for (int c = 0; c < x; ++c) move += row[c] * state[c];
-                if (steps.rate) {
-                    for (int c = 0; c < m; ++c) move += gains.previous[(r * m + i) * m + c] * before[c];
+                if (plan.previous) {
+                    for (int c = 0; c < m; ++c) move += plan.previous[(r * m + i) * m + c] * before[c];
                 }
-                if (steps.slack) {
-                    const double* slack = steps.slack + r * 2 * m;
+                if (plan.slack) {
+                    const double* slack = plan.slack + r * 2 * m;
                     move = std::min(std::max(move, slack[i]), slack[m + i]);
                 }
                 moves[r * m + i] = state[x + i] = move;
             }
         }
-        const double *A = steps.A + s * x * x, *B = steps.B + s * x * m;
+        const double *A = plan.A + s * x * x, *B = plan.B + s * x * m;
         for (int i = 0; i < x; ++i) {
             double total = 0.0;
             for (int c = 0; c < x; ++c) total += A[i * x + c] * state[c];
