@@ -733,10 +733,12 @@ class OptimalControlProblem(Frozen):
             return self.running.expand(*self.samples(q, v, u))
         return Expansion(*self.running.compiled.core.expand_steps(self.rule, q, v, u))
 
-    @property
+    @cached_property
     def places(self) -> Floats:
         """Sample points of running costs in a step of unit length (s,)."""
-        return _rule(self.sampling, self.dt, cubic=max(self.scene.rates, default=-1) >= 0)[0]
+        places = _rule(self.sampling, self.dt, cubic=max(self.scene.rates, default=-1) >= 0)[0]
+        places.setflags(write=False)
+        return places
 
     def expand_terminal(self, trajectory: Trajectory) -> Expansion:
         """Expansion of the terminal costs at the end of a motion, in (q, v, u)."""
