@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,7 +180,7 @@ class Rows:
         if plan.previous is not None:
             ahead[1:] -= np.einsum("kmi,ki->km", plan.previous[1:], self.moves[:-1])
         curvature = 2.0 * (self.lowered - self.regularizing(self.moves) - self.slope)
-        return replace(plan, feedforward=ahead, slope=self.slope, curvature=curvature, limited=True)
+        return plan._replace(feedforward=ahead, slope=self.slope, curvature=curvature, limited=True)
 
     def change(self, plan: Plan, held: list[Mask], ahead: list[Floats]) -> tuple[float, float]:
         """Change of the piecewise model over a plan's full step, and its slope at the start."""

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -70,10 +69,15 @@ def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask]
         else:
             plan, active = box.with_proximal(regularization * np.abs(stiffness)).minimum(plan, moves)
         if plan is not None:
-            return plan, active
-    return single_pass(along, regularization, curvature=curvature, limits=around_nominal(along.slack, along.states))[
-        0
-    ], None
+            return _holding(plan), active
+    limits = around_nominal(along.slack, along.states)
+    plan = single_pass(along, regularization, curvature=curvature, limits=limits)[0]
+    return None if plan is None else _holding(plan), None
+
+
+def _holding(plan: Plan) -> Plan:
+    """A plan within limits that knows whether it holds controls at them."""
+    return plan._replace(holds=not bool(plan.feedback.any(axis=2).all()))
 
 
 def free_pass(along: Along, regularization: float, curvature: Floats | None) -> tuple[Plan | None, Floats]:
@@ -91,7 +95,7 @@ def _sloped(plan: Plan, moves: Floats) -> Plan:
     slope = float((plan.gradient * moves).sum())
     if not (plan.expected_decrease > 0.0 and slope < 0.0):
         return plan
-    return replace(plan, slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
+    return plan._replace(slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
 
 
 def _matching(along: Along, regularization: float, curvature: Floats | None, plan: Plan) -> Plan | None:
@@ -309,7 +313,7 @@ class Box:
         )
         steps = alone.steps(0, problem.decisions * problem.hold, None, without_limits(m, x))
         core.run_gradients(problem.dt, problem.hold, 0.0, steps, gains, np.zeros(x))
-        more: Floats = foreseen(alone, replace(plan, feedforward=feedforward), np.zeros((0, 2, m)))[1]
+        more: Floats = foreseen(alone, plan._replace(feedforward=feedforward), np.zeros((0, 2, m)))[1]
         return to + more
 
     def _begin(self, plan: Plan) -> tuple[Mask, list[Mask], Floats, Floats]:
@@ -438,7 +442,7 @@ class Box:
         slope = float((plan.gradient * at.moves).sum())
         value = at.value - 0.5 * float((self.proximal * at.moves**2).sum())
         curvature, left = 2.0 * (value - slope), at.pressure - self.proximal * at.moves
-        return replace(plan, feedforward=ahead, slope=slope, curvature=curvature, limited=True, left=left)
+        return plan._replace(feedforward=ahead, slope=slope, curvature=curvature, limited=True, left=left)
 
 
 class _Least(NamedTuple):

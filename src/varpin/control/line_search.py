@@ -184,7 +184,6 @@ class _Lengths:
 
     def __init__(self, backtracking: float, shortest: float) -> None:
         self._backtracking, self._shortest = backtracking, max(shortest, _SHORTEST)
-        self._most = max(1, math.floor(math.log(_SHARPEST) / math.log(backtracking)))
         self._powers = 1
 
     def learn(self, step: float, change: float, slope: float) -> None:
@@ -192,8 +191,8 @@ class _Lengths:
         least = 0.5 / (1.0 - change / (step * slope)) if change > step * slope else 1.0
         self._powers = 1
         if least < self._backtracking:
-            powers = math.log(least) / math.log(self._backtracking) if least > 0.0 else math.inf
-            self._powers = self._most if powers >= self._most else max(1, math.floor(powers))
+            powers = math.log(max(least, _SHARPEST)) / math.log(self._backtracking)
+            self._powers = max(1, math.floor(powers))
 
     def __iter__(self) -> Iterator[float]:
         length, count = 1.0, 0

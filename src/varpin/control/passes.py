@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +25,7 @@ from varpin.trajectory import Trajectory
 TRUSTED = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(NamedTuple):
     """The result of a backward pass: gains, feed-forward changes of the controls, and the expected decrease."""
 
     feedforward: Floats  # (R, m)
@@ -45,6 +42,7 @@ class Plan:
     model: Model  # of the cost along the motion
     left: Floats | None = None  # (R, m) the model's gradient after a full step, which presses controls against limits
     rows: Mask | None = None  # active rows of all penalties where the last pass to the model's minimum ended
+    holds: bool = False  # whether it holds controls at their limits, where they have no feedback
 
     @property
     def expected_decrease(self) -> float:
@@ -52,25 +50,17 @@ class Plan:
         # Without limits the step is the model's minimum, where curvature = -slope.
         return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
 
-    @cached_property
-    def holds(self) -> bool:
-        """Whether it holds controls at their limits, where they have no feedback."""
-        return self.limited and not bool(self.feedback.any(axis=2).all())
-
     def followed(self, length: float) -> Plan:
         """The plan after a step of the given length, by the model: the same gains and the rest of the step."""
         left = 1.0 - length
-        return replace(self, feedforward=left * self.feedforward, gradient=left * self.gradient)
+        return self._replace(feedforward=left * self.feedforward, gradient=left * self.gradient)
 
     def free_gradient(self, problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
         """The gradient (R, m), zero where it pushes a control against its active limit; zero at an optimum."""
-        if not problem.limited:
+        if not self.holds:
             return self.gradient
         u, (lower, upper) = problem.decided(trajectory), problem.control_limits
-        low, high = u <= lower, u >= upper
-        if not (low | high).any():
-            return self.gradient
-        held = (low & (self.gradient > 0.0)) | (high & (self.gradient < 0.0))
+        held = ((u <= lower) & (self.gradient > 0.0)) | ((u >= upper) & (self.gradient < 0.0))
         return np.where(held, 0.0, self.gradient)
 
 
@@ -106,7 +96,7 @@ def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floa
 def without_feedback(plan: Plan, moves: Floats) -> Plan:
     """A plan of changes of the controls (R, m) alone."""
     previous = None if plan.previous is None else np.zeros(plan.previous.shape)
-    return replace(plan, feedforward=moves, feedback=np.zeros(plan.feedback.shape), previous=previous)
+    return plan._replace(feedforward=moves, feedback=np.zeros(plan.feedback.shape), previous=previous)
 
 
 def foreseen(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import numpy as np
 
@@ -43,7 +42,7 @@ def minimum(along: Along, regularization: float, curvature: Floats | None, likel
     steps.run(likely)
     if steps.best is None:
         return within_limits(along, regularization, curvature)
-    return replace(steps.best, model=along.model, rows=steps.rows.in_order(steps.met))
+    return steps.best._replace(model=along.model, rows=steps.rows.in_order(steps.met))
 
 
 class _Steps:
@@ -97,7 +96,7 @@ class _Steps:
         self.change, self.slope = rows.change(self.plan, self.held, self.ahead)
         if self.slope < 0.0 and self.change < self.least:
             curvature = 2.0 * (self.change - rows.regularizing(rows.ahead_of[1]) - self.slope)
-            self.best = replace(self.plan, slope=self.slope, curvature=curvature, limited=True)
+            self.best = self.plan._replace(slope=self.slope, curvature=curvature, limited=True)
             self.least = self.change
         self.met = rows.held(self.ahead)
         self.ended = same_rows(self.met, self.held)

@@ -11,7 +11,6 @@ import functools
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -29,7 +28,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback
 from varpin.control.trials import Trials
-from varpin.control.watchdog import Watchdog
+from varpin.control.watchdog import IN_A_ROW, Watchdog
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.mechanics.custom import CustomForceError
@@ -341,7 +340,7 @@ class Search:
         """A long step that may raise the cost, where steps have been short, (O16); and the backward passes it took."""
         dog = self.watchdog
         # Under noise that changes plans the costs of motions are not comparable from one plan to the next.
-        if not self.anew or self.any_steered or not dog.departs([item.step for item in self.history]):
+        if not self.anew or self.any_steered or not dog.departs([item.step for item in self.history[-IN_A_ROW:]]):
             return Step(), 0
         home, step, passes = (self.plan, self.planned, self.regularization, self.growth), Step(), 0
         if self.regularization > 0.0:
@@ -443,7 +442,7 @@ class Search:
         )
         if plan is None or rated is None:
             return plan
-        return replace(plan, noise=rated.plan.noise, jumps=rated.plan.jumps, spread=rated.plan.spread)
+        return plan._replace(noise=rated.plan.noise, jumps=rated.plan.jumps, spread=rated.plan.spread)
 
     def _compare_with_best(self, plan: Plan) -> None:
         noise = self._noise(plan)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 # A search departs after so many steps in a row that are no longer than _SHORT.
-_IN_A_ROW, _SHORT = 3, 0.25
+IN_A_ROW, _SHORT = 3, 0.25
 # Iterations after which it returns, and how many more they are after each departure in vain. Iterations before it
 # departs again; they double with each departure in vain.
 _AWAY, _LONGER, _REST = 6, 2, 4
@@ -40,8 +40,8 @@ class Watchdog(NamedTuple):
     growth: float = 1.0
 
     def departs(self, steps: Sequence[float]) -> bool:
-        """Whether a search departs after steps of these lengths."""
-        short = len(steps) >= _IN_A_ROW and all(0.0 < step <= _SHORT for step in steps[-_IN_A_ROW:])
+        """Whether a search departs after steps of these lengths, the last :data:`IN_A_ROW`."""
+        short = len(steps) >= IN_A_ROW and all(0.0 < step <= _SHORT for step in steps[-IN_A_ROW:])
         return short and self.away == 0 and self.rest == 0
 
     @property
@@ -59,6 +59,8 @@ class Watchdog(NamedTuple):
 
     def stepped(self) -> Watchdog:
         """After an iteration."""
+        if self.away == 0 and self.rest == 0:
+            return self
         return self._replace(rest=max(0, self.rest - 1)) if self.away == 0 else self._replace(away=self.away + 1)
 
     @property
