@@ -271,13 +271,14 @@ class Along:
         n = problem.scene.robot.dof
         end, x = problem.expand_terminal(self.trajectory), slice(0, 2 * n)
         cost = Expansion(end.gradient[:1, x], end.hessian[:1, x, x])
-        g, H, D = cost.gradient[0], cost.hessian[0], np.eye(2 * n)
+        g, H, D = cost.gradient[0], cost.hessian[0], None
         if problem.integrator.variational:
+            D = np.eye(2 * n)
             # The linearization of a motion of one block is kept, and includes the last node.
             slopes = self.linearized(0, problem.steps)[1] if len(self.blocks) == 1 else D[:0, n:]
             D[n:] = slopes[-1] if len(slopes) else velocity_at_nodes(problem.scene, q, v)[0]
             g, H = D.T @ g, D.T @ H @ D
-        return _Terminal(cost, D, g, H)
+        return _Terminal(cost, g, H, D)
 
     @cached_property
     def line(self) -> LinearSteps:
@@ -396,12 +397,17 @@ class Along:
 
 
 class _Terminal(NamedTuple):
-    """The terminal cost in (q, v), d(q, v)/dx, and the cost's gradient (2n,) and Hessian (2n, 2n) in x."""
+    """The terminal cost in (q, v), its gradient (2n,) and Hessian (2n, 2n) in x, and d(q, v)/dx unless x = (q, v)."""
 
     cost: Expansion
-    slopes: Floats
     gradient: Floats
     hessian: Floats
+    by_momentum: Floats | None
+
+    @property
+    def slopes(self) -> Floats:
+        """d(q, v)/dx (2n, 2n)."""
+        return np.eye(len(self.gradient)) if self.by_momentum is None else self.by_momentum
 
 
 def linearize(problem: OptimalControlProblem, part: Trajectory, begin: int) -> Linearization:

@@ -171,7 +171,7 @@ def one_pass(
     problem, running = along.problem, along.running
     scene = problem.scene
     n, m, k, N, R = scene.robot.dof, scene.controls, along.processes, problem.steps, problem.decisions
-    _, D, by_state, by_states = along.terminal
+    by_state, by_states = along.terminal.gradient, along.terminal.hessian
     if curvature is not None and problem.integrator.variational:
         pull = along.terminal.cost.gradient[:, n:]
         by_states = by_states + velocity_curvature(scene, along.trajectory.q[-1:], along.trajectory.v[-1:], pull)[0]
@@ -192,7 +192,9 @@ def one_pass(
         within = None if along.within is None else squares_of(np.zeros((N, 2 * n)), along.within)
         if final is None or squares is None or change is None or (within is None and along.within is not None):
             return None, costate
-        by_roots = _ByRoots(core.RootPass(m, final.after(D).core, by_state), squares, change, within)
+        by_roots = _ByRoots(
+            core.RootPass(m, final.after(along.terminal.slopes).core, by_state), squares, change, within
+        )
     if limits is None:
         limits = without_limits(m, 2 * n)
     samples = len(problem.model_rule)
@@ -253,7 +255,7 @@ def _one_pass_on_lines(
     """The pass of a plan whose controls are linear between nodes; ``by_states`` is the terminal Hessian (2n, 2n)."""
     problem, X, x = along.problem, along.states, 2 * along.problem.scene.robot.dof
     R, m = problem.decisions, problem.scene.controls
-    cost, D, by_state, _ = along.terminal
+    cost, by_state = along.terminal.cost, along.terminal.gradient
     end_gradient, end_hessian = np.zeros(X), np.zeros((X, X))
     end_gradient[:x], end_hessian[:x, :x] = by_state, by_states
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
@@ -279,7 +281,7 @@ def _one_pass_on_lines(
         change = squares_of(np.zeros((0, m)), np.zeros((0, m, m)))
         if final is None or squares is None or change is None:
             return None, of_states
-        wide = np.concatenate([D, np.zeros((x, X - x))], axis=1)
+        wide = np.concatenate([along.terminal.slopes, np.zeros((x, X - x))], axis=1)
         found = core.RootPass(m, final.after(wide).padded(X).core, end_gradient)
         failed = found.run(*how, steps, gains, squares.core, change.core)
     else:

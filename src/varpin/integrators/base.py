@@ -385,10 +385,10 @@ def ends_of(command: Commands, decided: Floats) -> tuple[Floats, Floats]:
     return nodes[:1], nodes[1:]
 
 
-def drifts(scene: Scene, trajectory: Trajectory) -> Floats:
-    """The drift of :func:`diffusion_and_drift` at the start of every step (N, n)."""
+def drifts(scene: Scene, trajectory: Trajectory) -> Floats | float:
+    """The drift of :func:`diffusion_and_drift` at the start of every step (N, n), or 0 where none has any."""
     if not scene.noise.velocity_dependent:
-        return np.zeros((trajectory.steps, scene.robot.dof))
+        return 0.0
     nodes = zip(trajectory.q[:-1], trajectory.v[:-1], trajectory.u, strict=True)
     return np.array(
         [

@@ -62,7 +62,7 @@ class _Explicit(Integrator):
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ExplicitRun, list[Segment]]:
         """See :meth:`Integrator.start`."""
-        refuse_constraints(scene, str(self))
+        refuse_constraints(scene, self)
         if scene.custom is not None:
             scene.custom.check(q0, v0)
         paths, n = q0.shape
@@ -150,7 +150,7 @@ class _Explicit(Integrator):
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""
-        refuse_constraints(scene, str(self))
+        refuse_constraints(scene, self)
         Jx, Jf = self._derivatives(scene, trajectory)
         return Jx, Jf, self._jump(Jx[:, :, scene.robot.dof :])
 

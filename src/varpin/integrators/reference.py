@@ -98,7 +98,7 @@ class Reference(Integrator):
         Raises:
             InputError: The scene has noise.
         """
-        refuse_constraints(scene, str(self))
+        refuse_constraints(scene, self)
         if scene.processes:
             raise InputError(f"{self} integrates no noise: leave it out of the scene")
         if scene.custom is not None:
@@ -216,7 +216,7 @@ class Reference(Integrator):
 
         The variational equations are integrated along with the motion, under the same tolerances.
         """
-        refuse_constraints(scene, str(self))
+        refuse_constraints(scene, self)
         n = scene.robot.dof
         J = self._linearized(scene, trajectory)
         return J[:, :, : 2 * n], J[:, :, 2 * n :], J[:, :, n : 2 * n]

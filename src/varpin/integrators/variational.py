@@ -175,7 +175,7 @@ class Variational(Integrator):
         """
         places = self._constraint_places()
         if places is None:
-            refuse_constraints(scene, str(self))
+            refuse_constraints(scene, self)
             raise InputError(f"{self} keeps no constraints")
         if scene.processes and self.left < 1.0:
             raise InputError("kick='split' does not go with constraints: take kick='left' or kick='held'")
@@ -474,7 +474,7 @@ class Variational(Integrator):
                 damage = "statistics.substeps holds numbers of parts that no step has"
             if damage is not None:
                 raise InputError(f"the trajectory is damaged: {damage}")
-        drift = self.drift_share * drifts(scene, trajectory) if scene.noise.velocity_dependent else 0.0
+        drift = self.drift_share * drifts(scene, trajectory)
         force = forces(scene, trajectory, drift)
         arrays = {
             "q": trajectory.q[:-1],

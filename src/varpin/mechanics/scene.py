@@ -705,7 +705,7 @@ def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
 _KEEPS = "motions and plans do, with varpin.Midpoint() or varpin.Gauss(stages)"
 
 
-def refuse_constraints(scene: Scene, what: str, instead: str = _KEEPS) -> None:
+def refuse_constraints(scene: Scene, what: object, instead: str = _KEEPS) -> None:
     """Refuse a scene with constraints in ``what``; the message ends with the alternative ``instead``.
 
     Raises:
