@@ -126,7 +126,7 @@ def test_slow_progress_ends_the_searches_of_coarse_steps() -> None:
     cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
     cost += vp.Terminal(vp.TrackingCost(up, 1e3) + vp.VelocityCost(1e2))
     scene = vp.Scene(vp.planar_chain(2), actuation=["joint2"], damping=0.02)
-    limits = (-10.0, 10.0)
+    limits = (-8.0, 8.0)
     problem = vp.OptimalControlProblem(scene, cost, down, np.zeros(2), dt=0.2, steps=20, control_limits=limits)
     plan = vp.solve(problem, true_cost=0.01, check=False)
     first = plan.refinement.tried[0]
