@@ -167,9 +167,13 @@ def linearize_steps(
     it. ``ramps`` asks for the derivatives in controls that change within a step.
     """
     n, m, steps = scene.robot.dof, scene.controls, trajectory.steps
-    Jx, Jf, Jk = integrator.linearize(scene, trajectory)
+    ramp = None
+    if ramps:
+        Jx, Jf, Jk, in_ramp = integrator.linearize_with_ramps(scene, trajectory)
+        ramp = in_ramp @ scene.transmission
+    else:
+        Jx, Jf, Jk = integrator.linearize(scene, trajectory)
     q, v = trajectory.q, trajectory.v
-    ramp = integrator.ramps(scene, trajectory) @ scene.transmission if ramps else None
     if ramp is not None and scene.inputs:
         # Only the end of a step counts.
         ramp[:, :, scene.prescribed] = (Jf @ scene.transmission)[:, :, scene.prescribed]

@@ -102,8 +102,8 @@ class Rollout {
     }
 };
 
-// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step, for f constant over it or a ramp up to f;
-// the outcome, and the number of steps done. first(step, guess, Jx, Jf) writes the derivatives of one step.
+// d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n) of each step, the outcome, and the number of steps done.
+// first(step, guess, Jx, Jf) writes the derivatives of one step.
 template <class First>
 std::tuple<Out, Out, std::int64_t, std::size_t> derivatives_of(const StepsAt& at, const Tableau& tableau,
                                                                const In<3>& guess, const First& first) {

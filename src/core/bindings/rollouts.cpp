@@ -70,18 +70,22 @@ class VariationalRollout : public Rollout<Stepper, PathState> {
     }
 };
 
-std::tuple<Out, Out, std::int64_t, std::size_t> variational_derivatives(
+std::tuple<Out, Out, Out, std::int64_t, std::size_t> variational_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double h, In<2> q,
     In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, bool external, Solver solver) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     std::unique_ptr<StepDerivatives> work = small_derivatives(mechanism, tableau, tolerance, guards, solver);
     if (!work) work = std::make_unique<VariationalLinearization<>>(mechanism, tableau, tolerance, guards, solver);
     work->varies = at.varies;
-    work->ramp = ramp;
     if (external) work->take_external();
-    return derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
-        return work->first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf, at.past(s));
-    });
+    double* in_ramps = nullptr;
+    const Out R = array_for(in_ramps, {ramp ? at.N : 0, 2 * at.n, at.n});
+    const auto [X, F, outcome, done] =
+        derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
+            double* Jr = ramp ? in_ramps + s * 2 * at.n * at.n : nullptr;
+            return work->first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf, Jr, at.past(s));
+        });
+    return {X, F, R, outcome, done};
 }
 
 // z . d2(q1, p1)/d(q0, p0, f)2 of each step (N, 3n, 3n), for the rows of z (N, 2n).

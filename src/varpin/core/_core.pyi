@@ -266,7 +266,10 @@ def constrained_derivatives(
     ramp: bool = False,
     external: bool = False,
 ) -> tuple[Floats, Floats, Floats, int, int]:
-    """As variational_derivatives, and derivatives (N, 2n, i) in the rates (N, i) of driven joints."""
+    """Derivatives as of variational_derivatives, and (N, 2n, i) in the rates (N, i) of driven joints.
+
+    With ``ramp`` those in the force are those in the one that grows.
+    """
 
 def variational_derivatives(
     mechanism: Mechanism,
@@ -284,12 +287,14 @@ def variational_derivatives(
     ramp: bool = False,
     external: bool = False,
     solver: Solver = Solver.automatic,
-) -> tuple[Floats, Floats, int, int]:
-    """d(q1, p1)/d(q0, p0) (N, 2n, 2n) and d(q1, p1)/df (N, 2n, n), the outcome, and the number of steps done.
+) -> tuple[Floats, Floats, Floats, int, int]:
+    """Derivatives of steps, the outcome, and the number of steps done.
 
-    ``force`` is (N, 1, n), constant over each step, or (N, s, n) at its stages. f is constant over the step, or with
-    ``ramp`` grows linearly from 0 at its start to f at its end. ``external``: f is not the force of the controls, which
-    drives limit, but acts beside it.
+    They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), and with ``ramp`` in one that
+    grows linearly from 0 at the start of a step to f at its end (N, 2n, n), else (0, 2n, n).
+
+    ``force`` is (N, 1, n), constant over each step, or (N, s, n) at its stages. ``external``: f is not the force of the
+    controls, which drives limit, but acts beside it.
 
     ``halvings`` are those of the parts of all steps with more than one of ``substeps``. The same parts are repeated;
     parts that active ``guards`` refuse are halved.

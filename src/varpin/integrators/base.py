@@ -291,14 +291,17 @@ class Integrator(ABC):
             LinearizationError: A step has no solution at dw = 0.
         """
 
-    def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
-        """Derivatives (N, 2n, n) in a force at the end of each step that grows linearly from 0 at its start.
+    def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
+        """:meth:`linearize`, and derivatives (N, 2n, n) in a force that grows linearly from 0 over each step.
+
+        They are taken in the force at the step's end.
 
         Raises:
             LinearizationError: A step has no solution at dw = 0.
         """
+        Jx, Jf, Jk = self.linearize(scene, trajectory)
         # Methods that hold the mean force take half of it.
-        return 0.5 * self.linearize(scene, trajectory)[1]
+        return Jx, Jf, Jk, 0.5 * Jf
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:  # noqa: ARG002
         """Second derivatives sum_a z_a d2 x1_a of each step at dw = 0 in (x0, f), (N, 3n, 3n), for z (N, 2n).

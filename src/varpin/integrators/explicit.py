@@ -228,6 +228,6 @@ class RungeKutta4(_Explicit):
         """See :meth:`Integrator.amplification`."""
         return 1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))
 
-    def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
-        """See :meth:`Integrator.ramps`."""
-        return self._derivatives(scene, trajectory, ramp=True)[1]
+    def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
+        """See :meth:`Integrator.linearize_with_ramps`."""
+        return *self.linearize(scene, trajectory), self._derivatives(scene, trajectory, ramp=True)[1]

@@ -221,9 +221,10 @@ class Reference(Integrator):
         J = self._linearized(scene, trajectory)
         return J[:, :, : 2 * n], J[:, :, 2 * n :], J[:, :, n : 2 * n]
 
-    def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
-        """See :meth:`Integrator.ramps`."""
-        return self._linearized(scene, trajectory, ramp=True)[:, :, 2 * scene.robot.dof :]
+    def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
+        """See :meth:`Integrator.linearize_with_ramps`."""
+        in_ramp = self._linearized(scene, trajectory, ramp=True)[:, :, 2 * scene.robot.dof :]
+        return *self.linearize(scene, trajectory), in_ramp
 
     def _linearized(self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False) -> Floats:
         """Derivatives (N, 2n, 3n) of each step in (q, v, force)."""

@@ -348,23 +348,34 @@ class Variational(Integrator):
 
         Divided steps are repeated in the same parts, and the derivatives of the parts are multiplied.
         """
-        Jx, Jf = self._derivatives(scene, trajectory)
+        Jx, Jf, _ = self._derivatives(scene, trajectory)
+        return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf)
+
+    def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
+        """See :meth:`Integrator.linearize_with_ramps`."""
+        if not self.stage_times:
+            return super().linearize_with_ramps(scene, trajectory)
+        Jx, Jf, Jr = self._derivatives(scene, trajectory, ramp=True)
+        return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf), Jr
+
+    def _kicks(self, scene: Scene, trajectory: Trajectory, Jx: Floats, Jf: Floats) -> Floats:
+        """The derivatives in the noise impulse, from those in the state and in a constant force."""
         n = scene.robot.dof
         if self.holds_noise:
             # Drives limit the force of the controls, not the noise.
             limits = bool(limited_servos(scene.elements))
             of_noise = self._derivatives(scene, trajectory, external=True)[1] if limits else Jf
-            return Jx, Jf, without_inputs(scene, of_noise[:, :, :n] / trajectory.dt)
+            return without_inputs(scene, of_noise[:, :, :n] / trajectory.dt)
         kicks = Jx[:, :, n:]
         if max(scene.rates, default=-1) >= 0:
             # A noise impulse does not change the velocity of a joint with a cubic input.
             kicks = kicks @ _along(scene, trajectory.q[:-1])
-        return Jx, Jf, kicks
+        return kicks
 
     def _derivatives(
         self, scene: Scene, trajectory: Trajectory, *, ramp: bool = False, external: bool = False
-    ) -> tuple[Floats, Floats]:
-        """Derivatives of each step in (q, p) and in a constant force, with ``ramp`` one that grows linearly from 0.
+    ) -> tuple[Floats, Floats, Floats]:
+        """Derivatives of each step in (q, p), in a constant force, and with ``ramp`` in one that grows linearly from 0.
 
         With ``external`` it is a force that drives do not limit. The columns of velocities of cubic inputs follow those
         of the force, as in :attr:`Scene.transmission`.
@@ -373,15 +384,21 @@ class Variational(Integrator):
         guess = np.ascontiguousarray(self._guess(trajectory))
         if scene.constraints:
             rates, cubic = _rates(scene, trajectory)
-            Jx, Jf, Jr, outcome, done = constrained_derivatives(
-                **steps, rates=rates, places=self._places(scene), guess=guess, ramp=ramp, external=external
-            )
-            if cubic:
-                Jf = np.concatenate([Jf, Jr[:, :, cubic]], axis=2)
-        else:
-            Jx, Jf, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp, external=external)
+            given: dict[str, Any] = {
+                "rates": rates,
+                "places": self._places(scene),
+                "guess": guess,
+                "external": external,
+            }
+            found = []
+            for growing in (False, True) if ramp else (False,):
+                Jx, Jf, by_rate, outcome, done = constrained_derivatives(**steps, **given, ramp=growing)
+                _require_solved(trajectory, outcome, done)
+                found.append(np.concatenate([Jf, by_rate[:, :, cubic]], axis=2) if cubic else Jf)
+            return Jx, found[0], found[-1]
+        Jx, Jf, Jr, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp, external=external)
         _require_solved(trajectory, outcome, done)
-        return Jx, Jf
+        return Jx, Jf, Jr
 
     def _contract_by_differences(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """:meth:`contract` under constraints, by differences of the gradients z' J with exact derivatives J.
@@ -425,12 +442,6 @@ class Variational(Integrator):
         H = np.swapaxes(np.linalg.solve(np.swapaxes(S, 1, 2), np.swapaxes(towards, 1, 2)), 1, 2)
         symmetric: Floats = 0.5 * (H + np.swapaxes(H, 1, 2))
         return symmetric
-
-    def ramps(self, scene: Scene, trajectory: Trajectory) -> Floats:
-        """See :meth:`Integrator.ramps`."""
-        if not self.stage_times:
-            return super().ramps(scene, trajectory)
-        return self._derivatives(scene, trajectory, ramp=True)[1]
 
     def contract(self, scene: Scene, trajectory: Trajectory, z: Floats) -> Floats:
         """See :meth:`Integrator.contract`; divided steps are treated as in :meth:`linearize`."""

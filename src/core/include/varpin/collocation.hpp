@@ -126,6 +126,11 @@ class Collocation {
         weighted = true;
         for (int i = 0; i < stages; ++i) weight[i] = begin + share * tableau.c[i];
     }
+    // Take derivatives in f for a constant force again.
+    void weigh_constant() {
+        weighted = false;
+        std::fill(weight.begin(), weight.end(), 1.0);
+    }
 
     // Solve the step equation from the guess in V.
     //

@@ -27,15 +27,13 @@ class StepDerivatives {
   public:
     virtual ~StepDerivatives() = default;
 
-    // varies: each step has forces (s, n) at its stages instead of a constant force (n). ramp: derivatives in f are
-    // those in a force that grows linearly from 0 at the start of the step to f at its end.
-    bool varies = false, ramp = false;
+    bool varies = false;  // each step has forces (s, n) at its stages instead of a constant force (n)
 
     // Take derivatives in an external force in the place of f, which drives limit.
     virtual void take_external() = 0;
 
     virtual Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                          std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past) = 0;
+                          std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr, int past) = 0;
 };
 
 // Numbers of joints and stages may be known at compile time.
@@ -54,7 +52,8 @@ class VariationalLinearization final : public StepDerivatives {
           from_p(n),
           dV(entries(stages * n, 3 * n)),
           dQ(entries(n, 3 * n)),
-          chained(n),
+          chained(n, n),
+          in_ramp(entries(2 * n, 2 * n)),
           multiplier(stages * n),
           slope(stages * n),
           direction(mechanism.tree),
@@ -71,24 +70,28 @@ class VariationalLinearization final : public StepDerivatives {
 
     void take_external() override { stepper.step_equation.by_external = true; }
 
-    // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f. An undivided step
+    // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f, and unless null
+    // Jr (2n, n) in a force that grows linearly from 0 at the start of the step to f at its end. An undivided step
     // is solved again from a guess (s, n) close to its root; the arrays q, p and force have `past` earlier steps before
     // the pointers. A divided step has `halvings`: its parts are repeated, and their derivatives are multiplied.
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0) override {
+                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr, int past = 0) override {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome == Outcome::solved) {
-                if (ramp) stepper.step_equation.weigh_ramp(0.0, 1.0);
                 stepper.step_equation.derivatives(h, dV, Jx, Jf);
+                if (Jr) ramp_derivatives(h, 0.0, 1.0, Jr);
             }
             return outcome;
         }
         chained.begin(Jx, Jf);
+        if (Jr) std::fill(Jr, Jr + entries(2 * n, n), 0.0);
         return parts(h, q, p, force, halvings, [&](double begin, double length) {
-            if (ramp) stepper.step_equation.weigh_ramp(begin, length / h);
             part_derivatives(length);
             chained.follow(Jx, Jf);
+            if (!Jr) return;
+            ramp_derivatives(length, begin, length / h, chained.part_rate.data());
+            chained.follow_rates(Jr);
         });
     }
 
@@ -181,6 +184,7 @@ class VariationalLinearization final : public StepDerivatives {
     std::vector<double> dV;  // (s, n, 3n)
     std::vector<double> dQ;  // (n, 3n) of one stage
     ChainedDerivatives chained;
+    std::vector<double> in_ramp;            // (2n, 2n) of the state, which ramps do not change
     std::vector<double> multiplier, slope;  // (s, n)
     Jet<Dual> direction;
     std::vector<Dual> at_q, at_v;
@@ -265,6 +269,13 @@ class VariationalLinearization final : public StepDerivatives {
             before[c] = 0.0;
             for (int r = 0; r < 2 * n; ++r) before[c] += chained.part[r * 2 * n + c] * row[r];
         }
+    }
+
+    // Derivatives (2n, n) in a ramp of the force over the whole step, of the part whose root is in the stepper.
+    void ramp_derivatives(double h, double begin, double share, double* Jr) {
+        stepper.step_equation.weigh_ramp(begin, share);
+        stepper.step_equation.derivatives(h, dV, in_ramp.data(), Jr);
+        stepper.step_equation.weigh_constant();
     }
 
     // Derivatives of the part whose root is in the stepper.
