@@ -39,8 +39,8 @@ VERY_SHORT = 0.01
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
 # A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
-# half. After another full step one more is tried along the parabola through the last motions, whose length counts as
-# two; otherwise the step is extended by a factor while that lowers the cost.
+# half. The step is extended by a factor while that lowers the cost. Where it is not, after another full step, a motion
+# on the parabola through the last ones is tried, whose length counts as two.
 _EARLY, _EXTENSION, _BENT = 0.85, 4.0, 2.0
 # Approximate shortest step of a line search, its greatest number of trials, and the least factor between two of them.
 _SHORTEST, _TRIALS, _SHARPEST = 1e-6, 40, 0.25
@@ -67,6 +67,7 @@ class Start(NamedTuple):
         exact: Whether the pass had second derivatives of the dynamics.
         whole: Whether the pass had the whole gradient of the noise cost.
         extends: Whether full steps that end early are extended.
+        overshot: Whether they are so only along the parabola through the last motions.
         follows: Whether a trial may follow foreseen states.
         bounded: Whether trials stop at a number of substeps.
         behind: The motion from which a full step led to this one, or None.
@@ -80,6 +81,7 @@ class Start(NamedTuple):
     exact: bool
     whole: bool
     extends: bool
+    overshot: bool
     follows: bool
     bounded: bool
     behind: Trajectory | None
@@ -282,15 +284,17 @@ class LineSearch:
 
     def _extended(self, step: Step, start: Start, here: _Here, bounds: _Bounds) -> Step:
         """A full step, or a longer one that lowers the cost further, where the full one ends early."""
-        slope, motion = start.plan.slope, step.taken.motion
-        if start.behind is not None and motion is not None and step.decrease >= -_EARLY * slope:
-            commands = self._bent(start.behind, motion.trajectory(), start, here)
-            return self._longer(step, _BENT, commands, start, here, bounds)
-        while step.decrease >= -_EARLY * step.length * slope:
+        early = -_EARLY * start.plan.slope
+        while step.decrease >= step.length * early and not start.overshot:
             before, length = step.length, _EXTENSION * step.length
             step = self._longer(step, length, here.commands(length, start.plan), start, here, bounds)
             if step.length == before:
+                step = step._replace(overshot=before == 1.0)
                 break
+        motion = step.taken.motion
+        if step.length == 1.0 and step.decrease >= early and start.behind is not None and motion is not None:
+            commands = self._bent(start.behind, motion.trajectory(), start, here)
+            step = self._longer(step, _BENT, commands, start, here, bounds)
         return step
 
     def _longer(
@@ -301,7 +305,7 @@ class LineSearch:
         step = step._replace(trials=step.trials + 1)
         if trial.expected < -step.decrease:
             return step._replace(length=length, decrease=-trial.expected, taken=trial)
-        return step._replace(overshot=step.length == 1.0)
+        return step
 
     def _bent(self, behind: Trajectory, ahead: Trajectory, start: Start, here: _Here) -> Commands:
         """Commands of the next motion on the parabola through three, with the plan's feedback around its states."""
