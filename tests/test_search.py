@@ -548,6 +548,15 @@ def test_longer_steps_go_along_the_parabola_through_the_last_motions(monkeypatch
             np.testing.assert_allclose(found.ravel(), wanted, rtol=0, atol=1e-12 * np.abs(at).max())
 
 
+@pytest.mark.parametrize("iterations", [17, 20, 23, 26])
+def test_a_given_first_control_stays_exactly_as_it_is(iterations):
+    before = np.random.default_rng(0).uniform(-5.0, 5.0, 2)
+    problem = swing_up(controls="linear", constraints=[vp.WithinControlRate(400.0, before=before)])
+    plan = vp.solve(problem, max_iterations=iterations, check=False)
+    assert any(row.step == 2.0 for row in plan.history)
+    np.testing.assert_array_equal(plan.search.trajectory.u_nodes[0], before)
+
+
 def test_the_parabola_through_the_last_motions_saves_iterations(monkeypatch):
     def iterations():
         plans = [

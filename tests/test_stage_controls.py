@@ -207,6 +207,9 @@ def test_derivatives_against_differences(integrator, split):
     assert (motion.statistics.split_steps > 0) == split
     lin = vp.linearize(scene, motion)
     assert lin.ramp is not None
+    both = integrator.linearize_with_ramps(scene, motion)
+    for found, alone in zip(both[:3], integrator.linearize(scene, motion), strict=True):
+        np.testing.assert_array_equal(found, alone)
     for k in range(motion.steps):
         start = motion.q[k], motion.p[k] if integrator.variational else motion.v[k]
 

@@ -114,7 +114,7 @@ bool linearize(const Motion& motion, Vector& A, Vector& B) {
         const std::span halvings(next, parts > 1 ? parts : 0);
         next += halvings.size();
         const varpin::Outcome outcome = linearization.first(h, q, motion.p_before(s), guess.data(), force.data(),
-                                                            halvings, &A[s * x * x], by_force.data(), nullptr);
+                                                            halvings, &A[s * x * x], by_force.data());
         if (outcome != varpin::Outcome::solved) return false;
         for (int i = 0; i < x; ++i) {
             double* row = &B[(s * x + i) * m];

@@ -83,7 +83,7 @@ std::tuple<Out, Out, Out, std::int64_t, std::size_t> variational_derivatives(
     const auto [X, F, outcome, done] =
         derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
             double* Jr = ramp ? in_ramps + s * 2 * at.n * at.n : nullptr;
-            return work->first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf, Jr, at.past(s));
+            return work->first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf, at.past(s), Jr);
         });
     return {X, F, R, outcome, done};
 }

@@ -76,7 +76,10 @@ def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask]
 
 
 def _holding(plan: Plan) -> Plan:
-    """A plan within limits that knows whether it holds controls at them."""
+    """A plan within limits that knows whether it holds controls at them.
+
+    Controls without effect have no feedback, either, and count as held: that changes nothing.
+    """
     return plan._replace(holds=not bool(plan.feedback.any(axis=2).all()))
 
 

@@ -56,9 +56,9 @@ class Iteration:
         noise_cost: Cost added by noise to the motion before the iteration.
         expected_decrease: Decrease of the expected cost by the quadratic model with a full step.
         decrease: Actual decrease of the expected cost, with the plan's model of the noise; 0 without a step.
-        step: Length of the accepted step, 0 if there is none; above 1 where the cost falls on beyond, and then 2 of a
-            step along the parabola through the last motions. Of a step along foreseen states it is the share of their
-            changes.
+        step: Length of the accepted step, 0 if there is none; 4 or more of one that was extended as the cost fell on
+            beyond, 2 of one along the parabola through the last motions. Of a step along foreseen states it is the
+            share of their changes.
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
         backward_passes: Number of backward passes with different regularizations. Those that determine the controls at

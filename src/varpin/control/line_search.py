@@ -39,8 +39,9 @@ VERY_SHORT = 0.01
 # Below this share of the expected decrease a step is poor: shorter steps are tried while they improve on it.
 _POOR = 0.3
 # A full step whose decrease is above this share of what the slope gives ends early: at the minimum of the model it is a
-# half. The step is extended by a factor while that lowers the cost. Where it is not, after another full step, a motion
-# on the parabola through the last ones is tried, whose length counts as two.
+# half. The step is extended by a factor while that lowers the cost. If it was not extended and the step before was a
+# full one, too, a motion on the parabola through the last ones is tried, whose length counts as two. That fails so
+# seldom that failures are not remembered.
 _EARLY, _EXTENSION, _BENT = 0.85, 4.0, 2.0
 # Approximate shortest step of a line search, its greatest number of trials, and the least factor between two of them.
 _SHORTEST, _TRIALS, _SHARPEST = 1e-6, 40, 0.25
@@ -67,7 +68,7 @@ class Start(NamedTuple):
         exact: Whether the pass had second derivatives of the dynamics.
         whole: Whether the pass had the whole gradient of the noise cost.
         extends: Whether full steps that end early are extended.
-        overshot: Whether they are so only along the parabola through the last motions.
+        overshot: Whether the last extension by a factor failed: then only the parabola is tried.
         follows: Whether a trial may follow foreseen states.
         bounded: Whether trials stop at a number of substeps.
         behind: The motion from which a full step led to this one, or None.
@@ -425,8 +426,8 @@ class LineSearch:
 
 
 def _on_parabola(behind: Floats, here: Floats, ahead: Floats) -> Floats:
-    """The next point on the parabola through three at equal distances."""
-    return behind - 3.0 * here + 3.0 * ahead
+    """The next point on the parabola through three at equal distances; exactly the same one where they are equal."""
+    return behind + 3.0 * (ahead - here)
 
 
 def _divides_others(trial: Trial, start: Start) -> bool:

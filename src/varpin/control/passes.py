@@ -56,7 +56,10 @@ class Plan(NamedTuple):
         return self._replace(feedforward=left * self.feedforward, gradient=left * self.gradient)
 
     def free_gradient(self, problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
-        """The gradient (R, m), zero where it pushes a control against its active limit; zero at an optimum."""
+        """The gradient (R, m), zero at an optimum.
+
+        Of a plan that holds controls at limits it is zero where it pushes a control of the motion against its limit.
+        """
         if not self.holds:
             return self.gradient
         u, (lower, upper) = problem.decided(trajectory), problem.control_limits

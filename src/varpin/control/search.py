@@ -699,6 +699,7 @@ class Search:
         A control that a plan holds at a limit has no feedback, also on trials so short that it is far from there.
         """
         after = self.plan, self.planned, self.trajectory, self.shares, self.cost, self.above, self.before, self.jumps
+        behind = self.behind
         if step.length > 0.0 and self.before is not None:
             self.trajectory, self.shares, self.cost, self.above = self.before
         self.clipping = True
@@ -709,6 +710,7 @@ class Search:
             return other._replace(trials=trials), passes
         self.clips = False
         self.plan, self.planned, self.trajectory, self.shares, self.cost, self.above, self.before, self.jumps = after
+        self.behind = behind
         return step._replace(trials=trials), passes
 
     def _jump(self) -> str:

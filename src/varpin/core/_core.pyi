@@ -478,7 +478,7 @@ def foresee(
     moves: Floats,
     after: Floats | None = None,
 ) -> None:
-    """The motion of N linearized steps under a plan of R decisions.
+    """The deviations on N linearized steps under a plan of R decisions.
 
     Its steps are ``A`` (N, 2n, 2n) and ``B`` (N, 2n, m), its controls change by ``feedforward`` (R, m), ``feedback``
     (R, m, 2n) of the state, and ``previous`` (R, m, m) of the previous control unless it is empty, clipped to ``slack``

@@ -81,7 +81,8 @@ class Integrator(ABC):
        state;
     2. ``rollout_compiled``, many steps of many paths in the core, and ``step_in_python``, one step of one path with
        noise that only Python can evaluate; both advance a state;
-    3. ``linearize``, the derivatives of its steps, and ``quiet_ends`` if it applies noise after a step too;
+    3. ``linearize``, the derivatives of its steps, ``linearize_with_ramps`` if it evaluates controls within a step, and
+       ``quiet_ends`` if it applies noise after a step too;
     4. ``variational``, True if it maps (q, p) and False if it maps (q, v), and ``order``.
     """
 
@@ -292,9 +293,9 @@ class Integrator(ABC):
         """
 
     def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        """:meth:`linearize`, and derivatives (N, 2n, n) in a force that grows linearly from 0 over each step.
+        """The three results of :meth:`linearize`, and derivatives (N, 2n, n) in a force that grows over each step.
 
-        They are taken in the force at the step's end.
+        It grows linearly from 0, and the derivatives are those in its value at the end of the step.
 
         Raises:
             LinearizationError: A step has no solution at dw = 0.

@@ -377,8 +377,8 @@ class Variational(Integrator):
     ) -> tuple[Floats, Floats, Floats]:
         """Derivatives of each step in (q, p), in a constant force, and with ``ramp`` in one that grows linearly from 0.
 
-        With ``external`` it is a force that drives do not limit. The columns of velocities of cubic inputs follow those
-        of the force, as in :attr:`Scene.transmission`.
+        Without ``ramp`` the last array is empty. With ``external`` the force is one that drives do not limit. The
+        columns of velocities of cubic inputs follow those of the force, as in :attr:`Scene.transmission`.
         """
         steps = self._steps(scene, trajectory)
         guess = np.ascontiguousarray(self._guess(trajectory))
@@ -395,7 +395,7 @@ class Variational(Integrator):
                 Jx, Jf, by_rate, outcome, done = constrained_derivatives(**steps, **given, ramp=growing)
                 _require_solved(trajectory, outcome, done)
                 found.append(np.concatenate([Jf, by_rate[:, :, cubic]], axis=2) if cubic else Jf)
-            return Jx, found[0], found[-1]
+            return Jx, found[0], found[1] if ramp else Jf[:0]
         Jx, Jf, Jr, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp, external=external)
         _require_solved(trajectory, outcome, done)
         return Jx, Jf, Jr

@@ -33,7 +33,7 @@ class StepDerivatives {
     virtual void take_external() = 0;
 
     virtual Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                          std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr, int past) = 0;
+                          std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past, double* Jr) = 0;
 };
 
 // Numbers of joints and stages may be known at compile time.
@@ -75,7 +75,8 @@ class VariationalLinearization final : public StepDerivatives {
     // is solved again from a guess (s, n) close to its root; the arrays q, p and force have `past` earlier steps before
     // the pointers. A divided step has `halvings`: its parts are repeated, and their derivatives are multiplied.
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr, int past = 0) override {
+                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0,
+                  double* Jr = nullptr) override {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome == Outcome::solved) {
@@ -184,7 +185,7 @@ class VariationalLinearization final : public StepDerivatives {
     std::vector<double> dV;  // (s, n, 3n)
     std::vector<double> dQ;  // (n, 3n) of one stage
     ChainedDerivatives chained;
-    std::vector<double> in_ramp;            // (2n, 2n) of the state, which ramps do not change
+    std::vector<double> in_ramp;            // (2n, 2n) the derivatives in the state again, which nobody reads
     std::vector<double> multiplier, slope;  // (s, n)
     Jet<Dual> direction;
     std::vector<Dual> at_q, at_v;
