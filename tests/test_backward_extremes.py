@@ -188,7 +188,7 @@ def test_both_forms_agree_where_digits_are_plenty(name, foresight, regularizatio
         expected = np.zeros((0, 9))
         if foresight:
             free = one_pass(along, regularization, False, None, None, roots=False)[0]
-            expected = foreseen(along, free)[0]
+            expected = foreseen(along, free).expected
         limits = Limits(along.slack, expected)
     (plain, first), (roots, second) = (
         one_pass(along, regularization, True, None, limits, roots=roots) for roots in (False, True)

@@ -657,6 +657,7 @@ def test_lengths_of_a_line_search_follow_the_parabola_through_a_trial(backtracki
     assert tried[:3] == lengths
 
 
+@pytest.mark.usefixtures("in_controls_alone")
 @pytest.mark.parametrize("into", [0, 1, 2])
 def test_searches_go_on_as_if_not_interrupted_while_they_are_away(into, tmp_path):
     whole = vp.solve(valley(), check=False)

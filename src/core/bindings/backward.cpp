@@ -224,7 +224,8 @@ void run_gradients(double h, int hold, double regularization, const HeldSteps& g
 }
 
 // The linearized motion under a plan from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
-void foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3> previous, In<3> slack, InOut<1> state,
+// True where a control reaches a limit.
+bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3> previous, In<3> slack, InOut<1> state,
              InOut<2> expected, InOut<2> moves, std::optional<InOut<2>> after) {
     const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), size = x + m;
     const std::size_t R = decisions_of(N, hold);
@@ -247,7 +248,7 @@ void foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3
                               .previous = given(previous, "previous", {R, m, m}) ? previous.data() : nullptr,
                               .slack = given(slack, "slack", {R, 2, m}) ? slack.data() : nullptr};
     nb::gil_scoped_release release;
-    predict(plan, state.data(), expected.data(), moves.data(), after ? after->data() : nullptr);
+    return predict(plan, state.data(), expected.data(), moves.data(), after ? after->data() : nullptr);
 }
 
 template <class Pass>

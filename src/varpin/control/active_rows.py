@@ -106,7 +106,7 @@ class Rows:
         problem, x = self.problem, self.states.shape[1]
         ((_, steps),) = passing.blocks
         states = np.zeros((steps + 1, passing.states))
-        _, moves = foreseen(passing, plan, slack, after=states[1:])
+        moves = foreseen(passing, plan, slack, after=states[1:]).moves
         # With linear controls the first step is the one that sets the first control.
         states = states[steps - problem.steps :, :x]
         self.ahead_of = states, moves

@@ -97,12 +97,13 @@ class Along:
         self.clipped = False  # whether passes leave the limits to the motion, which clips controls
         if problem.limited:
             self.slack = problem.control_limits - problem.decided(trajectory)[:, None]
-        block = max(1, _BLOCK // problem.hold) * problem.hold
-        self.blocks = [(max(0, end - block), end) for end in range(problem.steps, 0, -block)][::-1]
         # The number of states of the pass; with linear controls the state contains the control.
-        self.states = 2 * problem.scene.robot.dof
+        self.blocks, self.states = [(0, problem.steps)], 2 * problem.scene.robot.dof
         if problem.linear:
             self.blocks, self.states = [(0, problem.decisions)], size(problem)
+        elif problem.steps > _BLOCK:
+            block = max(1, _BLOCK // problem.hold) * problem.hold
+            self.blocks = [(max(0, end - block), end) for end in range(problem.steps, 0, -block)][::-1]
         self.kept: tuple[Linearization, Floats] | None = None
         # Gradient of the noise cost, added to the cost's gradient at its samples (N s, 2n + m) once it is known.
         self.added: Floats | None = None
@@ -232,12 +233,14 @@ class Along:
         """The gradient of the running cost at its samples, with that of the noise cost if it was added."""
         return self.running.gradient if self.added is None else self.running.gradient + self.added
 
-    @cached_property
+    @property
     def within(self) -> Floats | None:
         """The Hessian (N, 2n, 2n), in the noise's jumps, of what their velocities cost beyond the samples."""
+        return self._within if self.problem.processes and self.problem.integrator.holds_noise else None
+
+    @cached_property
+    def _within(self) -> Floats | None:
         problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.model_rule)
-        if not (problem.processes and problem.integrator.holds_noise):
-            return None
         found: list[Floats] = []
         n = problem.scene.robot.dof
         for begin, end in [(0, problem.steps)] if problem.linear else self.blocks:
@@ -270,7 +273,8 @@ class Along:
         problem, q, v = self.problem, self.trajectory.q[-1:], self.trajectory.v[-1:]
         n = problem.scene.robot.dof
         end, x = problem.expand_terminal(self.trajectory), slice(0, 2 * n)
-        cost = Expansion(end.gradient[:1, x], end.hessian[:1, x, x])
+        # Contiguous, as the core takes them.
+        cost = Expansion(end.gradient[:1, x], np.ascontiguousarray(end.hessian[:1, x, x]))
         g, H, D = cost.gradient[0], cost.hessian[0], None
         if problem.integrator.variational:
             D = np.eye(2 * n)

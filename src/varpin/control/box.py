@@ -60,14 +60,13 @@ def to_minimum(box: Box, regularization: float) -> tuple[Plan | None, list[Mask]
         return single_pass(along, regularization, curvature=curvature)[0], None
     plan, stiffness = free_pass(along, regularization, curvature)
     if plan is not None:
-        moves = foreseen(along, plan)[1]
-        lower, upper = along.slack[:, 0], along.slack[:, 1]
-        if not ((moves <= lower) | (moves >= upper)).any():
-            return _sloped(plan, moves), None
+        ahead = foreseen(along, plan)
+        if not ahead.limited:
+            return _sloped(plan, ahead.moves), None
         if problem.processes:
             plan, active = _matching(along, regularization, curvature, plan), None
         else:
-            plan, active = box.with_proximal(regularization * np.abs(stiffness)).minimum(plan, moves)
+            plan, active = box.with_proximal(regularization * np.abs(stiffness)).minimum(plan, ahead.moves)
         if plan is not None:
             return _holding(plan), active
     limits = around_nominal(along.slack, along.states)
@@ -95,7 +94,7 @@ def _sloped(plan: Plan, moves: Floats) -> Plan:
 
     The feed-forward parts belong together with the feedback, so the slope is that of both.
     """
-    slope = float((plan.gradient * moves).sum())
+    slope = float(np.vdot(plan.gradient, moves))
     if not (plan.expected_decrease > 0.0 and slope < 0.0):
         return plan
     return plan._replace(slope=slope, curvature=-2.0 * (plan.expected_decrease + slope), limited=True)
@@ -107,7 +106,7 @@ def _matching(along: Along, regularization: float, curvature: Floats | None, pla
     None if ever more of them change. The noise cost depends on the gains, so passes have no common model.
     """
     held: Mask = np.zeros(plan.feedforward.shape, dtype=np.bool_)
-    others, found, (expected, moves) = held.size + 1, plan, foreseen(along, plan)
+    others, found, (expected, moves, _) = held.size + 1, plan, foreseen(along, plan)
     while others > 0:
         limits = Limits(along.slack, expected)
         passed = single_pass(along, regularization, curvature=curvature, limits=limits)[0]
@@ -120,7 +119,7 @@ def _matching(along: Along, regularization: float, curvature: Floats | None, pla
         if changed >= others:
             return None
         held, others = now, changed
-        expected, moves = foreseen(along, found)
+        expected, moves, _ = foreseen(along, found)
     made = _sloped(found, moves)
     return made if made is not found else None
 
@@ -187,7 +186,7 @@ class Box:
             found = box._fixed(held)
             if found is None:
                 return None
-            at = box._at(plan, foreseen(box.along, found, box._slack(held))[1])
+            at = box._at(plan, foreseen(box.along, found, box._slack(held)).moves)
             if at is None:
                 return None
             size, force = _ROUNDED * np.abs(at.moves).max(axis=0), _ROUNDED * np.abs(at.pressure).max(axis=0)
@@ -261,7 +260,7 @@ class Box:
             found = self._passed(limits, stiff, -stiff * z)
             if found is None:
                 return None
-            to = foreseen(self.along, found, slack)[1]
+            to = foreseen(self.along, found, slack).moves
             d = np.where(fixed, 0.0, to - z)
             opening, turning = (d, -d), (-duals[0] * (1.0 + d / gaps[0]), -duals[1] * (1.0 - d / gaps[1]))
             length = min(1.0, _free_length((*gaps, *duals), (*opening, *turning)))
@@ -300,7 +299,7 @@ class Box:
         along, factors, (_, m), x = self.along, limits.factors, to.shape, self.along.states
         if factors is None or len(along.blocks) > 1:
             passed = self._passed(limits, stiff, pull)
-            return None if passed is None else foreseen(along, passed, limits.slack)[1]
+            return None if passed is None else foreseen(along, passed, limits.slack).moves
         problem, alone = along.problem, along.with_gradient_alone(push)
         decision, control = np.nonzero(self.lower >= self.upper)
         factors[decision, control, control] = _FIRM
@@ -316,7 +315,7 @@ class Box:
         )
         steps = alone.steps(0, problem.decisions * problem.hold, None, without_limits(m, x))
         core.run_gradients(problem.dt, problem.hold, 0.0, steps, gains, np.zeros(x))
-        more: Floats = foreseen(alone, plan._replace(feedforward=feedforward), np.zeros((0, 2, m)))[1]
+        more: Floats = foreseen(alone, plan._replace(feedforward=feedforward), np.zeros((0, 2, m))).moves
         return to + more
 
     def _begin(self, plan: Plan) -> tuple[Mask, list[Mask], Floats, Floats]:
@@ -431,7 +430,7 @@ class Box:
         """The model and its gradient at changes of the controls."""
         still = without_feedback(plan, moves)
         slack, pressure = np.stack([moves, moves], axis=1), np.zeros(moves.shape)
-        expected = foreseen(self.along, still, slack)[0]
+        expected = foreseen(self.along, still, slack).expected
         found = self._passed(Limits(slack, expected, pressure=pressure))
         return None if found is None else _Point(moves, expected, -found.expected_decrease, pressure)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,7 @@ AS_FORESEEN = 0.7
 # Lengths of steps along foreseen states. Their cost must fall by _CLEARLY times as much as with the full step, and no
 # joint may move away from the present motion by more than _FAR [rad or m]: arms that are moved far often reach for a
 # frame in a posture that costs more.
-_LENGTHS, _CLEARLY, _FAR = (1.0, 0.5), 1.1, 2.0
+_LENGTHS, _CLEARLY, _FAR = (1.0, 0.75, 0.5), 1.1, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +43,7 @@ def inverse_dynamics(problem: OptimalControlProblem, path: Path, controls: Float
 
     With ``controls`` (R, m) these are the controls.
     """
-    scene, hold, needed = problem.scene, problem.hold, _demand(problem, path)
+    scene, hold, needed = problem.scene, problem.hold, _demand(problem, path.q, path.v)
     if controls is None:
         controls = as_moved(scene, path.q[hold::hold], path.v[hold::hold], needed @ scene.allocation.T)
         controls = np.clip(controls, *problem.control_limits)
@@ -61,6 +62,20 @@ def states_on(problem: OptimalControlProblem, path: Path) -> Floats:
     if problem.integrator.variational:
         v = (node_jets(problem.scene, q, v)[0] @ v[:, :, None])[:, :, 0]
     return np.hstack([q, v])
+
+
+class Followed(NamedTuple):
+    """Motions that follow foreseen states.
+
+    Attributes:
+        commands: Their commands, which differ in the feedback: that which holds a motion on its path, then the plan's.
+        length: Length of the step.
+        cost: Change of the cost that is foreseen.
+    """
+
+    commands: tuple[Commands, Commands]
+    length: float
+    cost: float
 
 
 class Foresight:
@@ -82,16 +97,15 @@ class Foresight:
         return scene.direct or (scene.controls == n and int(np.linalg.matrix_rank(scene.actuation)) == n)
 
     @cached_property
-    def _gains(self) -> Floats:
+    def _holding(self) -> Floats:
+        """Gains of the controls (R, m, 2n) that hold a motion on a path."""
         problem = self.problem
         M = lagrangian_jet(problem.scene, problem.q0, np.zeros(problem.scene.robot.dof)).Lvv
         to_controls = problem.scene.allocation @ holding_feedback(problem, M)
-        return np.tile(to_controls, (self.problem.decisions, 1, 1))
+        return np.tile(to_controls, (problem.decisions, 1, 1))
 
-    def commands(
-        self, along: Along, plan: Plan, shares: Floats, full: float, feedback: Commands
-    ) -> tuple[Commands, float] | None:
-        """The commands of a motion that follows the plan's foreseen states, and its length; None without a good one.
+    def followed(self, along: Along, plan: Plan, shares: Floats, full: float, feedback: Commands) -> Followed | None:
+        """Motions that follow the plan's foreseen states; None where these are not good.
 
         Args:
             along: The motion that the plan is around.
@@ -103,52 +117,58 @@ class Foresight:
         Raises:
             CostError: A custom cost fails at the foreseen states.
         """
-        problem, n = self.problem, self.problem.scene.robot.dof
+        problem, n, motion = self.problem, self.problem.scene.robot.dof, along.trajectory
         if not self.possible or len(along.blocks) > 1:
             return None
-        here = Path(along.trajectory.q, along.trajectory.v)
-        change = self._foreseen(along, plan, here)
-        u, force, limits = problem.decided(along.trajectory), _demand(problem, here), problem.control_limits[:, None]
-        best, found, far = _CLEARLY * min(full, 0.0), None, float(np.abs(change[:, :n]).max())
-        for length in (each for each in _LENGTHS if each * far <= _FAR):
-            path = Path(here.q + length * change[:, :n], here.v + length * change[:, n:])
-            # Differences of the inverse dynamics: what it is off by on the motion itself cancels.
-            there = u + (_demand(problem, path) - force) @ problem.scene.allocation.T
-            if problem.limited and not ((limits[0] <= there) & (there <= limits[1])).all():
+        change = self._foreseen(along, plan)
+        far = float(np.abs(change[:, :n]).max())
+        lengths = [length for length in _LENGTHS if length * far <= _FAR]
+        if not lengths:
+            return None
+        # The motion itself is the first one.
+        parts = np.array([0.0, *lengths])[:, None, None]
+        q, v = motion.q + parts * change[:, :n], motion.v + parts * change[:, n:]
+        force = _demand(problem, q, v)
+        # Differences of the inverse dynamics: what it is off by on the motion itself cancels.
+        u = problem.decided(motion) + (force[1:] - force[:1]) @ problem.scene.allocation.T
+        q, v, rows = q[1:], v[1:], np.repeat(u, problem.hold, axis=1)
+        compiled = problem.running.compiled.values(*problem.samples(q, v, rows))
+        (lower, upper), best, found = problem.control_limits, _CLEARLY * min(full, 0.0), None
+        for k, length in enumerate(lengths):
+            if problem.limited and not ((lower <= u[k]) & (u[k] <= upper)).all():
                 continue
-            cost = float((self._shares(path, there) - shares).sum())
+            cost = float((problem.shares_along(q[k], v[k], rows[k], compiled[k]) - shares).sum())
             model = length * plan.slope + 0.5 * length**2 * plan.curvature
             if cost < best and cost <= AS_FORESEEN * model:
-                best, found = cost, (path, there, length)
+                best, found = cost, k
         if found is None:
             return None
-        path, there, length = found
-        return feedback._replace(u=there, gains=self._gains, reference=states_on(problem, path)), length
+        held = feedback._replace(
+            u=u[found], gains=self._holding, reference=states_on(problem, Path(q[found], v[found]))
+        )
+        return Followed((held, held._replace(gains=plan.feedback)), lengths[found], best)
 
-    def _foreseen(self, along: Along, plan: Plan, here: Path) -> Floats:
+    def _foreseen(self, along: Along, plan: Plan) -> Floats:
         """The changes of q and v at the nodes (N + 1, 2n) with a full step, by the linearized motion."""
-        problem, n = self.problem, self.problem.scene.robot.dof
+        problem, n, motion = self.problem, self.problem.scene.robot.dof, along.trajectory
         change = np.zeros((problem.steps + 1, 2 * n))
         foreseen(along, plan, after=change[1:])
         if problem.integrator.variational:
             slopes = along.linearized(0, problem.steps)[1]
-            slopes = slopes if len(slopes) else velocity_at_nodes(problem.scene, here.q, here.v)
+            slopes = slopes if len(slopes) else velocity_at_nodes(problem.scene, motion.q, motion.v)
             change[:, n:] = (slopes @ change[:, :, None])[:, :, 0]
         return change
 
-    def _shares(self, path: Path, u: Floats) -> Floats:
-        """The terms of the cost of a path under the controls that follow it."""
-        problem, rows = self.problem, np.repeat(u, self.problem.hold, axis=0)
-        compiled = problem.running.compiled.values(*problem.samples(path.q, path.v, rows))
-        return problem.shares_along(path.q, path.v, rows, compiled)
 
-
-def _demand(problem: OptimalControlProblem, path: Path) -> Floats:
-    """The joint forces (R, n) that controls have to give on a path, over each decision."""
-    q, v = path.q[:: problem.hold], path.v[:: problem.hold]
-    q, v, a = 0.5 * (q[:-1] + q[1:]), np.diff(q, axis=0) / problem.period, np.diff(v, axis=0) / problem.period
-    scene = problem.scene
+def _demand(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
+    """The joint forces (..., R, n) that controls have to give over each decision, on q and v (..., N + 1, n)."""
+    scene, period = problem.scene, problem.period
+    q, v = q[..., :: problem.hold, :], v[..., :: problem.hold, :]
+    before, after = (..., slice(None, -1), slice(None)), (..., slice(1, None), slice(None))
+    shape, n = q[before].shape, q.shape[-1]
+    at = (0.5 * (q[before] + q[after])).reshape(-1, n)
+    rate, acceleration = (((x[after] - x[before]) / period).reshape(-1, n) for x in (q, v))
     # A servo commanded to its present position exerts no spring force.
-    still = q @ scene.holding.T @ scene.actuation.T
-    needed: Floats = core.inverse_dynamics(scene.core, q, v, a) + still - scene.core.forces(q, v, still)[0]
-    return needed
+    still = at @ scene.holding.T @ scene.actuation.T
+    needed: Floats = core.inverse_dynamics(scene.core, at, rate, acceleration) + still
+    return (needed - scene.core.forces(at, rate, still)[0]).reshape(shape)

@@ -254,7 +254,8 @@ class LineSearch:
                 trial = self._try(step, start, here, bounds)
                 lengths.learn(step, trial.expected, slope)
                 if trials == 1 and (followed := self._following(trial, start, here, bounds)) is not None:
-                    trials, (other, along) = trials + 1, followed
+                    other, along, more = followed
+                    trials += more
                     strayed = not (other.cut or other.expected < trial.expected)
                     if not strayed and other.expected <= self.armijo * along * slope:
                         return Step(along, trials, -other.expected, taken=other)
@@ -353,22 +354,29 @@ class LineSearch:
         rise = -_DEAR * step * start.plan.slope
         return self._run(step, here.commands(step, start.plan), start, here, bounds, rise=rise)
 
-    def _following(self, full: Trial, start: Start, here: _Here, bounds: _Bounds) -> tuple[Trial, float] | None:
-        """A trial that follows foreseen states, with its length, if a ``full`` step is less good than foreseen.
+    def _following(self, full: Trial, start: Start, here: _Here, bounds: _Bounds) -> tuple[Trial, float, int] | None:
+        """The best trial that follows foreseen states, its length, and the number of trials it took.
 
-        None, too, where these states do not cost clearly less than the full step, or controls cannot follow them.
+        None where a ``full`` step is as good as foreseen, where these states do not cost clearly less than it, or where
+        controls cannot follow them.
         """
         if not (start.follows and self.closed) or -full.expected >= AS_FORESEEN * start.plan.expected_decrease:
             return None
         try:
-            found = self._foresight.commands(start.along, start.plan, start.shares, full.cost, here.feedback)
+            found = self._foresight.followed(start.along, start.plan, start.shares, full.cost, here.feedback)
         except TRIAL_ERRORS as error:
             logger.info("%s: states of the full step: %s", self.label, error)
             return None
         if found is None:
             return None
-        commands, length = found
-        return self._run(length, commands, start, here, bounds, rise=min(full.expected, 0.0)), length
+        best, most, trials = Trial(), min(full.expected, 0.0), 0
+        for commands in found.commands:
+            trial, trials = self._run(found.length, commands, start, here, bounds, rise=most), trials + 1
+            if trial.expected < best.expected or best.motion is None:
+                best, most = trial, min(trial.expected, most)
+            if best.expected <= AS_FORESEEN * found.cost:
+                break
+        return best, found.length, trials
 
     def _run(
         self, step: float, commands: Commands, start: Start, here: _Here, bounds: _Bounds, *, rise: float

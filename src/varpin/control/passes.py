@@ -102,26 +102,38 @@ def without_feedback(plan: Plan, moves: Floats) -> Plan:
     return plan._replace(feedforward=moves, feedback=np.zeros(plan.feedback.shape), previous=previous)
 
 
-def foreseen(
-    along: Along, plan: Plan, slack: Floats | None = None, after: Floats | None = None
-) -> tuple[Floats, Floats]:
+class Foreseen(NamedTuple):
+    """The linearized motion under a plan.
+
+    Attributes:
+        expected: The changes of the state and of the previous control before each decision (R, 2n + m).
+        moves: The changes of the controls (R, m).
+        limited: Whether a control reaches a limit.
+    """
+
+    expected: Floats
+    moves: Floats
+    limited: bool
+
+
+def foreseen(along: Along, plan: Plan, slack: Floats | None = None, after: Floats | None = None) -> Foreseen:
     """The linearized motion under a plan whose controls are clipped to their limits, or to ``slack`` (R, 2, m).
 
-    Returns the state and the change of the previous control before each decision (R, 2n + m), and the controls' changes
-    (R, m); ``after`` (N, 2n) receives the state after each step. Where controls are linear between nodes the state is X
-    of :mod:`varpin.control.linear_controls`, and there are N + 1 steps.
+    ``after`` (N, 2n) receives the change of the state after each step. Where controls are linear between nodes the
+    state is X of :mod:`varpin.control.linear_controls`, and there are N + 1 steps.
     """
     problem, (R, m, _), x = along.problem, plan.feedback.shape, along.states
     feedback, previous = gains_on_states(along, plan)
     expected, moves, state = np.empty((R, x + m)), np.empty((R, m)), np.zeros(x + m)
-    slack = along.slack if slack is None else slack
+    slack, limited = along.slack if slack is None else slack, False
     for begin, end in along.blocks:
         rows = slice(begin // problem.hold, end // problem.hold)
         A, B = along.state_steps(begin, end)
         then = None if after is None else after[begin:end]
         own = plan.feedforward[rows], feedback[rows], previous[rows], slack[rows]
-        core.foresee(problem.hold, A, B, *own, state, expected[rows], moves[rows], then)
-    return expected, moves
+        reached = core.foresee(problem.hold, A, B, *own, state, expected[rows], moves[rows], then)
+        limited = limited or reached
+    return Foreseen(expected, moves, limited)
 
 
 def gains_on_states(along: Along, plan: Plan) -> tuple[Floats, Floats]:

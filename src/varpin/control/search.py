@@ -28,7 +28,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback
 from varpin.control.trials import Trials
-from varpin.control.watchdog import IN_A_ROW, Watchdog
+from varpin.control.watchdog import Watchdog
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.mechanics.custom import CustomForceError
@@ -340,7 +340,7 @@ class Search:
         """A long step that may raise the cost, where steps have been short, (O16); and the backward passes it took."""
         dog = self.watchdog
         # Under noise that changes plans the costs of motions are not comparable from one plan to the next.
-        if not self.anew or self.any_steered or not dog.departs([item.step for item in self.history[-IN_A_ROW:]]):
+        if not self.anew or self.any_steered or not dog.departs(item.step for item in reversed(self.history)):
             return Step(), 0
         home, step, passes = (self.plan, self.planned, self.regularization, self.growth), Step(), 0
         if self.regularization > 0.0:
@@ -767,6 +767,8 @@ class Search:
 
 def _after(failed: Step, step: Step) -> Step:
     """A step with the trials of the line search before, which found none."""
+    if failed.trials == 0:
+        return step
     return step._replace(trials=failed.trials + step.trials, hidden=max(failed.hidden, step.hidden))
 
 

@@ -9,11 +9,12 @@ watchdog technique for forcing convergence in algorithms for constrained optimiz
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 # A search departs after so many steps in a row that are no longer than _SHORT.
-IN_A_ROW, _SHORT = 3, 0.25
+_IN_A_ROW, _SHORT = 3, 0.25
 # Iterations after which it returns, and how many more they are after each departure in vain. Iterations before it
 # departs again; they double with each departure in vain.
 _AWAY, _LONGER, _REST = 6, 2, 4
@@ -39,10 +40,12 @@ class Watchdog(NamedTuple):
     regularization: float = 0.0
     growth: float = 1.0
 
-    def departs(self, steps: Sequence[float]) -> bool:
-        """Whether a search departs after steps of these lengths, the last :data:`IN_A_ROW`."""
-        short = len(steps) >= IN_A_ROW and all(0.0 < step <= _SHORT for step in steps[-IN_A_ROW:])
-        return short and self.away == 0 and self.rest == 0
+    def departs(self, steps: Iterable[float]) -> bool:
+        """Whether a search departs after steps of these lengths, the last one first."""
+        if self.away or self.rest:
+            return False
+        short = itertools.takewhile(lambda step: 0.0 < step <= _SHORT, steps)
+        return len(list(itertools.islice(short, _IN_A_ROW))) == _IN_A_ROW
 
     @property
     def rise(self) -> float:

@@ -477,7 +477,7 @@ def foresee(
     expected: Floats,
     moves: Floats,
     after: Floats | None = None,
-) -> None:
+) -> bool:
     """The deviations on N linearized steps under a plan of R decisions.
 
     Its steps are ``A`` (N, 2n, 2n) and ``B`` (N, 2n, m), its controls change by ``feedforward`` (R, m), ``feedback``
@@ -486,7 +486,8 @@ def foresee(
 
     ``state`` (2n + m,) has the deviations of the state and of the previous control at the start, and is overwritten by
     those at the end. ``expected`` (R, 2n + m) receives those before each decision, ``moves`` (R, m) the changes of the
-    controls, and ``after`` (N, 2n) the deviations of the state after each step.
+    controls, and ``after`` (N, 2n) the deviations of the state after each step. The result tells whether a control
+    reaches a limit.
     """
 
 def box_minimum(H: Floats, g: Floats, limits: Floats, guess: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]] | None:

@@ -82,11 +82,12 @@ struct LinearizedPlan {
 // The linearized motion under a plan, each control clipped to its limits, from `state` (2n + m): the deviation of
 // the state and of the previous control at the start, overwritten by those at the end. Writes the deviations before
 // each decision into `expected` (R, 2n + m), the changes of the controls into `moves` (R, m), and unless it is null
-// the states after each step into `after` (N, 2n).
-inline void predict(const LinearizedPlan& plan, double* state, double* expected, double* moves,
+// the states after each step into `after` (N, 2n). True where a control reaches a limit.
+inline bool predict(const LinearizedPlan& plan, double* state, double* expected, double* moves,
                     double* after = nullptr) {
     const int x = plan.states, m = plan.controls, size = x + m, hold = plan.hold;
     std::vector<double> next(x);
+    bool limited = false;
     for (std::ptrdiff_t s = 0; s < plan.steps; ++s) {
         const std::ptrdiff_t r = s / hold;
         if (s % hold == 0) {
@@ -101,6 +102,7 @@ inline void predict(const LinearizedPlan& plan, double* state, double* expected,
                 }
                 if (plan.slack) {
                     const double* slack = plan.slack + r * 2 * m;
+                    limited = limited || move <= slack[i] || move >= slack[m + i];
                     move = std::min(std::max(move, slack[i]), slack[m + i]);
                 }
                 moves[r * m + i] = state[x + i] = move;
@@ -116,6 +118,7 @@ inline void predict(const LinearizedPlan& plan, double* state, double* expected,
         std::copy_n(next.data(), x, state);
         if (after) std::copy_n(state, x, after + s * x);
     }
+    return limited;
 }
 
 // Sums over a pass.
