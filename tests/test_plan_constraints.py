@@ -413,6 +413,37 @@ def test_control_limits_and_hold():
         assert np.abs(plan.controls).max() <= limits[1]
 
 
+@pytest.mark.parametrize(
+    ("goal", "duration", "steps", "speed", "torque"),
+    [([0.38, -1.25], 0.67, 16, 1.71, 43.0), ([1.32, 1.05], 0.95, 19, 1.4, 29.0)],
+)
+def test_torques_and_speeds_at_their_limits(goal, duration, steps, speed, torque):
+    """Joints that move at their greatest speed with little torque to spare: the last step has to keep to both limits.
+
+    The model's step beyond speeds that it has not met yet needs any torque, and says nothing of which reach a limit.
+    """
+    scene = vp.Scene(ROBOT, damping=0.1)
+    cost = vp.ControlCost(1e-6) + vp.VelocityCost(1e-2) + vp.Terminal(vp.TrackingCost(goal, 1e2) + vp.VelocityCost(1.0))
+    problem = vp.OptimalControlProblem(
+        scene,
+        cost,
+        np.zeros(2),
+        np.zeros(2),
+        dt=duration / steps,
+        steps=steps,
+        constraints=[vp.WithinVelocityLimits(ROBOT, (-speed, speed))],
+        control_limits=(-torque, torque),
+    )
+    plan = vp.solve(problem, check=False)
+    assert plan.status.converged
+    assert plan.violation <= 1e-9
+    u = plan.controls
+    assert (np.abs(u) >= torque).any()
+    assert np.abs(u).max() <= torque
+    assert plan.constraints[0].active.any()
+    assert kkt_residual(problem, plan) <= 1e-6
+
+
 RATE, GOAL = 1000.0, [2.5, 0.0, -2.2]
 
 

@@ -35,7 +35,6 @@ class ClosedLoop:
         gains: K (R, m, 2n); (R, m, X) of the states X of :mod:`varpin.control.linear_controls` with linear controls.
         previous: P (R, m, m); zero unless changes of controls have a cost or a limit.
         inverse: W (R, m, m), the inverse of the model's Hessian in w_k; zero in controls that are not free.
-        curvature: The Hessian's diagonal (R, m).
         gradient: Gradient of the cost in w (R, m).
     """
 
@@ -138,7 +137,7 @@ class ClosedLoop:
         x, remembers = A.shape[1], len(self._rate) > 0
         z = x + m
         self.gains, self.previous = np.zeros((R, m, x)), np.zeros((R, m, m))
-        self.inverse, self.curvature = np.zeros((R, m, m)), np.zeros((R, m))
+        self.inverse = np.zeros((R, m, m))
         V, T = np.zeros((z, z)), np.eye(z)
         V[:x, :x] = self._end[1]
         for k in reversed(range(R)):
@@ -154,7 +153,6 @@ class ClosedLoop:
                 Q[z:, z:] += self._rate[k]
                 Q[x:z, z:] -= self._rate[k]
                 Q[z:, x:z] -= self._rate[k]
-            self.curvature[k] = np.diagonal(Q)[z:]
             own = np.flatnonzero(free[k])
             if own.size:
                 W = _inverse(Q[z + own[:, None], z + own])
@@ -239,8 +237,22 @@ class ClosedLoop:
                 carried.append(wide)
                 node.append(steps + self._before)
                 of_row.append(index)
-        slopes, nodes, owners = np.concatenate(carried), _joined(node), _joined(of_row)
-        back = np.zeros((total, x))
+        return self._carried_back(G, np.concatenate(carried), _joined(node), _joined(of_row))
+
+    def rows_of_controls(self, chosen: Mask, sign: float) -> Floats:
+        """Derivatives (a, R, m) of the ``chosen`` controls (R, m), times ``sign``, in w."""
+        k, i = np.nonzero(chosen)
+        G = np.zeros((len(k), *chosen.shape))
+        G[np.arange(len(k)), k, i] = sign
+        none: Integers = np.zeros(0, dtype=np.int64)
+        return self._carried_back(G, np.zeros((0, self.gains.shape[2])), none, none)
+
+    def _carried_back(self, G: Floats, slopes: Floats, nodes: Integers, owners: Integers) -> Floats:
+        """The derivatives (a, R, m) in w of rows with the derivatives G (a, R, m) in the controls.
+
+        Rows ``owners`` also have the derivatives ``slopes`` in the states at ``nodes``, (b, X).
+        """
+        hold, back = self.problem.hold, np.zeros((len(G), slopes.shape[1]))
         for j in reversed(range(len(self._A))):
             own, here = j // hold, nodes == j + 1
             np.add.at(back, owners[here], slopes[here])
@@ -251,9 +263,7 @@ class ClosedLoop:
                 back += G[:, own] @ self.gains[own]
                 if own > 0:
                     G[:, own - 1] += G[:, own] @ self.previous[own]
-        given = problem.begin
-        if given is not None:
-            G[:, 0, ~np.isnan(given)] = 0.0
+        G[:, given_controls(self.problem)] = 0.0
         return G
 
     def response(self, ahead: Floats) -> tuple[Floats, Floats]:
@@ -287,6 +297,14 @@ class ClosedLoop:
                     after += np.einsum("krc,kc->kr", of_rows.by_controls, moved)
                 found.append(after)
         return found
+
+
+def given_controls(problem: OptimalControlProblem) -> Mask:
+    """Which decided controls (R, m) are given: those of the first instant, with linear controls."""
+    found = np.zeros((problem.decisions, problem.scene.controls), dtype=np.bool_)
+    if problem.begin is not None:
+        found[0] = ~np.isnan(problem.begin)
+    return found
 
 
 def _joined(parts: list[Integers]) -> Integers:

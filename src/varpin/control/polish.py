@@ -17,7 +17,7 @@ import scipy
 from varpin.arrays import Floats, Mask
 from varpin.control.active_rows import same_rows
 from varpin.control.along import states
-from varpin.control.closed_loop import ClosedLoop
+from varpin.control.closed_loop import ClosedLoop, given_controls
 from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.problem import OptimalControlProblem
@@ -148,12 +148,7 @@ def _first(
     backoff: list[Floats],
 ) -> _Step:
     """The first Newton step, around a given motion."""
-    lower, upper = problem.control_limits
-    u = problem.decided(motion)
-    free = (u > lower) & (u < upper)
-    if problem.begin is not None:
-        free[0] &= np.isnan(problem.begin)
-    return _Step(problem, motion, weights, backoff, multipliers, free)
+    return _Step(problem, motion, weights, backoff, multipliers)
 
 
 def _closer(after: Polished, before: Polished, length: float) -> bool:
@@ -171,8 +166,9 @@ class _Step:
 
     Attributes:
         found: The motion and its residuals.
-        free: The controls (R, m) that are not fixed at their limits; after :meth:`commands` those of the step.
-        multipliers: For each constraint (K, rows), likewise.
+        free: The controls (R, m) that are not fixed at their limits.
+        held: Those of them that the conditions of an optimum hold at a limit.
+        multipliers: For each constraint (K, rows); after :meth:`solve` those of the step.
     """
 
     def __init__(
@@ -182,9 +178,10 @@ class _Step:
         weights: Floats,
         backoff: list[Floats],
         multipliers: list[Floats],
-        free: Mask,
     ) -> None:
-        self.problem, self.motion, self.free, self.multipliers = problem, motion, free, multipliers
+        self.problem, self.motion, self.multipliers = problem, motion, multipliers
+        (lower, upper), decided = problem.control_limits, problem.decided(motion)
+        self.free = (decided > lower) & (decided < upper) & ~given_controls(problem)
         self.weights, self.backoff = weights, backoff
         self.bound = problem.bound_constraints
         u = problem.control_rows(motion)
@@ -196,7 +193,7 @@ class _Step:
             for item, rows, c in zip(self.bound, active, self.c, strict=True)
         ]
         self.loop = ClosedLoop(problem, motion, weights, multipliers)
-        self.loop.close(free)
+        self.loop.close(self.free)
         self.found = self._judged()
 
     def _judged(self) -> Polished:
@@ -209,15 +206,19 @@ class _Step:
         room = [np.where(rows & (item.source.equality | (c > 0.0)), 0.0, c)
                 for rows, (item, c) in zip(met, self._values(), strict=True)]  # fmt: skip
         self.rows = [rows | (c > -_CLOSE * item.scale) for rows, (item, c) in zip(met, self._values(), strict=True)]
-        multipliers, pull = self._dual(room, np.zeros(self.free.shape), loop.gradient)
-        self.rows = met
-        u, (lower, upper) = problem.decided(motion), problem.control_limits
+        none = np.zeros(self.free.shape, dtype=np.bool_)
+        multipliers, pull, self.held = self._dual(room, loop.gradient, (none, none))
         # A control at its limit is free again where the cost decreases inwards, if there is a way inwards.
-        inwards = ((u <= lower) & (pull < 0.0)) | ((u >= upper) & (pull > 0.0))
-        self.inwards = ~self.free & inwards & (lower < upper)
-        steep = np.where(loop.curvature > 0.0, loop.curvature, np.inf)
-        decrease = float(np.einsum("ki,kij,kj->", pull, loop.inverse, pull) + (pull**2 / steep)[self.inwards].sum())
-        decrease = 0.5 * decrease - sum(float((lam * c).sum()) for lam, c in zip(multipliers, room, strict=True))
+        u, (lower, upper) = problem.decided(motion), problem.control_limits
+        may = ~self.free & (lower < upper) & ~given_controls(problem)
+        low, high = may & (u <= lower) & (pull < 0.0), may & (u >= upper) & (pull > 0.0)
+        if low.any() or high.any():
+            self.free = self.free | low | high
+            loop.close(self.free)
+            multipliers, pull, self.held = self._dual(room, loop.gradient, (low, high))
+        self.rows, self.at_limits = met, (low, high)
+        decrease = 0.5 * float(np.einsum("ki,kij,kj->", pull, loop.inverse, pull))
+        decrease -= sum(float((lam * c).sum()) for lam, c in zip(multipliers, room, strict=True))
         violation = max(0.0, *(_violation(item, c) for item, c in self._values()))
         return Polished(motion, violation, multipliers, decrease, loop.stake.moved)
 
@@ -225,19 +226,35 @@ class _Step:
         """Each constraint with its values (K, rows)."""
         return zip(self.bound, self.c, strict=True)
 
-    def _dual(self, values: list[Floats], ahead: Floats, gradient: Floats) -> tuple[list[Floats], Floats]:
+    def _dual(
+        self, values: list[Floats], gradient: Floats, at_limits: tuple[Mask, Mask], held: Mask | None = None
+    ) -> tuple[list[Floats], Floats, Mask]:
         """Multipliers (K, rows) of the step for constraints' ``values``, and the pull g + G' lambda (R, m).
 
-        ``ahead`` (R, m) are given changes of the controls that are not free.
+        Free controls ``at_limits``, the lower and the upper ones (R, m), may not change beyond these, and not at all if
+        ``held`` (R, m); the last result (R, m) tells which of them are pressed against their limits.
         """
-        loop = self.loop
-        G = loop.rows(self.rows)
-        c = np.concatenate([value[rows] for value, rows in zip(values, self.rows, strict=True)])
+        loop, u = self.loop, self.problem.decided(self.motion)
+        sides = list(zip((-1.0, 1.0), self.problem.control_limits, at_limits, strict=True))
+        G = np.concatenate([loop.rows(self.rows), *(loop.rows_of_controls(side, sign) for sign, _, side in sides)])
+        c = [value[rows] for value, rows in zip(values, self.rows, strict=True)]
+        c += [sign * (u - limit)[side] for sign, limit, side in sides]
         equal, active = self._kinds(self.rows)
+        held = np.zeros(u.shape, dtype=np.bool_) if held is None else held
+        tight = np.concatenate([held[side] for side in at_limits])
         flat = G.reshape(len(G), loop.gradient.size)
         weighed = np.einsum("akm,kmi->aki", G, loop.inverse).reshape(flat.shape)
-        found = _least(weighed @ flat.T, c + flat @ ahead.ravel() - weighed @ gradient.ravel(), equal, active)
-        return _in_rows(found, self.rows), gradient + np.einsum("akm,a->km", G, found)
+        found = _least(
+            weighed @ flat.T,
+            np.concatenate(c) - weighed @ gradient.ravel(),
+            np.concatenate([equal, tight]),
+            np.concatenate([active, tight]),
+        )
+        of_rows, *of_limits = np.split(found, np.cumsum([len(equal), int(at_limits[0].sum())]))
+        pressed = np.zeros(u.shape, dtype=np.bool_)
+        for side, pushes in zip(at_limits, of_limits, strict=True):
+            pressed[side] |= pushes > 0.0
+        return _in_rows(of_rows, self.rows), gradient + np.einsum("akm,a->km", G, found), pressed
 
     def least_slope(self) -> list[Floats]:
         """Multipliers (K, rows) with which the Lagrangian's gradient in the free controls is least.
@@ -251,8 +268,9 @@ class _Step:
         rows = [met | push for met, push in zip(self.rows, pushing, strict=True)]
         equal, active = self._kinds(rows)
         size = np.abs(self.problem.decided(self.motion)).max(axis=0)
-        size = np.where(self.free, np.maximum(size, _SMALL * size.max()), 0.0)
-        loop.leave_penalties(self.free)
+        free = self.free & ~self.held
+        size = np.where(free, np.maximum(size, _SMALL * size.max()), 0.0)
+        loop.leave_penalties(free)
         calm, pull = loop.rows(rows), loop.gradient
         loop.open()
         G = loop.rows(rows)
@@ -278,31 +296,24 @@ class _Step:
         problem, loop = self.problem, self.loop
         lower, upper = problem.control_limits
         u = problem.decided(self.motion)
-        self.ahead = np.zeros(u.shape)
-        if self.inwards.any():
-            self.free = self.free | self.inwards
-            loop.close(self.free)
         for _ in range(_PASSES):
-            fixed = np.where(self.free, 0.0, self.ahead)
-            self.multipliers, pull = self._dual(self.c, fixed, loop.gradient)
-            self.ahead = fixed - np.einsum("kij,kj->ki", loop.inverse, pull)
+            self.multipliers, pull, self.ending = self._dual(self.c, loop.gradient, self.at_limits)
+            self.ahead = -np.einsum("kij,kj->ki", loop.inverse, pull)
             response, change = loop.response(self.ahead)
-            beyond = self.free & ((u + change < lower) | (u + change > upper))
-            if beyond.any():
-                # Controls at a limit are fixed there, and the free ones make up for them.
-                self.free = self.free & ~beyond
-                self.ahead = np.where(beyond, np.clip(u + change, lower, upper) - u, self.ahead)
-                loop.close(self.free)
-                continue
             met = [
                 rows | (c > _DONE)
                 for rows, c in zip(self.rows, loop.values_after(self.c, response, change), strict=True)
             ]
-            if same_rows(met, self.rows) or self._crowded(met) or time.perf_counter() > until:
+            beyond = u + change < lower, u + change > upper
+            reached = [known | (self.free & side) for known, side in zip(self.at_limits, beyond, strict=True)]
+            settled = same_rows(met, self.rows) or self._crowded(met)
+            if (settled and same_rows(reached, self.at_limits)) or time.perf_counter() > until:
                 break
-            self.rows = met
+            self.at_limits = reached[0], reached[1]
+            if not settled:
+                self.rows = met
         # The least step onto the constraints alone.
-        _, pull = self._dual(self.c, np.zeros(u.shape), np.zeros(u.shape))
+        _, pull, _ = self._dual(self.c, np.zeros(u.shape), self.at_limits, self.ending)
         self.onto = -np.einsum("kij,kj->ki", loop.inverse, pull)
 
     def _crowded(self, met: list[Mask]) -> bool:
@@ -321,7 +332,7 @@ class _Step:
         if not attempt.whole:
             return None
         try:
-            return _Step(self.problem, attempt.trajectory(), self.weights, self.backoff, self.multipliers, self.free)
+            return _Step(self.problem, attempt.trajectory(), self.weights, self.backoff, self.multipliers)
         except (CostError, LinearizationError):
             return None
 
@@ -330,8 +341,12 @@ class _Step:
         problem, loop = self.problem, self.loop
         u = problem.decided(self.motion)
         response, change = loop.response(length * self.ahead + (1.0 - length) * self.onto)
-        gains, reference = loop.gains, (states(problem, self.motion) + response)[: -1 : problem.hold]
-        after = u + change
+        # A control that ends at its limit does so exactly, and has no feedback.
+        ends = self.ending
+        after, (lower, upper) = u + change, problem.control_limits
+        after = np.where(ends, np.where(after - lower < upper - after, lower, upper), after)
+        gains, previous = (np.where(ends[:, :, None], 0.0, each) for each in (loop.gains, loop.previous))
+        reference = (states(problem, self.motion) + response)[: -1 : problem.hold]
         if problem.linear:
             m, x = change.shape[1], reference.shape[1]
             within = problem.begun(np.clip(after, *problem.control_limits))
@@ -340,9 +355,9 @@ class _Step:
                 gains=np.ascontiguousarray(gains[1:, :, : x + m]),
                 reference=np.hstack([reference, after[:-1]]),
             )
-        if loop.previous.any():
+        if previous.any():
             before = np.vstack([u[:1], after[:-1]])
-            gains, reference = np.concatenate([gains, loop.previous], axis=2), np.hstack([reference, before])
+            gains, reference = np.concatenate([gains, previous], axis=2), np.hstack([reference, before])
         return open_loop(after)._replace(
             hold=problem.hold,
             limits=problem.control_limits.copy(),
