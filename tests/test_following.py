@@ -7,7 +7,7 @@ import pytest
 import varpin as vp
 from varpin import core
 from varpin.control import following
-from varpin.control.commands import first_commands
+from varpin.control.commands import first_commands, with_feedback
 from varpin.control.following import Foresight, Path, inverse_dynamics, states_on
 from varpin.control.line_search import LineSearch
 from varpin.control.search import Search
@@ -15,11 +15,13 @@ from varpin.control.search import Search
 RNG = np.random.default_rng(5)
 
 
-def posture(*, goal=(2.0, -2.0, 2.0), scene=None, torque=1e-3, **options):
+def posture(*, goal=(2.0, -2.0, 2.0), scene=None, torque=1e-3, rate=0.0, **options):
     """Three links far from a posture."""
     scene = vp.Scene(vp.planar_chain(3)) if scene is None else scene
     end = vp.Terminal(vp.TrackingCost(goal, 1e3) + vp.VelocityCost(10.0))
     cost = vp.ControlCost(torque) + vp.VelocityCost(1e-2) + end
+    if rate:
+        cost += vp.ControlRateCost(rate)
     options = {"dt": 0.02, "steps": 50} | options
     return vp.OptimalControlProblem(scene, cost, np.zeros(3), np.zeros(3), **options)
 
@@ -51,19 +53,22 @@ def test_the_inverse_dynamics_is_that_of_pinocchio(name):
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4(), vp.Gauss(2)])
 @pytest.mark.parametrize("hold", [1, 2])
-def test_a_motion_goes_along_the_foreseen_states(integrator, hold):
+@pytest.mark.parametrize("rate", [0.0, 1e-4])
+def test_a_motion_goes_along_the_foreseen_states(integrator, hold, rate):
     """They are those of the linearized motion under the plan, here from products of its matrices."""
-    problem = posture(goal=(0.6, -0.5, 0.4), integrator=integrator, hold=hold)
+    problem = posture(goal=(0.6, -0.5, 0.4), rate=rate, integrator=integrator, hold=hold)
     search = planned(problem)
     plan, along, n = search.plan, search.along, 3
-    found = Foresight(problem).followed(
-        along, plan, search.shares, np.inf, first_commands(problem, search.trajectory.u[::hold])
-    )
+    feedback = with_feedback(problem, search.trajectory, plan, closed=True)
+    found = Foresight(problem).followed(along, plan, search.shares, np.inf, feedback)
     assert found.length == 1.0
+    np.testing.assert_array_equal(found.commands[1].gains, feedback.gains)
     lin, x, foreseen = along.linearized(0, problem.steps)[0], np.zeros(2 * n), [np.zeros(2 * n)]
+    du = np.zeros(n)
     for k in range(problem.steps):
         if k % hold == 0:
-            du = plan.feedforward[k // hold] + plan.feedback[k // hold] @ x
+            before, r = du, k // hold
+            du = plan.feedforward[r] + plan.feedback[r] @ x + (plan.previous[r] @ before if rate else 0.0)
         x = lin.A[k] @ x + lin.B[k] @ du
         foreseen.append(x)
     wanted = search.trajectory.q + np.array(foreseen)[:, :n]

@@ -15,8 +15,7 @@ from varpin.control.box import Box
 from varpin.control.closed_loop import ClosedLoop
 from varpin.control.multipliers import at_nodes
 from varpin.control.penalties import split
-from varpin.control.polish import _first as first_step
-from varpin.control.polish import judged
+from varpin.control.polish import _Step, judged
 from varpin.control.spread import Feedback, covariances
 from varpin.control.trials import Trials
 from varpin.errors import LinearizationError
@@ -595,7 +594,7 @@ def test_trials_of_the_last_step_that_leave_are_given_up():
     known = plan.multipliers
     whole = enforced(problem, known.between)
     values, backoff = (split(whole.bound_constraints, part) for part in (known.values, known.backoff))
-    step = first_step(whole, plan.trajectory, values, known.weights, backoff)
+    step = _Step(whole, plan.trajectory, values, known.weights, backoff)
     step.solve(np.inf)
     seen_parts = []
 

@@ -21,6 +21,7 @@ from varpin.control.hints import hints
 from varpin.control.hints import reach as hints_reach
 from varpin.control.penalties import _by_step, penalized, split
 from varpin.control.spread import Feedback, deviations
+from varpin.control.trials import Trials
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
 from varpin.support.one_thread import one_thread
@@ -413,19 +414,11 @@ def test_control_limits_and_hold():
         assert np.abs(plan.controls).max() <= limits[1]
 
 
-@pytest.mark.parametrize(
-    ("goal", "duration", "steps", "speed", "torque"),
-    [([0.38, -1.25], 0.67, 16, 1.71, 43.0), ([1.32, 1.05], 0.95, 19, 1.4, 29.0)],
-)
-def test_torques_and_speeds_at_their_limits(goal, duration, steps, speed, torque):
-    """Joints that move at their greatest speed with little torque to spare: the last step has to keep to both limits.
-
-    The model's step beyond speeds that it has not met yet needs any torque, and says nothing of which reach a limit.
-    """
-    scene = vp.Scene(ROBOT, damping=0.1)
+def hasty(goal, duration, steps, speed, torque):
+    """Joints that move at their greatest speed with little torque to spare."""
     cost = vp.ControlCost(1e-6) + vp.VelocityCost(1e-2) + vp.Terminal(vp.TrackingCost(goal, 1e2) + vp.VelocityCost(1.0))
-    problem = vp.OptimalControlProblem(
-        scene,
+    return vp.OptimalControlProblem(
+        vp.Scene(ROBOT, damping=0.1),
         cost,
         np.zeros(2),
         np.zeros(2),
@@ -434,6 +427,18 @@ def test_torques_and_speeds_at_their_limits(goal, duration, steps, speed, torque
         constraints=[vp.WithinVelocityLimits(ROBOT, (-speed, speed))],
         control_limits=(-torque, torque),
     )
+
+
+HASTY = [([0.38, -1.25], 0.67, 16, 1.71, 43.0), ([1.32, 1.05], 0.95, 19, 1.4, 29.0)]
+
+
+@pytest.mark.parametrize("numbers", HASTY)
+def test_torques_and_speeds_at_their_limits(numbers):
+    """The last step has to keep to both limits.
+
+    The model's step beyond speeds that it has not met yet needs any torque, and says nothing of which reach a limit.
+    """
+    problem, torque = hasty(*numbers), numbers[-1]
     plan = vp.solve(problem, check=False)
     assert plan.status.converged
     assert plan.violation <= 1e-9
@@ -442,6 +447,32 @@ def test_torques_and_speeds_at_their_limits(goal, duration, steps, speed, torque
     assert np.abs(u).max() <= torque
     assert plan.constraints[0].active.any()
     assert kkt_residual(problem, plan) <= 1e-6
+
+
+@pytest.mark.parametrize("numbers", HASTY)
+def test_steps_of_any_length_lead_onto_the_constraints(numbers):
+    """From motions off the optimum, at torques that are brought to their limits or come from them."""
+    problem, torque, rng = hasty(*numbers), numbers[-1], np.random.default_rng(3)
+    plan = vp.solve(problem, check=False)
+    multipliers = [report.multipliers for report in plan.constraints]
+    nothing = [np.zeros(item.shape) for item in problem.bound_constraints]
+    weights, trials, reached = np.array([1e3]), Trials(problem), 0
+    for _ in range(8):
+        u = np.clip(0.99 * plan.controls + 1e-2 * rng.normal(size=plan.controls.shape), -torque, torque)
+        step = polish._Step(problem, problem.simulate(u), multipliers, weights, nothing)
+        assert step.found.violation > 1e-3
+        step.solve(np.inf)
+        low, high = step.pressing
+        assert not (low & high).any()
+        reached += int((low | high).sum())
+        for length in (1.0, 0.5, 0.25, 0.0):
+            after = step.after(trials, length)
+            # A whole one moves the controls by newtons, and the model knows no curvature of the constraints.
+            assert after.found.violation <= (1.5 if length == 1.0 else 0.01) * step.found.violation
+            if length == 1.0:
+                np.testing.assert_array_equal(after.motion.u[low], -torque)
+                np.testing.assert_array_equal(after.motion.u[high], torque)
+    assert reached > 8
 
 
 RATE, GOAL = 1000.0, [2.5, 0.0, -2.2]

@@ -146,7 +146,11 @@ class Foresight:
         held = feedback._replace(
             u=u[found], gains=self._holding, reference=states_on(problem, Path(q[found], v[found]))
         )
-        return Followed((held, held._replace(gains=plan.feedback)), lengths[found], best)
+        reference = held.reference
+        if feedback.gains.shape[2] > 2 * n:
+            before = np.vstack([feedback.reference[:1, 2 * n :], u[found][:-1]])
+            reference = np.hstack([reference, before])
+        return Followed((held, held._replace(gains=feedback.gains, reference=reference)), lengths[found], best)
 
     def _foreseen(self, along: Along, plan: Plan) -> Floats:
         """The changes of q and v at the nodes (N + 1, 2n) with a full step, by the linearized motion."""

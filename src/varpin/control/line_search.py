@@ -369,14 +369,15 @@ class LineSearch:
             return None
         if found is None:
             return None
-        best, most, trials = Trial(), min(full.expected, 0.0), 0
+        best, most, trials, cut = Trial(), min(full.expected, 0.0), 0, False
         for commands in found.commands:
             trial, trials = self._run(found.length, commands, start, here, bounds, rise=most), trials + 1
-            if trial.expected < best.expected or best.motion is None:
+            cut = cut or trial.cut
+            if trial.expected < best.expected:
                 best, most = trial, min(trial.expected, most)
             if best.expected <= AS_FORESEEN * found.cost:
                 break
-        return best, found.length, trials
+        return best._replace(cut=cut), found.length, trials
 
     def _run(
         self, step: float, commands: Commands, start: Start, here: _Here, bounds: _Bounds, *, rise: float

@@ -103,7 +103,7 @@ def polished(
     """
     closely, level = (_DONE, _FLAT) if enough is None else (enough[0], max(enough[1], _FLAT))
     trials, longest = Trials(problem), 1.0
-    step = _first(problem, motion, multipliers, weights, backoff)
+    step = _Step(problem, motion, multipliers, weights, backoff)
     for left in reversed(range(_STEPS)):
         there = step.found.violation <= closely and step.found.decrease <= level * step.found.stake
         if there or time.perf_counter() > until:
@@ -136,19 +136,8 @@ def judged(
 
     See :func:`polished`.
     """
-    step = _first(problem, motion, multipliers, weights, backoff)
+    step = _Step(problem, motion, multipliers, weights, backoff)
     return replace(step.found, multipliers=step.least_slope())
-
-
-def _first(
-    problem: OptimalControlProblem,
-    motion: Trajectory,
-    multipliers: list[Floats],
-    weights: Floats,
-    backoff: list[Floats],
-) -> _Step:
-    """The first Newton step, around a given motion."""
-    return _Step(problem, motion, weights, backoff, multipliers)
 
 
 def _closer(after: Polished, before: Polished, length: float) -> bool:
@@ -167,17 +156,21 @@ class _Step:
     Attributes:
         found: The motion and its residuals.
         free: The controls (R, m) that are not fixed at their limits.
-        held: Those of them that the conditions of an optimum hold at a limit.
+        limited: Those whose lower and whose upper limit are rows of the dual problem, each (R, m).
+        pressed: Those (R, m) that the conditions of an optimum press against a limit on the motion.
         multipliers: For each constraint (K, rows); after :meth:`solve` those of the step.
+        pressing: After :meth:`solve`, the controls that the step leads to their lower and to their upper limit.
+        ahead: After :meth:`solve`, w of the step (R, m).
+        onto: After :meth:`solve`, the least w (R, m) onto the constraints.
     """
 
     def __init__(
         self,
         problem: OptimalControlProblem,
         motion: Trajectory,
+        multipliers: list[Floats],
         weights: Floats,
         backoff: list[Floats],
-        multipliers: list[Floats],
     ) -> None:
         self.problem, self.motion, self.multipliers = problem, motion, multipliers
         (lower, upper), decided = problem.control_limits, problem.decided(motion)
@@ -207,7 +200,7 @@ class _Step:
                 for rows, (item, c) in zip(met, self._values(), strict=True)]  # fmt: skip
         self.rows = [rows | (c > -_CLOSE * item.scale) for rows, (item, c) in zip(met, self._values(), strict=True)]
         none = np.zeros(self.free.shape, dtype=np.bool_)
-        multipliers, pull, self.held = self._dual(room, loop.gradient, (none, none))
+        multipliers, pull, pressed = self._dual(room, loop.gradient, (none, none))
         # A control at its limit is free again where the cost decreases inwards, if there is a way inwards.
         u, (lower, upper) = problem.decided(motion), problem.control_limits
         may = ~self.free & (lower < upper) & ~given_controls(problem)
@@ -215,8 +208,8 @@ class _Step:
         if low.any() or high.any():
             self.free = self.free | low | high
             loop.close(self.free)
-            multipliers, pull, self.held = self._dual(room, loop.gradient, (low, high))
-        self.rows, self.at_limits = met, (low, high)
+            multipliers, pull, pressed = self._dual(room, loop.gradient, (low, high))
+        self.rows, self.limited, self.pressed = met, (low, high), pressed[0] | pressed[1]
         decrease = 0.5 * float(np.einsum("ki,kij,kj->", pull, loop.inverse, pull))
         decrease -= sum(float((lam * c).sum()) for lam, c in zip(multipliers, room, strict=True))
         violation = max(0.0, *(_violation(item, c) for item, c in self._values()))
@@ -227,34 +220,34 @@ class _Step:
         return zip(self.bound, self.c, strict=True)
 
     def _dual(
-        self, values: list[Floats], gradient: Floats, at_limits: tuple[Mask, Mask], held: Mask | None = None
-    ) -> tuple[list[Floats], Floats, Mask]:
+        self, values: list[Floats], gradient: Floats, limited: tuple[Mask, Mask], still: Mask | None = None
+    ) -> tuple[list[Floats], Floats, tuple[Mask, Mask]]:
         """Multipliers (K, rows) of the step for constraints' ``values``, and the pull g + G' lambda (R, m).
 
-        Free controls ``at_limits``, the lower and the upper ones (R, m), may not change beyond these, and not at all if
-        ``held`` (R, m); the last result (R, m) tells which of them are pressed against their limits.
+        The lower and the upper limits of the controls ``limited``, each (R, m), are rows, too; ``still`` ones of them
+        (R, m) do not change at all. The last result tells which controls are pressed against the lower and the upper
+        limit.
         """
         loop, u = self.loop, self.problem.decided(self.motion)
-        sides = list(zip((-1.0, 1.0), self.problem.control_limits, at_limits, strict=True))
+        still = np.zeros(u.shape, dtype=np.bool_) if still is None else still
+        sides = list(zip((-1.0, 1.0), self.problem.control_limits, limited, strict=True))
         G = np.concatenate([loop.rows(self.rows), *(loop.rows_of_controls(side, sign) for sign, _, side in sides)])
         c = [value[rows] for value, rows in zip(values, self.rows, strict=True)]
-        c += [sign * (u - limit)[side] for sign, limit, side in sides]
+        c += [np.where(still, 0.0, sign * (u - limit))[side] for sign, limit, side in sides]
         equal, active = self._kinds(self.rows)
-        held = np.zeros(u.shape, dtype=np.bool_) if held is None else held
-        tight = np.concatenate([held[side] for side in at_limits])
+        fixed = np.concatenate([still[side] for side in limited])
         flat = G.reshape(len(G), loop.gradient.size)
         weighed = np.einsum("akm,kmi->aki", G, loop.inverse).reshape(flat.shape)
         found = _least(
             weighed @ flat.T,
             np.concatenate(c) - weighed @ gradient.ravel(),
-            np.concatenate([equal, tight]),
-            np.concatenate([active, tight]),
+            np.concatenate([equal, fixed]),
+            np.concatenate([active, fixed]),
         )
-        of_rows, *of_limits = np.split(found, np.cumsum([len(equal), int(at_limits[0].sum())]))
-        pressed = np.zeros(u.shape, dtype=np.bool_)
-        for side, pushes in zip(at_limits, of_limits, strict=True):
-            pressed[side] |= pushes > 0.0
-        return _in_rows(of_rows, self.rows), gradient + np.einsum("akm,a->km", G, found), pressed
+        of_rows, *of_limits = np.split(found, np.cumsum([len(equal), int(limited[0].sum())]))
+        low, high = np.zeros(u.shape, dtype=np.bool_), np.zeros(u.shape, dtype=np.bool_)
+        low[limited[0]], high[limited[1]] = (pushes > 0.0 for pushes in of_limits)
+        return _in_rows(of_rows, self.rows), gradient + np.einsum("akm,a->km", G, found), (low, high)
 
     def least_slope(self) -> list[Floats]:
         """Multipliers (K, rows) with which the Lagrangian's gradient in the free controls is least.
@@ -268,7 +261,7 @@ class _Step:
         rows = [met | push for met, push in zip(self.rows, pushing, strict=True)]
         equal, active = self._kinds(rows)
         size = np.abs(self.problem.decided(self.motion)).max(axis=0)
-        free = self.free & ~self.held
+        free = self.free & ~self.pressed
         size = np.where(free, np.maximum(size, _SMALL * size.max()), 0.0)
         loop.leave_penalties(free)
         calm, pull = loop.rows(rows), loop.gradient
@@ -297,23 +290,23 @@ class _Step:
         lower, upper = problem.control_limits
         u = problem.decided(self.motion)
         for _ in range(_PASSES):
-            self.multipliers, pull, self.ending = self._dual(self.c, loop.gradient, self.at_limits)
+            self.multipliers, pull, self.pressing = self._dual(self.c, loop.gradient, self.limited)
             self.ahead = -np.einsum("kij,kj->ki", loop.inverse, pull)
             response, change = loop.response(self.ahead)
             met = [
                 rows | (c > _DONE)
                 for rows, c in zip(self.rows, loop.values_after(self.c, response, change), strict=True)
             ]
-            beyond = u + change < lower, u + change > upper
-            reached = [known | (self.free & side) for known, side in zip(self.at_limits, beyond, strict=True)]
+            low, high = self.limited
+            reached = low | (self.free & (u + change < lower)), high | (self.free & (u + change > upper))
             settled = same_rows(met, self.rows) or self._crowded(met)
-            if (settled and same_rows(reached, self.at_limits)) or time.perf_counter() > until:
+            if (settled and same_rows([*reached], [low, high])) or time.perf_counter() > until:
                 break
-            self.at_limits = reached[0], reached[1]
+            self.limited = reached
             if not settled:
                 self.rows = met
         # The least step onto the constraints alone.
-        _, pull, _ = self._dual(self.c, np.zeros(u.shape), self.at_limits, self.ending)
+        _, pull, _ = self._dual(self.c, np.zeros(u.shape), self.limited, self.pressing[0] | self.pressing[1])
         self.onto = -np.einsum("kij,kj->ki", loop.inverse, pull)
 
     def _crowded(self, met: list[Mask]) -> bool:
@@ -332,7 +325,7 @@ class _Step:
         if not attempt.whole:
             return None
         try:
-            return _Step(self.problem, attempt.trajectory(), self.weights, self.backoff, self.multipliers)
+            return _Step(self.problem, attempt.trajectory(), self.multipliers, self.weights, self.backoff)
         except (CostError, LinearizationError):
             return None
 
@@ -341,10 +334,11 @@ class _Step:
         problem, loop = self.problem, self.loop
         u = problem.decided(self.motion)
         response, change = loop.response(length * self.ahead + (1.0 - length) * self.onto)
-        # A control that ends at its limit does so exactly, and has no feedback.
-        ends = self.ending
-        after, (lower, upper) = u + change, problem.control_limits
-        after = np.where(ends, np.where(after - lower < upper - after, lower, upper), after)
+        # Controls that end at a limit do so exactly, and have no feedback: after a shorter step those already there.
+        (low, high), (lower, upper) = self.pressing, problem.control_limits
+        if length < 1.0:
+            low, high = low & (u <= lower), high & (u >= upper)
+        after, ends = np.where(low, lower, np.where(high, upper, u + change)), low | high
         gains, previous = (np.where(ends[:, :, None], 0.0, each) for each in (loop.gains, loop.previous))
         reference = (states(problem, self.motion) + response)[: -1 : problem.hold]
         if problem.linear:

@@ -678,9 +678,7 @@ class OptimalControlProblem(Frozen):
         if self.running.others:
             at = self.samples(q, v, u)
             found += [weight * part.value(*at) for part in self.running.others]
-        end = q[-1:], v[-1:], np.zeros((1, u.shape[1]))
-        found.append(self.terminal.compiled.values(*end).ravel())
-        found += [part.value(*end).ravel() for part in self.terminal.others]
+        found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))
         return np.concatenate(found)
