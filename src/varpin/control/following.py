@@ -22,8 +22,9 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 
 # Natural frequency of the feedback that holds a motion on a path, times the decision period.
 _HOLDING_FREQUENCY = 0.25
-# Share of the decrease that the model says, from which on a step is as foreseen.
-AS_FORESEEN = 0.7
+# Share of the decrease that the model says, from which on a step is as foreseen; and of that of foreseen states, from
+# which on a motion follows them.
+AS_FORESEEN, FOLLOWS = 0.7, 0.8
 # Lengths of steps along foreseen states. Their cost must fall by _CLEARLY times as much as with the full step, and no
 # joint may move away from the present motion by more than _FAR [rad or m]: arms that are moved far often reach for a
 # frame in a posture that costs more.

@@ -16,7 +16,7 @@ from varpin.control.backward import backward
 from varpin.control.commands import with_feedback
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
-from varpin.control.following import AS_FORESEEN, Foresight
+from varpin.control.following import AS_FORESEEN, FOLLOWS, Foresight
 from varpin.control.passes import Plan, noise_shares
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.trials import HALVINGS, MORE_HALVINGS, Attempt, Trials, cut_less, few_halvings
@@ -375,7 +375,7 @@ class LineSearch:
             cut = cut or trial.cut
             if trial.expected < best.expected:
                 best, most = trial, min(trial.expected, most)
-            if best.expected <= AS_FORESEEN * found.cost:
+            if best.expected <= FOLLOWS * found.cost:
                 break
         return best._replace(cut=cut), found.length, trials
 
