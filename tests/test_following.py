@@ -241,3 +241,17 @@ def test_a_trial_that_strays_is_the_last_one(monkeypatch):
         assert steps[at].taken.motion is trial.motion
         assert (steps[at].length, steps[at].trials) == (length, 1 + trials)
     assert [steps[at].strayed for at, _ in tried] == [False] * (len(tried) - 1) + [True]
+
+
+@pytest.mark.parametrize(("task", "trials"), [(of_panda, 1), (strays, 2)])
+def test_weak_feedback_comes_first(monkeypatch, task, trials):
+    """It holds an arm's slow reach on its path, and the plan's feedback is not tried; a fast swing leaves it."""
+    found, following = [], LineSearch._following
+
+    def followed(self, *arguments):
+        found.append(following(self, *arguments))
+        return found[-1]
+
+    monkeypatch.setattr(LineSearch, "_following", followed)
+    vp.solve(task(), tolerance=1e-4, check=False)
+    assert {each[2] for each in found if each is not None} == {trials}

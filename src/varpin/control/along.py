@@ -236,7 +236,7 @@ class Along:
     @property
     def within(self) -> Floats | None:
         """The Hessian (N, 2n, 2n), in the noise's jumps, of what their velocities cost beyond the samples."""
-        # Without noise, which most plans are, no cached property: those of Python 3.11 take a lock.
+        # Most plans have no noise, and a cached property takes a lock for each motion in Python 3.11.
         return self._within if self.problem.processes and self.problem.integrator.holds_noise else None
 
     @cached_property
