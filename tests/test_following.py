@@ -60,7 +60,7 @@ def test_a_motion_goes_along_the_foreseen_states(integrator, hold, rate):
     search = planned(problem)
     plan, along, n = search.plan, search.along, 3
     feedback = with_feedback(problem, search.trajectory, plan, closed=True)
-    found = Foresight(problem).followed(along, plan, search.shares, np.inf, feedback)
+    found = Foresight(problem).followed(along, plan, search.shares, np.inf)
     assert found.length == 1.0
     np.testing.assert_array_equal(found.commands[1].gains, feedback.gains)
     lin, x, foreseen = along.linearized(0, problem.steps)[0], np.zeros(2 * n), [np.zeros(2 * n)]
@@ -140,16 +140,14 @@ def test_states_that_need_more_than_the_limits_are_not_followed():
     for limit, follows in ((1e3, True), (1.0, False)):
         problem = posture(goal=(0.9, -0.9, 0.9), control_limits=(-limit, limit))
         search = planned(problem)
-        found = Foresight(problem).followed(
-            search.along, search.plan, search.shares, np.inf, first_commands(problem, search.trajectory.u)
-        )
+        found = Foresight(problem).followed(search.along, search.plan, search.shares, np.inf)
         assert (found is not None) == follows
 
 
 def test_states_far_away_are_not_followed(monkeypatch):
     problem = posture()
     search = planned(problem)
-    arguments = search.along, search.plan, search.shares, np.inf, first_commands(problem, search.trajectory.u)
+    arguments = search.along, search.plan, search.shares, np.inf
     assert Foresight(problem).followed(*arguments).length == 0.75
     monkeypatch.setattr(following, "_FAR", 0.9)
     assert Foresight(problem).followed(*arguments) is None

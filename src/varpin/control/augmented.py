@@ -88,6 +88,12 @@ _MUCH = 1e-2
 # Greatest number of last steps, each with the rows between nodes of the motion before. As long as peaks move, a
 # violation of _ROUGH and a decrease of the cost by _SHARE of the tolerance are enough.
 _LOOKS, _ROUGH, _SHARE = 8, 1e-8, 0.1
+# Last steps are tried before the rounds have ended where violations are at most _REACHED of a constraint's scale. Rows
+# between nodes follow their peaks, and may be added, as long as the expected decrease has been less than _FALLS of the
+# least one before at least once in _WAITS times.
+_REACHED, _FALLS, _WAITS = 0.1, 0.5, 3
+# Greatest decrease of the cost that they leave, relative to the cost at stake.
+_EXACT = 1e-10
 # Violation between nodes that is left to the last steps.
 _CLOSE = 1e-6
 # Violation at which penalties stop growing; the last step removes the rest.
@@ -238,7 +244,11 @@ class _Rounds:
                 if hopeless and found.status not in (Status.INTERRUPTED, Status.OUT_OF_TIME):
                     status, reason = Status.INFEASIBLE, hopeless
                     break
-                if self._goes_between(kept, begun, status) or status is None:
+                early = self._early(kept, begun) if status is None else None
+                if early is not None:
+                    kept, closing = early
+                    status, reason = kept.status, f"{found.reason}; {closing}"
+                elif self._goes_between(kept, begun, status) or status is None:
                     continue
                 ended = status in (Status.INFEASIBLE, Status.STALLED) and kept.violation > FEASIBLE
                 if ended and not self._clearly_beyond(kept):
@@ -251,7 +261,7 @@ class _Rounds:
                         told = max(kept.constraints, key=lambda item: item.violation)
                         rest = f"{told.where} stays violated by {told.violation:.1e} {told.unit}"
                         status, reason = Status.STALLED, f"{found.reason}; {told.label}: {rest}"
-                elif kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
+                elif early is None and kept.violation <= FEASIBLE and status is not Status.INTERRUPTED:
                     closed, closing = self._polished(replace(kept, status=status))
                     missed = status is Status.CONVERGED and closed.status is Status.STALLED
                     if missed and self._goes_between(kept, begun, status, again=True):
@@ -410,22 +420,7 @@ class _Rounds:
             part.updated(item.value(motion.q, motion.v, self.problem.control_rows(motion)))
             for item, part in zip(self.bound, problem.all_penalties, strict=True)
         ]
-        multipliers = Multipliers(
-            values=flat(values),
-            backoff=flat(begun.backoff),
-            begun=flat(begun.multipliers),
-            weights=begun.weights.copy(),
-            first_weights=begun.first_weights.copy(),
-            worst=begun.worst.copy(),
-            tolerance=begun.tolerance,
-            round=begun.round,
-            iterations=known,
-            stuck=begun.stuck,
-            added=None if begun.added is None else flat(begun.added),
-            counts=begun.counts,
-            **_of_instants(begun.between),
-            **_of_instants(begun.between, "begun_"),
-        )
+        multipliers = replace(_begun(begun, known), values=flat(values))
         search = found.search
         if search is not None:
             passed = self.history[:known]
@@ -550,10 +545,8 @@ class _Rounds:
             bounds = [_CLOSE if close else REPORTED * item.scale for item in self.problem.bound_constraints]
             if (self._beyond(looked, begun.backoff) <= bounds).all():
                 return False
-        parts = (carried(self.problem, before, between, array) for array in (base.multipliers, base.backoff))
-        multipliers, backoff = next(parts), self._margins(next(parts), between)
-        arrays = (base.weights, base.first_weights, base.worst)
-        weights, first_weights, worst = (_of_all(array, before, between) for array in arrays)
+        self.state = self._with_rows(base, between)
+        multipliers, backoff, first_weights = self.state.multipliers, self.state.backoff, self.state.first_weights
         whole = enforced(self.problem, between)
         told = reports_of(whole, kept.trajectory, multipliers, backoff)
         most = max(told, key=lambda item: item.violation)
@@ -561,15 +554,6 @@ class _Rounds:
             "%s: between nodes %s is violated by %.1e %s: rows at %d instants from now on",
             self.label, most.label, most.violation, most.unit, len(between.rows),
         )  # fmt: skip
-        self.state = replace(
-            base,
-            multipliers=multipliers,
-            weights=weights,
-            first_weights=first_weights,
-            backoff=backoff,
-            worst=worst,
-            between=between,
-        )
         if first:
             lighter = first_weights
             if ended is None and kept.cost:
@@ -582,7 +566,7 @@ class _Rounds:
                 self.state,
                 weights=lighter,
                 first_weights=lighter,
-                worst=np.full(len(worst), np.inf),
+                worst=np.full(len(first_weights), np.inf),
                 tolerance=_LOOSE,
             )
         return True
@@ -650,8 +634,83 @@ class _Rounds:
         of_instants = [np.where(rows, backoff[i][between.of(i)[:, 0]], 0.0) for i, rows in enforced_rows]
         return [*backoff[:count], *of_instants]
 
-    def _polished(self, kept: Solution) -> tuple[Solution, str]:
+    def _with_rows(self, base: _State, between: Instants) -> _State:
+        """A state with rows at other instants between nodes."""
+        before = base.between
+        parts = (carried(self.problem, before, between, array) for array in (base.multipliers, base.backoff))
+        multipliers, backoff = next(parts), self._margins(next(parts), between)
+        arrays = (base.weights, base.first_weights, base.worst)
+        weights, first_weights, worst = (_of_all(array, before, between) for array in arrays)
+        return replace(
+            base,
+            multipliers=multipliers,
+            weights=weights,
+            first_weights=first_weights,
+            backoff=backoff,
+            worst=worst,
+            between=between,
+        )
+
+    def _early(self, kept: Solution, begun: _State) -> tuple[Solution, str] | None:
+        """The plan after last steps before the rounds have ended; None where these do not lead exactly to an optimum.
+
+        Rows between nodes are added where the motion violates a constraint there. These steps are tried after rounds
+        whose number is a power of two, if the violation decreases.
+        """
+        due = begun.round > 0 and begun.round & (begun.round - 1) == 0
+        if self.noisy or not due or self.state.stuck or self._clearly_beyond(kept, _REACHED):
+            return None
+        near: Solution | None = kept
+        try:
+            if self.problem.linear or self.problem.between_nodes:
+                near = self._brought_near(kept, begun)
+        except (CostError, NoiseFieldError, LinearizationError):
+            near = None
+        if near is not None:
+            closed, closing = self._polished(replace(near, status=Status.CONVERGED), _EXACT)
+            if closed.status.converged and closed.violation <= FEASIBLE:
+                return closed, closing
+        logger.info("%s: last steps after round %d do not lead to an optimum", self.label, begun.round)
+        self.whole = enforced(self.problem, begun.between)
+        return None
+
+    def _brought_near(self, kept: Solution, begun: _State) -> Solution | None:
+        """The plan after rough last steps, with rows at all peaks between nodes of the motion before each of them.
+
+        None where they do not lead to a motion that keeps to the constraints everywhere.
+        """
+        known = kept.multipliers
+        assert known is not None
+        motion, base = kept.trajectory, replace(begun, multipliers=split(self.bound, known.values))
+        looked, least, waited = seen(self.problem, motion), np.inf, 0
+        while waited < _WAITS:
+            if self._needs_rows(looked, base):
+                base = self._with_rows(base, self._followed(base.between, looked, base.backoff, anew=True))
+            self.whole = enforced(self.problem, base.between)
+            enough = _ROUGH, _SHARE * self.tolerance
+            after = polished(self.whole, motion, base.multipliers, base.weights, base.backoff, self.until, enough)
+            still, motion, base = after.motion is motion, after.motion, replace(base, multipliers=after.multipliers)
+            looked = seen(self.problem, motion)
+            rows = self._needs_rows(looked, base)
+            left = self._left(motion, looked, base.backoff) if rows else after.violation
+            if after.decrease <= self._bound(kept, after) and left <= FEASIBLE:
+                return self._along(kept, motion, _begun(base, known.iterations))
+            if still or time.perf_counter() > self.until:
+                break
+            waited = 0 if after.decrease < _FALLS * least else waited + 1
+            least = min(least, after.decrease)
+        return None
+
+    def _needs_rows(self, looked: Looked, base: _State) -> bool:
+        """Whether there are rows between nodes, or a motion of values ``looked`` needs the first ones."""
+        close = self.problem.between_nodes
+        bounds = [_CLOSE if close else REPORTED * item.scale for item in self.problem.bound_constraints]
+        return len(base.between.rows) > 0 or bool((self._beyond(looked, base.backoff) > bounds).any())
+
+    def _polished(self, kept: Solution, least: float = np.inf) -> tuple[Solution, str]:
         """The plan moved onto its constraints and to its optimum, with matching gains, and its residuals in words.
+
+        It is CONVERGED if the cost would fall by no more than the tolerance, and ``least``, of the cost at stake.
 
         Peaks between nodes then are elsewhere, so that the last step is made again. With such rows, the plan stays as
         it is if that does not lead closer, or to a peak that has no row. Steps are rough until the peaks stay inside.
@@ -662,7 +721,7 @@ class _Rounds:
         motion, between, dense = kept.trajectory, known.between, len(known.between.rows) > 0
         found: Polished | None = None
         looked = seen(self.problem, motion) if dense else None
-        least = max(self._left(motion, looked, backoff), FEASIBLE) if dense else np.inf
+        nearest = max(self._left(motion, looked, backoff), FEASIBLE) if dense else np.inf
         rough = dense
         try:
             for look in range(_LOOKS if dense else 1):
@@ -676,9 +735,9 @@ class _Rounds:
                 motion, values = after.motion, after.multipliers
                 looked = seen(self.problem, motion) if dense else None
                 left = self._left(motion, looked, backoff) if dense else 0.0
-                closer = not dense or (after.decrease <= self._bound(kept, after) and left <= least)
+                closer = not dense or (after.decrease <= self._bound(kept, after) and left <= nearest)
                 if closer:
-                    found, least = after, max(left, FEASIBLE)
+                    found, nearest = after, max(left, FEASIBLE)
                     known = replace(known, values=flat(values), **_of_instants(between))
                 # The peaks of a motion that does not move stay where they are, too.
                 settled = still or (closer and left <= FEASIBLE)
@@ -697,7 +756,8 @@ class _Rounds:
         )
         if kept.status in (Status.CONVERGED, Status.STALLED):
             # The decrease is a bound, whatever the multipliers, and the search may have stalled at a finer tolerance.
-            there = found.decrease <= self._bound(kept, found) and not self._clearly_beyond(plan)
+            most = min(self._bound(kept, found), least * found.stake)
+            there = found.decrease <= most and not self._clearly_beyond(plan)
             plan = replace(plan, status=Status.CONVERGED if there else self._stopped())
         return plan, closing
 
@@ -729,10 +789,10 @@ class _Rounds:
         """The status of a plan that a last step has not led to an optimum."""
         return Status.OUT_OF_TIME if time.perf_counter() > self.until else Status.STALLED
 
-    def _clearly_beyond(self, plan: Solution) -> bool:
-        """Whether the motion violates a constraint by more than a thousandth of its range."""
+    def _clearly_beyond(self, plan: Solution, share: float = REPORTED) -> bool:
+        """Whether the motion violates a constraint by more than a share of its range, by default a thousandth."""
         bound = self.problem.bound_constraints
-        return any(told.violation > REPORTED * item.scale for told, item in zip(plan.constraints, bound, strict=True))
+        return any(told.violation > share * item.scale for told, item in zip(plan.constraints, bound, strict=True))
 
     def _along(self, kept: Solution, motion: Trajectory, multipliers: Multipliers) -> Solution:
         """The plan with a neighbouring motion, its multipliers and the results of a backward pass along it."""
@@ -827,6 +887,26 @@ def _steadier(margins: Floats) -> Floats:
     smooth = ndimage.uniform_filter1d(most, size, axis=0, mode="nearest")
     found: Floats = np.minimum(smooth, np.maximum.accumulate(margins, axis=0))
     return found
+
+
+def _begun(begun: _State, iterations: int) -> Multipliers:
+    """The state before a round, which begins after that many iterations, as part of a solution."""
+    return Multipliers(
+        values=flat(begun.multipliers),
+        backoff=flat(begun.backoff),
+        begun=flat(begun.multipliers),
+        weights=begun.weights.copy(),
+        first_weights=begun.first_weights.copy(),
+        worst=begun.worst.copy(),
+        tolerance=begun.tolerance,
+        round=begun.round,
+        iterations=iterations,
+        stuck=begun.stuck,
+        added=None if begun.added is None else flat(begun.added),
+        counts=begun.counts,
+        **_of_instants(begun.between),
+        **_of_instants(begun.between, "begun_"),
+    )
 
 
 def _of_instants(between: Instants, prefix: str = "") -> dict[str, Any]:

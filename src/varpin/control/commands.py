@@ -110,24 +110,33 @@ def shifted_commands(problem: OptimalControlProblem, previous: Solution, decisio
 
 def with_feedback(problem: OptimalControlProblem, here: Trajectory, plan: Plan, *, closed: bool) -> Commands:
     """The controls of a motion, with a plan's feedback around it if ``closed``, without its feed-forward part."""
+    u = problem.decided(here)
     if not closed:
-        return _held(problem.decided(here), problem)
-    gains, reference = plan.feedback, states(problem, here)[: -1 : problem.hold]
-    if problem.linear and plan.previous is not None:
-        gains = np.concatenate([plan.feedback, plan.previous], axis=2)[1:]
-        reference = np.hstack([reference, here.u_nodes[:-1]])
-    elif plan.previous is not None:
-        before = here.u[: -problem.hold : problem.hold]
-        gains = np.concatenate([gains, plan.previous], axis=2)
+        return _held(u, problem)
+    return around(problem, u, states(problem, here)[: -1 : problem.hold], plan.feedback, plan.previous)
+
+
+def around(problem: OptimalControlProblem, u: Floats, x: Floats, gains: Floats, previous: Floats | None) -> Commands:
+    """Controls u (R, m) with feedback around the states x before each decision.
+
+    Args:
+        problem: The problem.
+        u: The controls without feedback.
+        x: States (R, 2n); (R - 1, 2n) with linear controls, the first of which is given.
+        gains: Gains (R, m, 2n) on the states.
+        previous: Gains (R, m, m) on the previous control, around ``u``; None without.
+    """
+    if previous is not None:
+        gains = np.concatenate([gains, previous], axis=2)
         # The control before the first one is given.
-        reference = np.hstack([reference, np.vstack([here.u[:1], before])])
+        before = u[:-1] if problem.linear else np.vstack([u[:1], u[:-1]])
+        x = np.hstack([x, before])
     if problem.linear:
-        commands = _held(problem.decided(here), problem)
-        return commands._replace(gains=gains, reference=np.ascontiguousarray(reference))
+        return _held(u, problem)._replace(gains=np.ascontiguousarray(gains[1:]), reference=np.ascontiguousarray(x))
     return Commands(
-        u=problem.decided(here),
-        gains=gains,
-        reference=np.ascontiguousarray(reference),
+        u=u,
+        gains=np.ascontiguousarray(gains),
+        reference=np.ascontiguousarray(x),
         hold=problem.hold,
         limits=problem.control_limits,
         before=np.zeros((0, problem.scene.controls)),

@@ -11,6 +11,7 @@ import numpy as np
 from varpin import core
 from varpin.arrays import Floats
 from varpin.control.along import Along
+from varpin.control.commands import around
 from varpin.control.passes import Plan, foreseen
 from varpin.control.penalties import PenalizedProblem
 from varpin.control.problem import OptimalControlProblem
@@ -105,7 +106,7 @@ class Foresight:
         to_controls = problem.scene.allocation @ holding_feedback(problem, M)
         return np.tile(to_controls, (problem.decisions, 1, 1))
 
-    def followed(self, along: Along, plan: Plan, shares: Floats, full: float, feedback: Commands) -> Followed | None:
+    def followed(self, along: Along, plan: Plan, shares: Floats, full: float) -> Followed | None:
         """Motions that follow the plan's foreseen states; None where these are not good.
 
         Args:
@@ -113,7 +114,6 @@ class Foresight:
             plan: The plan.
             shares: The terms of the motion's cost.
             full: Change of the cost by the full step. The foreseen states must cost clearly less.
-            feedback: Commands of the motion with the plan's feedback.
 
         Raises:
             CostError: A custom cost fails at the foreseen states.
@@ -144,14 +144,10 @@ class Foresight:
                 best, found = cost, k
         if found is None:
             return None
-        held = feedback._replace(
-            u=u[found], gains=self._holding, reference=states_on(problem, Path(q[found], v[found]))
-        )
-        reference = held.reference
-        if feedback.gains.shape[2] > 2 * n:
-            before = np.vstack([feedback.reference[:1, 2 * n :], u[found][:-1]])
-            reference = np.hstack([reference, before])
-        return Followed((held, held._replace(gains=feedback.gains, reference=reference)), lengths[found], best)
+        x = states_on(problem, Path(q[found], v[found]))
+        by_plan = around(problem, u[found], x, plan.feedback, plan.previous)
+        held = by_plan._replace(gains=self._holding, reference=x)
+        return Followed((held, by_plan), lengths[found], best)
 
     def _foreseen(self, along: Along, plan: Plan) -> Floats:
         """The changes of q and v at the nodes (N + 1, 2n) with a full step, by the linearized motion."""

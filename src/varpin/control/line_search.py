@@ -17,7 +17,8 @@ from varpin.control.commands import with_feedback
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
 from varpin.control.following import AS_FORESEEN, FOLLOWS, Foresight
-from varpin.control.passes import Plan, noise_shares
+from varpin.control.passes import Plan, foreseen, noise_shares
+from varpin.control.penalties import PenalizedProblem
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.trials import HALVINGS, MORE_HALVINGS, Attempt, Trials, cut_less, few_halvings
 from varpin.core import Watch
@@ -231,6 +232,7 @@ class LineSearch:
         self.armijo, self.backtracking, self.closed = armijo, backtracking, closed
         self._rounding = _at_rounding(problem.control_limits)
         self._foresight = Foresight(problem)
+        self._stiff = isinstance(problem, PenalizedProblem) and problem.later
         integrator = problem.integrator
         # Whether steps may be divided.
         self._divides = (
@@ -250,10 +252,11 @@ class LineSearch:
         for bounds in self._bounds(start):
             cut = []
             for step in left:
-                trials += 1
-                trial = self._try(step, start, here, bounds)
+                first = trials == 0
+                trial, more = self._try(step, start, here, bounds)
+                trials += more
                 lengths.learn(step, trial.expected, slope)
-                if trials == 1 and (followed := self._following(trial, start, here, bounds)) is not None:
+                if first and (followed := self._following(trial, start, here, bounds)) is not None:
                     other, along, more = followed
                     trials += more
                     strayed = not (other.cut or other.expected < trial.expected)
@@ -349,10 +352,23 @@ class LineSearch:
             yield _Bounds(cut_less(integrator, halvings), parts, watched=halvings > HALVINGS)
         yield _Bounds(integrator, np.inf, watched=True)
 
-    def _try(self, step: float, start: Start, here: _Here, bounds: _Bounds) -> Trial:
-        """A trial of length ``step`` along the plan."""
-        rise = -_DEAR * step * start.plan.slope
-        return self._run(step, here.commands(step, start.plan), start, here, bounds, rise=rise)
+    def _try(self, step: float, start: Start, here: _Here, bounds: _Bounds) -> tuple[Trial, int]:
+        """The best trial of length ``step`` along the plan, and how many there were.
+
+        Penalties make feedback so stiff that a motion may leave the neighbourhood of the foreseen one just for that.
+        Where the decrease is not as foreseen, a trial under the foreseen controls alone follows, but not in the first
+        round: its steps are large, and might lead to another local minimum.
+        """
+        plan = start.plan
+        rise = -_DEAR * step * plan.slope
+        trial = self._run(step, here.commands(step, plan), start, here, bounds, rise=rise)
+        model = step * plan.slope + 0.5 * step**2 * plan.curvature
+        if not (self._stiff and self.closed) or trial.expected <= AS_FORESEEN * model:
+            return trial, 1
+        alone = here.controls + step * foreseen(start.along, plan).moves
+        commands = here.feedback._replace(u=alone, gains=np.zeros(here.feedback.gains.shape))
+        other = self._run(step, commands, start, here, bounds, rise=min(trial.expected, 0.0))
+        return (other if other.expected < trial.expected else trial), 2
 
     def _following(self, full: Trial, start: Start, here: _Here, bounds: _Bounds) -> tuple[Trial, float, int] | None:
         """The best trial that follows foreseen states, its length, and the number of trials it took.
@@ -363,7 +379,7 @@ class LineSearch:
         if not (start.follows and self.closed) or -full.expected >= AS_FORESEEN * start.plan.expected_decrease:
             return None
         try:
-            found = self._foresight.followed(start.along, start.plan, start.shares, full.cost, here.feedback)
+            found = self._foresight.followed(start.along, start.plan, start.shares, full.cost)
         except TRIAL_ERRORS as error:
             logger.info("%s: states of the full step: %s", self.label, error)
             return None

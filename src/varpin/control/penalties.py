@@ -202,6 +202,11 @@ class PenalizedProblem(OptimalControlProblem):
         return self.given
 
     @property
+    def later(self) -> bool:
+        """Whether there are multipliers, of an earlier round."""
+        return any(part.multipliers.any() for part in self.all_penalties)
+
+    @property
     def processes(self) -> int:
         """See :attr:`OptimalControlProblem.processes`."""
         return 0 if self.quiet else self.scene.processes

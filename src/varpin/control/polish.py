@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -18,26 +19,39 @@ from varpin.arrays import Floats, Mask
 from varpin.control.active_rows import same_rows
 from varpin.control.along import states
 from varpin.control.closed_loop import ClosedLoop, given_controls
-from varpin.control.constraints import BoundBetween, BoundConstraint
+from varpin.control.commands import around
+from varpin.control.constraints import BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.trials import MORE_HALVINGS, Trials, cut_less, few_halvings
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
-from varpin.integrators.base import open_line, open_loop
 from varpin.trajectory import Trajectory
 
-# Greatest number of Newton steps, and how many of them, the last ones, lead onto the constraints only.
-_STEPS, _LAST = 15, 3
+# Greatest number of Newton steps, of those to a motion that may be rough, and how many of the last ones of the former
+# lead onto the constraints only.
+_STEPS, _FEW, _LAST = 60, 8, 3
 # Greatest number of passes in a step that determine the active rows and the controls at their limits.
 _PASSES = 12
+# Greatest number of rows in a step, relative to that of the controls. Where a motion keeps to a bound, a node and an
+# instant between nodes have a row each.
+_CROWDED = 2.0
+# Greatest number of steps until the expected decrease has fallen to a half.
+_WAITS = 8
 # Violation that counts as rounding error, and decrease of the cost, relative to the cost at stake, that does.
 _DONE, _FLAT = 1e-12, 1e-13
-# Lengths of the part of a step along the constraints: its model is without second derivatives of the dynamics and of
-# the constraints, but for those of sliding peaks. The part onto the constraints is whole.
-_LENGTHS = (1.0, 0.5, 0.25, 0.0)
+# The part of a step along the constraints is made shorter, by _SHARPEST to _BACK at a time and down to _SHORTEST: its
+# model is without second derivatives of the dynamics and of the constraints, but for those of sliding peaks. The part
+# onto the constraints is whole.
+_BACK, _SHARPEST, _SHORTEST = 0.5, 0.04, 0.05
+# Expected decrease, relative to the cost at stake, up to which it has to fall with a step if it can.
+_CALM = 1e-6
 # Greatest number of steps onto the constraints that follow one along them.
-_CORRECTIONS = 2
+_CORRECTIONS = 4
+# Least share of the expected decrease that the cost falls by with a step from a motion within the constraints.
+_LOWERED = 1e-3
+# Violation of a motion that is not looked at, relative to the constraint's scale, and to that of the motion before.
+_WILD = (0.1, 10.0)
 # Violation that steps along the constraints may cause; the next one removes it.
 _TRANSIENT = 1e-9
 # Distance from its bound at which a row counts as met, relative to the constraint's scale.
@@ -102,27 +116,44 @@ def polished(
         CostError: An expansion of the cost is not finite along it.
     """
     closely, level = (_DONE, _FLAT) if enough is None else (enough[0], max(enough[1], _FLAT))
-    trials, longest = Trials(problem), 1.0
+    trials, longest, closed = Trials(problem), 1.0, True
     step = _Step(problem, motion, multipliers, weights, backoff)
-    for left in reversed(range(_STEPS)):
+    least, waited = math.inf, 0
+    for left in reversed(range(_STEPS if enough is None else _FEW)):
         there = step.found.violation <= closely and step.found.decrease <= level * step.found.stake
-        if there or time.perf_counter() > until:
+        waited = 0 if step.found.decrease < 0.5 * least else waited + 1
+        least = min(least, step.found.decrease)
+        if there or waited > _WAITS + _LAST or time.perf_counter() > until:
             break
         step.solve(until)
-        # Where the model's curvature is too small, it is so in the next step, too.
-        for length in (item for item in _LENGTHS if item <= (longest if left >= _LAST else 0.0)):
-            after = step.after(trials, length)
-            for _ in range(_CORRECTIONS if length > 0.0 else 0):
-                if after is None or after.found.violation <= max(step.found.violation, _TRANSIENT):
-                    break
-                after.solve(until)
-                after = after.after(trials, 0.0)
-            if after is not None and _closer(after.found, step.found, length):
-                step, longest = after, length or longest
-                break
-        else:
+        along = (left >= _LAST and waited <= _WAITS) or enough is not None
+        after = _next(step, trials, longest if along else 0.0, closed=closed)
+        if after is None:
             break
+        step, length, closed = after
+        longest = min(2.0 * length, 1.0) or longest
     return replace(step.found, multipliers=step.least_slope())
+
+
+def _next(step: _Step, trials: Trials, length: float, *, closed: bool) -> tuple[_Step, float, bool] | None:
+    """The next step, after the first length that leads closer, that length, and whether the motion had feedback.
+
+    Feedback with penalties may be so stiff that a motion leaves the neighbourhood of the foreseen one just for that;
+    then motions have none from there on. Close to an optimum the expected decrease tells more than the cost.
+    """
+    close, lower = step.found.decrease <= _CALM * step.found.stake, None
+    while True:
+        for feedback in (True, False)[not closed :]:
+            after = step.after(trials, length, closed=feedback)
+            if after is None:
+                continue
+            found = after, length, feedback
+            if length == 0.0 or not close or after.found.decrease < step.found.decrease:
+                return found
+            lower = lower or found
+        if (lower is not None and length < _SHORTEST) or length == 0.0:
+            return lower
+        length = step.shorter(length) if length >= _SHORTEST else 0.0
 
 
 def judged(
@@ -140,11 +171,20 @@ def judged(
     return replace(step.found, multipliers=step.least_slope())
 
 
-def _closer(after: Polished, before: Polished, length: float) -> bool:
-    """Whether a motion is closer to the KKT conditions than another one, from which it is a step of given length."""
-    if length == 0.0:
-        return before.violation > _DONE and after.violation < before.violation
-    return after.decrease < before.decrease and after.violation <= max(before.violation, _TRANSIENT)
+class _Tried(NamedTuple):
+    """A motion after a step.
+
+    Attributes:
+        motion: The motion.
+        c: The constraints' values (K, rows) on it, margins included.
+        violation: The largest violation.
+        merit: Its cost and, with weights, the sum of its violations.
+    """
+
+    motion: Trajectory
+    c: list[Floats]
+    violation: float
+    merit: float
 
 
 class _Step:
@@ -155,12 +195,15 @@ class _Step:
 
     Attributes:
         found: The motion and its residuals.
+        cost: The cost of the motion.
         free: The controls (R, m) that are not fixed at their limits.
         limited: Those whose lower and whose upper limit are rows of the dual problem, each (R, m).
         pressed: Those (R, m) that the conditions of an optimum press against a limit on the motion.
         multipliers: For each constraint (K, rows); after :meth:`solve` those of the step.
         pressing: After :meth:`solve`, the controls that the step leads to their lower and to their upper limit.
         ahead: After :meth:`solve`, w of the step (R, m).
+        rise: After :meth:`after`, that of the merit; infinite where the motion was not looked at.
+        expected: After :meth:`solve`, decrease of the cost that the step expects.
         onto: After :meth:`solve`, the least w (R, m) onto the constraints.
     """
 
@@ -173,6 +216,7 @@ class _Step:
         backoff: list[Floats],
     ) -> None:
         self.problem, self.motion, self.multipliers = problem, motion, multipliers
+        self.cost = problem.cost_of(motion)
         (lower, upper), decided = problem.control_limits, problem.decided(motion)
         self.free = (decided > lower) & (decided < upper) & ~given_controls(problem)
         self.weights, self.backoff = weights, backoff
@@ -185,6 +229,8 @@ class _Step:
             rows | item.source.equality | (c > -_NEAR * item.scale)
             for item, rows, c in zip(self.bound, active, self.c, strict=True)
         ]
+        # The rows of the last dual problem, and its matrices.
+        self._known: tuple[list[Mask], tuple[Floats, Floats, Floats]] | None = None
         self.loop = ClosedLoop(problem, motion, weights, multipliers)
         self.loop.close(self.free)
         self.found = self._judged()
@@ -208,6 +254,7 @@ class _Step:
         if low.any() or high.any():
             self.free = self.free | low | high
             loop.close(self.free)
+            self._known = None
             multipliers, pull, pressed = self._dual(room, loop.gradient, (low, high))
         self.rows, self.limited, self.pressed = met, (low, high), pressed[0] | pressed[1]
         decrease = 0.5 * float(np.einsum("ki,kij,kj->", pull, loop.inverse, pull))
@@ -228,18 +275,16 @@ class _Step:
         (R, m) do not change at all. The last result tells which controls are pressed against the lower and the upper
         limit.
         """
-        loop, u = self.loop, self.problem.decided(self.motion)
+        u = self.problem.decided(self.motion)
         still = np.zeros(u.shape, dtype=np.bool_) if still is None else still
         sides = list(zip((-1.0, 1.0), self.problem.control_limits, limited, strict=True))
-        G = np.concatenate([loop.rows(self.rows), *(loop.rows_of_controls(side, sign) for sign, _, side in sides)])
+        G, weighed, S = self._quadratic(limited)
         c = [value[rows] for value, rows in zip(values, self.rows, strict=True)]
         c += [np.where(still, 0.0, sign * (u - limit))[side] for sign, limit, side in sides]
         equal, active = self._kinds(self.rows)
         fixed = np.concatenate([still[side] for side in limited])
-        flat = G.reshape(len(G), loop.gradient.size)
-        weighed = np.einsum("akm,kmi->aki", G, loop.inverse).reshape(flat.shape)
         found = _least(
-            weighed @ flat.T,
+            S,
             np.concatenate(c) - weighed @ gradient.ravel(),
             np.concatenate([equal, fixed]),
             np.concatenate([active, fixed]),
@@ -248,6 +293,17 @@ class _Step:
         low, high = np.zeros(u.shape, dtype=np.bool_), np.zeros(u.shape, dtype=np.bool_)
         low[limited[0]], high[limited[1]] = (pushes > 0.0 for pushes in of_limits)
         return _in_rows(of_rows, self.rows), gradient + np.einsum("akm,a->km", G, found), (low, high)
+
+    def _quadratic(self, limited: tuple[Mask, Mask]) -> tuple[Floats, Floats, Floats]:
+        """The derivatives G (a, R, m) of rows and ``limited`` controls in w, G W (a, R m), and G W G' (a, a)."""
+        rows, loop = [*self.rows, *limited], self.loop
+        if self._known is None or not same_rows(rows, self._known[0]):
+            sides = zip((-1.0, 1.0), limited, strict=True)
+            G = np.concatenate([loop.rows(self.rows), *(loop.rows_of_controls(side, sign) for sign, side in sides)])
+            flat = G.reshape(len(G), loop.gradient.size)
+            weighed = np.einsum("akm,kmi->aki", G, loop.inverse).reshape(flat.shape)
+            self._known = rows, (G, weighed, weighed @ flat.T)
+        return self._known[1]
 
     def least_slope(self) -> list[Floats]:
         """Multipliers (K, rows) with which the Lagrangian's gradient in the free controls is least.
@@ -299,65 +355,110 @@ class _Step:
             ]
             low, high = self.limited
             reached = low | (self.free & (u + change < lower)), high | (self.free & (u + change > upper))
-            settled = same_rows(met, self.rows) or self._crowded(met)
+            # So many rows are not met by any change.
+            crowded = sum(int(rows.sum()) for rows in met) > _CROWDED * self.free.size
+            settled = same_rows(met, self.rows) or crowded
             if (settled and same_rows([*reached], [low, high])) or time.perf_counter() > until:
                 break
             self.limited = reached
             if not settled:
                 self.rows = met
-        # The least step onto the constraints alone.
-        _, pull, _ = self._dual(self.c, np.zeros(u.shape), self.limited, self.pressing[0] | self.pressing[1])
-        self.onto = -np.einsum("kij,kj->ki", loop.inverse, pull)
+        self.expected = 0.5 * float((self.ahead * pull).sum()) - float((self.ahead * loop.gradient).sum())
+        self.onto = self._back(self.c)
 
-    def _crowded(self, met: list[Mask]) -> bool:
-        """Whether there are more rows than controls that could meet them, with rows between nodes among them."""
-        between = any(isinstance(item, BoundBetween) for item in self.bound)
-        return between and sum(int(rows.sum()) for rows in met) > self.free.size
+    def after(self, trials: Trials, length: float, *, closed: bool = True) -> _Step | None:
+        """The next step, after ``length`` of this one's part along the constraints, with or without feedback.
 
-    def after(self, trials: Trials, length: float) -> _Step | None:
-        """The next step, after ``length`` of this one's part along the constraints.
-
-        None where the motion fails, or has no derivative.
+        Where violations grow, corrections lead back onto the constraints, with the derivatives along this motion. None
+        where the motion fails, has no derivative, or is no closer to an optimum within the constraints: neither its
+        merit is less, nor the decrease that its own model expects.
         """
-        # Under stiff feedback a motion that leaves the neighbourhood may need any number of parts.
-        near = cut_less(self.problem.integrator, few_halvings(self.motion) + MORE_HALVINGS)
-        attempt = trials.attempt(self._commands(length), integrator=near)
-        if not attempt.whole:
+        w = length * self.ahead + (1.0 - length) * self.onto
+        here, least = self.found, max(self.found.violation, _TRANSIENT)
+        tried = self._tried(trials, w, length, closed=closed)
+        self.rise = math.inf
+        for _ in range(_CORRECTIONS):
+            if tried is None or self._lower(tried, length) or tried.violation <= least:
+                break
+            w = w + self._back(tried.c)
+            tried = self._tried(trials, w, length, closed=closed)
+        if tried is None:
+            return None
+        self.rise = tried.merit - self._merit(self.cost, self.c)
+        lower = self._lower(tried, length)
+        if not lower and tried.violation > least:
             return None
         try:
-            return _Step(self.problem, attempt.trajectory(), self.multipliers, self.weights, self.backoff)
+            after = _Step(self.problem, tried.motion, self.multipliers, self.weights, self.backoff)
         except (CostError, LinearizationError):
             return None
+        return after if lower or (length > 0.0 and after.found.decrease < here.decrease) else None
 
-    def _commands(self, length: float) -> Commands:
-        """The commands of the motion after the step, ``length`` of its part along the constraints, with feedback."""
+    def shorter(self, length: float) -> float:
+        """A shorter length than one whose motion was not closer: the minimum of a parabola through its merit."""
+        here = self._merit(self.cost, self.c)
+        slope = 2.0 * self.expected + here - self.cost
+        least = 0.5 * slope * length / (self.rise / length + slope) if self.rise > -slope * length else 1.0
+        return float(np.clip(least, _SHARPEST * length, _BACK * length))
+
+    def _tried(self, trials: Trials, w: Floats, length: float, *, closed: bool) -> _Tried | None:
+        """The motion after a step w (R, m); None where it fails, or violates a constraint by far more."""
+        # Under stiff feedback a motion that leaves the neighbourhood may need any number of parts.
+        near = cut_less(self.problem.integrator, few_halvings(self.motion) + MORE_HALVINGS)
+        commands = self._commands(w, length)
+        if not closed:
+            commands = commands._replace(gains=np.zeros(commands.gains.shape))
+        attempt = trials.attempt(commands, integrator=near)
+        if not attempt.whole:
+            return None
+        motion, c, worst = attempt.trajectory(), [], 0.0
+        u = self.problem.control_rows(motion)
+        for item, here, b in zip(self.bound, self.c, self.backoff, strict=True):
+            c.append(item.value(motion.q, motion.v, u) + b)
+            violation = _violation(item, c[-1])
+            if not violation <= max(_WILD[0] * item.scale, _WILD[1] * _violation(item, here)):
+                return None
+            worst = max(worst, violation)
+        return _Tried(motion, c, worst, self._merit(self.problem.cost_of(motion), c))
+
+    def _merit(self, cost: float, c: list[Floats]) -> float:
+        """The exact penalty function: cost, and violations with twice the multipliers of the step."""
+        for item, lam, values in zip(self.bound, self.multipliers, c, strict=True):
+            beyond = np.abs(values) if item.source.equality else np.maximum(values, 0.0)
+            cost += 2.0 * float(np.abs(lam).max(initial=0.0)) * float(beyond.sum())
+        return cost
+
+    def _lower(self, tried: _Tried, length: float) -> bool:
+        """Whether a motion after ``length`` of the step has less merit, or is clearly closer to the constraints."""
+        if length == 0.0:
+            return self.found.violation > _DONE and tried.violation < self.found.violation
+        here = self._merit(self.cost, self.c)
+        return tried.merit < here - _LOWERED * length * (self.expected + here - self.cost)
+
+    def _back(self, c: list[Floats]) -> Floats:
+        """The least w (R, m) that leads from values ``c`` (K, rows) onto the constraints."""
+        self.rows = [rows | (values > _DONE) for rows, values in zip(self.rows, c, strict=True)]
+        _, pull, _ = self._dual(c, np.zeros(self.ahead.shape), self.limited, self.pressing[0] | self.pressing[1])
+        onto: Floats = -np.einsum("kij,kj->ki", self.loop.inverse, pull)
+        return onto
+
+    def _commands(self, w: Floats, length: float) -> Commands:
+        """The commands of the motion after a step w (R, m), ``length`` along the constraints, with feedback."""
         problem, loop = self.problem, self.loop
         u = problem.decided(self.motion)
-        response, change = loop.response(length * self.ahead + (1.0 - length) * self.onto)
+        response, change = loop.response(w)
         # Controls that end at a limit do so exactly, and have no feedback: after a shorter step those already there.
         (low, high), (lower, upper) = self.pressing, problem.control_limits
         if length < 1.0:
             low, high = low & (u <= lower), high & (u >= upper)
         after, ends = np.where(low, lower, np.where(high, upper, u + change)), low | high
         gains, previous = (np.where(ends[:, :, None], 0.0, each) for each in (loop.gains, loop.previous))
-        reference = (states(problem, self.motion) + response)[: -1 : problem.hold]
+        x = (states(problem, self.motion) + response)[: -1 : problem.hold]
         if problem.linear:
-            m, x = change.shape[1], reference.shape[1]
-            within = problem.begun(np.clip(after, *problem.control_limits))
-            return open_line(within, problem.integrator.stage_times)._replace(
-                limits=problem.control_limits.copy(),
-                gains=np.ascontiguousarray(gains[1:, :, : x + m]),
-                reference=np.hstack([reference, after[:-1]]),
-            )
-        if previous.any():
-            before = np.vstack([u[:1], after[:-1]])
-            gains, reference = np.concatenate([gains, previous], axis=2), np.hstack([reference, before])
-        return open_loop(after)._replace(
-            hold=problem.hold,
-            limits=problem.control_limits.copy(),
-            gains=np.ascontiguousarray(gains),
-            reference=np.ascontiguousarray(reference),
-        )
+            # The control at the begin of a step is a part of its state.
+            size, m = x.shape[1], after.shape[1]
+            gains, previous = gains[:, :, :size], gains[:, :, size : size + m]
+        return around(problem, after, x, gains, previous if previous.any() else None)
 
 
 def _in_rows(numbers: Floats, rows: list[Mask]) -> list[Floats]:
