@@ -217,7 +217,7 @@ class _Rounds:
             around = self.problem.linear and any(watched(self.problem))
             longest = _BEFORE_PEAKS if around or len(begun.between.rows) else _OF_ROUND
             left = min(last - known, longest - done)
-            problem = penalized(self.whole, begun.multipliers, begun.weights, begun.backoff, until=self.until)
+            problem = self._penalized(begun)
             options: dict[str, Any] = dict(self.options)
             if resume is None:
                 options["controls"] = self.controls if begun.round == 0 else found
@@ -247,7 +247,11 @@ class _Rounds:
                 early = self._early(kept, begun) if status is None else None
                 if early is not None:
                     kept, closing = early
-                    status, reason = kept.status, f"{found.reason}; {closing}"
+                    status, reason = kept.status, f"last steps after round {begun.round}; {closing}"
+                elif status is None and time.perf_counter() > self.until:
+                    # The round has ended; the search goes on from there, and so do the last steps.
+                    status, reason = Status.OUT_OF_TIME, found.reason
+                    break
                 elif self._goes_between(kept, begun, status) or status is None:
                     continue
                 ended = status in (Status.INFEASIBLE, Status.STALLED) and kept.violation > FEASIBLE
@@ -660,15 +664,18 @@ class _Rounds:
         due = begun.round > 0 and begun.round & (begun.round - 1) == 0
         if self.noisy or not due or self.state.stuck or self._clearly_beyond(kept, _REACHED):
             return None
-        near: Solution | None = kept
+        between = (self.problem.linear or self.problem.between_nodes) and any(watched(self.problem))
         try:
-            if self.problem.linear or self.problem.between_nodes:
-                near = self._brought_near(kept, begun)
+            near = self._brought_near(kept, begun) if between else kept
         except (CostError, NoiseFieldError, LinearizationError):
             near = None
         if near is not None:
             closed, closing = self._polished(replace(near, status=Status.CONVERGED), _EXACT)
-            if closed.status.converged and closed.violation <= FEASIBLE:
+            known = closed.multipliers
+            assert known is not None
+            looked = seen(self.problem, closed.trajectory) if between and not len(known.between.rows) else None
+            holds = looked is None or not self._needs_rows(looked, begun)
+            if closed.status.converged and closed.violation <= FEASIBLE and holds:
                 return closed, closing
         logger.info("%s: last steps after round %d do not lead to an optimum", self.label, begun.round)
         self.whole = enforced(self.problem, begun.between)
@@ -683,7 +690,7 @@ class _Rounds:
         assert known is not None
         motion, base = kept.trajectory, replace(begun, multipliers=split(self.bound, known.values))
         looked, least, waited = seen(self.problem, motion), np.inf, 0
-        while waited < _WAITS:
+        while looked is not None and waited < _WAITS:
             if self._needs_rows(looked, base):
                 base = self._with_rows(base, self._followed(base.between, looked, base.backoff, anew=True))
             self.whole = enforced(self.problem, base.between)
@@ -694,12 +701,26 @@ class _Rounds:
             rows = self._needs_rows(looked, base)
             left = self._left(motion, looked, base.backoff) if rows else after.violation
             if after.decrease <= self._bound(kept, after) and left <= FEASIBLE:
-                return self._along(kept, motion, _begun(base, known.iterations))
+                return self._resumable(self._along(kept, motion, _begun(base, len(self.history))), base)
             if still or time.perf_counter() > self.until:
                 break
             waited = 0 if after.decrease < _FALLS * least else waited + 1
             least = min(least, after.decrease)
         return None
+
+    def _resumable(self, plan: Solution, begun: _State) -> Solution:
+        """A plan with the state of a search that has just begun with it, in a round with its rows."""
+        found = self.search(
+            self._penalized(begun), plan, tolerance=begun.tolerance, max_iterations=0, check=False, **self.options
+        )
+        if found.status is Status.INTERRUPTED or found.search is None:
+            raise KeyboardInterrupt
+        return replace(plan, search=replace(found.search, history=tuple(self.history)))
+
+    def _penalized(self, begun: _State) -> PenalizedProblem:
+        """The problem of the search of a round."""
+        state = begun.multipliers, begun.weights, begun.backoff
+        return penalized(self.whole, *state, until=self.until, later=begun.round > 0)
 
     def _needs_rows(self, looked: Looked, base: _State) -> bool:
         """Whether there are rows between nodes, or a motion of values ``looked`` needs the first ones."""

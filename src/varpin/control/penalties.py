@@ -185,6 +185,7 @@ class PenalizedProblem(OptimalControlProblem):
             of the nominal motion.
         until: Time (of ``time.perf_counter``) after which there is no further one of them.
         given: The given first controls, where controls are linear between nodes.
+        later: Whether the search is that of a later round, close to the plan, with heavy penalties.
     """
 
     penalties: tuple[Penalty, ...]
@@ -195,16 +196,12 @@ class PenalizedProblem(OptimalControlProblem):
     passes: int
     until: float
     given: Floats | None
+    later: bool
 
     @property
     def begin(self) -> Floats | None:
         """See :attr:`OptimalControlProblem.begin`."""
         return self.given
-
-    @property
-    def later(self) -> bool:
-        """Whether there are multipliers, of an earlier round."""
-        return any(part.multipliers.any() for part in self.all_penalties)
 
     @property
     def processes(self) -> int:
@@ -384,6 +381,7 @@ def penalized(
     quiet: bool = True,
     passes: int = _PASSES,
     until: float = math.inf,
+    later: bool = False,
 ) -> PenalizedProblem:
     """The augmented Lagrangian of a problem.
 
@@ -395,6 +393,7 @@ def penalized(
         quiet: Leave the scene's noise out.
         passes: Greatest number of backward passes that determine the active rows.
         until: Time (of ``time.perf_counter``) after which there is no further one of them.
+        later: Whether the search is that of a later round.
     """
     made = object.__new__(PenalizedProblem)
     parts = [
@@ -416,7 +415,7 @@ def penalized(
             m = problem.scene.controls
             rate = ControlRate(np.zeros((m, m)), _rate_of(on_rate[0]).before)
         changes["rate"] = PenalizedRate(rate, on_rate)
-    changes["given"] = problem.begin
+    changes |= {"given": problem.begin, "later": later}
     # The dataclass is frozen: attributes are set in its dictionary.
     vars(made).update(vars(problem) | changes)
     # Other penalties may have other samples.

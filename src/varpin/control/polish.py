@@ -21,11 +21,10 @@ from varpin.control.along import states
 from varpin.control.closed_loop import ClosedLoop, given_controls
 from varpin.control.commands import around
 from varpin.control.constraints import BoundConstraint
-from varpin.control.costs import CostError
+from varpin.control.line_search import TRIAL_ERRORS
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.trials import MORE_HALVINGS, Trials, cut_less, few_halvings
 from varpin.core.arrays import Commands
-from varpin.errors import LinearizationError
 from varpin.trajectory import Trajectory
 
 # Greatest number of Newton steps, of those to a motion that may be rough, and how many of the last ones of the former
@@ -48,7 +47,9 @@ _BACK, _SHARPEST, _SHORTEST = 0.5, 0.04, 0.05
 _CALM = 1e-6
 # Greatest number of steps onto the constraints that follow one along them.
 _CORRECTIONS = 4
-# Least share of the expected decrease that the cost falls by with a step from a motion within the constraints.
+# Weight of violations in the merit, relative to the largest multiplier; above 1 its minimum is within the constraints.
+_STRICT = 2.0
+# Least share of the expected decrease that the merit falls by with a step from a motion within the constraints.
 _LOWERED = 1e-3
 # Violation of a motion that is not looked at, relative to the constraint's scale, and to that of the motion before.
 _WILD = (0.1, 10.0)
@@ -97,13 +98,13 @@ def polished(
     until: float = math.inf,
     enough: tuple[float, float] | None = None,
 ) -> Polished:
-    """The motion near a given one that satisfies its constraints, and the conditions of an optimum, most closely.
+    """A motion from a given one on that satisfies its constraints, and the conditions of an optimum, most closely.
 
     Newton steps on the KKT conditions, equation (P4).
 
     Args:
         problem: The problem with its constraints.
-        motion: A nearly feasible and nearly optimal motion.
+        motion: A motion not far from the constraints. The closer it is to an optimum, the fewer steps follow.
         multipliers: For each constraint (K, rows); rows with positive multipliers are active.
         weights: Weights of the penalties (C,), which count in the feedback along the motion.
         backoff: For each constraint (K, rows).
@@ -127,7 +128,10 @@ def polished(
             break
         step.solve(until)
         along = (left >= _LAST and waited <= _WAITS) or enough is not None
-        after = _next(step, trials, longest if along else 0.0, closed=closed)
+        length = longest if along else 0.0
+        after = _next(step, trials, length, closed=closed, until=until)
+        if after is None and not closed:
+            after = _next(step, trials, length, closed=True, until=until)
         if after is None:
             break
         step, length, closed = after
@@ -135,25 +139,31 @@ def polished(
     return replace(step.found, multipliers=step.least_slope())
 
 
-def _next(step: _Step, trials: Trials, length: float, *, closed: bool) -> tuple[_Step, float, bool] | None:
+def _next(
+    step: _Step, trials: Trials, length: float, *, closed: bool, until: float
+) -> tuple[_Step, float, bool] | None:
     """The next step, after the first length that leads closer, that length, and whether the motion had feedback.
 
     Feedback with penalties may be so stiff that a motion leaves the neighbourhood of the foreseen one just for that;
     then motions have none from there on. Close to an optimum the expected decrease tells more than the cost.
     """
-    close, lower = step.found.decrease <= _CALM * step.found.stake, None
-    while True:
+    here, lower = step.found, None
+    close = here.violation <= _TRANSIENT and here.decrease <= _CALM * here.stake
+    while time.perf_counter() <= until:
+        step.rise = math.inf
         for feedback in (True, False)[not closed :]:
             after = step.after(trials, length, closed=feedback)
             if after is None:
                 continue
             found = after, length, feedback
-            if length == 0.0 or not close or after.found.decrease < step.found.decrease:
+            if length == 0.0 or not close or after.found.decrease < here.decrease:
                 return found
             lower = lower or found
+            break
         if (lower is not None and length < _SHORTEST) or length == 0.0:
-            return lower
+            break
         length = step.shorter(length) if length >= _SHORTEST else 0.0
+    return lower
 
 
 def judged(
@@ -202,7 +212,7 @@ class _Step:
         multipliers: For each constraint (K, rows); after :meth:`solve` those of the step.
         pressing: After :meth:`solve`, the controls that the step leads to their lower and to their upper limit.
         ahead: After :meth:`solve`, w of the step (R, m).
-        rise: After :meth:`after`, that of the merit; infinite where the motion was not looked at.
+        rise: Least rise of the merit after the length that was tried last; infinite where no motion was looked at.
         expected: After :meth:`solve`, decrease of the cost that the step expects.
         onto: After :meth:`solve`, the least w (R, m) onto the constraints.
     """
@@ -233,6 +243,7 @@ class _Step:
         self._known: tuple[list[Mask], tuple[Floats, Floats, Floats]] | None = None
         self.loop = ClosedLoop(problem, motion, weights, multipliers)
         self.loop.close(self.free)
+        self.rise = math.inf
         self.found = self._judged()
 
     def _judged(self) -> Polished:
@@ -256,7 +267,8 @@ class _Step:
             loop.close(self.free)
             self._known = None
             multipliers, pull, pressed = self._dual(room, loop.gradient, (low, high))
-        self.rows, self.limited, self.pressed = met, (low, high), pressed[0] | pressed[1]
+        self.rows = self._met = met
+        self.limited, self.pressed = (low, high), pressed[0] | pressed[1]
         decrease = 0.5 * float(np.einsum("ki,kij,kj->", pull, loop.inverse, pull))
         decrease -= sum(float((lam * c).sum()) for lam, c in zip(multipliers, room, strict=True))
         violation = max(0.0, *(_violation(item, c) for item, c in self._values()))
@@ -314,7 +326,7 @@ class _Step:
         """
         loop = self.loop
         pushing = [lam > 0.0 for lam in self.found.multipliers]
-        rows = [met | push for met, push in zip(self.rows, pushing, strict=True)]
+        rows = [met | push for met, push in zip(self._met, pushing, strict=True)]
         equal, active = self._kinds(rows)
         size = np.abs(self.problem.decided(self.motion)).max(axis=0)
         free = self.free & ~self.pressed
@@ -376,7 +388,6 @@ class _Step:
         w = length * self.ahead + (1.0 - length) * self.onto
         here, least = self.found, max(self.found.violation, _TRANSIENT)
         tried = self._tried(trials, w, length, closed=closed)
-        self.rise = math.inf
         for _ in range(_CORRECTIONS):
             if tried is None or self._lower(tried, length) or tried.violation <= least:
                 break
@@ -384,13 +395,13 @@ class _Step:
             tried = self._tried(trials, w, length, closed=closed)
         if tried is None:
             return None
-        self.rise = tried.merit - self._merit(self.cost, self.c)
+        self.rise = min(self.rise, tried.merit - self._merit(self.cost, self.c))
         lower = self._lower(tried, length)
         if not lower and tried.violation > least:
             return None
         try:
             after = _Step(self.problem, tried.motion, self.multipliers, self.weights, self.backoff)
-        except (CostError, LinearizationError):
+        except TRIAL_ERRORS:
             return None
         return after if lower or (length > 0.0 and after.found.decrease < here.decrease) else None
 
@@ -408,24 +419,27 @@ class _Step:
         commands = self._commands(w, length)
         if not closed:
             commands = commands._replace(gains=np.zeros(commands.gains.shape))
-        attempt = trials.attempt(commands, integrator=near)
-        if not attempt.whole:
-            return None
-        motion, c, worst = attempt.trajectory(), [], 0.0
-        u = self.problem.control_rows(motion)
-        for item, here, b in zip(self.bound, self.c, self.backoff, strict=True):
-            c.append(item.value(motion.q, motion.v, u) + b)
-            violation = _violation(item, c[-1])
-            if not violation <= max(_WILD[0] * item.scale, _WILD[1] * _violation(item, here)):
+        try:
+            attempt = trials.attempt(commands, integrator=near)
+            if not attempt.whole:
                 return None
-            worst = max(worst, violation)
-        return _Tried(motion, c, worst, self._merit(self.problem.cost_of(motion), c))
+            motion, c, worst = attempt.trajectory(), [], 0.0
+            u = self.problem.control_rows(motion)
+            for item, here, b in zip(self.bound, self.c, self.backoff, strict=True):
+                c.append(item.value(motion.q, motion.v, u) + b)
+                violation = _violation(item, c[-1])
+                if not violation <= max(_WILD[0] * item.scale, _WILD[1] * _violation(item, here)):
+                    return None
+                worst = max(worst, violation)
+            return _Tried(motion, c, worst, self._merit(self.problem.cost_of(motion), c))
+        except TRIAL_ERRORS:
+            return None
 
     def _merit(self, cost: float, c: list[Floats]) -> float:
-        """The exact penalty function: cost, and violations with twice the multipliers of the step."""
+        """The exact penalty function: cost, and violations with more than the multipliers of the step."""
         for item, lam, values in zip(self.bound, self.multipliers, c, strict=True):
             beyond = np.abs(values) if item.source.equality else np.maximum(values, 0.0)
-            cost += 2.0 * float(np.abs(lam).max(initial=0.0)) * float(beyond.sum())
+            cost += _STRICT * float(np.abs(lam).max(initial=0.0)) * float(beyond.sum())
         return cost
 
     def _lower(self, tried: _Tried, length: float) -> bool:
