@@ -7,7 +7,8 @@ import pytest
 import varpin as vp
 from varpin import core
 from varpin.control import following
-from varpin.control.commands import first_commands, with_feedback
+from varpin.control.commands import first_commands
+from varpin.control.feedback import with_feedback
 from varpin.control.following import Foresight, Path, inverse_dynamics, states_on
 from varpin.control.line_search import LineSearch
 from varpin.control.search import Search

@@ -11,7 +11,7 @@ import numpy as np
 from varpin import core
 from varpin.arrays import Floats
 from varpin.control.along import Along
-from varpin.control.commands import around
+from varpin.control.feedback import around
 from varpin.control.passes import Plan, foreseen
 from varpin.control.penalties import PenalizedProblem
 from varpin.control.problem import OptimalControlProblem

@@ -13,9 +13,9 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.along import Along
 from varpin.control.backward import backward
-from varpin.control.commands import with_feedback
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
+from varpin.control.feedback import with_feedback
 from varpin.control.following import AS_FORESEEN, FOLLOWS, Foresight
 from varpin.control.passes import Plan, foreseen, noise_shares
 from varpin.control.penalties import PenalizedProblem

@@ -19,8 +19,8 @@ from varpin.arrays import Floats, Mask
 from varpin.control.active_rows import same_rows
 from varpin.control.along import states
 from varpin.control.closed_loop import ClosedLoop, given_controls
-from varpin.control.commands import around
 from varpin.control.constraints import BoundConstraint
+from varpin.control.feedback import around
 from varpin.control.line_search import TRIAL_ERRORS
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.trials import MORE_HALVINGS, Trials, cut_less, few_halvings
