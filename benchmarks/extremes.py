@@ -1,16 +1,16 @@
 """The battery of extreme scenes on every robot that goes by a name, and on random trees.
 
 Keeps a record for each robot (JSON) in a folder: what is there already is not run again, so an interrupted run goes on
-where it stopped; an edit of varpin's sources starts it anew. Writes the table of ``docs/limits.md`` between its
-markers, and exits with status 1 if anything is silent wrong.
+where it stopped; an edit of varpin's sources starts it anew. Prints a table, and exits with status 1 if anything is
+silent wrong.
 
     python benchmarks/extremes.py FOLDER             # some five hours of one core
     python benchmarks/extremes.py FOLDER --turns 6   # an hour: trees and larger robots take turns at the trials
-    python benchmarks/extremes.py FOLDER ur5 tree17  # these alone, and no table
+    python benchmarks/extremes.py FOLDER ur5 tree17  # these alone
     python benchmarks/extremes.py FOLDER --scenes    # the scenes made up for it, to FOLDER/scenes.json: 20 minutes
     python benchmarks/extremes.py FOLDER --deep      # and the long ones: hours
 
-``docs/limits.py`` makes its tables of the record of scenes.
+``docs/limits.py`` makes a table of the record of scenes.
 """
 
 import argparse
@@ -21,7 +21,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from pages import fill
 
 import varpin as vp
 from varpin.model import bundled_robots
@@ -33,7 +32,6 @@ import battery  # noqa: E402
 from battery import Kind, Record  # noqa: E402
 from mechanisms import random_tree  # noqa: E402
 
-DOCUMENT = ROOT / "docs" / "limits.md"
 TREES = 200
 RATIOS = (1e-4, 1e-2, 1.0, 1e2, 1e4)
 # Robots of more joints than LARGE, whose motions take minutes, always take turns at the trials.
@@ -150,7 +148,7 @@ def scenes(path: Path, *, deep: bool) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("folder", type=Path, help="where the records are kept")
-    parser.add_argument("robots", nargs="*", help="these alone, and no table in the page")
+    parser.add_argument("robots", nargs="*", help="these alone in the page")
     parser.add_argument("--turns", type=int, default=1, metavar="K", help="trees and larger robots get each K-th trial")
     parser.add_argument("--scenes", action="store_true", help="the scenes made up for the battery, and no robots")
     parser.add_argument("--deep", action="store_true", help="the long scenes, too")
@@ -172,8 +170,6 @@ def main() -> int:
     if any(record.missing for record in records):
         print("interrupted: the same command goes on from here")
         return 130
-    if not options.robots:
-        fill(DOCUMENT, {"robots": "\n".join(lines)})
     return 1 if any(record.wrong() for record in records) else 0
 
 

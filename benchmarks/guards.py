@@ -1,4 +1,4 @@
-"""Energy errors of undamped planar chains at coarse steps, and what the guards of the midpoint step cost.
+"""Energy errors of an undamped planar chain at coarse steps, and what the guards of the midpoint step cost.
 
 Writes the table of ``docs/mathematics.md`` between its markers.
 
@@ -21,7 +21,7 @@ def row(links: int, dt: float) -> str:
     """One chain at one step, as a row of a Markdown table."""
     steps = round(DURATION / dt)
     scene, rest = vp.Scene(vp.planar_chain(links)), np.zeros(links)
-    motion = vp.simulate(scene, rest, rest, dt=dt, steps=steps, integrator=vp.Midpoint())
+    motion = vp.simulate(scene, rest, rest, dt=dt, steps=steps, integrator=vp.Midpoint(), check=False)
     error = (motion.energy - motion.energy[0]) / (9.81 * links**2 / 2)
     work = motion.statistics
     evaluations = (work.jets.sum() + work.sweeps.sum()) / work.substeps.sum()
@@ -36,7 +36,7 @@ def main() -> None:
     table = [
         "| links | dt [s] | largest error | mean error | split | substeps a step | jets a substep | with sweeps |",
         "|---|---|---|---|---|---|---|---|",
-        *(row(links, dt) for links in (2, 3, 5) for dt in (0.01, 0.05, 0.1, 0.2, 0.5)),
+        *(row(links, dt) for links in (3,) for dt in (0.01, 0.05, 0.1, 0.2, 0.5)),
     ]
     print("\n".join(table))
     fill(DOCUMENT, {"guards": "\n".join(table)})

@@ -18,7 +18,7 @@ from peers import mujoco_model
 import varpin as vp
 from varpin.core import Solver, VariationalRollout
 from varpin.core.arrays import new_nodes
-from varpin.integrators.base import open_loop
+from varpin.signals.commands import open_loop
 
 LINKS = (3, 6, 10, 15, 20, 30, 60, 100, 200, 1000)
 # Joints that follow, in chains of so many links; how many.

@@ -41,7 +41,7 @@ from scipy.integrate import solve_ivp
 import varpin as vp
 from varpin.control.problem import bind_cost
 from varpin.control.verification import accurate_cost
-from varpin.simulation.friction import rate_at_rest
+from varpin.simulation.spectrum import rate_at_rest
 
 WITHIN = 0.01
 TOLERANCE, ITERATIONS = 1e-4, 100

@@ -20,7 +20,7 @@ from sddp import in_turns
 
 import varpin as vp
 from varpin.control.verification import accurate_cost
-from varpin.integrators.base import open_loop
+from varpin.signals.commands import open_loop
 
 DURATION = 1.0
 TOLERANCE = 1e-6

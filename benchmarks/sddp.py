@@ -17,7 +17,7 @@ from crocoddyl_reference import PROBLEMS, Problem, require_gravity, shooting
 
 import varpin as vp
 from varpin.control.verification import accurate_cost
-from varpin.integrators.base import open_loop
+from varpin.signals.commands import open_loop
 
 ROUNDS = 15
 PASSES = 3

@@ -24,8 +24,8 @@ import numpy as np
 import plans
 
 import varpin as vp
-from varpin.integrators.base import open_loop
 from varpin.linearization import linearize_steps, node_jets, velocity_at_nodes
+from varpin.signals.commands import open_loop
 
 TASKS = (
     "ur5 posture, free",

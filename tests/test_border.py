@@ -11,7 +11,8 @@ from refusals import refused
 import varpin as vp
 from varpin import core
 from varpin.core.arrays import Commands, RolloutArrays, new_nodes
-from varpin.integrators.tableau import gauss_coefficients, interpolation, lobatto_places
+from varpin.integrators.tableau import gauss_coefficients, lobatto_places
+from varpin.signals.commands import interpolation
 
 N, P = 4, 2
 NOISE = vp.AdditiveNoise(1e-3) + vp.ControlNoise(0.1) + vp.StateNoise(0.1)

@@ -3,7 +3,6 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from findings import about
 from refusals import naming, refused
 from scipy.integrate import solve_ivp
 
@@ -299,7 +298,6 @@ def test_problems_of_closed_loops_take_an_integrator_that_keeps_them(fast):
     scene, q0 = five_bar(**fast)
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), q0, np.zeros(4), dt=0.05, steps=4)
     assert problem.integrator == vp.Gauss(4)
-    motion = problem.simulate(np.zeros(2))
+    motion = vp.simulate(scene, q0, np.zeros(4), dt=0.05, steps=4, integrator=problem.integrator)
     assert np.abs(scene.core.constraints(motion.q)[0]).max() < 1e-12
-    assert about(motion.warnings, "stiff damping")
     assert not any("Radau" in sentence for sentence in motion.warnings)

@@ -149,33 +149,8 @@ def test_rows_mean_what_pinocchio_says(arm):
     )
 
 
-@pytest.mark.parametrize("name", LOOPS)
-@pytest.mark.parametrize(("integrator", "steps"), [(vp.Midpoint(), 40), (vp.Gauss(2), 20), (vp.Gauss(3), 5)])
-def test_loops_converge_with_the_order_of_the_integrator(name, integrator, steps):
-    steps *= 4 if name == "five-bar" and integrator.order == 6 else 1
-    scene, q, v = loop(name, damping=0.1)
-    end_q, end_v = (x[-1] for x in reference(scene, q, v, np.array([0.5])))
-    errors, order = [], integrator.order
-    for N in (steps, 2 * steps, 4 * steps):
-        motion = vp.simulate(scene, q, v, dt=0.5 / N, steps=N, integrator=integrator, check=False)
-        assert motion.statistics.split_steps == 0
-        errors.append(max(np.abs(motion.q[-1] - end_q).max(), np.abs(motion.v[-1] - end_v).max()))
-    assert np.log2(errors[0] / errors[1]) > order - 0.4
-    assert np.log2(errors[1] / errors[2]) > order - 0.4
-
-
 def shake(t):
     return 0.3 * np.array([np.sin(7.0 * t), np.cos(5.0 * t), np.sin(3.0 * t + 1.0)])
-
-
-@pytest.mark.parametrize(("integrator", "steps"), [(vp.Midpoint(), 40), (vp.Gauss(2), 20), (vp.Gauss(3), 8)])
-def test_torques_of_time_keep_the_order(integrator, steps):
-    scene, q, v = loop("four-bar", damping=0.1)
-    end = reference(scene, q, v, np.array([0.5]), shake)[0][-1]
-    options = {"controls": vp.OpenLoop(shake), "integrator": integrator, "check": False}
-    motions = [vp.simulate(scene, q, v, dt=0.5 / N, steps=N, **options) for N in (steps, 2 * steps)]
-    errors = [np.abs(motion.q[-1] - end).max() for motion in motions]
-    assert np.log2(errors[0] / errors[1]) > integrator.order - 0.4
 
 
 def test_parts_of_a_step_are_under_their_own_torques():

@@ -280,7 +280,7 @@ def random_policy(scene, steps, hold=1, before=None, limits=None):
 )
 def test_policies_feed_the_control_before_back(monkeypatch, integrator, limits, before):
     """In the core, in SciPy's integrator, and across the pieces that a long simulation is made in."""
-    monkeypatch.setattr("varpin.simulation.run._CHUNK", 8)
+    monkeypatch.setattr("varpin.simulation.simulate._CHUNK", 8)
     scene = vp.Scene(sliders(2), gravity=False, damping=0.3)
     policy = random_policy(scene, 10, 2, before, limits)
     motion = vp.simulate(scene, [0.3, -0.4], [0.5, 0.1], dt=0.05, steps=20, controls=policy, integrator=integrator)

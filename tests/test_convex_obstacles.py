@@ -200,7 +200,7 @@ def test_what_is_no_hull_is_refused(given, facts):
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 def test_millimetres(scale):
     problem = around(vp.Obstacle.convex(scale * WEDGE, [2.0, 1.0, 1.0], name="wedge"), steps=2)
-    told = naming([found.sentence for found in hints(problem)], "millimetres", "'wedge'")
+    told = naming(hints(problem), "millimetres", "'wedge'")
     assert bool(told) == (scale > 1.0)
 
 

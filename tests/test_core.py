@@ -25,8 +25,8 @@ from varpin.core import (
     linearize_explicit,
 )
 from varpin.core.arrays import ConstraintRows, new_nodes
-from varpin.integrators.base import open_loop
 from varpin.model.kinematics import links
+from varpin.signals.commands import open_loop
 
 rng = np.random.default_rng(3)
 ROBOTS = ("finger", "ur5", "panda", "chain")

@@ -266,7 +266,8 @@ def test_a_function_that_raises_in_the_check_leaves_the_motion():
     scene = vp.Scene(vp.planar_chain(2), forces=[force])
     motion = vp.simulate(scene, [0.3, 0.3], [0.0, 0.0], dt=0.05, steps=30, integrator=vp.Midpoint())
     assert motion.steps == 30
-    assert not unnamed(motion.warnings[0], "not checked", "beyond the table")
+    assert not unnamed(motion.warnings[0], "not known", "beyond the table")
+    assert np.isnan(motion.error).all()
 
 
 def narrow(q, v):

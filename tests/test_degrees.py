@@ -155,7 +155,7 @@ def test_clearances_in_millimetres(distance, told):
     problem = vp.OptimalControlProblem(
         vp.Scene(robot), vp.ControlCost(1e-3), np.zeros(6), np.zeros(6), dt=0.05, steps=4, constraints=[clear]
     )
-    found = [finding.sentence for finding in hints(problem) if finding.kind == "places in millimetres"]
+    found = [finding for finding in hints(problem) if finding.kind == "places in millimetres"]
     assert len(found) == told
     assert not told or not unnamed(found[0], ("KeepClear: distance", f"{distance:g} m", "may be in millimetres"))
 
@@ -245,6 +245,6 @@ def test_millimetres_in_obstacles_and_regions(scene, make, named, scale):
     constraints = [make(scene.robot, scale)]
     given = {"dt": 0.05, "steps": 2, "constraints": constraints}
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), np.deg2rad(HOME), np.zeros(6), **given)
-    told = [found.sentence for found in hints(problem) if "millimetres" in found.sentence]
+    told = [found for found in hints(problem) if "millimetres" in found]
     assert bool(told) == (scale > 1.0)
     assert scale == 1.0 or not unnamed(told[0], named)

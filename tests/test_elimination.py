@@ -9,8 +9,8 @@ from scipy.linalg import eigh
 import varpin as vp
 from varpin.core import Elimination, ForwardDynamics, Solver, VariationalRollout, variational_derivatives
 from varpin.core.arrays import new_nodes
-from varpin.integrators.base import open_loop
 from varpin.model import example_robot_data
+from varpin.signals.commands import open_loop
 
 
 def star(branches, links, seed=0):

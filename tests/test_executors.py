@@ -176,18 +176,18 @@ def test_monte_carlo_tells_of_what_its_paths_do(caplog):
     plan = vp.solve(problem, max_iterations=2)
     with caplog.at_level(logging.WARNING, "varpin.control.monte_carlo"):
         found = plan.monte_carlo(60, 0)
-    assert about(found.warnings, "coarse steps")
+    assert about(found.warnings, "error")
 
     def interrupt(done, paths):
         raise KeyboardInterrupt
 
     with pytest.raises(vp.MonteCarloInterrupted) as caught:
         plan.monte_carlo(600, 0, progress=interrupt)
-    assert about(caught.value.result.warnings, "coarse steps")
+    assert about(caught.value.result.warnings, "error")
     for warning in found.warnings:
         assert f"warning: {warning}" in str(found)
     assert f"{len(found.warnings)} warning" in repr(found)
-    assert about(found._repr_html_(), "coarse steps")
+    assert about(found._repr_html_(), "error")
 
 
 def test_work_and_precision_on_processes(spawned, tmp_path):

@@ -1,14 +1,9 @@
-"""Gauss collocation against exact solutions, a plain version of itself, the midpoint rule, and its own promises."""
-
-import functools
-import itertools
+"""Gauss collocation against a plain version of itself, closed forms, the midpoint rule, and its own promises."""
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from mechanisms import slider
 from refusals import refused
-from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
 import varpin as vp
@@ -17,22 +12,6 @@ from varpin.integrators.tableau import gauss_coefficients
 GRAVITY = 9.81
 ALL = [1, 2, 3, 4, 5, 6]
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-
-
-def reference(scene, q0, v0, duration, force):
-    """q(duration) under a constant force by DOP853 on Pinocchio's forward dynamics."""
-    robot = scene.robot
-    model = robot.model.copy()
-    model.gravity = pin.Motion(scene.gravity, np.zeros(3))
-    data = model.createData()
-    n = robot.dof
-
-    def rate(t, x):
-        q, v = x[:n], x[n:]
-        total = force - scene.damping * v - scene.stiffness * (q - scene.rest)
-        return np.concatenate([v, pin.aba(model, data, robot.configuration(q), v, total)])
-
-    return solve_ivp(rate, (0, duration), np.concatenate([q0, v0]), method="DOP853", rtol=1e-13, atol=1e-13).y[:n, -1]
 
 
 @pytest.mark.parametrize("stages", ALL)
@@ -84,44 +63,6 @@ ARMS = {
     "ur5": (None, 1.0, 1.5, 1.0),
     "panda": ({"panda_finger_joint1": 0.02}, 0.05, 1.0, 0.4),
 }
-# Steps: fine enough for the leading term of the error to lead, coarse enough for it to stand out from rounding.
-STEPS = {
-    "finger": {1: (500, 1000, 2000), 2: (256, 360, 512), 3: (140, 180, 240), 4: (68, 76, 84)},
-    "ur5": {1: (500, 1000, 2000), 2: (256, 360, 512), 3: (140, 180, 240), 4: (68, 76, 84)},
-    "panda": {1: (250, 500, 1000), 2: (100, 150, 200), 3: (50, 60, 80), 4: (44, 50, 56)},
-}
-
-
-@functools.cache
-def problem(name, forced):
-    """A scene, its start, its force, and q at the end: Gauss with six stages, held against DOP853."""
-    lock, size, speed, duration = ARMS[name]
-    robot = vp.load_robot(name, lock=lock)
-    n = robot.dof
-    scene, u = vp.Scene(robot), np.zeros(n)
-    if forced:
-        scene = vp.Scene(robot, damping=0.5 * size, stiffness=8.0 * size, rest=0.1)
-        u = 4.0 * size * np.cos(np.arange(n))
-    start = np.linspace(0.2, 0.6, n), 0.5 * speed * np.linspace(1.0, -1.0, n)
-    end = vp.simulate(scene, *start, dt=duration / 400, steps=400, controls=u, integrator=vp.Gauss(6)).q[-1]
-    np.testing.assert_allclose(end, reference(scene, *start, duration, u), rtol=0, atol=1e-12)
-    return scene, start, u, duration, end
-
-
-@pytest.mark.parametrize("stages", [1, 2, 3, 4])
-@pytest.mark.parametrize("name", ARMS)
-@pytest.mark.parametrize("forced", [False, True])
-def test_order_twice_the_stages(stages, name, forced):
-    scene, start, u, duration, exact = problem(name, forced)
-    errors = []
-    for steps in STEPS[name][stages]:
-        end = vp.simulate(
-            scene, *start, dt=duration / steps, steps=steps, controls=u, integrator=vp.Gauss(stages), check=False
-        )
-        assert end.statistics.split_steps == 0
-        errors.append(np.linalg.norm(end.q[-1] - exact))
-    slopes = -np.diff(np.log(errors)) / np.diff(np.log(STEPS[name][stages]))
-    assert np.abs(slopes - 2 * stages).max() < 0.1, (errors, slopes)
 
 
 @pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
@@ -147,63 +88,6 @@ def test_one_stage_is_the_midpoint_rule(name):
     for quantity in ("A", "B", "K"):
         one, other = getattr(lin, quantity), getattr(same, quantity)
         np.testing.assert_allclose(other, one, rtol=0, atol=1e-10 * np.abs(one).max())
-
-
-@pytest.mark.parametrize("stages", ALL)
-@pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
-def test_symplectic(stages, name):
-    """A'JA = J to 1e-12 where nothing is damped."""
-    scene = vp.Scene(vp.load_robot(name, lock=ARMS[name][0]))
-    n = scene.robot.dof
-    integrator = vp.Gauss(stages)
-    rng = np.random.default_rng(1)
-    motion = vp.simulate(scene, rng.normal(size=n), rng.normal(size=n), dt=5e-3, steps=5, integrator=integrator)
-    assert motion.statistics.split_steps == 0
-    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
-    size = np.concatenate([np.ones(n), np.full(n, np.abs(motion.p).max())])
-    for A in vp.linearize(scene, motion, integrator=integrator).A:
-        scaled = A / size[:, None] * size[None, :]
-        assert np.abs(scaled.T @ J @ scaled - J).max() < 1e-12 * max(1.0, np.abs(scaled).max() ** 2)
-
-
-@pytest.mark.parametrize("stages", [1, 2, 3, 4, 6])
-@pytest.mark.parametrize("name", ["finger", "ur5", "panda"])
-@pytest.mark.parametrize("kick", ["left", "split"])
-def test_linearization_against_differences(stages, name, kick):
-    """A, B and G to 1e-8 of eighth-order differences of the step, with damping, springs, controls and noise."""
-    lock, size, *_ = ARMS[name]
-    robot = vp.load_robot(name, lock=lock)
-    noise = vp.AdditiveNoise(1e-2 * size) + vp.ControlNoise(0.1) + vp.StateNoise(size, center=0.3)
-    actuation = size * np.eye(robot.dof)  # so that controls are of the size of the check's steps
-    scene = vp.Scene(robot, damping=size, stiffness=5.0 * size, actuation=actuation, noise=noise)
-    q, v, u = np.random.default_rng(0).uniform(-1, 1, (3, robot.dof))
-    found = vp.check_linearization(scene, q, v, u, dt=2e-3, integrator=vp.Gauss(stages, kick=kick))
-    assert found.worst < 1e-8
-    assert min(found.A[1], found.B[1], found.G[1]) > 0.0
-
-
-@pytest.mark.parametrize("stages", ALL)
-@pytest.mark.parametrize("name", ARMS)
-def test_reversible(stages, name):
-    """Turned round, a conservative motion runs back to where it came from, to what rounding grows to on the way."""
-    scene, (q0, v0), _, duration, _ = problem(name, False)
-    run = {"dt": duration / 100, "steps": 100, "integrator": vp.Gauss(stages)}
-    there = vp.simulate(scene, q0, v0, **run)
-    back = vp.simulate(scene, there.q[-1], -there.v[-1], **run)
-    assert there.statistics.split_steps == back.statistics.split_steps == 0
-    np.testing.assert_allclose(back.q[-1], q0, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(-back.v[-1], v0, rtol=0, atol=1e-11 * np.abs(there.v).max())
-
-
-@pytest.mark.parametrize("stages", [2, 4])
-def test_momentum_about_a_vertical_axis_is_conserved_to_rounding(stages):
-    """Gravity does not see the first joint of an arm that stands upright."""
-    scene = vp.Scene(vp.load_robot("ur5"))
-    start = [0.3, -1.0, 0.8, 0.2, 0.4, 0.1], [2.0, 0.5, 0, 1, 0, 3]
-    motion = vp.simulate(scene, *start, dt=4e-3, steps=5000, integrator=vp.Gauss(stages))
-    about_axis = motion.p[:, 0]
-    assert np.ptp(motion.p[:, 1]) > 1.0
-    assert np.abs(about_axis - about_axis[0]).max() <= 4.0 * np.spacing(abs(about_axis[0]))
 
 
 def oscillator(stiffness):
@@ -330,51 +214,6 @@ def test_split_steps_are_counted_and_chained():
     assert np.abs(A.T @ J @ A - J).max() < 1e-11 * np.abs(A).max() ** 2
 
 
-@pytest.mark.parametrize("kick", ["left", "split"])
-def test_kicks_of_one_stage_are_those_of_the_midpoint_rule(kick):
-    """With the same increments, and noise of every kind the core evaluates."""
-    noise = vp.AdditiveNoise(0.3) + vp.ControlNoise(0.1) + vp.StateNoise(0.5, center=0.3)
-    scene = vp.Scene(vp.load_robot("ur5"), damping=0.5, noise=noise)
-    u = np.random.default_rng(1).normal(size=(50, 6))
-    start = np.full(6, 0.2), np.zeros(6)
-    runs = [
-        vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u, rng=7, integrator=integrator)
-        for integrator in (vp.Midpoint(kick=kick), vp.Gauss(1, kick=kick))
-    ]
-    quiet = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u, integrator=vp.Gauss(1, kick=kick))
-    assert np.abs(runs[1].q[-1] - quiet.q[-1]).max() > 1e-4
-    np.testing.assert_allclose(runs[1].q, runs[0].q, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(runs[1].p, runs[0].p, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("kick", ["left", "split"])
-def test_fields_in_python_and_in_the_core_do_the_same(kick):
-    """A user's field, evaluated in Python, against the same field in the core."""
-    robot = vp.load_robot("ur5")
-    custom = vp.CustomNoise(
-        field=lambda q, v, u: np.diag(0.3 + 0.5 * (q - 0.3) ** 2),
-        processes=6,
-        dq=lambda q, v, u: np.einsum("ij,jk->ijk", np.eye(6), np.diag(q - 0.3)),
-    )
-    dw = np.random.default_rng(2).normal(size=(40, 6)) * np.sqrt(1e-3)
-    both = vp.AdditiveNoise(0.3) + vp.StateNoise(0.5, center=0.3)
-    start = np.full(6, 0.2), np.zeros(6)
-    integrator = vp.Gauss(3, kick=kick)
-    in_python = vp.simulate(
-        vp.Scene(robot, noise=custom), *start, dt=1e-3, steps=40, increments=dw, integrator=integrator
-    )
-    in_core = vp.simulate(
-        vp.Scene(robot, noise=both),
-        *start,
-        dt=1e-3,
-        steps=40,
-        increments=np.concatenate([dw, dw], axis=1),
-        integrator=integrator,
-    )
-    np.testing.assert_allclose(in_python.q, in_core.q, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(in_python.p, in_core.p, rtol=0, atol=1e-12)
-
-
 def test_an_ensemble_is_its_paths():
     """Paths side by side do what each does alone: nothing leaks from one to the next."""
     scene = vp.Scene(vp.load_robot("finger"), damping=1e-5, noise=vp.AdditiveNoise(1e-5))
@@ -382,34 +221,6 @@ def test_an_ensemble_is_its_paths():
     together = vp.simulate_ensemble(scene, *start, paths=4, rng=7, **options)
     for path, child in enumerate(np.random.default_rng(7).spawn(4)):
         np.testing.assert_array_equal(together.q[path], vp.simulate(scene, *start, rng=child, **options).q)
-
-
-def test_a_function_and_an_array_of_controls_do_the_same():
-    """Step by step through Python or in one call of the core: the past is carried from call to call."""
-    scene = vp.Scene(vp.load_robot("finger"), gravity=False, damping=1e-5)
-    u = np.random.default_rng(0).normal(size=(50, 3)) * 1e-5
-    start, integrator = (np.zeros(3), np.ones(3)), vp.Gauss(3)
-    by_array = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u, integrator=integrator)
-    by_law = vp.simulate(
-        scene, *start, dt=1e-3, steps=50, controls=lambda t, q, v: u[round(t / 1e-3)], integrator=integrator
-    )
-    np.testing.assert_allclose(by_law.q, by_array.q, rtol=0, atol=1e-14)
-
-
-def test_feedback_is_that_of_a_digital_controller():
-    """Off the continuous law in first order of the period, whatever s."""
-    scene = vp.Scene(vp.load_robot("ur5"), gravity=False)
-
-    def law(t, q, v):
-        return 3.0 * np.sin(4.0 * t) - 2.0 * v
-
-    ends = [
-        vp.simulate(scene, np.zeros(6), np.zeros(6), dt=0.5 / k, steps=k, controls=law, integrator=vp.Gauss(3)).q[-1]
-        for k in (100, 200, 400, 800)
-    ]
-    changes = [np.abs(one - other).max() for one, other in itertools.pairwise(ends)]
-    slopes = np.log2(np.array(changes[:-1]) / changes[1:])
-    assert ((slopes > 0.9) & (slopes < 1.1)).all(), slopes
 
 
 @pytest.mark.parametrize("links", [3, 7])

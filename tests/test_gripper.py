@@ -79,14 +79,11 @@ def test_a_gripper_whose_loops_are_open_says_so(caplog):
     assert vp.load_robot("finger").loops == ()
     assert not about(caplog.messages, "open loops")
     start = np.zeros(6), np.zeros(6)
-    for check in (True, False):
-        tied = vp.Scene(robot, damping=0.0, constraints=vp.JointTie("left_crank", "right_crank"))
-        motion = vp.simulate(tied, *start, dt=1e-3, steps=3, check=check)
+    tied = vp.Scene(robot, damping=0.0, constraints=vp.JointTie("left_crank", "right_crank"))
+    for _ in range(2):
+        motion = vp.simulate(tied, *start, dt=1e-3, steps=3)
         assert naming(about(motion.warnings, "open loops"), "'right_crank_pin'", "'right_finger_pin'")
         assert len(about(caplog.messages, "open loops")) == 1
-        vp.simulate(tied, *start, dt=1e-3, steps=3, check=check)
-        assert len(about(caplog.messages, "open loops")) == 1
-        caplog.clear()
     one = vp.Scene(robot, damping=0.0, constraints=vp.PointOnPoint("right_crank_pin", "right_finger_pin", axes="xz"))
     assert not about(vp.simulate(one, *start, dt=1e-3, steps=3).warnings, "open loops")
     assert not vp.load_scene("gripper_closes").scene.open_loops

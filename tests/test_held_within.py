@@ -32,10 +32,10 @@ def test_speeds_hold_between_nodes_at_least_cost():
     plan, alone = vp.solve(problem), vp.solve(problem.at(between_nodes=False))
     assert plan.status is vp.Status.CONVERGED, plan.reason
     assert plan.violation <= 1e-6
-    assert not about(plan.warnings, "between nodes")
+    assert not about(plan.warnings, "constraints between nodes")
     assert speeds(problem, alone.controls, 32).max() > LIMIT + 1e-2
     assert speeds(problem, plan.controls, 32).max() <= LIMIT + 2e-6
-    (told,) = about(alone.warnings, "between nodes")
+    (told,) = about(alone.warnings, "constraints between nodes")
     assert "between_nodes=True" in told
     rules = [{"type": "ineq", "fun": lambda x: LIMIT - speeds(problem, x.reshape(N, 2), 16)[1:].ravel()}]
     best = minimize(

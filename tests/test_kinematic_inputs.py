@@ -431,15 +431,6 @@ def test_what_does_not_know_inputs_refuses_them():
         vp.Scene(robot, constraints=vp.KinematicInput("joint9"))
 
 
-def test_a_motion_by_hand_comes_back_from_its_file(tmp_path):
-    scene, q, _ = crank()
-    motion = vp.simulate(scene, q, np.zeros(3), dt=0.01, steps=3)
-    back = vp.Trajectory.load(motion.save(tmp_path / "crank.npz"))
-    np.testing.assert_array_equal(back.q, motion.q)
-    np.testing.assert_array_equal(back.constraint_forces, motion.constraint_forces)
-    np.testing.assert_array_equal(vp.linearize(scene, back).B, vp.linearize(scene, motion).B)
-
-
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_a_file_moves_a_joint_to_where_its_sine_is_at_the_nodes(tmp_path, interpolation):
     path = tmp_path / "hand.toml"

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from scipy.optimize import fsolve
 
 import varpin as vp
-from varpin.simulation.loop_stability import unstable_loop
+from varpin.simulation.loop import unstable_loop
 
 INTEGRATORS = (vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4())
 
@@ -170,9 +170,9 @@ def test_a_saturated_loop_that_flips_is_told_of(links, period, kd, limit):
     motion, _ = run(scene, zero, zero, saturated(100.0, kd, limit), **options)
     late = motion.u[::period][-50:]
     assert (late[1:] * late[:-1] < 0.0).mean() > 0.9
-    assert about(motion.warnings, "unstable loop", "period too long")
+    assert about(motion.warnings, "unstable loop")
     calm, _ = run(scene, zero, zero, saturated(100.0, 10.0 / period, limit), **options)
-    assert not about(calm.warnings, "unstable loop", "period too long")
+    assert not about(calm.warnings, "unstable loop")
 
 
 def test_a_law_is_read_off_where_it_does_not_saturate():
@@ -197,7 +197,7 @@ def clipped_loops():
 
 
 def speaks_of_the_loop(motion):
-    return bool(about(motion.warnings, "unstable loop", "period too long"))
+    return bool(about(motion.warnings, "unstable loop"))
 
 
 def test_random_clipped_loops():
@@ -224,7 +224,7 @@ def test_random_clipped_loops():
         off = np.abs(motion.q - 0.3).max(axis=1)
         if unstable and (off.max() > 10.0 * off[0] or (np.abs(motion.u[400:]) == limit).any()):
             assert speaks_of_the_loop(motion), what
-            told[any("goes from one of its limits" in text for text in motion.warnings)] += 1
+            told[any("from limit to limit" in text for text in motion.warnings)] += 1
         if not unstable:
             assert not speaks_of_the_loop(motion), (what, motion.warnings)
     # Laws that can be told from the nodes inside their limits, and laws that cannot.
@@ -244,28 +244,19 @@ def test_a_clipped_loop_is_judged_by_its_few_nodes_inside_its_limits():
     assert not unnamed(motion.warnings[0], f"{radius:.4g}")
 
 
-@pytest.mark.parametrize("steps", [600, 1200])
-def test_a_law_that_is_never_inside_its_limits_is_told_of(steps):
-    """Nothing can be fitted; a goal that moves the same way, or a law that pumps on purpose, is no alarm."""
+def test_goals_that_move_from_limit_to_limit_are_no_alarm():
+    """Nor is a law that pumps on purpose."""
     scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=0.01)
-
-    def late(law, q0=0.0):
-        motion = vp.simulate(scene, [q0], [0.0], dt=5e-3, steps=steps, controls=law)
-        half = motion.u[steps // 2 :]
-        assert (half == motion.u.max()).any()
-        assert (half == motion.u.min()).any()
-        return motion
-
-    cycling = late(saturated(1e6, 10.0, 20.0), 1.2)
-    assert (np.abs(cycling.u) == 20.0).all()
-    assert not unnamed(cycling.warnings[0], "limits", "-20", "20", "period", "gains")
     for law in (
         lambda t, q, v: np.clip(-1e3 * (q - 3.0 * np.sin(6.0 * t)) - 50.0 * v, -10.0, 10.0),
         lambda t, q, v: np.clip(-3e3 * (q - np.sin(8.0 * t)) - 60.0 * (v - 8.0 * np.cos(8.0 * t)), -10.0, 10.0),
         lambda t, q, v: np.clip(-300.0 * (q - 0.5 * np.sign(np.sin(9.0 * t))) - 20.0 * v, -5.0, 5.0),
         lambda t, q, v: 10.0 * np.sign(np.sin(9.0 * t)) * np.ones(1),
     ):
-        motion = late(law)
+        motion = vp.simulate(scene, [0.0], [0.0], dt=5e-3, steps=600, controls=law)
+        late = motion.u[300:]
+        assert (late == motion.u.max()).any()
+        assert (late == motion.u.min()).any()
         assert not speaks_of_the_loop(motion), motion.warnings
 
 
@@ -504,9 +495,9 @@ def test_the_sentence_says_what_to_do(caplog):
         motion, _ = run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=5e-3, steps=50)
         run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=5e-3, steps=50)
     (sentence,) = motion.warnings
-    assert not unnamed(sentence, "unstable", "0.005 s", "2.136", "0.0025 s", "gains")
+    assert not unnamed(sentence, "unstable", "0.005 s", "2.136", "0.00295 s", "gains")
     assert [record.getMessage() for record in caplog.records] == [sentence]
-    assert not run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=2.5e-3, steps=50)[1]
+    assert not run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=2.9e-3, steps=50)[1]
     assert run(scene, [0], [0], spring_and_damper(1e4, 200.0), dt=5e-3, steps=50, check=False)[0].warnings == ()
 
 

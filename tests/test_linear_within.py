@@ -203,7 +203,7 @@ def test_motions_do_not_go_around_velocity_limits():
         plan = vp.solve(problem)
         assert plan.status.converged
         assert plan.violation <= 1e-6
-        assert not about(plan.warnings, "between nodes")
+        assert not about(plan.warnings, "constraints between nodes")
         costs[controls] = plan.cost
         if controls == "linear":
             assert fastest(problem, plan.controls, 64).max() <= 0.3 + 1e-6
@@ -219,7 +219,7 @@ def test_speeds_hold_between_nodes(name):
     problem = reach(robot, 0.8) if name == "ur5" else reach(robot, 0.6, dt=0.1, steps=10)
     plan = vp.solve(problem)
     assert plan.status.converged, plan.reason
-    assert not about(plan.warnings, "between nodes")
+    assert not about(plan.warnings, "constraints between nodes")
     limit = problem.constraints[0].limits[1].max()
     assert plan.violation <= 1e-6
     assert fastest(problem, plan.controls, 32).max() <= limit * (1.0 + 1e-5)

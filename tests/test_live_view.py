@@ -291,7 +291,7 @@ def law(t, q, v):
     ],
 )
 def test_who_asks_for_nodes_gets_all_of_them_once(scene, options, monkeypatch):
-    monkeypatch.setattr("varpin.simulation.run._CHUNK", 50)
+    monkeypatch.setattr("varpin.simulation.simulate._CHUNK", 50)
     parts = []
 
     def progress(done, steps, nodes):

@@ -57,7 +57,7 @@ def test_a_seed_of_nothing_is_told_of():
 
 def test_paths_that_are_all_one_are_told_of():
     same = vp.simulate_ensemble(QUIET, [0, 0], [0, 0], **SHORT, paths=3, rng=0)
-    assert about(same.warnings, "one motion")
+    assert about(same.warnings, "paths alike")
     starts = [[0.0, 0.0], [0.1, 0.0], [0.2, 0.0]]
     for apart in (
         vp.simulate_ensemble(QUIET, starts, [0, 0], **SHORT, paths=3, rng=0),

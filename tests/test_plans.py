@@ -1,7 +1,6 @@
 """Plans that a robot can follow: what the defaults promise holds on the continuous robot, or the plan says so."""
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,11 +8,9 @@ from findings import about
 from refusals import naming, refused, unnamed
 
 import varpin as vp
+from varpin.control.chatter import RUN, alternation, restlessness
 from varpin.control.examination import findings, replayed
 from varpin.io.scenefile import scenes
-from varpin.simulation import limits
-from varpin.simulation.chatter import RUN, alternation, restlessness
-from varpin.simulation.soundness import findings_from_record
 
 ARMS = {
     "ur5": {},
@@ -85,12 +82,12 @@ def test_the_midpoint_rule_tells_that_it_chatters(load, caplog):
     with caplog.at_level(logging.WARNING):
         plans = [vp.solve(problem) for _ in range(2)]
     assert changes(plans[0].trajectory).max() > 90
-    assert about(plans[0].warnings[0], "alternating steps")
+    assert about(plans[0].warnings[0], "alternating velocities")
     assert not unnamed(plans[0].warnings[0], "sampling='gauss'")
     assert plans[0].warnings == plans[1].warnings
-    assert len(about(caplog.messages, "alternating steps")) == 1
+    assert len(about(caplog.messages, "alternating velocities")) == 1
     for text in (str(plans[0]), plans[0].table(), plans[0]._repr_html_()):
-        assert about(text, "alternating steps")
+        assert about(text, "alternating velocities")
     assert vp.solve(problem, check=False).warnings == ()
 
 
@@ -107,11 +104,11 @@ def test_a_plan_that_whirls_says_so_and_how_to_calm_it(load):
     most = changes(whirling.trajectory)
     assert most.max() > 12 >= changes(calm.trajectory).max()
     name = load("ur10").joint_names[most.argmax()]
-    told = about(whirling.warnings, "restless plan")
+    told = about(whirling.warnings, "restless velocities")
     assert told == naming(told, name, str(most.max()))
     assert len(told) == 1
     assert "VelocityCost" in told[0]
-    assert not about(calm.warnings, "restless plan")
+    assert not about(calm.warnings, "restless velocities")
 
 
 def test_dampers_faster_than_the_step(load):
@@ -120,31 +117,13 @@ def test_dampers_faster_than_the_step(load):
     plan = vp.solve(problem.at(integrator=vp.Gauss(2)))
     truth = plan.verify(tolerance=1e-6)
     assert truth.closed_loop_loss > 1e-2
-    assert about(plan.warnings, "stiff damping")
-    assert "problem.at(dt=0.0025, hold=4)" in vp.solve(problem.at(integrator=vp.Gauss(2))).warnings[0]
+    assert "problem.at(dt=0.0025, hold=4)" in about(plan.warnings, "replay")[0]
     finer = vp.solve(problem.at(integrator=vp.Gauss(2), dt=0.0025, hold=4))
     assert finer.warnings == ()
     assert abs(finer.verify(tolerance=1e-6).closed_loop_loss) < 1e-3
     usual = vp.solve(problem)
     assert usual.warnings == ()
     assert abs(usual.verify(tolerance=1e-6).closed_loop_loss) < 1e-3
-
-
-def test_fast_dampers_are_looked_for_along_the_motion():
-    """An arm that folds: its inertia, and with it the rate of a damper, depends on where it is."""
-    scene = vp.Scene(vp.planar_chain(2), damping=[20.0, 0.0], gravity=False)
-    rates = [
-        np.abs(np.linalg.eigvals(np.linalg.solve(vp.lagrangian_jet(scene, [0.0, q], [0, 0]).Lvv, np.diag([20.0, 0]))))
-        for q in (0.0, 0.5 * np.pi)
-    ]
-    slow, fast = sorted(float(rate.max()) for rate in rates)
-    dt = 2.0 / np.sqrt(slow * fast)
-    begin = 0.0 if rates[0].max() == slow else 0.5 * np.pi
-    q = np.linspace([0.0, begin], [0.0, 0.5 * np.pi - begin], 20)
-    motion = vp.simulate(scene, q[0], [0, 0], dt=dt, steps=19)
-    assert "fast damping" in {
-        finding.kind for finding in findings_from_record(scene, vp.Midpoint(), replace(motion, q=q))
-    }
 
 
 @pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Gauss(4), vp.RungeKutta4(), vp.SemiImplicitEuler()], ids=str)
@@ -187,7 +166,7 @@ def test_ctrl_c_ends_the_look_and_not_the_plan(monkeypatch):
     monkeypatch.setattr("varpin.control.examination.replayed", stop)
     plan = vp.solve(reach(vp.planar_chain(2), 3, steps=10, dt=0.05))
     assert plan.status.converged
-    assert about(plan.warnings[0], "look interrupted")
+    assert about(plan.warnings[0], "interrupted")
 
 
 def test_warnings_go_through_files(tmp_path, load):
@@ -196,7 +175,7 @@ def test_warnings_go_through_files(tmp_path, load):
     assert plan.warnings
     again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem)
     assert again.warnings == plan.warnings
-    assert tuple(finding.sentence for finding in findings(again)) == plan.warnings
+    assert findings(again) == plan.warnings
 
 
 def test_alternation():
@@ -246,7 +225,7 @@ def test_random_torques_and_noise_are_no_chatter(seed):
     options = {"dt": 1e-3, "steps": 2000, "controls": rng.normal(size=(2000, 2))}
     for noise in (None, seed):
         motion = vp.simulate(scene, [0.1, 0.2], [0, 0], rng=noise, **options)
-        assert not about(motion.warnings, "alternating steps")
+        assert not about(motion.warnings, "alternating velocities")
 
 
 def light_cart(mass):
@@ -290,7 +269,7 @@ def test_random_reaches_of_five_arms_hold_or_say_so(load):
         running = "velocity" if seed % 2 else "tracking"
         plan = vp.solve(reach(arm(load, name), seed, running=running))
         assert plan.status.converged
-        said = [sentence for sentence in plan.warnings if not sentence.startswith(limits.KINDS)]
+        said = [told for told in plan.warnings if not told.kind.endswith(" limits")]
         warned += bool(said)
         assert said or held(plan), (seed, name)
     assert warned <= 4

@@ -8,7 +8,7 @@ from varpin.control import search
 from varpin.control.along import Along
 from varpin.control.backward import backward
 from varpin.errors import LinearizationError
-from varpin.simulation.friction import rate_at_rest
+from varpin.simulation.spectrum import rate_at_rest
 
 GOAL = np.array([1.0, -0.7])
 STIFFNESS, DAMPING = np.array([400.0, 200.0]), np.array([40.0, 15.0])

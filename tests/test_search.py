@@ -20,7 +20,7 @@ from varpin.control.search import Search
 from varpin.control.trials import Trials
 from varpin.control.watchdog import Watchdog
 from varpin.core import Watch, stake_of
-from varpin.integrators.base import open_loop
+from varpin.signals.commands import open_loop
 
 GOAL = [0.8, -0.5]
 

@@ -61,9 +61,9 @@ def mpc():
 
 
 def test_runs_that_last_another_time_say_so():
-    told = about(mpc().run(duration=0.12).warnings, "not whole ticks")
+    told = about(mpc().run(duration=0.12).warnings, "rounded duration")
     assert len(told) == len(naming(told, "0.12 s", "0.05 s", "2", "0.1 s")) == 1
-    assert not about(mpc().run(duration=0.1).warnings, "not whole ticks")
+    assert not about(mpc().run(duration=0.1).warnings, "rounded duration")
 
 
 def test_a_checked_linearization_has_a_verdict():

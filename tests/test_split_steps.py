@@ -10,7 +10,7 @@ from refusals import refused
 import varpin as vp
 from varpin import trajectory
 from varpin.core import variational_ends
-from varpin.integrators.base import open_loop
+from varpin.signals.commands import open_loop
 from varpin.trajectory import chained
 
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}

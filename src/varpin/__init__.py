@@ -26,6 +26,7 @@ from varpin.errors import UnknownJoint as UnknownJoint
 from varpin.errors import UnknownPosture as UnknownPosture
 from varpin.errors import UnsupportedJoint as UnsupportedJoint
 from varpin.errors import VarpinError as VarpinError
+from varpin.finding import Finding as Finding
 from varpin.integrators import ExplicitEuler as ExplicitEuler
 from varpin.integrators import Gauss as Gauss
 from varpin.integrators import Guard as Guard
@@ -68,9 +69,6 @@ from varpin.mechanics.noise import CustomNoise as CustomNoise
 from varpin.mechanics.noise import Noise as Noise
 from varpin.mechanics.noise import NoiseFieldError as NoiseFieldError
 from varpin.mechanics.noise import StateNoise as StateNoise
-from varpin.mechanics.policy import FirstOrderHold as FirstOrderHold
-from varpin.mechanics.policy import LinearPolicy as LinearPolicy
-from varpin.mechanics.policy import OpenLoop as OpenLoop
 from varpin.mechanics.scene import Scene as Scene
 from varpin.model import Payload as Payload
 from varpin.model import Robot as Robot
@@ -79,6 +77,9 @@ from varpin.model import load_robot as load_robot
 from varpin.model import planar_chain as planar_chain
 from varpin.model import robot_names as robot_names
 from varpin.show.replay import replay as replay
+from varpin.signals.policy import FirstOrderHold as FirstOrderHold
+from varpin.signals.policy import LinearPolicy as LinearPolicy
+from varpin.signals.policy import OpenLoop as OpenLoop
 from varpin.simulation.failures import ConstraintError as ConstraintError
 from varpin.simulation.failures import ControlError as ControlError
 from varpin.simulation.failures import ForceError as ForceError
@@ -86,7 +87,7 @@ from varpin.simulation.failures import Interrupted as Interrupted
 from varpin.simulation.failures import NoiseError as NoiseError
 from varpin.simulation.failures import StepFailure as StepFailure
 from varpin.simulation.failures import ToleranceError as ToleranceError
-from varpin.simulation.run import simulate as simulate
+from varpin.simulation.simulate import simulate as simulate
 from varpin.trajectory import Accuracy as Accuracy
 from varpin.trajectory import Nodes as Nodes
 from varpin.trajectory import StepStatistics as StepStatistics

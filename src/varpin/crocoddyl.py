@@ -21,10 +21,10 @@ from varpin.arrays import Floats
 from varpin.control.along import states
 from varpin.control.problem import OptimalControlProblem, bind_cost
 from varpin.errors import InputError, VarpinError
-from varpin.integrators.base import open_loop
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.policy import LinearPolicy
+from varpin.signals.commands import open_loop
+from varpin.signals.policy import LinearPolicy
 from varpin.simulation.failures import StepFailure
 from varpin.simulation.record import rollout
 from varpin.trajectory import Trajectory

@@ -15,12 +15,13 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint, integrator_of
-from varpin.integrators.base import diffusion_and_drift, ends_at, noise_fields, open_line, open_loop
+from varpin.integrators.base import diffusion_and_drift, ends_at, noise_fields
 from varpin.integrators.same_scene import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.model import joint_unit
-from varpin.simulation.damping import fast_damping
+from varpin.signals.commands import open_line, open_loop
+from varpin.simulation.spectrum import fastest_rate
 from varpin.support.checks import as_floats, finite_array
 from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory
@@ -148,7 +149,7 @@ def wrong_variances(scene: Scene, trajectory: Trajectory, integrator: Integrator
         return ()
     rates = _WITHIN if integrator.holds_noise or integrator.left < 1.0 else _BEFORE
     dt = trajectory.dt
-    rate = fast_damping(scene, trajectory.q, trajectory.v, trajectory.u, 2.0 * dt / rates).rate
+    rate = fastest_rate(scene, trajectory.q, trajectory.v, trajectory.u, rates / dt)
     if not rate:
         return ()
     return (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from varpin._version import __version__
 from varpin.arrays import Floats, Integers
 from varpin.errors import FileError, InputError
+from varpin.finding import Finding
 from varpin.io.archive import Axes, read_npz, record_of, save_npz
 from varpin.model import Robot, require_robot
 from varpin.support.checks import path_like
@@ -96,6 +97,12 @@ class StepStatistics(Frozen):
 STEP_NUMBERS = tuple(item.name for item in fields(StepStatistics) if item.name != "halvings")
 # Largest number of halvings of a step.
 MOST_HALVINGS = 30
+
+
+def _sealed(array: Floats) -> Floats:
+    """The array itself, read-only."""
+    array.setflags(write=False)
+    return array
 
 
 def _parts_in(substeps: Integers) -> int:
@@ -201,7 +208,12 @@ class Trajectory(Frozen):
         joint_names: Names of the coordinates.
         statistics: Work and accuracy of each step.
         version: The version of varpin that computed it.
-        warnings: One sentence each: dt too coarse, energy off, steps split into parts.
+        warnings: What is doubtful about the motion, the worst first: strings of one sentence, with their numbers as
+            attributes (:class:`varpin.Finding`).
+        error: The estimated error of q at each node (N + 1, n) [rad or m]: the distance from a repetition of the motion
+            by a method of more stages. NaN from where the repetition fails; None for a motion that was not checked. It
+            is computed on first use where the check has proven :attr:`error_bound` without a repetition.
+        error_bound: Largest error that the check has proven without a repetition [rad or m]; None for other motions.
         scene_values: Numbers of its scene, :attr:`varpin.Scene.values`; empty in files of versions that did not store
             them.
         u_stages: Controls (N, s, m) at the stages of each step, if they change within it (:class:`varpin.OpenLoop` or
@@ -229,7 +241,7 @@ class Trajectory(Frozen):
     joint_names: tuple[str, ...]
     statistics: StepStatistics
     version: str = __version__
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Finding, ...] = ()
     scene_values: Mapping[str, Floats] = field(
         default_factory=lambda: MappingProxyType({}), repr=False, metadata={"entry": "scene"}
     )
@@ -244,6 +256,30 @@ class Trajectory(Frozen):
     u_nodes: Annotated[Floats, Axes("nodes", "lines", finite=True)] = field(
         default_factory=lambda: np.zeros((0, 0)), repr=False
     )
+    # A factory leaves the class without the attribute, so that __getattr__ is asked for it.
+    error: Annotated[Floats, Axes("nodes", "joints")] | None = field(default_factory=lambda: None, repr=False)
+    error_bound: float | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        """The error of a motion that is repeated only now: see :meth:`with_error`."""
+        if name != "error":
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        repeat = vars(self).get("_repeat")
+        vars(self)["error"] = None if repeat is None else _sealed(repeat())
+        vars(self).pop("_repeat", None)
+        return vars(self)["error"]
+
+    def __getstate__(self) -> dict[str, Any]:
+        _ = self.error
+        return super().__getstate__()
+
+    def with_error(self, error: Floats | Callable[[], Floats], bound: float | None = None) -> Trajectory:
+        """The motion with its error (N + 1, n), or with a function that computes it on first use, and its bound."""
+        if not callable(error):
+            return self.changed(error=_sealed(error), error_bound=bound)
+        made = self.changed(_repeat=error, error_bound=bound)
+        vars(made).pop("error", None)
+        return made
 
     def __post_init__(self) -> None:
         if not self.constraint_labels and not np.size(self.constraint_forces):
@@ -267,6 +303,8 @@ class Trajectory(Frozen):
                 "u_nodes": (nodes, m if lines != (0,) else 0),
             }
         )
+        if self.error is not None:
+            self._require({"error": (nodes, n)})
         self._seal()
 
     @classmethod
@@ -311,8 +349,9 @@ class Trajectory(Frozen):
         if begin == 0 and end == self.steps:
             return self
         nodes, steps = slice(begin, end + 1), slice(begin, end)
-        return replace(
+        part = replace(
             self,
+            error=known[nodes] if isinstance(known := vars(self).get("error"), np.ndarray) else None,
             **{name: getattr(self, name)[nodes] for name in ("t", "q", "v", "p", "energy", "u_nodes")},
             u=self.u[steps],
             u_stages=self.u_stages[steps],
@@ -320,11 +359,21 @@ class Trajectory(Frozen):
             constraint_forces=self.constraint_forces[steps],
             statistics=self.statistics.part(begin, end),
         )
+        pending = "_repeat" in vars(self)
+        return part.with_error(lambda: np.array(self.error)[nodes], self.error_bound) if pending else part
+
+    @property
+    def error_text(self) -> str:
+        """The largest error in words, ``"error 2e-06"`` or ``"error below 1e-03"`` [rad or m]; empty if not checked."""
+        known = vars(self).get("error")
+        if known is None:
+            return "" if self.error_bound is None else f"error below {self.error_bound:.1g}"
+        return f"error {known.max():.2g}" if np.isfinite(known).all() else "error unknown"
 
     def __repr__(self) -> str:
         split = self.statistics.split_steps
         flag = f", {split} {'step' if split == 1 else 'steps'} split by the guards" if split else ""
-        reached = f", estimated error {self.accuracy.error:.1e}" if self.accuracy is not None else ""
+        reached = f", {self.error_text}" if self.error_text else ""
         return (
             f"Trajectory({self.robot}: {len(self.joint_names)} joints, {self.steps} steps of {self.dt:g} s, "
             f"{self.integrator}{flag}{reached}{warning_count(self.warnings)})"
@@ -338,8 +387,8 @@ class Trajectory(Frozen):
             ("energy [J]", f"{self.energy[0]:.6g} at first, {self.energy[-1]:.6g} in the end"),
             ("energy's largest change [J]", f"{np.abs(self.energy - self.energy[0]).max():.3g}"),
         ]
-        if self.accuracy is not None:
-            rows.append(("estimated error in q [rad or m]", f"{self.accuracy.error:.2g}"))
+        if self.error_text:
+            rows.append(("estimated error of q [rad or m]", self.error_text.removeprefix("error ")))
         if statistics.energy_defect.any():
             rows.append(("of it, not the work of a force [J]", f"{np.abs(statistics.energy_defect).max():.3g}"))
         if statistics.newton_iterations.any():
@@ -482,6 +531,8 @@ def chained(parts: Sequence[Trajectory]) -> Trajectory:
         statistics=joined([part.statistics for part in parts]),
         warnings=(),
         accuracy=None,
+        error=None,
+        error_bound=None,
     )
 
 

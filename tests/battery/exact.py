@@ -1,7 +1,7 @@
 """Exact motions with noise, in closed form and from nodes all over a motion, beside those of varpin's own check.
 
-The exact motion is LSODA's at 1e-11: it takes stiff dampers, and shares nothing with the integrator. Where it is
-compared and from which error on a motion is wrong are :mod:`varpin.simulation.accuracy`'s, as for the warnings.
+The exact motion is LSODA's at 1e-11: it takes stiff dampers, and shares nothing with the integrator. From which error
+on a motion is wrong is in :mod:`varpin.study.extremes.units`.
 """
 
 from __future__ import annotations
@@ -18,16 +18,6 @@ from varpin.core import ForwardDynamics
 from varpin.errors import VarpinError
 from varpin.integrators import ExplicitEuler, Integrator
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import (
-    CLOSE,
-    DISTURBANCE,
-    Window,
-    disturbance,
-    examined_nodes,
-    grown,
-    inertias,
-    nodes_between,
-)
 from varpin.study.extremes.exact import (
     NODES,
     PATIENCE,
@@ -39,16 +29,17 @@ from varpin.study.extremes.exact import (
     integrated,
     kicked,
 )
+from varpin.study.extremes.units import DISTURBANCE, WRONG_MOTION, WRONG_VELOCITY, grown
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-# Ways shorter than this are the tolerance's own over a period [rad or m].
-_SHORTEST_PERIOD = 1e-8
 # Steps integrated between two tests of whether the motion is still predictable.
 _CHUNK = 32
 # Processor time, which other programs do not change [s]: for all periods, for one of them.
 _PATIENCE_PERIODS, _PATIENCE_PERIOD = 4.0, 1.0
+# Nodes from which the motion is repeated, and steps from each.
+_BEGINS, _STEPS = 8, 64
 
 
 def motion_of(
@@ -164,52 +155,42 @@ def _reference(setup: Setup, dt: float, steps: int, left: float | None) -> tuple
 
 
 def period_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> float:
-    """The largest error over a period from any of some nodes, in units of what is wrong; NaN where none is known.
+    """The largest error from any of some nodes on, in units of what is wrong; NaN where none is known.
 
-    From the nodes of :func:`varpin.simulation.accuracy.examined_nodes` and three more; from many more where the error
-    comes close to what is wrong. One of them that is wrong makes the motion wrong.
+    Errors are shares of the joint's travel and largest speed over the whole motion, as far as a small disturbance does
+    not grow out of hand.
     """
     if not trajectory.steps or scene.noise.diffusion is None or not np.abs(trajectory.v).max() > 0.0:
         return math.nan
-    quarters = np.linspace(0, trajectory.steps, 5)[1:-1].astype(np.int64)
-    first = examined_nodes(scene, trajectory)
-    inertia = inertias(scene, trajectory.q[first])
-    first = np.concatenate([first, np.setdiff1d(quarters, first)])
+    whole = np.arange(trajectory.steps + 1)
+    units = in_units(
+        scene, trajectory.q[0], trajectory.v[0], trajectory.dt, whole, trajectory.q, trajectory.v, cut=False
+    )
     worst, end = math.nan, time.process_time() + _PATIENCE_PERIODS
-    for steps in (first, nodes_between(trajectory.steps, first)):
-        for step in steps.tolist():
-            worst = np.fmax(worst, _error_from(scene, integrator, trajectory, step, inertia))
-            if worst >= 1.0 or time.process_time() > end:
-                return float(worst)
-        if not worst >= CLOSE:
+    for step in np.unique(np.linspace(0, max(0, trajectory.steps - _STEPS), _BEGINS).astype(np.int64)).tolist():
+        worst = np.fmax(worst, _error_from(scene, integrator, trajectory, step, units))
+        if worst >= 1.0 or time.process_time() > end:
             break
     return float(worst)
 
 
-def _error_from(scene: Scene, integrator: Integrator, trajectory: Trajectory, step: int, inertia: Floats) -> float:
-    """The error over a period from one node, as far as a small disturbance does not grow out of hand.
-
-    NaN where the exact motion ends before: of a part of a start, even half a step is much; and where nothing moves
-    to speak of.
-    """
-    n, node = scene.robot.dof, Window.at(scene, trajectory, step)
-    count = int(node.judged.max())
-    by = disturbance(trajectory, step, count)
+def _error_from(scene: Scene, integrator: Integrator, trajectory: Trajectory, step: int, units: Exact) -> float:
+    """The error from one node on; NaN where the exact motion ends before."""
+    n, ahead = scene.robot.dof, slice(step, step + min(_STEPS, trajectory.steps - step))
     end = time.process_time() + _PATIENCE_PERIOD
-    ahead = slice(step, step + count)
 
-    def path(in_q: float, in_v: float) -> Iterator[Floats]:
-        x = np.concatenate([trajectory.q[step] + in_q, trajectory.v[step] + in_v])
+    def path(by: float) -> Iterator[Floats]:
+        x = np.concatenate([trajectory.q[step] + by, trajectory.v[step]])
         dw = trajectory.dw[ahead] if trajectory.dw.any() else None
         u, dt, left = trajectory.u[ahead], trajectory.dt, before_step(integrator)
         return motion_of(scene, x, u, dt, dw=dw, left=left, origin=trajectory.q[0], end=end)
 
-    plain, known = _predictable(path(0.0, 0.0), path(*by), by[0])
-    if known == len(plain) - 1 < count:
+    by = DISTURBANCE * max(1e-3, float(np.ptp(trajectory.q, axis=0).max()))
+    plain, known = _predictable(path(0.0), path(by), by)
+    if known == len(plain) - 1 < ahead.stop - step:
         return math.nan
     nodes, plain = slice(step, step + known + 1), plain[: known + 1]
-    if max(np.ptp(q, axis=0).max() for q in (plain[:, :n], trajectory.q[nodes])) < _SHORTEST_PERIOD:
-        return math.nan
     with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(plain[:, :n] - trajectory.q[nodes]), np.abs(plain[:, n:] - trajectory.v[nodes])
-    return node.error(scene, trajectory, inertia, off, cut=known < count).worst
+        q = np.abs(plain[:, :n] - trajectory.q[nodes]) / units.travels / WRONG_MOTION
+        v = np.abs(plain[:, n:] - trajectory.v[nodes]) / units.speeds / WRONG_VELOCITY
+    return float(max(q.max(), v.max()))

@@ -22,7 +22,7 @@ from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
 from varpin.model.chain import rod_chain
-from varpin.simulation.run import simulate
+from varpin.simulation.simulate import simulate
 from varpin.study.extremes.checks import energy_error
 from varpin.study.extremes.record import LEVELS, Kind
 from varpin.trajectory import Trajectory

@@ -39,55 +39,6 @@ bool pulls_fast_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> f, double
                    [&](Inertias& inertias, const States& states) { return pulls_fast(inertias, states, dt); });
 }
 
-std::tuple<double, double, Out, Out> energy_turnover(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> u,
-                                                     double dt, double even, int looks) {
-    const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
-    const std::size_t steps = u.shape(0);
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&p, "p"}}) require(*array, name, {steps + 1, n});
-    require(u, "u", {steps, m});
-    if (!(dt > 0.0)) throw std::invalid_argument("dt must be positive");
-    if (looks < 2) throw std::invalid_argument("looks must be at least 2");
-    Turnover found;
-    {
-        nb::gil_scoped_release release;
-        found = turnover(mechanism, {static_cast<std::int64_t>(steps), q.data(), v.data(), p.data(), u.data(), dt},
-                         even, looks);
-    }
-    return {found.kinetic, found.work, array_of(found.kinetic_of.data(), {n}), array_of(found.work_of.data(), {n})};
-}
-
-std::tuple<double, bool, bool, bool> glance_at(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u,
-                                               Integers<1> substeps, double dt) {
-    const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
-    const std::size_t steps = u.shape(0);
-    if (steps == 0) throw std::invalid_argument("a motion needs at least one step");
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {steps + 1, n});
-    require(u, "u", {steps, m});
-    require(substeps, "substeps", {steps});
-    nb::gil_scoped_release release;
-    const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), nullptr, u.data(), dt};
-    const Glance seen = glance(mechanism, record, substeps.data());
-    return {seen.fastest, seen.split, seen.steady, seen.pulled};
-}
-
-bool windows_agree(const Mechanism& mechanism, In<2> q, In<2> v, Integers<1> begins, std::size_t length, double dt,
-                   In<3> again_q, In<3> again_v, double travel, double velocity, double little, double light,
-                   double even) {
-    const auto n = static_cast<std::size_t>(mechanism.dof());
-    const std::size_t nodes = q.shape(0), windows = begins.shape(0), looks = again_q.shape(1);
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {nodes, n});
-    for (const auto& [array, name] : {std::pair{&again_q, "again_q"}, {&again_v, "again_v"}})
-        require(*array, name, {windows, looks, n});
-    if (looks == 0 || length % looks != 0) throw std::invalid_argument("looks must divide the length of a window");
-    for (std::size_t w = 0; w < windows; ++w) {
-        if (begins(w) < 0 || static_cast<std::size_t>(begins(w)) + length >= nodes)
-            throw std::invalid_argument("a window is beyond the motion");
-    }
-    nb::gil_scoped_release release;
-    return agree_in_windows(mechanism, q.data(), v.data(), begins.data(), windows, length, dt, again_q.data(),
-                            again_v.data(), looks, {travel, velocity, little, light, even});
-}
-
 Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
     const std::size_t steps = sums.shape(1), points = sums.shape(2), all = places.shape(1);
     if (steps == 0 || points < 2 || (points - 1) % steps != 0 || all % steps != 0)
@@ -103,40 +54,29 @@ Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
         copied(places)};
 }
 
-double clear_growth(const Mechanism& mechanism, In<2> q, In<2> v, In<2> p, In<2> u, In<3> within, In<1> defect,
-                    Integers<1> substeps, double dt, const Stretch& narrow, const Stretch* wide, double still,
-                    double energy, double damping, std::int64_t damped_at, double travel, double velocity,
-                    double little, double light, double even, std::int64_t window, double whole, double grown,
-                    double aligned, std::int64_t few, double known) {
+std::tuple<Out, Out> propagated_errors(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within, double dt,
+                                       const Stretch& narrow, const Stretch* wide, double damping,
+                                       std::int64_t damped_at, In<1> most_q, In<1> most_v) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
     const std::size_t steps = u.shape(0), stages = within.shape(1);
-    if (steps == 0) throw std::invalid_argument("a motion needs at least one step");
-    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}, {&p, "p"}}) require(*array, name, {steps + 1, n});
+    for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {steps + 1, n});
+    for (const auto& [array, name] : {std::pair{&most_q, "most_q"}, {&most_v, "most_v"}}) require(*array, name, {n});
     require(u, "u", {steps, m});
     require(within, "within", {steps, stages, m});
-    require(defect, "defect", {steps});
-    require(substeps, "substeps", {steps});
     if (!(dt > 0.0)) throw std::invalid_argument("dt must be positive");
     if (narrow.steps != 1 || (wide && wide->steps != 2))
         throw std::invalid_argument("narrow and wide must be stretches of one step and of two");
     if (static_cast<std::size_t>(narrow.stages) != stages || (wide && wide->stages != narrow.stages))
         throw std::invalid_argument("narrow and wide must have the stages of the controls");
-    if (window < 1 || damped_at < 2) throw std::invalid_argument("window and damped_at must be at least 1 and 2");
-    nb::gil_scoped_release release;
-    const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), p.data(), u.data(), dt};
-    const Clear clear{still,
-                      energy,
-                      damping,
-                      whole,
-                      grown,
-                      aligned,
-                      window,
-                      few,
-                      damped_at,
-                      known,
-                      {travel, velocity, little, light, even}};
-    Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, narrow, wide, clear);
-    return clearance.growth(defect.data(), substeps.data());
+    if (damped_at < 2) throw std::invalid_argument("damped_at must be at least 2");
+    Propagated found;
+    {
+        nb::gil_scoped_release release;
+        const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), u.data(), dt};
+        Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, narrow, wide, damping, damped_at);
+        found = clearance.errors(most_q.data(), most_v.data());
+    }
+    return {array_of(found.q.data(), {n}), array_of(found.v.data(), {n})};
 }
 
 std::tuple<bool, bool, bool> inside_bounds(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within,
@@ -148,7 +88,7 @@ std::tuple<bool, bool, bool> inside_bounds(const Mechanism& mechanism, In<2> q, 
     require(within, "within", {steps, stages, m});
     require(bounds, "bounds", {3, 2, n});
     nb::gil_scoped_release release;
-    const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), nullptr, u.data(), 0.0};
+    const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), u.data(), 0.0};
     const Inside found =
         inside_of(mechanism, record, stages > 0 ? within.data() : nullptr, static_cast<int>(stages), bounds.data());
     return {found.position, found.velocity, found.effort};
@@ -170,17 +110,10 @@ void register_look(nb::module_& m) {
     m.def("longest_alternation", &alternation, "v"_a, "u"_a.none(), nb::kw_only(), "counts"_a, "idle"_a, "even"_a);
     m.def("fastest_damping", &fastest_damping_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "least"_a);
     m.def("pulls_fast", &pulls_fast_at, "mechanism"_a, "q"_a, "v"_a, "f"_a, "dt"_a);
-    m.def("glance", &glance_at, "mechanism"_a, "q"_a, "v"_a, "u"_a, "substeps"_a, "dt"_a);
-    m.def("energy_turnover", &energy_turnover, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "dt"_a, nb::kw_only(),
-          "even"_a, "looks"_a);
     nb::class_<Stretch>(m, "Stretch").def_static("make", &stretch_of, nb::kw_only(), "curves"_a, "sums"_a, "places"_a);
-    m.def("clear_growth", &clear_growth, "mechanism"_a, "q"_a, "v"_a, "p"_a, "u"_a, "within"_a, "defect"_a,
-          "substeps"_a, "dt"_a, nb::kw_only(), "narrow"_a, "wide"_a.none(), "still"_a, "energy"_a, "damping"_a,
-          "damped_at"_a, "travel"_a, "velocity"_a, "little"_a, "light"_a, "even"_a, "window"_a, "whole"_a, "grown"_a,
-          "aligned"_a, "few"_a, "known"_a);
+    m.def("propagated_errors", &propagated_errors, "mechanism"_a, "q"_a, "v"_a, "u"_a, "within"_a, "dt"_a,
+          nb::kw_only(), "narrow"_a, "wide"_a.none(), "damping"_a, "damped_at"_a, "most_q"_a, "most_v"_a);
     m.def("inside_bounds", &inside_bounds, "mechanism"_a, "q"_a, "v"_a, "u"_a, "within"_a, "bounds"_a);
-    m.def("windows_agree", &windows_agree, "mechanism"_a, "q"_a, "v"_a, "begins"_a, "length"_a, "dt"_a, "again_q"_a,
-          "again_v"_a, nb::kw_only(), "travel"_a, "velocity"_a, "little"_a, "light"_a, "even"_a);
 }
 
 }  // namespace varpin::border

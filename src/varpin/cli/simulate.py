@@ -32,7 +32,7 @@ from varpin.errors import InputError
 from varpin.mechanics.scene import Scene
 from varpin.show.replay import frame_names
 from varpin.simulation.failures import Interrupted, StepFailure
-from varpin.simulation.run import simulate
+from varpin.simulation.simulate import simulate
 from varpin.support.checks import count, positive
 from varpin.support.tables import WIDTH, add_row, facts
 from varpin.trajectory import Trajectory
@@ -181,6 +181,8 @@ def _summary(trajectory: Trajectory, asked: int | None, wall_time: float, driven
             f"the search took {accuracy.search_steps} steps",
             style="" if accuracy.met else "bold yellow",
         )
+    elif trajectory.error_text:
+        add_row(table, "estimated error in q", f"{trajectory.error_text.removeprefix('error ')} rad or m")
     # Explicit methods solve no equations and have no branches.
     if steps and statistics.branch_margin.any():
         newton, split = statistics.newton_iterations, statistics.split_steps

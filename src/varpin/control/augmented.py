@@ -39,8 +39,8 @@ from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, deviations
 from varpin.control.unconstrained import checked_time, closing_of, require_reports
 from varpin.errors import InputError, LinearizationError, VarpinError
+from varpin.finding import announce
 from varpin.mechanics.noise import NoiseFieldError
-from varpin.simulation.soundness import announce
 from varpin.support.checks import count, flag, positive
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
@@ -204,7 +204,7 @@ class _Rounds:
         first = self._first()
         # Before the search, which takes long where there is no plan.
         before = foreseen(self.problem) if self.check else []
-        announce(logger, self.problem.scene, self.problem.dt, before)
+        announce(logger, self.problem.scene.announced, self.problem.dt, before)
         hopeless = out_of_reach(self.problem, first.trajectory)
         last = len(self.history) + (min(self.most, _HOPELESS) if hopeless else self.most)
         found, resume = first, self._resumed_search()

@@ -14,8 +14,8 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution, rest_of
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
-from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import closest_controls
+from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, as_floats, control_array, finite_array
 
 

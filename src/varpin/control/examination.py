@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from varpin.arrays import Floats
+from varpin.control.chatter import alternation, restlessness
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
@@ -20,14 +21,14 @@ from varpin.control.spread import Feedback, covariances, state_slopes
 from varpin.control.verification import accurate_cost, at_start, percent
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, VarpinError
+from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
-from varpin.integrators.base import open_line, open_loop
 from varpin.linearization import wrong_variances
 from varpin.mechanics.forces import of_kind
 from varpin.model import joint_unit
-from varpin.simulation.chatter import alternation, restlessness
+from varpin.signals.commands import open_line, open_loop
+from varpin.simulation.check import check
 from varpin.simulation.record import rollout
-from varpin.simulation.soundness import Finding, announce, examined, findings_from_record
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +37,7 @@ PARTS = 4
 # Greatest relative excess of the replay's cost over the plan's, and shortfall, without a warning.
 LOSS, GAIN = 1e-3, 1e-2
 # Kinds of findings about single steps; their effect on the whole plan is measured by the replay.
-_OF_STEPS = ("coarse steps", "fast damping", "fast friction", "split steps")
+_OF_STEPS = ("error",)
 # Greatest expected decrease of a stalled search, relative to its cost, without a warning.
 _LITTLE = 1e-3
 # Standard deviation of a velocity, in widths of its dry friction, up to which tanh is linear to 6 %.
@@ -80,14 +81,15 @@ def looked_at(solution: Solution, before: Sequence[Finding] | None = None) -> tu
     except KeyboardInterrupt:
         found = (Finding("interrupted", "interrupted before the plan was replayed: its accuracy is not known"),)
     problem = solution.problem
-    announce(logger, problem.scene, problem.dt, found)
-    return replace(solution, warnings=tuple(finding.sentence for finding in found)), found
+    announce(logger, problem.scene.announced, problem.dt, found)
+    return replace(solution, warnings=tuple(found)), found
 
 
 def findings(solution: Solution, before: Sequence[Finding] | None = None) -> tuple[Finding, ...]:
     """Findings about a plan: its energy balance, velocities, constraints, convergence and cost in finer steps."""
     problem, motion = solution.problem, solution.trajectory
-    _, found = examined(problem.scene, problem.integrator, motion)
+    policy = solution.policy_on("momentum" if problem.integrator.variational else "velocity")
+    found = check(problem.scene, problem.integrator, motion, policy).warnings
     warnings = [*(foreseen(problem) if before is None else before)]
     warnings += [finding for finding in found if finding.kind not in (*_OF_STEPS, _ALTERNATION)]
     if solution.refinement is not None and not solution.refinement.met:
@@ -110,10 +112,7 @@ def findings(solution: Solution, before: Sequence[Finding] | None = None) -> tup
     if replay.holds or _as_wished(solution, replay):
         return tuple(warnings)
     warnings.append(Finding("replay", _sentence(problem, replay)))
-    reasons = [finding for finding in found if finding.kind in _OF_STEPS]
-    # Findings about steps that are negligible for the motion may explain the plan's loss.
-    record = findings_from_record(problem.scene, problem.integrator, motion)
-    return *warnings, *(reasons or [finding for finding in record if finding.kind in _OF_STEPS])
+    return *warnings, *(finding for finding in found if finding.kind in _OF_STEPS)
 
 
 def _as_wished(solution: Solution, replay: Replay) -> bool:
@@ -205,9 +204,11 @@ def starts_outside(problem: OptimalControlProblem) -> list[Finding]:
             found.append(
                 Finding(
                     "start outside constraints",
-                    f"the start is outside {problem.label_of(bound.source)}, "
-                    f"{bound.rows[row]} by {c[row]:.2g} {bound.unit}, and the first node, {problem.dt:g} s later, "
-                    "has to be inside: begin inside, or widen the bound",
+                    f"the start is outside {problem.label_of(bound.source)}, {bound.rows[row]} by {c[row]:.2g} "
+                    f"{bound.unit}, and the first node has to be inside. Begin inside, or widen the bound",
+                    time=0.0,
+                    value=float(c[row]),
+                    unit=bound.unit,
                 )
             )
     return found
@@ -241,9 +242,11 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
     return [
         Finding(
             "friction under noise",
-            f"noise moves joint {name!r} by {worst:.2g} times the width of its dry friction ({width:g} {unit}), "
-            "for which the friction is not linear: noise_cost, gains and margins are of the linearized friction and "
-            "may be wrong many times over; plan.monte_carlo() and simulate_ensemble have the whole of it",
+            f"noise moves joint {name!r} by {worst:.2g} widths of its dry friction ({width:g} {unit}): noise_cost, "
+            "gains and margins, which linearize it, may be wrong many times over. Use plan.monte_carlo()",
+            name,
+            value=worst,
+            unit="widths",
         )
     ]
 
@@ -281,9 +284,9 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
     return [
         Finding(
             "noise within steps",
-            f"noise costs {fine:.3g} by half steps, and {planned:.3g} by the plan's of dt = {problem.dt:g} s, which "
-            "are long for it: on the robot it costs nearer to the former. plan.monte_carlo() takes the plan's steps "
-            f"and cannot show that; {closer}",
+            f"noise costs {fine:.3g} in half steps and {planned:.3g} in the plan's of dt = {problem.dt:g} s, as "
+            f"plan.monte_carlo() does: the robot is nearer to the former, and {closer}",
+            value=fine,
         )
     ]
 
@@ -308,9 +311,9 @@ def _noise_left_out(solution: Solution) -> list[Finding]:
     return [
         Finding(
             "noise left out",
-            "with constraints the motion is that of least cost without noise. The strength of this noise depends on "
-            f"the motion, and the noise cost, {solution.noise_cost:.4g}, may be less along another one: without "
-            "constraints=, solve lowers it, too",
+            f"with constraints the noise cost, {solution.noise_cost:.4g}, is left out of the search: the motion is "
+            "that of least cost without noise. Without constraints=, solve lowers it, too",
+            value=solution.noise_cost,
         )
     ]
 
@@ -374,6 +377,9 @@ def _between(solution: Solution) -> list[Finding]:
                     "constraints between nodes",
                     f"{problem.label_of(bound.source)} holds at the nodes, but between nodes {bound.rows[row]} is "
                     f"violated by {c[sample, row]:.2g} {bound.unit} at t = {bound.times[sample]:.4g} s: {advice}",
+                    time=float(bound.times[sample]),
+                    value=float(c[sample, row]),
+                    unit=bound.unit,
                 )
             )
     return found
@@ -403,10 +409,10 @@ def _restless(solution: Solution) -> list[Finding]:
     return [
         Finding(
             _RESTLESS,
-            f"the velocity of {name} goes up and down {found.changes} times in {len(decided) - 1} decisions: if the "
-            "task does not require that, the cost hardly weighs it; a small running VelocityCost, or a larger one, "
-            "calms it",
-            found.joint,
+            f"the velocity of {name} goes up and down {found.changes} times in {len(decided) - 1} decisions, which the "
+            "cost hardly weighs. A larger running VelocityCost calms it",
+            name,
+            value=float(found.changes),
         )
     ]
 

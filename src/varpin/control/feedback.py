@@ -9,7 +9,7 @@ from varpin.control.along import states
 from varpin.control.passes import Plan
 from varpin.control.problem import OptimalControlProblem
 from varpin.core.arrays import Commands
-from varpin.integrators.base import open_line, open_loop
+from varpin.signals.commands import open_line, open_loop
 from varpin.trajectory import Trajectory
 
 

@@ -12,10 +12,10 @@ from varpin.control.between_nodes import at_times
 from varpin.control.constraints import BoundConstraint, BoundRate
 from varpin.control.multipliers import REPORTED
 from varpin.control.problem import OptimalControlProblem
-from varpin.integrators.base import open_line, open_loop
 from varpin.linearization import node_jets
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import quiet
+from varpin.signals.commands import open_line, open_loop
 from varpin.simulation.record import rollout
 from varpin.trajectory import Trajectory
 

@@ -18,8 +18,8 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.core.arrays import Commands
 from varpin.linearization import node_jets, velocity_at_nodes
 from varpin.mechanics.forces import limited_servos
-from varpin.mechanics.inputs import as_moved
 from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.signals.inputs import as_moved
 
 # Natural frequency of the feedback that holds a motion on a path, times the decision period.
 _HOLDING_FREQUENCY = 0.25

@@ -23,6 +23,7 @@ from varpin.control.constraints import (
 from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
 from varpin.control.costs.base import Scaled, weight_matrix
 from varpin.control.problem import OptimalControlProblem
+from varpin.finding import Finding
 from varpin.model import (
     ADVICE,
     AFAR,
@@ -36,7 +37,6 @@ from varpin.model import (
     millimetres_hint,
 )
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
-from varpin.simulation.soundness import Finding
 from varpin.simulation.start import in_other_units
 
 # Kinds of findings about values in wrong units.
@@ -270,8 +270,9 @@ def _overlaps(problem: OptimalControlProblem, bound: BoundConstraint) -> Iterato
         yield Finding(
             "pair always too close",
             f"KeepClear: {constraint.pairs[pair]} are too close by {least[pair]:.2g} m or more in each of {_POSTURES} "
-            "postures, so hardly any plan keeps them apart. A link is modelled by a capsule, which is larger than the "
-            "link: leave it out with links=, give it a smaller one with capsules=, or move the obstacle",
+            "postures. Use links= to leave one out, capsules= for a smaller capsule, or move the obstacle",
+            value=float(least[pair]),
+            unit="m",
         )
 
 

@@ -16,8 +16,8 @@ from varpin.arrays import Floats
 from varpin.control.costs import Expansion
 from varpin.control.problem import OptimalControlProblem
 from varpin.linearization import Linearization, linearize_steps, node_jets
-from varpin.mechanics.inputs import with_ends
 from varpin.mechanics.scene import quiet
+from varpin.signals.inputs import with_ends
 from varpin.trajectory import Trajectory
 
 # The sampling rule of a cost in (X, u) at the beginning of the step.

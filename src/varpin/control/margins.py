@@ -23,10 +23,10 @@ from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, decided, of_values, propagated, state_slopes
 from varpin.ensemble.paths import simulate_paths
 from varpin.errors import VarpinError
+from varpin.finding import Finding
 from varpin.linearization import linearize_steps
 from varpin.mechanics.wiener import Children, children, wiener_increments
 from varpin.simulation.failures import NoiseError, StepFailure
-from varpin.simulation.soundness import Finding
 from varpin.support.executors import executing, in_order
 from varpin.support.frozen import Frozen
 
@@ -219,16 +219,17 @@ def _told(solution: Solution, row: _Row, counted: _Counted) -> Finding | None:
     needed = float(counted.needed(row)[0])
     if solution.problem.scene.noise.diffusion is None:
         enough = math.ceil(10.0 * needed / row.own[place, r]) / 10.0
-        which, advice = ", which is of the linear model,", f"margin={enough:g} is about enough there"
+        advice = f"margin={enough:g} is about enough there"
     else:
         narrower = needed - row.margin[place, r]
-        which, advice = ", even as wide as it has become,", f"a bound narrower by {narrower:.2g} {bound.unit} may do"
+        advice = f"a bound narrower by {narrower:.2g} {bound.unit} may do"
     return Finding(
         "small margin",
-        f"{solution.problem.label_of(bound.source)}: margin={margin:g}{which} is too small for this noise: "
-        f"{bound.rows[r]} at t = {bound.times[place]:.4g} s is violated by {100.0 * often:.2g} +- {100.0 * error:.1g} "
-        f"% of all motions, not {100.0 * row.promised:.2g} %, as {len(counted.values)} motions under noise say; "
-        f"{advice}, and plan.monte_carlo counts",
+        f"{solution.problem.label_of(bound.source)}: margin={margin:g} is too small for this noise: {bound.rows[r]} at "
+        f"t = {bound.times[place]:.4g} s is violated by {100.0 * often:.2g} +- {100.0 * error:.1g} % of "
+        f"{len(counted.values)} motions, not {100.0 * row.promised:.2g} %; {advice}",
+        time=float(bound.times[place]),
+        value=float(often),
     )
 
 

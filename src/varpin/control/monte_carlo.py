@@ -20,11 +20,12 @@ from varpin.control.verification import excess, percent
 from varpin.ensemble.looks import greater, looked_at, looked_at_here
 from varpin.ensemble.paths import Extremes, simulate_paths
 from varpin.errors import VarpinError
-from varpin.mechanics.policy import LinearPolicy
+from varpin.finding import Finding, announce
 from varpin.mechanics.wiener import Children, children
+from varpin.signals.policy import LinearPolicy
+from varpin.simulation.check import check
 from varpin.simulation.failures import NoiseError, StepFailure
-from varpin.simulation.loop_stability import examined_in_loop
-from varpin.simulation.soundness import Finding, announce
+from varpin.simulation.loop import unstable_loop
 from varpin.support.checks import count, counting
 from varpin.support.executors import executing, in_order, take_all
 from varpin.support.frozen import Frozen
@@ -91,7 +92,7 @@ class MonteCarlo:
     predicted: float
     paths: int
     failures: int
-    warnings: tuple[str, ...] = field(default=(), repr=False)
+    warnings: tuple[Finding, ...] = field(default=(), repr=False)
     broken: tuple[Broken, ...] = ()
 
     def __repr__(self) -> str:
@@ -228,7 +229,7 @@ def monte_carlo(
     if result is None:
         raise VarpinError(f"fewer than two of {paths} paths got to the end; a smaller dt may help")
     found = (*_lost(result), *found)
-    announce(logger, problem.scene, problem.dt, found)
+    announce(logger, problem.scene.announced, problem.dt, found)
     return _warned(result, found)
 
 
@@ -284,8 +285,10 @@ def _look_alone(given: _Alone) -> tuple[Finding, ...]:
     motion = given.problem.simulate(given.policy, rng=child)
     # The loop's check is for held controls.
     hold = None if given.problem.linear else given.policy.hold_at(given.problem.dt)
-    _, found = examined_in_loop(given.problem.scene, given.problem.integrator, motion, hold)
-    return tuple(Finding(finding.kind, f"path {given.path}: {finding.sentence}") for finding in found)
+    scene, policy = given.problem.scene, given.policy
+    loop = () if hold is None else unstable_loop(scene, motion, hold)
+    found = (*loop, *check(scene, given.problem.integrator, motion, policy).warnings)
+    return tuple(finding.about(f"path {given.path}: ") for finding in found)
 
 
 def _lost(result: MonteCarlo) -> tuple[Finding, ...]:
@@ -297,7 +300,7 @@ def _lost(result: MonteCarlo) -> tuple[Finding, ...]:
 
 
 def _warned(result: MonteCarlo, found: Sequence[Finding]) -> MonteCarlo:
-    return replace(result, warnings=tuple(finding.sentence for finding in found))
+    return replace(result, warnings=tuple(found))
 
 
 def _mean(

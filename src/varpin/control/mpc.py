@@ -13,27 +13,29 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control import Kept, OptimalControlProblem, Solution, kept, looked_at, replan, solve
+from varpin.control.chatter import alternation
 from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.multipliers import REPORTED
 from varpin.control.solution import rest_of
 from varpin.errors import InputError, LinearizationError, VarpinError
+from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure
-from varpin.mechanics.inputs import in_parts_of_steps, with_ends
 from varpin.mechanics.noise import NoiseFieldError
-from varpin.mechanics.policy import FirstOrderHold
 from varpin.mechanics.scene import Scene, closest_controls, require_scene
 from varpin.mechanics.wiener import generator, wiener_increments
 from varpin.model.units import joint_unit
-from varpin.simulation.chatter import alternation
-from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
+from varpin.signals.inputs import in_parts_of_steps, with_ends
+from varpin.signals.policy import FirstOrderHold
+from varpin.simulation.check import check
+from varpin.simulation.choice import usual_integrator
 from varpin.simulation.failures import Interrupted, StepFailure
-from varpin.simulation.loop_stability import examined_in_loop
+from varpin.simulation.limits import beyond_limits
+from varpin.simulation.loop import unstable_loop
 from varpin.simulation.progress import Progress
-from varpin.simulation.run import noise_forgotten, simulated
-from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
+from varpin.simulation.simulate import noise_forgotten, simulate
 from varpin.support.checks import JointValues, control_values, count, positive, real, told_motion
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
@@ -104,7 +106,7 @@ class MpcRun(Frozen):
     period: float
     budget: float
     constraints: tuple[Kept, ...] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Finding, ...] = ()
 
     @property
     def infeasible(self) -> int:
@@ -351,9 +353,6 @@ class Mpc:
             raise KeyboardInterrupt
         noisy = drawn_by is not None and plant.scene.processes > 0
         method = _method(plant, active.trajectory, dt, noisy=noisy)
-        # The integrator was chosen for the first plan: the plant may leave it.
-        watched = plant.integrator is None and not noisy and changes_along(plant.scene)
-        unfit: tuple[Finding, ...] = ()
         parts: list[Trajectory] = []
         plans, seconds, iterations = [], np.zeros(ticks), np.zeros(ticks, dtype=np.int64)
         late, failed, reasons = np.zeros(ticks, bool), np.zeros(ticks, bool), list[str]()
@@ -361,7 +360,7 @@ class Mpc:
 
         def so_far(*last: Trajectory) -> Trajectory:
             planned = failed[:decided]
-            return _so_far(plant, method, [*parts, *last], _failed(planned, reasons, self.period))
+            return _so_far(plant, [*parts, *last], _failed(planned, reasons, self.period))
 
         try:
             for tick in range(ticks):
@@ -396,8 +395,6 @@ class Mpc:
                     begun = active.controls[0] if age == 0 or applied is None else applied
                 applied = _decision(active, age, q, v, before if begun is None else begun)
                 parts.append(_simulated(plant, method, dt, q, v, applied, drawn_by, begun, so_far))
-                if watched and not unfit:
-                    unfit = _unfit(plant.scene, method, parts[-1], tick * self.period)
                 q, v = parts[-1].q[-1], parts[-1].v[-1]
                 before = applied if problem.remembers else None
                 if moving:
@@ -408,16 +405,22 @@ class Mpc:
             if not parts:
                 raise
             raise Interrupted(so_far()) from None
-        motion, found = examined_in_loop(plant.scene, method, chained(parts), plant.substeps, corrected=True)
-        found = (*noise_forgotten(plant.scene, rng), *unfit, *found, *_alternating(motion, plant.substeps))
+        # The controller corrects the errors of a tick in the next.
+        motion = check(plant.scene, method, chained(parts), restart=plant.substeps)
+        found = (
+            *noise_forgotten(plant.scene, rng),
+            *unstable_loop(plant.scene, motion, plant.substeps),
+            *motion.warnings,
+        )
+        found = (*found, *_alternating(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
         found = (*found, *_failed(failed, reasons, self.period))
         found = (*found, *_whole_ticks(duration, ticks, self.period), *_at_nodes_alone(problem))
         held = kept(problem, tuple(plans), motion, plant.substeps)
         found = (*found, *_outside(held, noisy=bool(motion.dw.any())), *_blown_up(plans, motion))
-        announce(logger, plant.scene, dt, found)
+        announce(logger, plant.scene.announced, dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
-        first = [finding.sentence for finding in of_plan if (finding.kind, finding.joint) not in again]
+        first = [finding for finding in of_plan if (finding.kind, finding.joint) not in again]
         return MpcRun(
             motion,
             tuple(plans),
@@ -429,8 +432,8 @@ class Mpc:
             self.budget,
             constraints=held,
             warnings=(
-                *(f"the first plan: {sentence}" for sentence in first),
-                *(finding.sentence for finding in found),
+                *(finding.about("the first plan: ") for finding in first),
+                *(finding for finding in found),
             ),
         )
 
@@ -510,10 +513,9 @@ def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, .
     return (Finding("rounded duration", sentence),)
 
 
-def _so_far(plant: Plant, method: Integrator, parts: Sequence[Trajectory], found: tuple[Finding, ...]) -> Trajectory:
+def _so_far(plant: Plant, parts: Sequence[Trajectory], found: tuple[Finding, ...]) -> Trajectory:
     """The plant's motion so far, with its warnings and those of ``found``."""
-    motion = chained(parts)
-    return with_warnings(motion, (*findings_from_record(plant.scene, method, motion), *found))
+    return chained(parts).changed(warnings=(*beyond_limits(plant.scene, chained(parts)), *found))
 
 
 def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:
@@ -524,8 +526,7 @@ def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:
         return ()
     sentence = (
         f"planning took longer than the period of {1e3 * period:.3g} ms in {slow} of {len(planned)} ticks "
-        f"({1e3 * planned.mean():.3g} ms in the mean): a controller this slow cannot keep up with a robot; fewer steps "
-        "ahead, fewer iterations or a longer period (hold=) make it faster"
+        f"({1e3 * planned.mean():.3g} ms in the mean). Use fewer steps, fewer iterations or a longer period (hold=)"
     )
     return (Finding("slow planning", sentence),)
 
@@ -536,8 +537,8 @@ def _late(late: NDArray[np.bool_], budget: float) -> tuple[Finding, ...]:
     if not missed > _FEW * planned:
         return ()
     sentence = (
-        f"{missed} of {planned} plans came later than the budget of {1e3 * budget:.3g} ms, and the feedback of an "
-        "older plan acted in their place: fewer steps ahead, fewer iterations or a larger budget give more of them time"
+        f"{missed} of {planned} plans came later than the budget of {1e3 * budget:.3g} ms: the feedback of an older "
+        "one acted. Use fewer steps, fewer iterations or a larger budget"
     )
     return (Finding("late plans", sentence),)
 
@@ -585,12 +586,11 @@ def _blown_up(plans: Sequence[Solution], motion: Trajectory) -> tuple[Finding, .
         return ()
     plan, unit = plans[int(np.argmax(planned[:, joint]))], joint_unit(robot, joint, speed=True)
     sentence = (
-        f"the loop is unstable: {robot.joint_names[joint]} moves at up to {moved[joint]:.3g} {unit}, and at up to "
-        f"{planned[:, joint].max():.3g} {unit} in the plan made at t = {plan.problem.t0:.4g} s, where the first plan "
-        f"foresaw no more than {fastest:.3g} {unit} of any joint: more iterations a tick, or greater weights on "
-        "velocities and controls, may keep it stable"
+        f"the loop is unstable: {robot.joint_names[joint]} moves at up to {moved[joint]:.3g} {unit}, in the plan of "
+        f"t = {plan.problem.t0:.4g} s at up to {planned[:, joint].max():.3g}, and no joint at more than "
+        f"{fastest:.3g} in the first plan. Use more iterations a tick, or greater weights"
     )
-    return (Finding("unstable loop", sentence, joint),)
+    return (Finding("unstable loop", sentence, robot.joint_names[joint]),)
 
 
 def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | None = None) -> Floats:
@@ -664,23 +664,7 @@ def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integr
     if plant.integrator is not None:
         return plant.integrator
     scene = plant.scene
-    chosen = usual_integrator(scene, plan.q[0], plan.v[0], dt, noisy=noisy, ahead=True)
-    if noisy or not changes_along(scene):
-        return chosen
-    return integrator_along(scene, chosen, plan.q, plan.v, plan.u, dt)
-
-
-def _unfit(scene: Scene, method: Integrator, part: Trajectory, begin: float) -> tuple[Finding, ...]:
-    """A finding if the plant's motion in a tick that begins at ``begin`` [s] needs another integrator."""
-    other = integrator_along(scene, method, part.q, part.v, part.u, part.dt)
-    if other.same_map(method):
-        return ()
-    sentence = (
-        f"from t = {begin:.4g} s on the plant needs varpin.{other}: damping, friction or stops are faster than its "
-        f"steps of {part.dt:g} s there, and were not along the first plan, for which {method} was chosen and goes on; "
-        f"Plant(integrator=varpin.{other}) takes the other from the start"
-    )
-    return (Finding("unfit integrator", sentence),)
+    return usual_integrator(scene, plan.q[0], plan.v[0], dt, noisy=noisy)
 
 
 def _inputs(scene: Scene, *, cubic: bool) -> tuple[str, ...]:
@@ -719,8 +703,8 @@ def _simulated(
     drawn = wiener_increments(plant.scene.processes, dt, plant.substeps, rng)
     options |= {"increments": drawn if len(drawn) else 0.0}
     try:
-        # The whole run is examined, and its findings logged, at the end.
-        return simulated(plant.scene, q, v, **options, check=False)[0]
+        # The whole run is checked, and its findings logged, at the end.
+        return simulate(plant.scene, q, v, **options, check=False)
     except StepFailure as failure:
         whole = joined(failure.trajectory)
         raise StepFailure(whole.steps, whole.t[-1], Failure(failure.reason, failure.residual), whole) from None

@@ -31,11 +31,11 @@ from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.inputs import with_ends
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene, assisted, quiet
 from varpin.model import degrees_hint, joint_unit
+from varpin.signals.inputs import with_ends
+from varpin.signals.policy import LinearPolicy
 from varpin.simulation.failures import StepFailure, named
 from varpin.simulation.record import Motions
 from varpin.support.checks import as_floats, finite_array

@@ -10,10 +10,11 @@ from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.integrators import Integrator
-from varpin.integrators.base import Lines, Segment, on_lines, open_loop
+from varpin.integrators.base import Segment
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
+from varpin.signals.commands import Lines, on_lines, open_loop
 from varpin.simulation.record import trajectory_of
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory, joined

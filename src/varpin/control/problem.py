@@ -32,16 +32,16 @@ from varpin.control.costs import (
 )
 from varpin.core import sample_steps
 from varpin.errors import InputError
+from varpin.finding import announce
 from varpin.integrators import Gauss, Integrator, Radau
 from varpin.integrators.same_scene import require_motion
-from varpin.mechanics.inputs import as_moved
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.mechanics.policy import LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
+from varpin.signals.inputs import as_moved
+from varpin.signals.policy import LinearPolicy, OpenLoop
 from varpin.simulation.choice import usual_kick
-from varpin.simulation.friction import damping_matrices, rate_at_rest
-from varpin.simulation.run import simulate
-from varpin.simulation.soundness import announce
+from varpin.simulation.simulate import simulate
+from varpin.simulation.spectrum import damping_matrices, rate_at_rest
 from varpin.simulation.start import on_constraints
 from varpin.simulation.time_steps import time_steps
 from varpin.support.checks import (
@@ -231,7 +231,7 @@ class OptimalControlProblem(Frozen):
         at, speed = joint_array("q0", q0, scene.robot.joint_names), joint_array("v0", v0, scene.robot.joint_names)
         if scene.constraints:
             at, speed, moved = on_constraints(scene, at, speed)
-            announce(logger, scene, dt, moved)
+            announce(logger, scene.announced, dt, moved)
         rate = control_rate(cost, m, scene.control_joints)
         given = _constraints(constraints)
         values = {

@@ -26,7 +26,7 @@ from varpin.control.steps_tried import (
 )
 from varpin.control.verification import OnRobot, excess
 from varpin.errors import VarpinError
-from varpin.mechanics.policy import LinearPolicy
+from varpin.signals.policy import LinearPolicy
 
 Search = Callable[[OptimalControlProblem, LinearPolicy | Solution | None], Solution]
 

@@ -25,7 +25,7 @@ from varpin.control.steps_tried import (
 )
 from varpin.control.verification import excess
 from varpin.errors import VarpinError
-from varpin.mechanics.policy import LinearPolicy
+from varpin.signals.policy import LinearPolicy
 
 # Greatest number of halvings of the step: the last steps of plans within many bounds take long on fine grids.
 _HALVINGS = 7

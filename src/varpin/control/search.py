@@ -33,7 +33,7 @@ from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError
 from varpin.mechanics.custom import CustomForceError
 from varpin.simulation.failures import StepFailure, named
-from varpin.simulation.kinks import saturates
+from varpin.simulation.limits import saturates
 from varpin.simulation.record import located
 from varpin.trajectory import Trajectory
 

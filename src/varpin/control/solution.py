@@ -24,9 +24,10 @@ from varpin.control.solution_file import read, write
 from varpin.control.spread import Feedback
 from varpin.control.verification import Verification, verify
 from varpin.errors import InputError
+from varpin.finding import Finding
 from varpin.linearization import velocity_at_nodes
-from varpin.mechanics.policy import LinearPolicy
 from varpin.model import joint_unit
+from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import JointValues, count, is_one_of, positive
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, folded, listed, table, warning_count
@@ -118,7 +119,7 @@ class Solution(Frozen):
     history: tuple[Iteration, ...]
     search: SearchState | None = None
     previous_gains: Floats | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Finding, ...] = ()
     refinement: Refinement | None = None
     multipliers: Multipliers | None = None
 

@@ -20,6 +20,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.refined import Refined, Refinement
 from varpin.control.watchdog import Watchdog
 from varpin.errors import FileError
+from varpin.finding import Finding
 from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
 from varpin.mechanics.scene import same
 from varpin.model import Robot
@@ -92,7 +93,7 @@ class _Plan:
     noise_cost: float
     status: str
     reason: str
-    warnings: tuple[str, ...] = field(metadata={"entry": "plan.warnings"})
+    warnings: tuple[Finding, ...] = field(metadata={"entry": "plan.warnings"})
     history: Annotated[Floats, Axes("iterations", len(_COLUMNS))]
     previous_gains: Annotated[Floats, Axes("decisions", "controls", "controls", finite=True)] | None = None
     second_order: Annotated[Floats, Axes("iterations")] | None = None

@@ -15,9 +15,9 @@ from varpin.control.refined import Refined, Refinement, part
 from varpin.control.solution import Solution
 from varpin.control.verification import OnRobot, excess, true_costs
 from varpin.errors import InputError
-from varpin.mechanics.policy import LinearPolicy
-from varpin.simulation.friction import rate_at_rest
+from varpin.signals.policy import LinearPolicy
 from varpin.simulation.record import rollout
+from varpin.simulation.spectrum import rate_at_rest
 
 logger = logging.getLogger(__name__)
 

@@ -17,9 +17,10 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.core import Watch
 from varpin.core.arrays import Bytes, Commands, RolloutArrays
 from varpin.integrators import Integrator
-from varpin.integrators.base import Failure, Lines, lines, statistics_of
+from varpin.integrators.base import Failure, statistics_of
 from varpin.integrators.variational import Variational
-from varpin.mechanics.inputs import with_ends
+from varpin.signals.commands import Lines, lines
+from varpin.signals.inputs import with_ends
 from varpin.trajectory import Trajectory
 
 # Halvings that a step of a trial may take, if the motion it is near has no more, and further ones where it may take

@@ -27,8 +27,8 @@ from varpin.control.refinement import COMPARISON, SLOW, SUFFICIENT, refine
 from varpin.control.search import ARMIJO, BACKTRACKING, Report, Search
 from varpin.control.solution import Solution
 from varpin.errors import InputError
-from varpin.mechanics.policy import LinearPolicy
-from varpin.simulation.soundness import announce
+from varpin.finding import announce
+from varpin.signals.policy import LinearPolicy
 from varpin.support.checks import (
     JointValues,
     count,
@@ -185,7 +185,7 @@ def solve(
     path = None if states is None else path_of(problem, states)
     # Before the search, which may take long where values are in wrong units.
     before = foreseen(problem) if check else []
-    announce(logger, problem.scene, problem.dt, before)
+    announce(logger, problem.scene.announced, problem.dt, before)
 
     def searched(
         problem: OptimalControlProblem,

@@ -17,10 +17,10 @@ from varpin.control.problem import OptimalControlProblem, bind_cost
 from varpin.core import fastest_damping
 from varpin.core.arrays import Commands
 from varpin.integrators import Gauss, Integrator, Radau, RungeKutta4
-from varpin.integrators.base import open_line, open_loop
-from varpin.mechanics.policy import LinearPolicy
-from varpin.simulation.friction import rate_at_rest
+from varpin.signals.commands import open_line, open_loop
+from varpin.signals.policy import LinearPolicy
 from varpin.simulation.record import rollout
+from varpin.simulation.spectrum import rate_at_rest
 from varpin.support.markup import facts, table
 from varpin.trajectory import Trajectory
 

@@ -12,7 +12,7 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.errors import LinearizationError
 from varpin.integrators.collocation import Collocation
 from varpin.linearization import Linearization, velocity_at_nodes
-from varpin.simulation.friction import damping_matrices
+from varpin.simulation.spectrum import damping_matrices
 from varpin.trajectory import Trajectory
 
 # Terms of the series for a short part of a step, and the decay over it up to which its error is a rounding error.

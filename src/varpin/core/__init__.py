@@ -24,19 +24,17 @@ from varpin.core._core import Watch as Watch
 from varpin.core._core import accelerations as accelerations
 from varpin.core._core import box_minimum as box_minimum
 from varpin.core._core import change_values as change_values
-from varpin.core._core import clear_growth as clear_growth
 from varpin.core._core import constrained_derivatives as constrained_derivatives
 from varpin.core._core import coupling_kinds as coupling_kinds
 from varpin.core._core import element_kinds as element_kinds
-from varpin.core._core import energy_turnover as energy_turnover
 from varpin.core._core import expand_changes as expand_changes
 from varpin.core._core import fastest_damping as fastest_damping
 from varpin.core._core import foresee as foresee
-from varpin.core._core import glance as glance
 from varpin.core._core import inside_bounds as inside_bounds
 from varpin.core._core import inverse_dynamics as inverse_dynamics
 from varpin.core._core import linearize_explicit as linearize_explicit
 from varpin.core._core import longest_alternation as longest_alternation
+from varpin.core._core import propagated_errors as propagated_errors
 from varpin.core._core import pulls_fast as pulls_fast
 from varpin.core._core import run_gradients as run_gradients
 from varpin.core._core import sample_steps as sample_steps
@@ -45,4 +43,3 @@ from varpin.core._core import variational_bends as variational_bends
 from varpin.core._core import variational_curvatures as variational_curvatures
 from varpin.core._core import variational_derivatives as variational_derivatives
 from varpin.core._core import variational_ends as variational_ends
-from varpin.core._core import windows_agree as windows_agree

@@ -621,24 +621,6 @@ def fastest_damping(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, least
 def pulls_fast(mechanism: Mechanism, q: Floats, v: Floats, f: Floats, dt: float) -> bool:
     """Whether springs, servos or gravity advance a mode by more than a radian in dt [s], at a row of q, v, f (K, n)."""
 
-def glance(
-    mechanism: Mechanism, q: Floats, v: Floats, u: Floats, substeps: Integers, dt: float
-) -> tuple[float, bool, bool, bool]:
-    """The largest velocity; whether steps were divided, all have the same controls, and :func:`pulls_fast` over a step.
-
-    The nodes are (N + 1, n), ``dt`` [s] apart, the controls (N, m). The last value is taken at both ends of the motion.
-    """
-
-def energy_turnover(
-    mechanism: Mechanism, q: Floats, v: Floats, p: Floats, u: Floats, dt: float, *, even: float, looks: int
-) -> tuple[float, float, Floats, Floats]:
-    """The energy that a motion turns over [J], from its nodes (N + 1, n), ``dt`` [s] apart, and controls (N, m).
-
-    Returns the largest kinetic energy; the largest accumulated work of all controls, for servos that of their drives;
-    and for each coordinate (n,) the kinetic energy of the largest change of its velocity, at least the share ``even``
-    of its largest velocity, and the largest accumulated work.
-    """
-
 class Stretch:
     """Polynomials over consecutive steps, and a quadrature on them; see src/core/include/varpin/clearance.hpp."""
 
@@ -646,44 +628,27 @@ class Stretch:
     def make(*, curves: Floats, sums: Floats, places: Floats) -> Stretch:
         """Raises ValueError for arrays that do not fit each other."""
 
-def clear_growth(
+def propagated_errors(
     mechanism: Mechanism,
     q: Floats,
     v: Floats,
-    p: Floats,
     u: Floats,
     within: Floats,
-    defect: Floats,
-    substeps: Integers,
     dt: float,
     *,
     narrow: Stretch,
     wide: Stretch | None,
-    still: float,
-    energy: float,
     damping: float,
     damped_at: int,
-    travel: float,
-    velocity: float,
-    little: float,
-    light: float,
-    even: float,
-    window: int,
-    whole: float,
-    grown: float,
-    aligned: float,
-    few: int,
-    known: float,
-) -> float:
-    """The factor up to which disturbances may grow over a motion for it to be clearly right.
+    most_q: Floats,
+    most_v: Floats,
+) -> tuple[Floats, Floats]:
+    """The largest errors of q and v (n,) at the nodes (N + 1, n) of a motion, from the defects of its steps.
 
-    It is infinite where they grow less: the equations of motion hold along the record far better than any warning
-    needs. It is 0 where they do not.
-
-    The arguments are those of :func:`glance` and :func:`energy_turnover`; controls at the stages of each step
-    ``within`` (N, s, m), s = 0 for controls that are constant over each; the error ``defect`` (N,) of the energy
-    balance; and stretches of one step, ``narrow``, and of two. All others are largest errors, see
-    src/core/include/varpin/clearance.hpp.
+    They are infinite where they are not known or exceed ``most_q`` and ``most_v`` (n,). The controls are u (N, m), and
+    those at the stages of each step ``within`` (N, s, m), s = 0 for controls that are constant over each; ``narrow`` is
+    a stretch of one step, ``wide`` of two. Along single steps errors are not known where one of ``damped_at`` nodes has
+    dampers faster than ``damping`` / dt.
     """
 
 def inside_bounds(
@@ -692,28 +657,6 @@ def inside_bounds(
     """Whether q and v (N + 1, n) and the controls' forces are each within ``bounds`` (3, 2, n), the least and the most.
 
     The controls are u (N, m), and those at the stages of each step ``within`` (N, s, m).
-    """
-
-def windows_agree(
-    mechanism: Mechanism,
-    q: Floats,
-    v: Floats,
-    begins: Integers,
-    length: int,
-    dt: float,
-    again_q: Floats,
-    again_v: Floats,
-    *,
-    travel: float,
-    velocity: float,
-    little: float,
-    light: float,
-    even: float,
-) -> bool:
-    """Whether windows of a motion (N + 1, n) agree with the results (K, looks, n) of other steps.
-
-    Errors may reach the share ``travel`` of each coordinate's travel in the window, and ``velocity`` of its largest
-    velocity. The results are at ``looks`` evenly spaced nodes of each window.
     """
 
 def longest_alternation(

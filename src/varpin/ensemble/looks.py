@@ -8,9 +8,10 @@ from contextlib import closing
 
 from varpin.arrays import Floats
 from varpin.ensemble.paths import Extremes, Shared, Task
-from varpin.simulation.loop_stability import examined_in_loop
+from varpin.finding import Finding
+from varpin.simulation.check import check
+from varpin.simulation.loop import unstable_loop
 from varpin.simulation.record import Motions
-from varpin.simulation.soundness import Finding
 from varpin.support.executors import in_order
 
 # Up to this number of paths, every path is examined.
@@ -23,17 +24,17 @@ def greater(one: Extremes, other: Extremes) -> Extremes:
 
 
 def looked_at(pool: Executor, shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:
-    """Findings about a few paths: each kind once, for the first path that has it."""
+    """Findings about a few paths: each kind once, for the path with the largest value."""
     tasks = _examined(shared, q0, v0, extremes)
     with closing(in_order(pool, _examine, tasks)) as findings:
-        return _first_of_each_kind(tasks, findings)
+        return _worst_of_each_kind(tasks, findings)
 
 
 def looked_at_here(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> tuple[Finding, ...]:
     """:func:`looked_at` after Ctrl-C, without the workers, which may have stopped; empty after a second Ctrl-C."""
     tasks = _examined(shared, q0, v0, extremes)
     try:
-        return _first_of_each_kind(tasks, map(_examine, tasks))
+        return _worst_of_each_kind(tasks, map(_examine, tasks))
     except KeyboardInterrupt:
         return ()
 
@@ -50,11 +51,13 @@ def _examined(shared: Shared, q0: Floats, v0: Floats, extremes: Extremes) -> lis
     return [Task(shared, path, q0[path : path + 1].copy(), v0[path : path + 1].copy()) for path in paths]
 
 
-def _first_of_each_kind(tasks: Sequence[Task], findings_of_tasks: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
+def _worst_of_each_kind(tasks: Sequence[Task], findings_of_tasks: Iterable[tuple[Finding, ...]]) -> tuple[Finding, ...]:
     found: dict[str, Finding] = {}
     for task, findings in zip(tasks, findings_of_tasks, strict=True):
         for finding in findings:
-            found.setdefault(finding.kind, Finding(finding.kind, f"path {task.first}: {finding.sentence}"))
+            kept = found.get(finding.kind)
+            if kept is None or (finding.value or 0.0) > (kept.value or 0.0):
+                found[finding.kind] = finding.about(f"path {task.first}: ")
     return tuple(found.values())
 
 
@@ -67,6 +70,5 @@ def _examine(task: Task) -> tuple[Finding, ...]:
     motion, _ = motions.under(shared.commands, increments=drawn)
     # The loop's check is for held controls.
     held = len(shared.commands.gains) and not len(shared.commands.stage_times)
-    hold = shared.commands.hold if held else None
-    fed = shared.commands if held else None
-    return examined_in_loop(shared.scene, shared.integrator, motion, hold, commands=fed)[1]
+    loop = unstable_loop(shared.scene, motion, shared.commands.hold) if held else ()
+    return (*loop, *check(shared.scene, shared.integrator, motion, shared.commands if held else None).warnings)

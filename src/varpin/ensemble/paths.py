@@ -17,11 +17,12 @@ from varpin.ensemble.histogram import count_in_bins
 from varpin.ensemble.record import PathFailure
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator, Segment
-from varpin.integrators.base import Failure, lines, rows
+from varpin.integrators.base import Failure
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.inputs import as_moved, with_ends
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import Children
+from varpin.signals.commands import lines, rows
+from varpin.signals.inputs import as_moved, with_ends
 from varpin.simulation.record import located
 from varpin.support.frozen import Frozen
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
+from varpin.finding import Finding
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, table, warning_count
 
@@ -71,7 +72,7 @@ class Ensemble(Frozen):
         u: Controls applied (P, N, m).
         energy: Energy (P, N + 1) [J].
         failures: Paths that stopped early. The statistics leave a path out after its failure.
-        warnings: One sentence each: dt too coarse, energy off, paths that stopped early. The first path, the one with
+        warnings: One of each kind: errors, limits, paths that stopped early. The first path, the one with
             the most split steps, the one with the most energy and the fastest are examined as :func:`varpin.simulate`
             examines its motion; of up to ten paths, all are.
         integrator: The integrator of all paths.
@@ -85,7 +86,7 @@ class Ensemble(Frozen):
     u: Floats | None
     energy: Floats | None
     failures: tuple[PathFailure, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Finding, ...] = ()
     integrator: str = ""
 
     def __repr__(self) -> str:

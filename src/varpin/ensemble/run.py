@@ -16,14 +16,13 @@ from varpin.ensemble.paths import Part, Shared, simulate_paths, without_geometry
 from varpin.ensemble.record import Ensemble, EnsembleInterrupted
 from varpin.ensemble.statistics import Sums
 from varpin.errors import InputError, VarpinError
+from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
-from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import children
-from varpin.simulation.choice import changes_along, integrator_along, stronger, usual_integrator
+from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
+from varpin.simulation.choice import stronger, usual_integrator
 from varpin.simulation.commands import commands_of
-from varpin.simulation.record import rollout
-from varpin.simulation.soundness import Finding, announce
 from varpin.simulation.start import in_other_units, on_constraints
 from varpin.simulation.time_steps import time_steps
 from varpin.support.checks import (
@@ -123,7 +122,7 @@ def simulate_ensemble(
         controls = scene.command_at(start[0][0])
     start, moved = _onto_constraints(scene, start)
     if integrator is None:
-        integrator = _usual(scene, start[0], start[1], controls, steps, dt)
+        integrator = _usual(scene, start[0], start[1], dt)
     commands = commands_of(scene, integrator, controls, steps, dt)
     with executing(executor, workers) as pool:
         shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
@@ -141,7 +140,7 @@ def simulate_ensemble(
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
     found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
-    announce(logger, scene, dt, found)
+    announce(logger, scene.announced, dt, found)
     return sums.ensemble(found)
 
 
@@ -149,20 +148,13 @@ def _usual(
     scene: Scene,
     q0: Floats,
     v0: Floats,
-    controls: JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None,
-    steps: int,
     dt: float,
 ) -> Integrator:
     """The integrator of paths from (q0, v0) (P, n) where none is given: one that is right for a few of them."""
     if scene.processes:
         return usual_integrator(scene, q0[0], v0[0], dt, noisy=True)
     some = np.linspace(0, len(q0) - 1, min(1 + len(q0) // _OF, _CHOOSING)).astype(np.int64)
-    chosen = stronger(usual_integrator(scene, q0[path], v0[path], dt, noisy=False) for path in some)
-    if not changes_along(scene) or not steps:
-        return chosen
-    commands = commands_of(scene, chosen, controls, steps, dt)
-    motions = (rollout(scene, chosen, q0[path], v0[path], commands, dt)[0] for path in some)
-    return stronger(integrator_along(scene, chosen, own.q, own.v, own.u, dt) for own in motions if own.steps)
+    return stronger(usual_integrator(scene, q0[path], v0[path], dt, noisy=False) for path in some)
 
 
 def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Floats], tuple[Finding, ...]]:
@@ -175,9 +167,7 @@ def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Float
         return [np.broadcast_to(q, q0.shape), np.broadcast_to(v, v0.shape)], found
     moved = [on_constraints(scene, q, v) for q, v in zip(q0, v0, strict=True)]
     findings = (
-        tuple(Finding(finding.kind, f"path {path}: {finding.sentence}") for finding in found)
-        for path, (_, _, found) in enumerate(moved)
-        if found
+        tuple(finding.about(f"path {path}: ") for finding in found) for path, (_, _, found) in enumerate(moved) if found
     )
     return [np.array([q for q, _, _ in moved]), np.array([v for _, v, _ in moved])], next(findings, ())
 

@@ -15,7 +15,7 @@ from varpin.ensemble.histogram import Histogram
 from varpin.ensemble.looks import greater
 from varpin.ensemble.paths import Extremes, Moments, Part, Shared, Task, chunks
 from varpin.ensemble.record import Ensemble, EnsembleStatistics, PathFailure
-from varpin.simulation.soundness import Finding
+from varpin.finding import Finding
 
 # Without stored paths, quantiles are exact up to this many numbers, P (N + 1) 2n.
 _EXACT = 2**25
@@ -132,7 +132,7 @@ class Sums:
             u=stored.get("u"),
             energy=stored.get("energy"),
             failures=tuple(self.failures),
-            warnings=tuple(finding.sentence for finding in found),
+            warnings=tuple(found),
             integrator=str(self.shared.integrator),
         )
 

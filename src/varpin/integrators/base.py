@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,11 @@ from varpin.arrays import Floats, Integers
 from varpin.core import Watch
 from varpin.core.arrays import Commands, RolloutArrays
 from varpin.errors import InputError, SingularMassMatrix
-from varpin.mechanics.inputs import with_ends
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import Fields, over_steps
 from varpin.mechanics.scene import Scene
+from varpin.signals.commands import contiguous, open_loop, rest_of_line, rows, steps_of
+from varpin.signals.inputs import with_ends
 from varpin.trajectory import Bytes, StepStatistics, Trajectory, joined
 
 # Fields of a segment with one row for each node.
@@ -97,7 +98,7 @@ class Integrator(ABC):
 
         A trajectory stores it.
         """
-        return written(self, self.named)
+        return _name_of(self) if isinstance(self, Hashable) else written(self, self.named)
 
     def same_map(self, other: Integrator) -> bool:
         """Whether ``other`` has the same step map for undivided steps."""
@@ -175,7 +176,7 @@ class Integrator(ABC):
                 row = open_loop(segments[-1].u)._replace(hold=commands.hold - taken)
                 if len(commands.stage_times):
                     first = segments[j - taken - 1].u if j > taken else commands.before[:1]
-                    row = _rest_of_line(row, first, taken, commands)
+                    row = rest_of_line(row, first, taken, commands)
             segments.append(self.step_in_python(scene, state, row, increments[:, j : j + 1], dt))
             if segments[-1].failure is not None:
                 break
@@ -316,6 +317,12 @@ class Integrator(ABC):
         )
 
 
+@functools.lru_cache(maxsize=256)
+def _name_of(integrator: Integrator) -> str:
+    """The text of an integrator, which a program has few of."""
+    return written(integrator, integrator.named)
+
+
 def written(made: object, named: Sequence[str] = ()) -> str:
     """A dataclass as the text of its constructor call, with the options in ``named`` and those not at their default."""
     given: dict[str, Any] = {item.name: item.default for item in fields(made)} if is_dataclass(made) else {}
@@ -379,14 +386,6 @@ def noise_of_step(
     if dw.size > k:
         impulse = impulse + over_steps(scene.noise, q[None], v[None], ends[0], ends, start).F[0, :, k:] @ dw[k:]
     return impulse
-
-
-def ends_of(command: Commands, decided: Floats) -> tuple[Floats, Floats]:
-    """The controls (1, m) at both ends of the first step under a decision's control (m,)."""
-    if not len(command.stage_times):
-        return decided[None], decided[None]
-    nodes = lines(command, decided[None], ()).nodes
-    return nodes[:1], nodes[1:]
 
 
 def drifts(scene: Scene, trajectory: Trajectory) -> Floats | float:
@@ -514,128 +513,3 @@ def _no_statistics() -> StepStatistics:
     for array in (none, zero, halvings):
         array.setflags(write=False)
     return StepStatistics(none, none, none, none, halvings, zero, zero, zero)
-
-
-def open_loop(u: Floats) -> Commands:
-    """Controls (N, m) without feedback."""
-    return Commands(np.ascontiguousarray(u), *_without_feedback(u.shape[1]))
-
-
-def open_line(u: Floats, times: Sequence[float]) -> Commands:
-    """Controls (N + 1, m) at nodes without feedback, linear between them, for a method with stages at ``times``."""
-    return open_loop(u[1:])._replace(before=u[:1].copy(), stage_times=np.array(tuple(times) or (0.5,)))
-
-
-@functools.cache
-def _without_feedback(controls: int) -> tuple[Floats, Floats, int, Floats, Floats]:
-    """Gains, reference, hold, limits and control before the first of :func:`open_loop`, read-only."""
-    gains, reference, before = np.zeros((0, controls, 0)), np.zeros((0, 0)), np.zeros((0, controls))
-    for array in (gains, reference, before):
-        array.setflags(write=False)
-    return gains, reference, 1, no_limits(controls), before
-
-
-@functools.cache
-def no_limits(controls: int) -> Floats:
-    """Infinite limits (2, m) for controls without limits, read-only."""
-    limits = np.outer([-np.inf, np.inf], np.ones(controls))
-    limits.setflags(write=False)
-    return limits
-
-
-class Lines(NamedTuple):
-    """Controls of N steps that are linear between nodes."""
-
-    mean: Floats  # over each step (N, m)
-    stages: Floats  # at the stages of each step (N, s, m), (N, 0, m) for methods that hold the mean
-    nodes: Floats  # (N + 1, m)
-
-
-def lines(commands: Commands, ends: Floats, times: Sequence[float]) -> Lines:
-    """The controls within each step of ``commands`` that are linear between nodes.
-
-    ``ends`` (N, m) are the recorded controls at the end of each step's decision, ``times`` are
-    :attr:`Integrator.stage_times`.
-    """
-    steps = np.arange(len(ends))
-    begins = np.vstack([commands.before[:1], ends])[steps - steps % commands.hold]
-
-    mean, after = on_lines(begins, ends, commands.hold, (0.5, 1.0)).swapaxes(0, 1)
-    return Lines(mean.copy(), on_lines(begins, ends, commands.hold, times), np.vstack([commands.before[:1], after]))
-
-
-def on_lines(begins: Floats, ends: Floats, hold: int, times: Sequence[float]) -> Floats:
-    """Controls (N, s, m) at ``times`` (s,) in N steps of unit length, every ``hold`` of which are on one line.
-
-    ``begins`` and ``ends`` (N, m) are those of each step's line.
-    """
-    share = ((np.arange(len(ends)) % hold)[:, None] + np.array(times))[:, :, None] / hold
-    found: Floats = (1.0 - share) * begins[:, None] + share * ends[:, None]
-    return found
-
-
-def _rest_of_line(end: Commands, first: Floats, taken: int, commands: Commands) -> Commands:
-    """The line from ``first`` (1, m) to ``end`` over the steps of a decision, after ``taken`` steps."""
-    here = first + taken / commands.hold * (end.u - first)
-    return end._replace(before=here, hold=commands.hold - taken, stage_times=commands.stage_times)
-
-
-def first_of(command: Commands, control: Floats, times: Sequence[float]) -> Commands:
-    """The first step under a decision's ``control`` (m,): its mean, and the values at the stages if they change."""
-    if not len(command.stage_times):
-        return open_loop(control[None])._replace(within=command.within)
-    mean, stages, _ = lines(command, control[None], times)
-    return open_loop(mean) if not stages.size else open_loop(mean)._replace(within=np.ascontiguousarray(stages))
-
-
-def control_of(commands: Commands, decision: int, x: Floats, before: Floats) -> Floats:
-    """The control (m,) of a decision at a state x (2n,), by the formula of the core.
-
-    ``before`` is the previous control (1, m), or (0, m) for that of the reference.
-    """
-    u = commands.u[decision]
-    if len(commands.gains):
-        gains, change = commands.gains[decision], x - commands.reference[decision, : x.size]
-        u = u + gains[:, : x.size] @ change
-        if len(before) and gains.shape[1] > x.size:
-            u = u + gains[:, x.size :] @ (before[0] - commands.reference[decision, x.size :])
-    limited: Floats = np.clip(u, *commands.limits)
-    return limited
-
-
-def contiguous(commands: Commands) -> Commands:
-    """Commands with C-contiguous arrays, as the core requires."""
-    if (
-        commands.u.flags.c_contiguous
-        and commands.gains.flags.c_contiguous
-        and commands.reference.flags.c_contiguous
-        and commands.limits.flags.c_contiguous
-        and commands.within.flags.c_contiguous
-    ):
-        return commands
-    return commands._replace(
-        u=np.ascontiguousarray(commands.u),
-        gains=np.ascontiguousarray(commands.gains),
-        reference=np.ascontiguousarray(commands.reference),
-        limits=np.ascontiguousarray(commands.limits),
-        within=np.ascontiguousarray(commands.within),
-    )
-
-
-def steps_of(commands: Commands) -> int:
-    """Number of steps of the commands, for each path."""
-    return (commands.own or len(commands.u)) * commands.hold
-
-
-def rows(commands: Commands, begin: int, end: int, before: Floats | None = None) -> Commands:
-    """The commands of decisions begin, ..., end - 1; ``before`` (P, m) replaces the previous control of each path."""
-    if begin == 0 and end >= len(commands.u) and before is None:
-        return commands
-    part = slice(begin, end)
-    return commands._replace(
-        u=commands.u[part],
-        gains=commands.gains[part],
-        reference=commands.reference[part],
-        before=commands.before if before is None else before.copy(),
-        within=commands.within[begin * commands.hold : end * commands.hold],
-    )

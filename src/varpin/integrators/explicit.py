@@ -17,21 +17,17 @@ from varpin.integrators.base import (
     Failure,
     Integrator,
     Segment,
-    contiguous,
-    control_of,
     diffusion_and_drift,
     drifts,
-    ends_of,
     failure_of,
     first_nodes,
-    first_of,
     forces,
     noise_of_step,
     segments_of,
-    steps_of,
 )
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, refuse_constraints
+from varpin.signals.commands import contiguous, control_of, ends_of, first_of, steps_of
 from varpin.trajectory import Bytes, Trajectory
 
 REASONS: dict[int, str] = {

@@ -12,19 +12,11 @@ from varpin.arrays import Floats
 from varpin.core import ExplicitMethod, ExplicitRollout, ForwardDynamics
 from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
-from varpin.integrators.base import (
-    Failure,
-    Integrator,
-    Segment,
-    control_of,
-    drifts,
-    forces,
-    segments_of,
-    steps_of,
-)
+from varpin.integrators.base import Failure, Integrator, Segment, drifts, forces, segments_of
 from varpin.integrators.explicit import REASONS, accelerations
-from varpin.integrators.tableau import gauss_coefficients, interpolation
+from varpin.integrators.tableau import gauss_coefficients
 from varpin.mechanics.scene import Scene, refuse_constraints
+from varpin.signals.commands import control_of, interpolation, steps_of
 from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
 

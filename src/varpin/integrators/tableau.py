@@ -8,16 +8,7 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.core import Tableau
-
-
-def interpolation(nodes: Floats, at: Floats) -> Floats:
-    """Values at ``at`` (r,) of the Lagrange polynomials on ``nodes`` (s,): (r, s)."""
-    values = np.ones((at.size, nodes.size))
-    for j in range(nodes.size):
-        for k in range(nodes.size):
-            if k != j:
-                values[:, j] *= (at - nodes[k]) / (nodes[j] - nodes[k])
-    return values
+from varpin.signals.commands import interpolation
 
 
 @functools.cache

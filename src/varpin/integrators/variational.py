@@ -29,25 +29,21 @@ from varpin.integrators.base import (
     Failure,
     Integrator,
     Segment,
-    contiguous,
-    control_of,
     diffusion_and_drift,
     drifts,
-    ends_of,
     failure_of,
     first_nodes,
-    first_of,
     forces,
     noise_of_step,
     parts_of,
     segments_of,
-    steps_of,
     without_inputs,
     written,
 )
 from varpin.mechanics.forces import limited_servos
-from varpin.mechanics.inputs import in_parts_of_steps, prescribing, with_ends
 from varpin.mechanics.scene import Scene, refuse_constraints
+from varpin.signals.commands import contiguous, control_of, ends_of, first_of, steps_of
+from varpin.signals.inputs import in_parts_of_steps, prescribing, with_ends
 from varpin.support.checks import count, fraction, is_one_of, positive
 from varpin.trajectory import MOST_HALVINGS, Bytes, Trajectory
 

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import FileError, InputError
+from varpin.finding import Finding
 from varpin.support.checks import is_file, path_like, writable
 
 T = TypeVar("T")
@@ -196,7 +197,7 @@ def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
             columns = [column.name for column in fields(row)]
             members |= {f"{name}.{key}": np.array([getattr(entry, key) for entry in value]) for key in columns}
         else:
-            members[name] = np.array(value, dtype=np.str_) if hint == tuple[str, ...] else value
+            members[name] = np.array([_text(own) for own in value], dtype=np.str_) if _texts(hint) else value
     return members
 
 
@@ -320,6 +321,8 @@ class _Builder:
         return tuple(self.build(kind, item, f"{entry}[{index}]") for index, (kind, item) in pairs)
 
     def _scalar(self, kind: Any, value: Any, entry: str) -> Any:
+        if issubclass(kind, Finding):
+            return kind.of_entry(self._scalar(str, value, entry))
         if issubclass(kind, Enum):
             allowed = [member.value for member in kind]
             if value not in allowed:
@@ -369,6 +372,16 @@ def _row(hint: Any) -> Any:
     """The dataclass of an annotation ``tuple[record, ...]``; None for other annotations."""
     first, *_ = typing.get_args(hint) or (None,)
     return first if typing.get_origin(hint) is tuple and is_dataclass(first) else None
+
+
+def _texts(hint: Any) -> bool:
+    """Whether an annotation is ``tuple[str, ...]``, or of findings."""
+    return typing.get_origin(hint) is tuple and typing.get_args(hint)[0] in (str, Finding)
+
+
+def _text(value: str) -> str:
+    """A text, or a finding with its numbers, as one string."""
+    return value.entry() if isinstance(value, Finding) else value
 
 
 def _array_type(hint: Any) -> tuple[np.dtype[Any], Axes | None]:

@@ -19,6 +19,7 @@ from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism as Core
 from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
+from varpin.finding import Told
 from varpin.mechanics.constraints import (
     Bound,
     Constraint,
@@ -164,7 +165,7 @@ class Scene(Frozen):
     bound_constraints: Bound = field(repr=False)
     constraint_order: NDArray[np.int64] = field(repr=False)
     # Warnings that this process has logged: kind, time step [s] and joint, or None.
-    announced: set[tuple[str, float, int | None]] = field(repr=False)
+    announced: Told = field(repr=False)
 
     def __init__(
         self,
@@ -890,28 +891,26 @@ def given_constraints(
 
 def _log_left_out(robot: Robot, *, damped: bool, dry: bool) -> None:
     """Log damping and dry friction of the description that the scene has none of."""
-    left_out = []
-    if robot.damping.any() and not damped:
-        left_out.append(
-            f"damping [N m s/rad or N s/m] of {_by_joint(robot, robot.damping)} "
-            "(damping='robot' takes it, damping=0 silences this message)"
-        )
-    if robot.friction.any() and not dry:
-        left_out.append(
-            f"dry friction [N m or N] of {_by_joint(robot, robot.friction)} "
-            "(friction='robot' takes it, friction=0 silences this message)"
-        )
-    if left_out:
-        message = "robot %r: the scene leaves out what the description gives: %s"
-        logger.warning(message, robot.name, ", and ".join(left_out))
+    given = (("damping", damped, robot.damping, "s"), ("friction", dry, robot.friction, ""))
+    left_out = [(name, values, per) for name, scene_has, values, per in given if values.any() and not scene_has]
+    if not left_out:
+        return
+    parts = [
+        f"{name} (of {int(np.count_nonzero(values))} joints, up to {values.max():g} {_unit_of(robot, values, per)})"
+        for name, values, per in left_out
+    ]
+    cure = ", ".join(f"{name}='robot'" for name, _, _ in left_out)
+    off = ", ".join(f"{name}=0" for name, _, _ in left_out)
+    message = "robot %r: the scene leaves out the %s of its description: %s takes it, %s silences this"
+    logger.warning(message, robot.name, " and the ".join(parts), cure, off)
 
 
-def _by_joint(robot: Robot, values: Floats) -> str:
-    """The first nonzero numbers by joint, as text."""
-    named = [f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value]
-    if len(named) == robot.dof and np.ptp(values) == 0.0:
-        return f"{values[0]:g} at every joint"
-    return ", ".join(named[:_NAMED]) + (f" and {len(named) - _NAMED} more" if len(named) > _NAMED else "")
+def _unit_of(robot: Robot, values: Floats, per: str) -> str:
+    """The unit of the largest of some joints' forces, or of forces per velocity (``per`` = "s")."""
+    slides = bool(robot.slides[int(np.argmax(values))])
+    if per:
+        return "N s/m" if slides else "N m s/rad"
+    return "N" if slides else "N m"
 
 
 def _forces(

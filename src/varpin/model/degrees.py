@@ -52,6 +52,8 @@ def degrees_per_second_hint(robot: Robot, name: str, v: Floats) -> str:
         name: Name of the velocity, for the sentence.
         v: Velocity (n,) [rad/s or m/s].
     """
+    if not v.any():
+        return ""
     limit = robot.velocity_limit
     limited = ~robot.slides & np.isfinite(limit) & (limit > 0.0)
     times = np.where(limited, np.abs(v), 0.0) / np.where(limited, limit, 1.0)

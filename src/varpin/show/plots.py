@@ -77,6 +77,26 @@ def plot_velocities(
     return _plot_nodes(trajectory, trajectory.v, "velocity", ("rad/s", "m/s"), axes, robot, limits)
 
 
+def plot_error(
+    trajectory: Motion, axes: Axes | None = None, *, robot: Robot | None = None
+) -> tuple[Figure | SubFigure, Axes]:
+    """The estimated error of the joint positions over time, on a logarithmic axis.
+
+    The arguments are those of :func:`plot_joints`.
+
+    Raises:
+        InputError: As for :func:`plot_joints`, or the motion was not checked.
+    """
+    trajectory = _require_motion(trajectory, robot)
+    if trajectory.error is None:
+        raise InputError("the motion has no error: it was simulated with check=False")
+    figure, axes = _plot_nodes(trajectory, trajectory.error, "estimated error", ("rad", "m"), axes, robot, None)
+    if trajectory.error.any():
+        # The error is zero at the start.
+        axes.set_yscale("log")
+    return figure, axes
+
+
 def plot_controls(
     trajectory: Motion,
     axes: Axes | None = None,
@@ -202,7 +222,9 @@ def plot_trajectory(
         count = 4 if driven else 3
         new = Figure(figsize=(9.0, 2.5 * count), layout="constrained")
         panels = new.subplots(count, 1, sharex=True)
-        new.suptitle(f"{trajectory.robot}: {trajectory.integrator}, dt = {trajectory.dt:g} s", fontsize="large")
+        off = f", {trajectory.error_text} rad or m" if trajectory.error_text else ""
+        title = f"{trajectory.robot}: {trajectory.integrator}, dt = {trajectory.dt:g} s{off}"
+        new.suptitle(title, fontsize="large")
     else:
         panels = np.asarray(axes, dtype=object).ravel()
         if panels.size != 4:
@@ -306,7 +328,7 @@ def plot_advice(advice: Advice, axes: Axes | None = None) -> tuple[Figure | SubF
         axes.axvline(advice.budget, label="budget", **_MARK)
     _legend(axes)
     axes.set_xlabel("predicted wall time [s]")
-    axes.set_ylabel("predicted error in q at the end [rad or m]")
+    axes.set_ylabel("error in q [rad or m]")
     return figure, axes
 
 

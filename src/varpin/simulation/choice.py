@@ -1,8 +1,4 @@
-"""The integrator of a motion where none is given.
-
-It is chosen by the rates at the start. Where damping or stops are faster than the step later in the motion, the motion
-is repeated with another integrator.
-"""
+"""The integrator of a motion where none is given, chosen once, by the rates at the start and in all joint stops."""
 
 from __future__ import annotations
 
@@ -15,10 +11,8 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.core import fastest_damping, pulls_fast
 from varpin.integrators import Gauss, Integrator, Midpoint, Radau
-from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
-from varpin.simulation.damping import fast_damping, stops_ahead, turns_fast
-from varpin.simulation.refinement import candidates, first_steps
+from varpin.simulation.spectrum import stops_ahead
 
 # The default, and the default under noise, where more stages do not raise the strong order.
 _USUAL, _NOISY = Gauss(2), Midpoint(kick="held")
@@ -29,58 +23,30 @@ _SWINGING, _TURNS = Gauss(4), 0.4
 _STOPPING, _RINGS = Radau(4), 2.0
 # Most joints of a robot for which rates are computed: for more it takes as long as a motion.
 _MOST_JOINTS = 200
-# Further candidates for a tolerance, where damping is faster than the coarsest steps by this factor.
-_STIFF, _FAR = (Radau(3), Radau(4)), 4.0
 
 
-def usual_integrator(
-    scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: bool, ahead: bool = False
-) -> Integrator:
+def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: bool) -> Integrator:
     """The integrator of a motion where none is given; that of a plan is :func:`varpin.control.problem.integrator_for`.
 
     Under noise it is the midpoint rule with the noise held over the step, whose stationary distributions are those of
     the continuous system also where damping is faster than the step; Radau's velocities lose nearly all of the noise.
-
-    With ``ahead`` the choice covers all stops that joints may run into, for a motion that cannot be repeated.
     """
     if noisy:
         return _NOISY
     # Radau's methods do not keep constraints.
-    if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt, ahead=ahead):
+    if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt):
         return _of(_STOPPING, scene)
-    return _of(_SWINGING if _swings_faster(scene, q0, _TURNS / dt, ahead=ahead) else _USUAL, scene)
+    return _of(_SWINGING if _swings_faster(scene, q0, _TURNS / dt) else _USUAL, scene)
 
 
 def _of(chosen: Gauss | Radau, scene: Scene) -> Integrator:
     """The choice with noise held over the step in scenes with noise: a motion without it may be linearized."""
-    return replace(chosen, kick=usual_kick(scene))
+    return replace(chosen, kick="held") if scene.processes else chosen
 
 
 def usual_kick(scene: Scene) -> Literal["left", "held"]:
     """How noise acts where no integrator is given."""
     return "held" if scene.processes else "left"
-
-
-def changes_along(scene: Scene) -> bool:
-    """Whether a motion without noise may need another integrator than its start."""
-    if not scene.elements and not scene.couplings:
-        return False
-    stiffens = scene.couplings or of_kind(scene.elements, "JointStop")
-    return bool((stiffens or scene.dissipates) and scene.custom is None and scene.robot.dof <= _MOST_JOINTS)
-
-
-def integrator_along(scene: Scene, integrator: Integrator, q: Floats, v: Floats, u: Floats, dt: float) -> Integrator:
-    """The integrator that a motion needs for which :func:`usual_integrator` has chosen ``integrator``.
-
-    q and v (N + 1, n) are those of the nodes, u (N, m) of the steps, of a scene for which :func:`changes_along` holds.
-    """
-    if integrator.same_map(_of(_STOPPING, scene)):
-        return integrator
-    if not scene.constraints and fast_damping(scene, q, v, u, dt).rate:
-        return _of(_STOPPING, scene)
-    if integrator.same_map(_of(_USUAL, scene)) and turns_fast(scene, q, v, u, dt / _TURNS):
-        return _of(_SWINGING, scene)
-    return integrator
 
 
 def stronger(chosen: Iterable[Integrator]) -> Integrator:
@@ -92,31 +58,23 @@ def stronger(chosen: Iterable[Integrator]) -> Integrator:
     return max(chosen, key=lambda own: ranks[str(own)], default=_USUAL)
 
 
-def tolerance_candidates(scene: Scene, q0: Floats, v0: Floats, duration: float) -> tuple[Integrator, ...]:
-    """Candidates for a tolerance; with Radau's methods where damping is far faster than the motion."""
-    if scene.constraints:
-        return candidates(scene)
-    moves = first_steps(scene, q0, v0, duration, 1) / duration
-    return candidates(scene) + (_STIFF if _damps_faster(scene, q0, v0, _FAR * moves) else ())
-
-
-def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float, *, ahead: bool = False) -> bool:
+def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float) -> bool:
     """Whether dampers, dry friction or servos are faster than a rate [1/s] at (q0, v0) or at (q0, 0)."""
     # Custom forces are called in the motion alone, where an error has its step.
     if not scene.dissipates or scene.custom is not None or len(q0) > _MOST_JOINTS:
         return False
     # At rest dry friction is steepest, and servos that hold q0 do not saturate.
-    q = np.concatenate([np.tile(q0, (2, 1)), stops_ahead(scene, q0)]) if ahead else np.tile(q0, (2, 1))
+    q = np.concatenate([np.tile(q0, (2, 1)), stops_ahead(scene, q0)])
     v = np.zeros_like(q)
     v[0] = v0
     forces = np.tile(scene.actuation @ scene.holding @ q0, (len(q), 1))
     return fastest_damping(scene.core, q, v, forces, rate) > 0.0
 
 
-def _swings_faster(scene: Scene, q0: Floats, rate: float, *, ahead: bool) -> bool:
+def _swings_faster(scene: Scene, q0: Floats, rate: float) -> bool:
     """Whether springs, servos or gravity make a mode faster than a rate [rad/s] at rest at the start."""
     if scene.custom is not None or len(q0) > _MOST_JOINTS:
         return False
-    q = np.concatenate([q0[None], stops_ahead(scene, q0)]) if ahead else q0[None]
+    q = np.concatenate([q0[None], stops_ahead(scene, q0)])
     forces = np.tile(scene.actuation @ scene.holding @ q0, (len(q), 1))
     return bool(pulls_fast(scene.core, q, np.zeros_like(q), forces, 1.0 / rate))

@@ -10,12 +10,11 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.integrators import Integrator
-from varpin.integrators.base import open_line, open_loop, rows
-from varpin.integrators.within import Times, changing
-from varpin.mechanics.inputs import in_parts_of_steps, prescribing
-from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene
-from varpin.simulation.functions import ControlLaw, decision, evaluated, sampled
+from varpin.signals.commands import Times, changing, open_line, open_loop, rows
+from varpin.signals.inputs import in_parts_of_steps, prescribing
+from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
+from varpin.simulation.functions import ControlLaw, Sampled, decision, of_time, sampled
 from varpin.simulation.record import MotionRecord, next_command
 from varpin.support.checks import JointValues, as_floats, control_array, require_finite
 
@@ -49,7 +48,8 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
             steps, scene.controls, scene.robot.dof, integrator.variational, dt, integrator.stage_times
         )
     if isinstance(controls, OpenLoop):
-        return evaluated(controls, scene, integrator, dt, range(steps))
+        of = controls if isinstance(controls, Sampled) and controls.dt == dt else Sampled(controls, scene, dt)
+        return of_time(of, of.moments(0, steps, None), integrator)
     if isinstance(controls, FirstOrderHold):
         if controls.u.shape != (steps + 1, scene.controls):
             raise InputError(
@@ -140,7 +140,7 @@ def next_block(
             u = in_parts_of_steps(record.scene, u, *state, commands.hold * record.dt, commands.hold)
             return open_loop(u[:left])
         return open_loop(u)._replace(hold=min(1 if most == 1 else commands.hold, left))
-    if isinstance(controls, OpenLoop):
+    if isinstance(controls, Sampled):
         return sampled(controls, record, min(most, left))
     if most == 1 and not len(commands.stage_times):
         return next_command(commands, record)

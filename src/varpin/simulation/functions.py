@@ -1,38 +1,32 @@
-"""Controls that are functions: control laws, and functions of time."""
+"""Controls that are functions: control laws, and functions of time, of which a step takes their own moments."""
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, UnknownJoint
+from varpin.finding import Finding
 from varpin.integrators import Integrator
-from varpin.integrators.base import open_loop
-from varpin.integrators.within import changing
-from varpin.mechanics.inputs import as_moved, prescribing
-from varpin.mechanics.policy import FirstOrderHold, OpenLoop
 from varpin.mechanics.scene import Scene
+from varpin.signals.commands import changing, open_loop
+from varpin.signals.inputs import as_moved, prescribing
+from varpin.signals.moments import Moments, joined, moments_of
+from varpin.signals.policy import FirstOrderHold, OpenLoop
 from varpin.simulation.failures import ControlError
-from varpin.simulation.growth import WARNED, better, growth_bound, whole_error
 from varpin.simulation.record import MotionRecord
-from varpin.simulation.soundness import Finding, share_in_words
 from varpin.support.checks import JointValues, control_values, finite_array, takes
-from varpin.trajectory import Trajectory
 
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
-# Number of steps in which the mean of a function of time is compared with that of two half steps, and the largest
-# difference without a warning, as a share of the mean.
-_COMPARED, _ALIKE = 16, 0.05
-# The difference, as a share of what the function changes by and grown as the motion's fastest mode grows, from which on
-# the motion is repeated with its values at the stages of a better method; and the part of it that may be rounding.
-_SEEN, _ROUNDING = 2e-4, 1e-8
+# Root mean square of what a step's polynomial leaves of a function of time, as a share of its largest value, up to
+# which the motion's own residual shows its error: a third order of it is lost.
+_RESOLVED = 0.02
 # Distance of a kinematic input from its control at the start [rad or m, rad/s or m/s] without a warning.
 _ELSEWHERE = 1e-6
 # Name of a function of time in errors.
@@ -60,48 +54,86 @@ def decision(law: ControlLaw, record: MotionRecord) -> Floats:
     return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
 
 
-def sampled(controls: OpenLoop, record: MotionRecord, steps: int) -> Commands:
+class Sampled(OpenLoop):
+    """A function of time with its moments over the steps so far, for the motion and its repetition alike."""
+
+    scene: Scene
+    dt: float
+    parts: list[Moments]
+    done: int
+
+    def __init__(self, given: OpenLoop, scene: Scene, dt: float) -> None:
+        super().__init__(given.f, given.vectorized, given.breaks)
+        # The frozen dataclass refuses assignments.
+        vars(self).update(scene=scene, dt=dt, parts=[], done=0)
+
+    def moments(self, first: int, last: int, record: MotionRecord | None) -> Moments:
+        """The moments over steps first .. last, which begin at a step that is known or the next one.
+
+        Raises:
+            ControlError: The function failed.
+        """
+        if last > self.done:
+            values = _at_all_times if self.vectorized else _at_times
+
+            def at(times: Floats, steps: Integers) -> Floats:
+                return values(self.f, self.scene, times, steps, record)
+
+            self.parts.append(moments_of(at, self.done, last - self.done, self.dt, self.breaks))
+            vars(self)["done"] = last
+        return joined(self.parts).part(first, last)
+
+
+def sampled(controls: Sampled, record: MotionRecord, steps: int) -> Commands:
     """Controls of the next steps up to the first for which the function fails.
 
     Raises:
         ControlError: It fails for the first of them.
     """
-    inputs = controls, record.scene, record.integrator, record.dt
+    first = record.steps
     try:
-        return evaluated(*inputs, range(record.steps, record.steps + steps), record)
+        found = controls.moments(first, first + steps, record)
     except ControlError as error:
-        if error.step == record.steps:
+        if error.step == first:
             raise
-        return evaluated(*inputs, range(record.steps, error.step), record)
+        found = controls.moments(first, error.step, record)
+    return of_time(controls, found, record.integrator, first, record)
 
 
-def evaluated(
-    controls: OpenLoop,
-    scene: Scene,
-    integrator: Integrator,
-    dt: float,
-    steps: Iterable[int],
-    record: MotionRecord | None = None,
+def of_time(
+    controls: Sampled, found: Moments, integrator: Integrator, first: int = 0, record: MotionRecord | None = None
 ) -> Commands:
-    """Controls that are a function of time at the stages of some steps, or in their middles for one-stage methods."""
-    times, numbers = integrator.stage_times, np.array(steps, dtype=np.int64)
-    # Kinematic inputs move to the values at the ends of steps.
-    fractions = (*(times or (0.5,)), *((1.0,) if scene.inputs else ()))
-    at = (numbers[:, None] + np.array(fractions)) * dt
+    """The controls of steps from ``first`` on with given moments; kinematic inputs move to the values at their ends."""
+    times, scene = integrator.stage_times, controls.scene
+    commands = changing(found.at(times), times) if times else open_loop(found.mean)
+    if not len(scene.prescribed):
+        return commands
+    steps = np.arange(first, first + len(found.series))
     values = _at_all_times if controls.vectorized else _at_times
-    if times and times[0] == 0.0 and times[-1] == 1.0:
-        # The first stage of a step is the last stage of the step before.
-        called = np.ones(at.shape, dtype=np.bool_)
-        called[1:, 0] = np.diff(numbers) != 1
-        found = np.empty((*at.shape, scene.controls))
-        found[called] = values(controls.f, scene, at[called], np.repeat(numbers, called.sum(axis=1)), record)
-        shared = np.flatnonzero(~called[:, 0])
-        found[shared, 0] = found[shared - 1, -1]
-    else:
-        found = values(controls.f, scene, at.ravel(), np.repeat(numbers, at.shape[1]), record)
-        found = found.reshape(*at.shape, scene.controls)
-    ends, found = found[:, -1], found[:, : len(times) or 1]
-    return prescribing(scene, changing(found, times) if times else open_loop(found[:, 0]), ends)
+    return prescribing(
+        scene, commands, values(controls.f, scene, np.float64(controls.dt) * (steps + 1.0), steps, record)
+    )
+
+
+def unsettled(controls: Sampled) -> tuple[Finding, ...]:
+    """A warning if the quadrature of a function of time has not settled in some steps."""
+    steps = joined(controls.parts).unsettled.tolist() if controls.parts else []
+    if not steps:
+        return ()
+    text = (
+        f"the controls of OpenLoop change too fast in {len(steps)} steps for their impulse to be known "
+        f"(from t = {steps[0] * controls.dt:.3g} s). Name the instants of jumps, OpenLoop(f, breaks=[...])"
+    )
+    return (Finding("fast controls", text, time=steps[0] * controls.dt, value=float(len(steps)), unit="steps"),)
+
+
+def resolved(controls: Sampled, integrator: Integrator) -> bool:
+    """Whether the polynomials that a method takes are nearly the function itself in all steps."""
+    if not controls.parts:
+        return True
+    found = joined(controls.parts)
+    rest = found.rest[:, max(1, len(integrator.stage_times)) - 1]
+    return bool(rest.max(initial=0.0) <= _RESOLVED * found.largest) and not len(found.unsettled)
 
 
 def _at_times(
@@ -159,77 +191,6 @@ def _at_all_times(
     return np.concatenate(values) if values else np.zeros((0, m))
 
 
-@functools.lru_cache(maxsize=64)
-def _compared(steps: int) -> tuple[int, ...]:
-    """The steps of a motion in which means are compared."""
-    return tuple(np.unique(np.linspace(0, steps - 1, _COMPARED).astype(np.int64)).tolist())
-
-
-def undersampled(
-    controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory, *, right: bool
-) -> tuple[Finding, ...]:
-    """A warning if the mean of a function of time over a step differs from that of two half steps.
-
-    A motion has the function's values at its stages alone. If it is ``right`` with these, it is repeated with those at
-    the stages of a better method wherever the means differ at all.
-    """
-    dt, times = trajectory.dt, integrator.stage_times
-    if not trajectory.steps:
-        return ()
-    at = _compared(trajectory.steps)
-    try:
-        halves = evaluated(controls, scene, integrator, 0.5 * dt, [2 * k + i for k in at for i in (0, 1)])
-    except ControlError:
-        return ()
-    mean, taken = 0.5 * (halves.u[::2] + halves.u[1::2]), trajectory.u[list(at)]
-    if len(scene.prescribed):
-        forces = np.setdiff1d(np.arange(scene.controls), scene.prescribed)
-        mean, taken = mean[:, forces], taken[:, forces]
-    total, off = (float(np.abs(part).sum()) for part in (mean, mean - taken))
-    if not off > _ALIKE * total:
-        least = _SEEN * float(np.abs(mean - mean.mean(axis=0)).sum())
-        may_matter = right and off > _ROUNDING * least and off * growth_bound(scene, trajectory) > least
-        return _moved_within(controls, scene, integrator, trajectory) if may_matter else ()
-    stages = f"{len(times)} stages of a step" if times else "middle of a step"
-    return (
-        Finding(
-            "fast controls",
-            f"the controls of OpenLoop change too fast for dt = {dt:g} s: their means over a step, from the {stages}, "
-            f"are off by {100.0 * off / total:.3g}% of those in half the step"
-            if total > 0.0
-            else f"the controls of OpenLoop change too fast for dt = {dt:g} s: half the step sees none of them",
-        ),
-    )
-
-
-def _moved_within(
-    controls: OpenLoop, scene: Scene, integrator: Integrator, trajectory: Trajectory
-) -> tuple[Finding, ...]:
-    """A warning if values of a function of time at the stages of a better method move the joints elsewhere."""
-    other, dt = better(integrator, trajectory), trajectory.dt
-    times = other.method.stage_times
-    if scene.inputs or not times:
-        return ()
-    try:
-        values = evaluated(controls, scene, other.method, dt, range(trajectory.steps)).within
-    except ControlError:
-        return ()
-    found = whole_error(scene, trajectory.changed(u_stages=values), other, times)
-    if found is None or found[2] < WARNED:
-        return ()
-    joint, off, share = found
-    name = trajectory.joint_names[joint]
-    return (
-        Finding(
-            "fast controls",
-            f"the controls of OpenLoop change too fast for dt = {dt:g} s: with their values at {len(times)} instants "
-            f"of each step a method of more stages moves joint {name!r} by up to "
-            f"{share_in_words(scene, joint, off, share)}",
-            joint,
-        ),
-    )
-
-
 def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floats, v0: Floats) -> tuple[Finding, ...]:
     """A warning if a kinematic input's control at the first node differs from the motion's start (q0, v0)."""
     if not scene.inputs:
@@ -242,11 +203,11 @@ def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floa
     found = []
     there = as_moved(scene, q0, v0, first)
     for k in scene.prescribed[np.abs(there - first)[scene.prescribed] > _ELSEWHERE].tolist():
-        sentence = (
-            f"control {k}, of a KinematicInput, is {first[k]:.6g} at t = 0, and the motion begins with {there[k]:.6g}: "
-            "the joint makes up for the difference within the first step"
+        text = (
+            f"control {k}, of a KinematicInput, is {first[k]:.6g} at t = 0 and the motion begins with {there[k]:.6g}: "
+            "the joint jumps in the first step. Start there, or give another control"
         )
-        found.append(Finding("jump at the start", sentence))
+        found.append(Finding("jump at the start", text, time=0.0, value=float(there[k] - first[k])))
     return tuple(found)
 
 

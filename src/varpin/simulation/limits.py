@@ -1,91 +1,75 @@
-"""Limits of the robot's description that a motion exceeds, of joints and of motors; and loops that are open.
+"""Limits of the robot's description that a motion passes, of joints and of motors; and loops that are open.
 
-The limits do not act on the motion. It may be right for a robot without end stops and with motors that are strong
-enough.
+Limits do not act on the motion: it may be right for a robot without end stops and with motors that are strong enough.
 """
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import numpy as np
 
 from varpin.arrays import Floats
 from varpin.core import inside_bounds
-from varpin.mechanics.forces import drive_forces, of_kind
+from varpin.finding import Finding, and_more
+from varpin.mechanics.forces import drive_forces, limited_servos, of_kind
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
 
-# First words of the warnings. The motion may still be a correct solution of its equations.
-POSITION = "joints leave their limits"
-VELOCITY = "joints pass their velocity limits"
-EFFORT = "controls pass the joints' effort limits"
-LOOPS = "loops of the robot's description are open"
-KINDS = (POSITION, VELOCITY, EFFORT, LOOPS)
-# Excess over a limit from which on a warning is given: of positions [rad or m], of others as a share of the limit.
-_OUTSIDE, _SHARE = 1e-6, 1e-6
-# Most joints that a warning names.
-_NAMED = 6
+# Kinds of these findings. The motion may still be a correct solution of its equations.
+KINDS = ("position limits", "velocity limits", "effort limits", "open loops")
+_UNITS = (("rad", "m"), ("rad/s", "m/s"), ("N m", "N"))
+# Excess over a limit from which on it is told: rounding, of positions [rad or m], of others as a share of the limit.
+_ROUNDING = 1e-6
 
 
-def left(scene: Scene, trajectory: Trajectory) -> Iterator[tuple[str, str]]:
-    """The kinds of limits that a motion exceeds, each with a sentence: which joints, by how much, and when.
-
-    Loops that the scene leaves open come first.
-    """
+def beyond_limits(scene: Scene, trajectory: Trajectory) -> list[Finding]:
+    """Loops that the scene leaves open, and for each kind of limit the joint that passes it by most."""
+    found = []
     if loops := scene.open_loops:
-        (a, b), pairs = loops[0], ", ".join(f"{a!r} on {b!r}" for a, b in loops)
-        closed = f"varpin.Scene(robot, constraints=[varpin.PointOnPoint({a!r}, {b!r}), ...])"
-        if scene.robot.equalities:
-            closed = "varpin.Scene(robot, constraints='robot')"
-        yield LOOPS, f"{LOOPS}, and the motion is that of a tree: {pairs}; {closed} closes them"
+        a, b = loops[0]
+        cure = "constraints='robot'" if scene.robot.equalities else f"constraints=[varpin.PointOnPoint({a!r}, {b!r})]"
+        text = f"the robot's loop of {a!r} on {b!r} is open{and_more(len(loops) - 1, 'loop')}: the motion is a tree's. "
+        found.append(Finding("open loops", f"{text}Use varpin.Scene(robot, {cure})"))
     if not any(scene.bounded):
-        return
+        return found
     q, v, u = trajectory.q, trajectory.v, trajectory.u
     inside = inside_bounds(scene.core, q, v, u, trajectory.u_stages, scene.bound_rows)
-    if all(inside) and scene.direct_efforts:
-        return
-    robot, t = scene.robot, trajectory.t
-    stopped = {element.coordinate for element in of_kind(scene.elements, "JointStop")}
-    for bounded, kept, (kind, why, of, (least, most), beyond, units) in zip(
-        scene.bounded,
-        (*inside[:2], inside[2] and scene.direct_efforts),
-        (
-            (POSITION, "which nothing stops", _positions, scene.bounds.position, _OUTSIDE, ("rad", "m")),
-            (VELOCITY, "which nothing holds back", _velocities, scene.bounds.velocity, None, ("rad/s", "m/s")),
-            (EFFORT, "which nothing cuts off", _efforts, scene.bounds.effort, None, ("N m", "N")),
-        ),
-        strict=True,
-    ):
-        if kept or not bounded:
+    kept = (inside[0], inside[1], inside[2] and scene.direct_efforts)
+    bounds = scene.bounds.position, scene.bounds.velocity, scene.bounds.effort
+    for kind, (least, most) in enumerate(bounds):
+        if kept[kind] or not scene.bounded[kind]:
             continue
-        values = of(scene, trajectory)
-        slides = robot.slides
+        values = (q, v, _efforts(scene, trajectory) if kind == 2 else v)[kind]
         with np.errstate(invalid="ignore"):
             excess = np.maximum(least - values, values - most)
-            excess = np.where(excess > (_SHARE * most if beyond is None else beyond), excess, -np.inf)
+            excess = np.where(excess > _ROUNDING * (most if kind else 1.0), excess, -np.inf)
         worst = excess.max(axis=0, initial=-np.inf)
-        if not (worst > 0.0).any():
-            continue
-        parts, joints = [], [int(c) for c in np.argsort(-worst, kind="stable") if worst[c] > 0.0]
-        for c in joints[:_NAMED]:
-            first, peak = int(np.argmax(excess[:, c] > 0.0)), int(np.argmax(excess[:, c]))
-            since = "from the start" if first == 0 else f"from t = {t[first]:.4g} s"
-            side, limit = ("above", most[c]) if values[peak, c] > most[c] else ("below", least[c])
-            amount = f"at most {worst[c]:.3g} {units[int(slides[c])]} {side} {limit:.4g} at t = {t[peak]:.4g} s"
-            softly = " (its stop gives way)" if kind == POSITION and c in stopped else ""
-            parts.append(f"{robot.joint_names[c]!r} {since}, {amount}{softly}")
-        more = f"; and {len(joints) - _NAMED} more" if len(joints) > _NAMED else ""
-        reason = "" if kind == POSITION and set(joints) <= stopped else f", {why}"
-        yield kind, f"{kind}{reason}: {'; '.join(parts)}{more}"
+        if worst.max() > 0.0:
+            found.append(_passed(scene, trajectory, kind, values, excess, (least, most)))
+    return found
 
 
-def _positions(_: Scene, trajectory: Trajectory) -> Floats:
-    return trajectory.q
-
-
-def _velocities(_: Scene, trajectory: Trajectory) -> Floats:
-    return trajectory.v
+def _passed(
+    scene: Scene, trajectory: Trajectory, kind: int, values: Floats, excess: Floats, limits: tuple[Floats, Floats]
+) -> Finding:
+    """The finding about one kind of limits: the joint with the largest ``excess`` (K, n), and when."""
+    worst = excess.max(axis=0)
+    joint = int(worst.argmax())
+    name, peak, first = (
+        scene.robot.joint_names[joint],
+        int(excess[:, joint].argmax()),
+        int((excess[:, joint] > 0).argmax()),
+    )
+    unit = _UNITS[kind][int(scene.robot.slides[joint])]
+    limit = limits[int(values[peak, joint] > 0.5 * (limits[0][joint] + limits[1][joint]))][joint]
+    what = ("position", "velocity", "effort")[kind]
+    stopped = kind == 0 and any(stop.coordinate == joint for stop in of_kind(scene.elements, "JointStop"))
+    soft = " (its JointStop gives way)" if stopped else "; nothing stops it there" if kind == 0 else ""
+    when = f"at t = {trajectory.t[peak]:.3g} s"
+    text = (
+        f"joint {name!r} passes its {what} limit {limit:.4g} {unit} by {worst[joint]:.3g} {when}{soft}"
+        f"{and_more(int((worst > 0).sum()) - 1, 'joint')}"
+    )
+    return Finding(KINDS[kind], text, name, time=float(trajectory.t[first]), value=float(worst[joint]), unit=unit)
 
 
 def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
@@ -100,3 +84,14 @@ def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
     for row, c in scene.inputs.items():
         forces[:, c] = trajectory.constraint_forces[:, int(np.argmax(scene.constraint_order == row))]
     return forces
+
+
+def saturates(scene: Scene, trajectory: Trajectory) -> bool:
+    """Whether a servo's drive comes to its effort limit along a motion."""
+    force = trajectory.u @ scene.actuation.T
+    for servo in limited_servos(scene.elements):
+        c, (stiffness, damping, effort) = servo.coordinate, servo.values
+        pull = -stiffness * trajectory.q[:, c] - damping * trajectory.v[:, c]
+        if max(np.abs(force[:, c] + pull[:-1]).max(), np.abs(force[:, c] + pull[1:]).max()) >= effort:
+            return True
+    return False

@@ -11,11 +11,12 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator, Segment
-from varpin.integrators.base import Failure, join, lines, open_loop, rows, steps_of
+from varpin.integrators.base import Failure, join
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.inputs import as_moved
 from varpin.mechanics.scene import Scene
+from varpin.signals.commands import lines, open_loop, rows, steps_of
+from varpin.signals.inputs import as_moved
 from varpin.simulation.failures import ConstraintError, ForceError, StepError
 from varpin.trajectory import Trajectory
 

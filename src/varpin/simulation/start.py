@@ -8,10 +8,10 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
+from varpin.finding import Finding
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.scene import CORRECTED, EARTH, Scene
 from varpin.model import degrees_hint, degrees_per_second_hint, joint_unit, millimetres_hint
-from varpin.simulation.soundness import Finding
 
 # Shift of a start onto its constraints up to which no warning is given [rad or m]: rounding.
 _ROUNDING = 1e-9

@@ -1,301 +1,264 @@
-"""The integrator and step that meet a tolerance on a motion at the lowest cost, with the estimated error.
-
-Costs are numbers of evaluations, so that the choice is the same on every machine. Errors are those at all nodes.
-"""
+"""The integrator, the step and the controls of a motion with a tolerance, and its error."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
-from varpin.integrators import Integrator, Segment
-from varpin.integrators.base import rows, steps_of
+from varpin.errors import InputError, VarpinError
+from varpin.finding import Finding
+from varpin.integrators import Integrator, Reference, integrator_of
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
-from varpin.simulation.refinement import (
-    CHECKS,
-    ROUNDING,
-    SAFETY,
-    SENSIBLE,
-    Found,
-    Method,
-    Sample,
-    Search,
-    distance,
-    first_steps,
-)
+from varpin.signals.commands import open_loop
+from varpin.signals.inputs import held_in_parts
+from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
+from varpin.simulation.check import distance, repeated
+from varpin.simulation.commands import Controls, commands_of, held_rows
+from varpin.simulation.failures import ToleranceError
+from varpin.simulation.functions import ControlLaw, Sampled, require_law
+from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, candidates, first_steps
+from varpin.simulation.record import Motions, located
+from varpin.support.checks import positive
+from varpin.trajectory import Accuracy
 
-# Work between two checks for Ctrl-C, in steps of one joint.
-_CHUNK = 100_000
-# About the number of nodes of a run that are kept; of runs with no more steps, all that the core gives is.
-_NODES = 4096
-# Number of evaluations, times the number of joints, after which no further run begins.
+# Number of evaluations, times the number of joints, after which no further trial begins.
 _MOST_WORK = 50_000_000
-# Where differences between runs shrink by at least this factor, twice, a limit is extrapolated; its distance from the
-# last run in units of the last difference: 0.75 / (1 - 0.75).
-_SHRINKS, _LEFT = 0.75, 3.0
-# Factor on the number of steps of a second run that samples a function of time elsewhere: a jump lies at another place
-# of a step.
-_OTHER = 1.37
-# Factor on the tolerance from which on an error ends the trial of the earlier integrator.
-_FAR = 30.0
-# Number of runs with a failing user's function after which the search ends, if no run has passed.
+# Trials of the integrator and step of an earlier motion.
+_AGAIN = 3
+# Factor on the number of steps in which the failing step of a user's function is looked for.
+_REFINED = 16
+# Trials in which a user's function fails after which the search ends, if none has passed.
 _RAISES = 24
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """The motion to integrate.
-
-    Attributes:
-        scene: Without noise.
-        q0: (n,) [rad or m].
-        v0: (n,) [rad/s or m/s].
-        duration: [s].
-        parts: All numbers of steps are multiples of it.
-        commands: The commands for an integrator and a number of steps.
-        sampled: Whether the commands are samples of a function: where it jumps, steps and half steps may have the same
-            samples.
-    """
-
-    scene: Scene
-    q0: Floats
-    v0: Floats
-    duration: float
-    parts: int
-    commands: Callable[[Integrator, int], Commands]
-    sampled: bool = False
-
-
-# Consecutive steps, with their commands.
-Steps = tuple[tuple[Segment, Commands], ...]
-
-
-class Raised(Exception):
-    """A run in which a function of a custom force or constraint failed.
-
-    Attributes:
-        integrator: Of the run.
-        steps: Of the run.
-        error: Of the function.
-    """
-
-    def __init__(self, integrator: Integrator, steps: int, error: CustomForceError | CustomConstraintError) -> None:
-        self.integrator, self.steps, self.error = integrator, steps, error
-        super().__init__(str(error))
-
-
-class _Runs:
-    """Runs of a motion, with their total cost."""
-
-    def __init__(self, motion: Motion) -> None:
-        self.motion = motion
-        self.most = _MOST_WORK / len(motion.q0)
-        self.steps = self.evaluations = 0
-        self.raised: Raised | None = None
-        self._raises, self._passed = 0, False
-        self._done: dict[tuple[str, int], Sample] = {}
-        self._whole: dict[tuple[str, int], Steps] = {}
-
-    def whole(self, integrator: Integrator, steps: int) -> Steps:
-        """All steps of an earlier run; empty for a long one, which is not kept."""
-        return self._whole.get((str(integrator), steps), ())
-
-    def __call__(self, integrator: Integrator, steps: int) -> Sample:
-        key = str(integrator), steps
-        if key not in self._done:
-            self._done[key] = self._run(integrator, steps)
-        return self._done[key]
-
-    def _run(self, integrator: Integrator, steps: int) -> Sample:
-        given, stride = self.motion, 1
-        while steps % (2 * stride) == 0 and steps // stride > _NODES:
-            stride *= 2
-        n, dt, nothing = len(given.q0), given.duration / steps, np.zeros((0, 0, 0))
-        if steps > self.most:
-            # Too long to run. Its cost is counted, which ends a search whose runs all fail in their first steps.
-            self.evaluations += steps
-            return Sample(steps, np.full((steps // stride, n), np.nan), math.inf, pure=False)
-        commands = given.commands(integrator, steps)
-        state, (last,) = integrator.start(given.scene, given.q0[None], given.v0[None])
-        q, done, evaluations, pure = np.full((steps // stride, n), np.nan), 0, 0, True
-        parts: list[tuple[Segment, Commands]] = []
-        chunk = max(1, _CHUNK // n // commands.hold)
-        while done < steps and pure:
-            first = done // commands.hold
-            block = rows(commands, first, first + chunk, last.u[None, -1] if done else None)
-            try:
-                (last,) = integrator.rollout(given.scene, state, block, nothing, dt)
-            except (CustomForceError, CustomConstraintError) as error:
-                # Coarse steps may go where the function is not defined.
-                self.raised, pure = Raised(integrator, steps, error), False
-                self._raises += 1
-                if self._raises >= _RAISES and not self._passed:
-                    raise self.raised from error
-                evaluations += steps
-                break
-            nodes = done + 1 + np.arange(len(last.q))
-            kept = nodes % stride == 0
-            q[nodes[kept] // stride - 1] = last.q[kept]
-            statistics = last.statistics
-            evaluations += int(statistics.sweeps.sum() + statistics.jets.sum())
-            pure = last.failure is None and statistics.split_steps == 0
-            done += steps_of(block)
-            if steps <= _NODES:
-                parts.append((last, block))
-        if pure:
-            self._whole[str(integrator), steps] = tuple(parts)
-        self.steps += done
-        self.evaluations += evaluations
-        self._passed = self._passed or pure
-        # A run with divided steps does not show the method's order; it ends there.
-        return Sample(steps, q, float(evaluations) * steps / max(done, 1), pure)
-
-
-class _CheckedSearch(Search):
-    """A search whose costs are evaluations, and whose choice is checked by a run at half its step."""
-
-    def __init__(self, methods: Sequence[Method], runs: _Runs) -> None:
-        super().__init__(methods, lambda: runs.evaluations > runs.most, math.inf)
-        self.sampled = runs.motion.sampled
-
-    def limits(self) -> list[tuple[Floats, float]]:
-        """See :meth:`Search.limits`; where no method shows its order, limits of shrinking differences."""
-        return super().limits() or [limit for limit in map(_rough_limit, self.methods) if limit is not None]
-
-    def checked(self, choice: Found, tolerance: float) -> Found:
-        """See :meth:`Search.checked`; errors at all nodes."""
-        method, best = self._of(choice), choice
-        for trial in range(CHECKS):
-            if self.late() and best.steps > method.last.steps:
-                break
-            error = _error(method, best.steps)
-            if self.sampled:
-                error = max(error, _error_of_samples(method, best.steps))
-            if self.limit is not None:
-                error = max(error, distance(method.run(method.integrator, best.steps).q, self.limit) - self.uncertainty)
-            best = replace(best, error=max(error, self.floor) if math.isfinite(error) else math.inf, measured=True)
-            if best.error <= tolerance or trial == CHECKS - 1:
-                break
-            best = replace(best, steps=method.more(best.steps, error, tolerance))
-        return best
-
-    def as_they_are(self) -> list[Found]:
-        """See :meth:`Search.as_they_are`; an unknown error where no method has a pure run."""
-        if any(method.whole for method in self.methods):
-            return super().as_they_are()
-        method = self.methods[-1]
-        return [Found(method.integrator, method.last.steps, math.inf, method.last.cost, measured=True)]
-
-
-def _rough_limit(method: Method) -> tuple[Floats, float] | None:
-    """The last run, and its distance from the limit, from differences that shrink twice, at whatever rate."""
-    if len(method.whole) < 4:
-        return None
-    a, b, c, d = (sample.q for sample in method.whole[-4:])
-    before, middle, after = distance(a, b), distance(b, c), distance(c, d)
-    if not (middle <= _SHRINKS * before and after <= _SHRINKS * middle and _LEFT * after < SENSIBLE):
-        return None
-    return d, _LEFT * after
-
-
-def _error(method: Method, steps: int) -> float:
-    """The error of a run at its nodes, from a run at half the step; NaN where one of them fails."""
-    once, twice = (method.run(method.integrator, k) for k in (steps, 2 * steps))
-    gain = 2.0**method.order if len(method.errors) == 0 or method.regular else 2.0
-    return distance(once.q, twice.q) * gain / (gain - 1.0)
-
-
-def _error_of_samples(method: Method, steps: int) -> float:
-    """The difference at the end from a run with other sampling times; NaN where one of them fails."""
-    other = method.rounded(_OTHER * steps)
-    one, two = (method.run(method.integrator, k).q[-1] for k in (steps, other))
-    return float(np.abs(one - two).max())
-
-
-@dataclass(frozen=True)
-class Choice:
-    """The chosen integrator and number of steps, with the cost of the search.
-
-    Attributes:
-        integrator: The method.
-        steps: Its number of steps.
-        error: The estimate, at all nodes [rad or m]; infinite where nothing is known.
-        search_steps: Steps of all runs.
-        search_evaluations: Evaluations in them.
-        floor: The smallest error that rounding allows [rad or m].
-        raised: The last run in which a function of a custom force or constraint failed, if one did.
-        motion: All steps of the chosen run; empty if it is long, or was not run.
-    """
+class Chosen(NamedTuple):
+    """What :func:`steps_for_tolerance` has found; ``error`` (N + 1, n) is that of the motion [rad or m]."""
 
     integrator: Integrator
     steps: int
-    error: float
-    search_steps: int
-    search_evaluations: int
-    floor: float
-    raised: Raised | None = None
-    motion: Steps = ()
+    controls: Controls
+    accuracy: Accuracy
+    found: tuple[Finding, ...]
+    error: Floats
 
 
-def choose(
-    motion: Motion,
-    candidates: Callable[[], Sequence[Integrator]],
-    tolerance: float,
-    first: tuple[Integrator, float] | None = None,
-) -> Choice:
-    """The cheapest of some integrators, and its number of steps, for an error in q of at most ``tolerance``.
+class _Search:
+    """Trials of a motion."""
+
+    def __init__(self, scene: Scene, q0: Floats, v0: Floats, duration: float, controls: Controls) -> None:
+        self.scene, self.q0, self.v0, self.duration = scene, q0, v0, duration
+        self.controls: Floats | LinearPolicy | OpenLoop | FirstOrderHold
+        self.rows = 1
+        if isinstance(controls, LinearPolicy | OpenLoop | FirstOrderHold):
+            self.controls = controls
+            if isinstance(controls, LinearPolicy):
+                self.rows = _intervals(controls, duration)
+            elif isinstance(controls, FirstOrderHold):
+                self.rows = len(controls.u) - 1
+        else:
+            self.controls = held_rows(scene, controls)
+            self.rows = len(self.controls)
+        self.most = _MOST_WORK / len(q0)
+        self.steps = self.evaluations = 0
+        self.errors: dict[tuple[str, int], Floats] = {}
+        self._sampled: dict[int, Sampled] = {}
+        self._raised, self._passed = 0, False
+
+    def given(self, steps: int) -> Controls:
+        """The controls of a motion in so many steps."""
+        controls, parts = self.controls, steps // self.rows
+        start, span = (self.q0, self.v0), self.duration / self.rows
+        if isinstance(controls, OpenLoop):
+            if steps not in self._sampled:
+                self._sampled[steps] = Sampled(controls, self.scene, self.duration / steps)
+            return self._sampled[steps]
+        if isinstance(controls, FirstOrderHold):
+            fine = controls.refined(parts).u.copy()
+            own = self.scene.prescribed
+            fine[1:, own] = held_in_parts(self.scene, controls.u[1:], *start, span, parts)[:, own]
+            return FirstOrderHold(fine)
+        if isinstance(controls, LinearPolicy):
+            return controls
+        return held_in_parts(self.scene, controls, *start, span, parts)
+
+    def commands(self, integrator: Integrator, steps: int) -> Commands:
+        """The same as commands of the core."""
+        controls = self.given(steps)
+        if isinstance(controls, np.ndarray):
+            return open_loop(controls)
+        return commands_of(self.scene, integrator, controls, steps, self.duration / steps)
+
+    def attempt(self, integrator: Integrator, steps: int) -> Trial:
+        """A motion with its error, and the evaluations that it takes.
+
+        Raises:
+            VarpinError: A user's function has failed in all of many trials.
+        """
+        if steps > self.most:
+            # Too long to run. Its cost is counted, which ends a search whose trials all fail in their first steps.
+            self.evaluations += steps
+            return Trial(steps, math.inf, math.inf)
+        dt, controls = self.duration / steps, self.given(steps)
+        commands = self.commands(integrator, steps)
+        try:
+            motion, failure = Motions(self.scene, integrator, self.q0, self.v0, dt).under(commands)
+            work = motion.statistics.jets.sum() + motion.statistics.sweeps.sum()
+            self.steps, self.evaluations = self.steps + motion.steps, self.evaluations + int(work)
+            if failure is not None:
+                return Trial(steps, math.inf, float(work) * steps / max(motion.steps, 1))
+            again = repeated(self.scene, integrator, motion, controls)
+            # A repetition takes about twice the evaluations.
+            self.steps, self.evaluations = self.steps + steps, self.evaluations + 2 * int(work)
+        except (CustomForceError, CustomConstraintError, VarpinError) as error:
+            if not isinstance(error, CustomForceError | CustomConstraintError) and not hasattr(error, "trajectory"):
+                raise
+            # Coarse steps may go where the function is not defined.
+            self._raised, self.evaluations = self._raised + 1, self.evaluations + steps
+            if self._raised >= _RAISES and not self._passed:
+                raise self._located(integrator, steps, error) from error
+            return Trial(steps, math.inf, float(steps))
+        self._passed = True
+        off = distance(again, motion)[0]
+        floor = ROUNDING * max(1.0, float(np.abs(motion.q).max()))
+        self.errors[str(integrator), steps] = off
+        largest = max(float(off.max()), floor)
+        whole = motion.statistics.split_steps == 0
+        return Trial(steps, largest if math.isfinite(largest) else math.inf, float(work), whole=whole)
+
+    def _located(self, integrator: Integrator, steps: int, error: Exception) -> VarpinError:
+        """The error of a user's function with its failing step, found in smaller steps or, failing that, in its own."""
+        cause = error if isinstance(error, CustomForceError | CustomConstraintError) else error.__cause__
+        if not isinstance(cause, CustomForceError | CustomConstraintError):
+            assert isinstance(error, VarpinError)
+            return error
+        for fine in (_REFINED * steps, steps):
+            start, dt = (self.q0, self.v0), self.duration / fine
+            found = located(self.scene, integrator, start, self.commands(integrator, fine), dt, None, cause)
+            if found is not cause:
+                return found
+        return cause
+
+
+def steps_for_tolerance(
+    scene: Scene,
+    q0: Floats,
+    v0: Floats,
+    duration: float,
+    tolerance: float | Accuracy,
+    wanted: Controls | ControlLaw,
+    integrator: Integrator | None,
+) -> Chosen:
+    """Integrator, number of steps and controls for a tolerance, with the accuracy, the error and warnings.
 
     Args:
-        motion: To integrate.
-        candidates: The integrators to choose from, called if the first one does not do.
-        tolerance: At all nodes [rad or m].
-        first: An integrator and a step [s] to try first: taken if they, or somewhat smaller steps, meet the tolerance.
+        scene: The scene, without noise.
+        q0: Initial configuration (n,) [rad or m].
+        v0: Initial velocity (n,) [rad/s or m/s].
+        duration: Of the motion [s].
+        tolerance: The largest error in q [rad or m], or the accuracy of an earlier motion.
+        wanted: The controls.
+        integrator: The only one to consider; None for all.
 
     Raises:
-        SingularMassMatrix: M(q0) is not positive definite.
-        VarpinError: No integrator gets to the end.
-        Raised: A function of a custom force or constraint fails in all runs.
+        InputError: The scene, the controls or the integrator are none that a tolerance can choose steps for.
+        ToleranceError: No number of steps gives an error below 1 rad or m.
+        VarpinError: A user's function fails, or no integrator gets to the end.
     """
-    runs = _Runs(motion)
+    earlier = tolerance if isinstance(tolerance, Accuracy) else None
+    wish = positive("tolerance", earlier.tolerance if earlier else tolerance, "rad or m")
+    search = _Search(scene, q0, v0, duration, _require_choice(scene, wanted, integrator))
+    floor = ROUNDING * max(1.0, float(np.abs(q0).max()))
+    found = None
+    if earlier is not None:
+        known = integrator_of(earlier.integrator)
+        # A given integrator keeps its own guard and solver tolerance.
+        if integrator is None or integrator.same_map(known):
+            first = search.rows * math.ceil(duration / earlier.dt * (1.0 - 1e-9) / search.rows)
+            again = Ladder(search.attempt, [integrator or known], first, search.rows, lambda: False)
+            for _ in range(_AGAIN):
+                (rung,) = again.rungs
+                if rung.met(max(wish, floor)) is None:
+                    again.climb(rung, rung.steps_for(max(wish, floor)))
+            if rung.met(max(wish, floor)) is not None:
+                found = again.for_tolerance(max(wish, floor))[0][0]
+    if found is None:
+        members = (integrator,) if integrator is not None else _members(search)
+        # Raise for a state from which no motion can start.
+        members[0].start(scene, q0[None], v0[None])
+        coarse = first_steps(scene, q0, v0, duration, search.rows)
+        ladder = Ladder(search.attempt, members, coarse, search.rows, lambda: search.evaluations > search.most)
+        try:
+            found = ladder.for_tolerance(max(wish, floor))[0][0]
+        except VarpinError as failure:
+            if hasattr(failure, "trajectory"):
+                raise
+            raise ToleranceError(wish, duration, coarse, math.inf) from None
+    if not found.error < SENSIBLE:
+        raise ToleranceError(wish, duration, found.steps, found.error)
+    record = Accuracy(
+        wish, found.error, str(found.integrator), duration / found.steps, search.steps, search.evaluations
+    )
+    told = () if record.met else (_unmet(record, floor),)
+    error = search.errors[str(found.integrator), found.steps]
+    return Chosen(found.integrator, found.steps, search.given(found.steps), record, told, error)
 
-    def of(integrator: Integrator, least: int) -> Method:
-        return Method(runs, integrator, least, motion.parts, integrator.order)
 
-    if first is not None and motion.duration / first[1] < runs.most:
-        _require_start(motion, first[0])
-        method = of(first[0], motion.parts)
-        steps = method.rounded(motion.duration / first[1] * (1.0 - 1e-9))
-        for _ in range(CHECKS):
-            error = _error(method, steps)
-            floor = ROUNDING * max(1.0, float(np.abs(runs(first[0], steps).q).max()))
-            if not (runs(first[0], steps).pure and math.isfinite(error) and error < SENSIBLE):
-                break
-            if max(error, floor) <= tolerance:
-                found = runs.whole(first[0], steps)
-                return Choice(first[0], steps, max(error, floor), runs.steps, runs.evaluations, floor, motion=found)
-            if error > _FAR * tolerance:
-                break
-            steps = method.more(steps, error, tolerance)
-    integrators = candidates()
-    _require_start(motion, integrators[0])
-    coarse = first_steps(motion.scene, motion.q0, motion.v0, motion.duration, motion.parts)
-    if coarse > runs.most:
-        return Choice(integrators[0], coarse, math.inf, 0, 0, 0.0)
-    # Powers of two, so that runs share as many nodes as possible.
-    least = motion.parts * 2 ** math.ceil(math.log2(coarse // motion.parts))
-    search = _CheckedSearch([of(member, least) for member in integrators], runs)
-    (best, *_), _ = search.for_tolerance(tolerance / SAFETY)
-    found, spent = runs.whole(best.integrator, best.steps), (runs.steps, runs.evaluations)
-    return Choice(best.integrator, best.steps, best.error, *spent, search.floor, runs.raised, found)
+def _members(search: _Search) -> Sequence[Integrator]:
+    """The integrators to choose from."""
+    found = candidates(search.scene)
+    if isinstance(search.controls, LinearPolicy):
+        found = tuple(member for member in found if member.variational != (search.controls.on == "velocity"))
+    return found
 
 
-def _require_start(motion: Motion, integrator: Integrator) -> None:
-    """Raise for a state from which no motion can start."""
-    integrator.start(motion.scene, motion.q0[None], motion.v0[None])
+def _unmet(record: Accuracy, floor: float) -> Finding:
+    """The warning that a tolerance is not met, with the cause."""
+    cause = f"rounding leaves {floor:.1e}" if record.tolerance < floor else "errors grow, or forces jump within steps"
+    text = (
+        f"tolerance = {record.tolerance:g} is not met: q is off by up to {record.error:.1e} with {record.integrator} "
+        f"at dt = {record.dt:.3g} s ({cause})"
+    )
+    return Finding("tolerance not met", text, value=record.error, unit="rad or m")
+
+
+def _require_choice(scene: Scene, controls: Controls | ControlLaw, integrator: Integrator | None) -> Controls:
+    """The controls, if a tolerance can choose steps for them.
+
+    Raises:
+        InputError: The scene has noise, the controls are a law, or the integrator chooses its own steps.
+    """
+    if scene.processes:
+        raise InputError(
+            "tolerance is of single motions without noise: leave the noise out of the scene, or give dt and steps"
+        )
+    if isinstance(integrator, Reference):
+        raise InputError("Reference chooses its own steps: its tolerance is rtol; give it dt and steps")
+    if callable(controls):
+        require_law(controls)
+        raise InputError(
+            "a control law is called once every period, in steps, and a tolerance chooses the steps: give dt and "
+            "steps with a law, or a varpin.LinearPolicy with a period, or a varpin.OpenLoop(f)"
+        )
+    return controls
+
+
+def _intervals(policy: LinearPolicy, duration: float) -> int:
+    """The number of a policy's intervals over a motion whose steps a tolerance chooses."""
+    if policy.linear:
+        raise InputError("tolerance chooses dt, and a policy whose controls are linear between nodes takes it: dt=")
+    if policy.period is None:
+        raise InputError("tolerance chooses dt, so a LinearPolicy needs the period of its intervals, period= [s]")
+    parts = len(policy.gains)
+    if abs(parts * policy.period - duration) > 1e-9 * duration:
+        raise InputError(
+            f"the policy has {parts} intervals of {policy.period:g} s, {parts * policy.period:g} s in all, and "
+            f"duration = {duration:g} s"
+        )
+    return parts

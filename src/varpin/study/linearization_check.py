@@ -16,7 +16,7 @@ from varpin.mechanics.assembly import along_constraints, nearest
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.simulation.choice import usual_integrator
-from varpin.simulation.run import simulate
+from varpin.simulation.simulate import simulate
 from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, finite_array, joint_array, positive
 

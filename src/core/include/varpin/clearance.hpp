@@ -1,5 +1,5 @@
-// Motions that are clearly right, from the residual of the equations of motion along their record. docs/limits.md, "The
-// warnings".
+// Motions that are clearly right, from the residual of the equations of motion along their record. docs/mathematics.md,
+// "The error of a motion".
 //
 // Through the nodes of one step or of two goes the polynomial with their q, v and accelerations a, of degree 5 or 8.
 // With the accelerations a(t) of the scene on it, each of its steps is off by
@@ -7,7 +7,7 @@
 //     dv = v1 - v0 - integral of a(t)        dq = q1 - q0 - h v0 - integral of (t1 - t) a(t)
 //
 // and by the error of the quadrature. Either is small for small errors in steps that resolve the motion, and not for
-// others.
+// others. What is off propagates as the linearized motion does.
 #pragma once
 
 #include <algorithm>
@@ -40,60 +40,53 @@ struct Stretch {
     int node(int j) const { return j * (points - 1) / steps; }
 };
 
-// Largest errors of a motion that is clearly right.
-struct Clear {
-    double still = 0.0;          // velocity up to which nothing moves
-    double energy = 0.0;         // of the balance, as a share of the energy that is turned over
-    double damping = 0.0;        // rates of dampers along single steps, in units of 1 / h
-    double whole = 0.0;          // sum over the motion, as a share of the travel
-    double grown = 0.0;          // this sum, grown as the fastest mode does
-    double aligned = 0.0;        // share of a mode's exponent by which errors grow
-    std::int64_t window = 0;     // most steps of a window
-    std::int64_t few = 0;        // number of steps below which errors do not grow
-    std::int64_t damped_at = 0;  // nodes at which dampers are looked at
-    double known = -1.0;         // error of q at all nodes, if it is known, else negative
-    Allowed allowed;             // in each window
+// Largest errors of q and of v at the nodes of a motion (n), from the defects of its steps. Infinite where they are not
+// known, as along steps that dampers outpace.
+struct Propagated {
+    std::vector<double> q, v;
 };
 
 class Clearance {
   public:
-    // `wide` is a stretch of two steps, or null.
+    // `wide` is a stretch of two steps, or null. `damping` are rates of dampers along single steps, in units of 1 / h, at
+    // `damped_at` nodes; above them the errors are not known.
     Clearance(const Mechanism& mechanism, const Record& record, const double* within, const Stretch& narrow,
-              const Stretch* wide, const Clear& clear)
+              const Stretch* wide, double damping, std::int64_t damped_at)
         : mechanism_(mechanism),
           record_(record),
           within_(within),
           narrow_(narrow),
           wide_(wide),
-          clear_(clear),
+          damping_(damping),
+          damped_at_(damped_at),
           n_(mechanism.dof()),
           dynamics_(mechanism, false),
+          slopes_(mechanism, true),
           inertias_(mechanism),
           before_(n_),
           last_(n_),
           q_(n_),
           v_(n_),
-          off_q_(n_),
-          off_v_(n_) {
+          rate_(n_),
+          error_q_(n_),
+          error_v_(n_),
+          aq_(n_ * n_),
+          av_(n_ * n_),
+          af_(n_ * n_),
+          lu_(n_ * n_) {
         const int points = std::max(narrow.points, wide ? wide->points : 0);
         const int steps = std::max(narrow.steps, wide ? wide->steps : 0);
         for (auto* rows : {&force_, &a_}) rows->resize(points * n_);
         for (auto* rows : {&step_q_, &step_v_}) rows->resize(steps * n_);
     }
 
-    // The factor up to which disturbances may grow over the motion for it to be clearly right: infinite where they grow
-    // less, 0 where it is not. `defect` (N) is the error of the energy balance, `substeps` (N) the number of parts of
-    // each step.
-    double growth(const double* defect, const std::int64_t* substeps) {
-        const Glance seen = glance(mechanism_, record_, substeps);
-        const bool plain = seen.fastest > clear_.still && !seen.split && !seen.pulled && balanced(defect) &&
-                           !(clear_.known >= 0.0 && damped());
-        if (!plain) return 0.0;
-        double found = growth_of_errors();
+    // The errors, as long as none exceeds `most_q` and `most_v` (n): a motion that is that wrong is not clearly right.
+    Propagated errors(const double* most_q, const double* most_v) {
+        Propagated found = propagated(most_q, most_v);
         // Controls may have kinks at the nodes.
-        if (found == 0.0 && wide_ && within_) {
+        if (!(found.q.empty() || std::isfinite(found.q[0])) && wide_ && within_) {
             wide_ = nullptr;
-            found = growth_of_errors();
+            found = propagated(most_q, most_v);
         }
         return found;
     }
@@ -104,25 +97,18 @@ class Clearance {
     const double* within_;  // (N, s, m) controls at the stages; null for controls that are constant over each step
     const Stretch& narrow_;
     const Stretch* wide_;
-    const Clear& clear_;
+    double damping_;
+    std::int64_t damped_at_;
     int n_;
-    ForwardDynamics dynamics_;
+    ForwardDynamics dynamics_, slopes_;
     Inertias inertias_;
     std::vector<double> force_, a_;        // (points, n) of a stretch: of the controls, and accelerations
     std::vector<double> before_, last_;    // the same at the end of the stretch before
-    std::vector<double> step_q_, step_v_;  // errors of the steps of a stretch (steps, n)
+    std::vector<double> step_q_, step_v_;  // defects of the steps of a stretch (steps, n)
     std::int64_t from_ = 0, until_ = 0;    // its nodes
-    std::vector<double> q_, v_, off_q_, off_v_;
+    std::vector<double> q_, v_, rate_, error_q_, error_v_;
+    std::vector<double> aq_, av_, af_, lu_;
     std::optional<bool> damped_;
-
-    bool balanced(const double* defect) const {
-        double off = 0.0;
-        for (std::int64_t k = 0; k < record_.steps; ++k) off = larger(off, std::abs(defect[k]));
-        const Turnover found = turnover(mechanism_, record_, clear_.allowed.even, 2);
-        double turned = 0.0;
-        for (double part : found.kinetic_of) turned += part;
-        return off <= clear_.energy * (std::min(found.kinetic, turned) + found.work);
-    }
 
     // Whether a damper may be faster than the step.
     bool damped() {
@@ -133,50 +119,72 @@ class Clearance {
     bool outpaced() {
         if (!mechanism_.forces.any()) return false;
         std::vector<double> force(n_);
-        const std::int64_t last = clear_.damped_at - 1;
+        const std::int64_t last = damped_at_ - 1;
         for (std::int64_t i = 0; i <= last; ++i) {
             const std::int64_t node = i * record_.steps / last;
             force_at(std::min(node, record_.steps - 1), force.data());
             inertias_.masses_at(record_.q + node * n_);
             inertias_.forces_at(record_.q + node * n_, record_.v + node * n_, force.data());
-            if (!inertias_.outpaces_dampers(clear_.damping / record_.h)) return true;
+            if (!inertias_.outpaces_dampers(damping_ / record_.h)) return true;
         }
         return false;
     }
 
-    // `growth` from the errors in each window and in the whole motion.
-    double growth_of_errors() {
-        const std::int64_t steps = record_.steps, pieces = (steps + clear_.window - 1) / clear_.window;
-        const bool known = clear_.known >= 0.0;
-        Yardstick yardstick(mechanism_);
-        double total = 0.0;
+    // The error e of the motion from its defects l: e -> Phi e + l, with the flow Phi of the motion linearized in the
+    // middle of each few steps, by the implicit midpoint rule.
+    Propagated propagated(const double* most_q, const double* most_v) {
+        const double unknown = std::numeric_limits<double>::infinity();
+        const Propagated none{std::vector<double>(n_, unknown), std::vector<double>(n_, unknown)};
+        Propagated found{std::vector<double>(n_, 0.0), std::vector<double>(n_, 0.0)};
+        std::fill(error_q_.begin(), error_q_.end(), 0.0);
+        std::fill(error_v_.begin(), error_v_.end(), 0.0);
         from_ = until_ = -1;
-        for (std::int64_t piece = 0; piece < pieces; ++piece) {
-            const std::int64_t begin = piece * steps / pieces, end = (piece + 1) * steps / pieces;
-            std::fill(off_q_.begin(), off_q_.end(), known ? clear_.known : 0.0);
-            // No mode turns or decays by much in a step here.
-            std::fill(off_v_.begin(), off_v_.end(), known ? 2.0 * clear_.known / record_.h : 0.0);
-            for (std::int64_t k = begin; k < end && !known; ++k) {
-                if (k >= until_ && !examine(k)) return 0.0;
-                const double left = record_.h * static_cast<double>(end - k - 1);
-                for (int c = 0; c < n_; ++c) {
-                    const double dv = step_v_[(k - from_) * n_ + c];
-                    off_v_[c] += dv;
-                    off_q_[c] += step_q_[(k - from_) * n_ + c] + left * dv;
-                }
+        for (std::int64_t k = 0; k < record_.steps; ++k) {
+            if (k >= until_ && !examine(k)) return none;
+            if (k % frozen == 0 && !linearize(std::min(k + frozen / 2, record_.steps - 1))) return none;
+            advance();
+            for (int c = 0; c < n_; ++c) {
+                error_q_[c] += step_q_[(k - from_) * n_ + c];
+                error_v_[c] += step_v_[(k - from_) * n_ + c];
+                found.q[c] = larger(found.q[c], std::abs(error_q_[c]));
+                found.v[c] = larger(found.v[c], std::abs(error_v_[c]));
+                if (!(found.q[c] <= most_q[c] && found.v[c] <= most_v[c])) return none;
             }
-            const double* q = record_.q + begin * n_;
-            const auto length = static_cast<std::size_t>(end - begin);
-            yardstick.lay(q, record_.v + begin * n_, length, record_.h, clear_.allowed);
-            const double travel = yardstick.of_travel(off_q_, clear_.allowed);
-            if (!(travel <= clear_.allowed.travel)) return 0.0;
-            if (!(yardstick.of_speed(off_v_, clear_.allowed) <= clear_.allowed.velocity)) return 0.0;
-            total = larger(total, travel * static_cast<double>(steps) / static_cast<double>(length));
         }
-        if (known) return std::numeric_limits<double>::infinity();
-        if (!(total <= clear_.whole)) return 0.0;
-        const double factor = total > 0.0 ? clear_.grown / total : std::numeric_limits<double>::infinity();
-        return steps < clear_.few || grows_less(factor) ? std::numeric_limits<double>::infinity() : factor;
+        return found;
+    }
+
+    // Number of steps with the same linearization.
+    static constexpr std::int64_t frozen = 4;
+
+    // The derivatives of the accelerations at a node, and the factors of 1 - h/2 av - h^2/4 aq.
+    bool linearize(std::int64_t node) {
+        const double *q = record_.q + node * n_, *v = record_.v + node * n_, h = record_.h;
+        for (auto* matrix : {&aq_, &av_, &af_}) std::fill(matrix->begin(), matrix->end(), 0.0);
+        force_at(node, rate_.data());
+        if (!slopes_.at(q, v)) return false;
+        std::vector<double>& a = q_;
+        slopes_.acceleration(rate_.data(), a.data());
+        slopes_.differentiate(v, a.data());
+        slopes_.derivatives(aq_.data(), av_.data(), af_.data());
+        for (int i = 0; i < n_ * n_; ++i)
+            lu_[i] = (i % (n_ + 1) == 0 ? 1.0 : 0.0) - 0.5 * h * av_[i] - 0.25 * h * h * aq_[i];
+        return factor_lu(lu_.data(), n_, {0, n_});
+    }
+
+    // One step of the linearized motion: v1 = 2 vm - v0 and q1 = q0 + h vm, with the mean velocity vm.
+    void advance() {
+        const double h = record_.h;
+        for (int i = 0; i < n_; ++i) {
+            double sum = error_v_[i];
+            for (int j = 0; j < n_; ++j) sum += 0.5 * h * aq_[i * n_ + j] * error_q_[j];
+            rate_[i] = sum;
+        }
+        solve_lu(lu_.data(), n_, {0, n_}, rate_.data(), rate_.data());
+        for (int i = 0; i < n_; ++i) {
+            error_q_[i] += h * rate_[i];
+            error_v_[i] = 2.0 * rate_[i] - error_v_[i];
+        }
     }
 
     // The errors of the steps of a stretch with step k; false where they are not known.
@@ -233,8 +241,8 @@ class Clearance {
                     gained += gains[i] * a_[i * n_ + c];
                     moved += moves[i] * a_[i * n_ + c];
                 }
-                step_v_[j * n_ + c] = std::abs(v[n_ + c] - v[c] - h * gained);
-                step_q_[j * n_ + c] = std::abs(q[n_ + c] - q[c] - h * (v[c] + h * moved));
+                step_v_[j * n_ + c] = v[n_ + c] - v[c] - h * gained;
+                step_q_[j * n_ + c] = q[n_ + c] - q[c] - h * (v[c] + h * moved);
             }
         }
         std::copy_n(&force_[last * n_], n_, before_.begin());
@@ -271,49 +279,6 @@ class Clearance {
 
     void force_at(std::int64_t k, double* force) const {
         constant_force(mechanism_, nullptr, record_.u + k * mechanism_.controls, force);
-    }
-
-    // Whether disturbances grow by less than a factor: whether r is above the logarithmic norm of the motion linearized
-    // at two of its nodes, and so above the rates of all modes, for errors that grow as exp(aligned r t). Of (dq, dv)
-    // the norm is r^2 dq'M dq + dv'M dv.
-    bool grows_less(double factor) {
-        if (!(factor < std::numeric_limits<double>::infinity())) return true;
-        const double r = std::log(factor) / (clear_.aligned * record_.h * static_cast<double>(record_.steps));
-        if (!(r > 0.0)) return false;
-        const int n = n_, size = 2 * n;
-        ForwardDynamics dynamics(mechanism_, true);
-        std::vector<double> aq(n * n), av(n * n), af(n * n), by_q(n * n), by_v(n * n), test(size * size);
-        for (std::int64_t node : {record_.steps / 3, 2 * record_.steps / 3}) {
-            const double *q = record_.q + node * n, *v = record_.v + node * n;
-            for (auto* matrix : {&aq, &av, &af}) std::fill(matrix->begin(), matrix->end(), 0.0);
-            force_at(node, force_.data());
-            if (!dynamics.at(q, v)) return false;
-            dynamics.acceleration(force_.data(), a_.data());
-            dynamics.differentiate(v, a_.data());
-            dynamics.derivatives(aq.data(), av.data(), af.data());
-            inertias_.masses_at(q);
-            const auto times_mass = [&](const std::vector<double>& x, std::vector<double>& out) {
-                for (int i = 0; i < n; ++i) {
-                    for (int j = 0; j < n; ++j) {
-                        double sum = 0.0;
-                        for (int k = 0; k < n; ++k) sum += inertias_.mass(i, k) * x[k * n + j];
-                        out[i * n + j] = sum;
-                    }
-                }
-            };
-            times_mass(aq, by_q);
-            times_mass(av, by_v);
-            for (int i = 0; i < n; ++i) {
-                for (int j = 0; j < n; ++j) {
-                    const double mass = inertias_.mass(i, j);
-                    test[i * size + j] = r * r * r * mass;
-                    test[(n + i) * size + j] = -0.5 * (r * r * mass + by_q[i * n + j]);
-                    test[(n + i) * size + n + j] = r * mass - 0.5 * (by_v[i * n + j] + by_v[j * n + i]);
-                }
-            }
-            if (!factor_ldl(test.data(), size, {0, size})) return false;
-        }
-        return true;
     }
 };
 

@@ -22,11 +22,11 @@ from varpin.io.scenefile.reading import find_scene, read_scene
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.required import Required, idle_joints, requirements
 from varpin.io.scenefile.shown import marks_of
-from varpin.mechanics.policy import LinearPolicy
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
+from varpin.signals.policy import LinearPolicy
 from varpin.simulation.choice import usual_integrator
-from varpin.simulation.run import simulate
+from varpin.simulation.simulate import simulate
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
 

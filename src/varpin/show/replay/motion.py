@@ -209,7 +209,9 @@ def replay(
         scene, wanted, begin = held[k]
         beyond = (ties(scene), regions(wanted, begin + np.minimum(times, t[-1])), goals(wanted, marked))
         actors.append(Actor(arm, positions, tuple(lines), tuple(plans), triads[k], efforts, *beyond))
-    script = Script(times / speed, tuple(actors), paths, marked, step, loop, speed)
+    errors = [path.error_text for _, path in pairs if isinstance(path, Trajectory) and path.error_text]
+    told = f"estimated {'; '.join(errors)} rad or m" if errors else ""
+    script = Script(times / speed, tuple(actors), paths, marked, step, loop, speed, told)
 
     from varpin.show.replay import viewer  # noqa: PLC0415 - meshcat is slow to import, and few runs show anything
 

@@ -40,6 +40,8 @@ class Page:
         stream = b"".join(len(command).to_bytes(4, "little") + command for command in self.commands)
         packed = base64.b64encode(gzip.compress(stream, 6, mtime=0)).decode()
         title, key = markup.escape(script.title), "\n".join(map(_line, legend(script)))
+        if script.error:
+            key += f"\n<li>{markup.escape(script.error)}</li>"
         return f"""<!DOCTYPE html>
 <html lang="en">
 <head>

@@ -181,6 +181,7 @@ class Script:
         offset: Translation from one robot to the next (3,) [m]; None to place them side by side.
         loop: Start again at the end.
         speed: Seconds of motion in a second of playback.
+        error: The estimated error of the motions in words; empty where it is not known.
     """
 
     times: Floats
@@ -190,6 +191,7 @@ class Script:
     offset: Floats | None = None
     loop: bool = True
     speed: float = 1.0
+    error: str = ""
 
     @property
     def target_names(self) -> tuple[str, ...]:

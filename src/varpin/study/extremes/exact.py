@@ -1,7 +1,7 @@
 """The exact motion of a scene, and the distance of an integrator's motion from it.
 
 The exact motion is LSODA's at 1e-11: it takes stiff dampers, and shares nothing with the integrator. From which error
-on a motion is wrong is :mod:`varpin.simulation.accuracy`'s, as for the warnings.
+on a motion is wrong is in :mod:`varpin.study.extremes.units`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from varpin.integrators import ExplicitEuler, Integrator
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.simulation.accuracy import DISTURBANCE, error_units, grown, light_joint_speed, masses, velocity_change
+from varpin.simulation.spectrum import masses
+from varpin.study.extremes.units import DISTURBANCE, error_units, grown, light_joint_speed, velocity_change
 from varpin.trajectory import Trajectory
 
 _TOLERANCE = 1e-11

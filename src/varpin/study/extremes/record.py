@@ -9,7 +9,7 @@ from pathlib import Path
 
 from varpin._version import __version__
 from varpin.io.archive import load_json, save_json
-from varpin.simulation.accuracy import WRONG_ENERGY, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY
+from varpin.study.extremes.units import WRONG_ENERGY, WRONG_MOTION, WRONG_POSITION, WRONG_VELOCITY
 
 FORMAT = "varpin.extremes/3"
 

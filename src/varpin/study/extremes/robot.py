@@ -14,15 +14,15 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import VarpinError
-from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, RungeKutta4, SemiImplicitEuler
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Midpoint, Radau, RungeKutta4, SemiImplicitEuler
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import AdditiveNoise
 from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.model import Robot, load_robot
-from varpin.simulation import growth, limits
+from varpin.simulation import limits
 from varpin.simulation.failures import Interrupted
-from varpin.simulation.run import simulate
+from varpin.simulation.simulate import simulate
 from varpin.study.extremes.checks import condition, findings, finite, measures
 from varpin.study.extremes.exact import exact_motion
 from varpin.study.extremes.record import LEVELS, Cell, Kind, Record, line_of
@@ -34,6 +34,7 @@ Progress = Callable[[int, int, str], None]
 INTEGRATORS: tuple[Integrator, ...] = (
     *(Midpoint(alpha=alpha) for alpha in (0.0, 0.5, 1.0)),
     *(Gauss(stages=stages) for stages in (1, 2, 3, 4)),
+    Radau(stages=4),
     ExplicitEuler(),
     SemiImplicitEuler(),
     RungeKutta4(),
@@ -207,8 +208,8 @@ def judge(
         wrong: The failed checks.
     """
     # These warnings are not about the steps that the checks judge.
-    elsewhere = (*limits.KINDS, growth.WORDS)
-    warnings = (warning for warning in trajectory.warnings if not warning.startswith(elsewhere))
+    elsewhere = limits.KINDS
+    warnings = (warning for warning in trajectory.warnings if warning.kind not in elsewhere)
     said = (*(() if error is None else (line_of(error),)), *warnings)
     if not finite(trajectory):
         return Kind.WRONG, said, ("the record is not finite", *wrong)

@@ -12,7 +12,7 @@ import numpy as np
 from varpin.integrators import RungeKutta4
 from varpin.mechanics.scene import Scene
 from varpin.simulation.failures import StepFailure
-from varpin.simulation.run import simulate
+from varpin.simulation.simulate import simulate
 from varpin.study.paper import cases
 from varpin.study.paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS, Setting
 from varpin.study.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell

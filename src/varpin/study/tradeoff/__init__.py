@@ -4,7 +4,7 @@
 S-DDP, and :func:`advise` picks an integrator and a step from a few short runs.
 """
 
-from varpin.simulation.refinement import INTEGRATORS as INTEGRATORS
+from varpin.simulation.ladder import INTEGRATORS as INTEGRATORS
 from varpin.study.tradeoff.advice import Advice as Advice
 from varpin.study.tradeoff.advice import Choice as Choice
 from varpin.study.tradeoff.advice import advise as advise

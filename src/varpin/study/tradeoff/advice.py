@@ -1,24 +1,24 @@
 """Advice: the cheapest integrator and step that meet an accuracy, or the most accurate within a time.
 
-Costs are wall times. How errors are found out is in :mod:`varpin.simulation.refinement`.
+Costs are wall times. Errors and steps are found as for a tolerance, see :mod:`varpin.simulation.ladder`.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-import numpy as np
-
 from varpin.errors import InputError
 from varpin.integrators import Guard, Integrator, Reference, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.simulation.refinement import REACH, SAFETY, Found, Method, Sample, Search, first_steps
+from varpin.signals.commands import open_loop
+from varpin.simulation.check import distance, repeated
+from varpin.simulation.ladder import Ladder, Rung, Trial, first_steps
+from varpin.simulation.record import rollout
 from varpin.study.tradeoff.setting import Setting, integrators_of
 from varpin.support.checks import JointValues, positive
 from varpin.support.markup import facts, table
@@ -28,8 +28,6 @@ COLUMNS = ("integrator", "dt [s]", "steps", "predicted time [s]", "predicted err
 
 # Total time of the repetitions of a short run [s], and their largest number: the first ones find caches cold.
 _TIMING, _REPEATS = 0.02, 5
-# Longest predicted time of a run that confirms the prediction [s].
-_CHEAP = 0.5
 # Nodes at which the midpoint integrator's largest step is computed: a bound by samples, for information.
 _NODES = 32
 # Part of a budget that is planned for; the rest is for the scatter of wall times.
@@ -44,7 +42,7 @@ class Choice:
         integrator: The method.
         dt: Its step [s].
         steps: Over the horizon.
-        error: Predicted error in q at the end, the largest over the joints [rad or m]; infinite where not known.
+        error: The largest error in q over nodes and joints [rad or m]; infinite where not known.
         seconds: Predicted wall time [s].
         measured: Whether runs at steps as small or smaller stand behind it; else the method's order does.
     """
@@ -116,7 +114,7 @@ class Advice:
 
     @property
     def error(self) -> float:
-        """The error in q at the end to expect [rad or m]."""
+        """The largest error in q to expect [rad or m]."""
         return self.best.error
 
     @property
@@ -142,7 +140,7 @@ def advise(
 ) -> Advice:
     """The cheapest integrator and step that meet an accuracy on a motion, or the most accurate in a time.
 
-    What counts is the error in q at the end, the largest over the joints, on this scene from this state under these
+    What counts is the largest error in q over all nodes and joints, on this scene from this state under these
     controls. The search takes several times as long as the motion itself. The end of a chaotic motion over many
     oscillations is beyond every method; the advice then reports that the tolerance is not reached.
 
@@ -173,14 +171,13 @@ def advise(
     rows = len(setting.controls)
     first = first_steps(scene, setting.q0, setting.v0, setting.duration, rows)
     begin = time.perf_counter()
-    methods = [Method(partial(_timed, setting), member, first, rows, member.order) for member in members]
-    search = _Timed(methods, lambda: time.perf_counter() > begin + patience, _CHEAP)
+    late = partial(_later, begin + patience)
+    ladder = Ladder(partial(_timed, setting), members, first, rows, late)
     if tolerance is not None:
-        target = positive("tolerance", tolerance, "rad or m") / SAFETY
-        choices, reached = search.for_tolerance(target)
+        choices, reached = ladder.for_tolerance(positive("tolerance", tolerance, "rad or m"))
     else:
-        choices, reached = search.for_budget(positive("budget", budget, "s"))
-    bound = _largest_step(setting, methods)
+        choices, reached = ladder.for_budget(_PLANNED * positive("budget", budget, "s"))
+    bound = _largest_step(setting, ladder.rungs)
     best, *others = (
         Choice(each.integrator, setting.duration / each.steps, each.steps, each.error, each.cost, each.measured)
         for each in choices
@@ -189,62 +186,35 @@ def advise(
     return Advice(best, reached, tuple(others), bound, tolerance, budget, time.perf_counter() - begin, reason)
 
 
-def _timed(setting: Setting, integrator: Integrator, steps: int) -> Sample:
-    """A run and its wall time, the best of several short ones."""
+def _later(end: float) -> bool:
+    """Whether a time has passed."""
+    return time.perf_counter() > end
+
+
+def _timed(setting: Setting, integrator: Integrator, steps: int) -> Trial:
+    """A trial and its wall time, the best of several short ones."""
     outcome = setting.run(integrator, steps)
     begin, seconds = time.perf_counter(), [outcome.seconds]
     while len(seconds) < _REPEATS and time.perf_counter() - begin < _TIMING:
         seconds.append(setting.run(integrator, steps).seconds)
-    pure = not outcome.failure and outcome.split_steps == 0
-    return Sample(steps, outcome.q[1:], min(seconds), pure)
+    if outcome.failure:
+        return Trial(steps, math.inf, min(seconds))
+    scene, start, dt = setting.scene, (setting.q0, setting.v0), setting.duration / steps
+    motion, failure = rollout(scene, integrator, *start, open_loop(setting.rows(steps)), dt)
+    off = math.inf if failure is not None else float(distance(repeated(scene, integrator, motion), motion)[0].max())
+    return Trial(steps, off if math.isfinite(off) else math.inf, min(seconds))
 
 
-class _Timed(Search):
-    """A search whose costs are wall times [s]."""
-
-    def for_budget(self, budget: float) -> tuple[list[Found], bool]:
-        """The best of every method within a time [s], the most accurate first, and whether there is one."""
-        while not self.late():
-            reach = 1.0 if budget < self.cheap else REACH
-            rivals = [m for m in self.methods if m.open and reach * m.last.cost < budget]
-            if not rivals:
-                break
-            self.refine(min(rivals, key=lambda m: m.last.cost))
-        choices = []
-        for method in self.methods:
-            # More accuracy than rounding leaves is not to be had for more steps.
-            enough = method.steps_for(self.floor)
-            steps = min(_steps_within(method, _PLANNED * budget), enough if enough is not None else sys.maxsize)
-            if not math.isfinite(method.error_at(steps)):
-                known = [s.steps for s, e in zip(method.whole, method.errors, strict=True) if np.isfinite(e)]
-                steps = max((k for k in known if method.cost_at(k) <= budget), default=0)
-            if steps:
-                choices.append(method.choice(steps, self.floor))
-        if choices:
-            return sorted(choices, key=lambda c: (c.error, c.cost)), True
-        return sorted(self.as_they_are(), key=lambda c: c.cost), False
-
-
-def _steps_within(method: Method, seconds: float) -> int:
-    """The most steps that a time allows, a multiple of R."""
-    rows = method.rows
-    counts = [rows, *(sample.steps for sample in method.samples)]
-    times = np.append(0.0, np.maximum.accumulate([sample.cost for sample in method.samples]))
-    inside = float(np.interp(seconds, times, counts))
-    most = inside if seconds <= times[-1] else counts[-1] + (seconds - times[-1]) / method.cost_a_step
-    return max(rows, rows * int(most / rows))
-
-
-def _largest_step(setting: Setting, methods: Sequence[Method]) -> float:
+def _largest_step(setting: Setting, rungs: Sequence[Rung]) -> float:
     """The smallest of the midpoint guard's largest steps along the best motion there is [s]."""
-    able = [m for m in methods if m.whole]
+    able = [rung for rung in rungs if any(math.isfinite(trial.error) for trial in rung.trials)]
     if not able or setting.scene.constraints:
         return math.nan
-    method = max(able, key=lambda m: (m.order, m.last.steps))
-    rows = len(setting.controls)
-    parts = method.last.steps // rows
+    method = max(able, key=lambda rung: (rung.integrator.order, rung.trials[-1].steps))
+    rows, last = len(setting.controls), method.trials[-1].steps
+    parts = last // rows
     samples = rows * max(k for k in range(1, max(1, _NODES // rows) + 1) if parts % k == 0)
-    motion = setting.run(method.integrator, method.last.steps, samples=samples)
+    motion = setting.run(method.integrator, last, samples=samples)
     margin = Guard().branch_margin
     bounds = []
     for q, v in zip(motion.q, motion.v, strict=True):

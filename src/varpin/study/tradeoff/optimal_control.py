@@ -80,11 +80,8 @@ class OptimalControlTradeoff(Tradeoff):
     runs: tuple[OptimalControlRun, ...]
 
     def pareto(self) -> tuple[OptimalControlRun, ...]:
-        """The runs that no other beats in both solve time and true open-loop cost, from the fastest up.
-
-        As in :meth:`WorkPrecision.pareto`.
-        """
-        return pareto_front(self.runs, lambda run: run.seconds, lambda run: run.open_loop_cost, lambda run: run.spread)
+        """The runs than which no other is better in both solve time and true open-loop cost, from the fastest up."""
+        return pareto_front(self.runs, lambda run: run.seconds, lambda run: run.open_loop_cost)
 
 
 def optimal_control_tradeoff(

@@ -18,7 +18,7 @@ from varpin.ensemble.paths import without_geometry
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.integrators import Gauss, Integrator, Reference
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
-from varpin.simulation.refinement import ROUNDING, SENSIBLE, first_steps
+from varpin.simulation.ladder import ROUNDING, SENSIBLE, first_steps
 from varpin.study.tradeoff.records import pareto_front
 from varpin.study.tradeoff.runs import Progress, Run, Tradeoff, complete
 from varpin.study.tradeoff.setting import PARTS, Outcome, Setting, integrators_of
@@ -132,13 +132,8 @@ class WorkPrecision(Tradeoff):
         return run.error <= self.reference_error
 
     def pareto(self, quantity: Quantity = "q") -> tuple[WorkPrecisionRun, ...]:
-        """The runs that no other beats, from the fastest up.
-
-        One beats another that is no less accurate and faster by more than the spread of either time, and than 2 %.
-        """
-        return pareto_front(
-            self.runs, lambda run: run.seconds, lambda run: self.error_of(run, quantity), lambda run: run.spread
-        )
+        """The runs than which no other is both faster and more accurate, from the fastest up."""
+        return pareto_front(self.runs, lambda run: run.seconds, lambda run: self.error_of(run, quantity))
 
 
 def work_precision(

@@ -17,9 +17,6 @@ from varpin.support import markup
 
 Row = TypeVar("Row")
 
-# Costs closer than this, relative, are the same.
-MARGIN = 0.02
-
 
 class RunTable:
     """A frozen dataclass of ``runs`` and of the facts common to all of them, saved as npz and written as CSV.
@@ -33,7 +30,7 @@ class RunTable:
     _columns: ClassVar[Sequence[str]]
 
     def pareto(self) -> tuple[Any, ...]:
-        """The runs that no other beats."""
+        """The runs than which no other is better in both columns."""
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
@@ -93,18 +90,12 @@ def pareto_front(
     rows: Sequence[Row],
     cost: Callable[[Row], float],
     error: Callable[[Row], float],
-    spread: Callable[[Row], float],
 ) -> tuple[Row, ...]:
-    """The rows that no other row clearly beats, from the cheapest up; rows with NaN are out.
-
-    One beats another that is no less accurate and cheaper by more than the spread of either cost and more than 2 %:
-    costs are measured, and a difference that the next measurement may turn round decides nothing.
-    """
+    """The rows than which no other is better in both cost and error, from the cheapest up; rows with NaN are out."""
     finite = [row for row in rows if np.isfinite(cost(row)) and np.isfinite(error(row))]
 
     def beats(other: Row, row: Row) -> bool:
-        margin = max(MARGIN * cost(row), spread(row), spread(other))
-        return error(other) <= error(row) and cost(other) < cost(row) - margin
+        return error(other) < error(row) and cost(other) < cost(row)
 
     front = [row for row in finite if not any(beats(other, row) for other in finite)]
     return tuple(sorted(front, key=lambda row: (cost(row), error(row))))

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
+from varpin.finding import announce
 from varpin.integrators import Integrator
-from varpin.integrators.base import Segment, open_loop
-from varpin.mechanics.inputs import held_in_parts
+from varpin.integrators.base import Segment
 from varpin.mechanics.scene import OF_CONSTRAINTS, Scene, require_scene
+from varpin.signals.commands import open_loop
+from varpin.signals.inputs import held_in_parts
 from varpin.simulation.commands import held_rows
-from varpin.simulation.refinement import candidates
-from varpin.simulation.soundness import announce
+from varpin.simulation.ladder import candidates
 from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, joint_array, positive
 from varpin.support.frozen import Frozen
@@ -106,7 +107,7 @@ class Setting(Frozen):
         duration = positive("duration", duration, "s")
         if scene.constraints:
             begin, speed, moved = on_constraints(scene, begin, speed)
-            announce(logger, scene, duration / len(rows), moved)
+            announce(logger, scene.announced, duration / len(rows), moved)
         return cls(scene, begin, speed, rows, duration)
 
     @property
@@ -150,7 +151,7 @@ class Setting(Frozen):
         q, v = np.full((2, samples + 1, n), np.nan)
         q[0], v[0] = self.q0, self.v0
         nothing = np.zeros((0, 0, 0))
-        moved = self._of_inputs(steps) if self.scene.inputs else None
+        moved = self.rows(steps) if self.scene.inputs else None
         tally, drift, failure = np.zeros(4, dtype=np.int64), 0.0, ""
         begin = time.perf_counter()
         state, (start,) = integrator.start(self.scene, self.q0[None], self.v0[None])
@@ -172,8 +173,8 @@ class Setting(Frozen):
         newton, jets, sweeps, split = (int(x) for x in tally)
         return Outcome(q, v, drift, seconds, newton, jets, sweeps, split, failure)
 
-    def _of_inputs(self, steps: int) -> Floats:
-        """Controls (steps, m) of a scene with kinematic inputs."""
+    def rows(self, steps: int) -> Floats:
+        """The controls of each of so many steps (steps, m); kinematic inputs are on their way."""
         parts = len(self.controls)
         start = self.q0, self.v0
         return held_in_parts(self.scene, self.controls, *start, self.duration / parts, steps // parts)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,25 +10,26 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
+from varpin.finding import Finding, announce, ranked
 from varpin.integrators import Integrator, Segment
-from varpin.integrators.base import Failure, open_loop, steps_of
+from varpin.integrators.base import Failure
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
-from varpin.mechanics.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
-from varpin.simulation import limits
-from varpin.simulation.choice import changes_along, integrator_along, usual_integrator
+from varpin.signals.commands import open_loop, steps_of
+from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
+from varpin.simulation.check import check as checked
+from varpin.simulation.choice import usual_integrator
 from varpin.simulation.commands import Controls, commands_of, next_block
 from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, named
-from varpin.simulation.functions import ControlLaw, begins_elsewhere, require_law, undersampled
-from varpin.simulation.loop_stability import examined_in_loop, outgrown, unstable_loop
+from varpin.simulation.functions import ControlLaw, Sampled, begins_elsewhere, require_law, resolved, unsettled
+from varpin.simulation.loop import outgrown, unstable_loop
 from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import MotionRecord, function_error
-from varpin.simulation.soundness import Finding, announce, findings_from_record, with_warnings
 from varpin.simulation.start import controls_in_degrees, in_other_units, on_constraints
-from varpin.simulation.time_steps import duration_for_tolerance, steps_for_tolerance, time_steps
-from varpin.simulation.tolerance import Steps
+from varpin.simulation.time_steps import duration_for_tolerance, time_steps
+from varpin.simulation.tolerance import steps_for_tolerance
 from varpin.support.checks import JointValues, as_floats, count, flag, joint_array
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 
@@ -85,14 +84,11 @@ def simulate(
             step. A law is a digital controller: it is called once at the start of each of its periods, with the time
             and state of that node, and its value is held over the period.
         period: Of a control law, in steps.
-        integrator: If left out, it is chosen by the rates at the start: ``Radau(stages=4)`` where dampers, dry
-            friction or servos are more than twice as fast as the step and the scene has no constraints;
-            ``Gauss(stages=4)`` where springs turn a mode by more than 0.4 rad in a step; else ``Gauss(stages=2)``.
-            If such rates occur only later in the motion, in a joint stop for example, the motion is repeated with the
-            other integrator, which ``Trajectory.integrator`` names. The motion of a law is not repeated, for the law
-            is called once a period, and may have a state that more calls would change; its integrator is chosen for
-            all stops from the start, and the check tells where it was not enough. A CustomForce has no part
-            in the choice. ``Midpoint(kick="held")`` where noise is drawn; with a tolerance, the cheapest of all.
+        integrator: If left out, it is chosen once, by the rates at the start and in all joint stops:
+            ``Radau(stages=4)`` where dampers, dry friction or servos are more than twice as fast as the step and the
+            scene has no constraints; ``Gauss(stages=4)`` where springs turn a mode by more than 0.4 rad in a step; else
+            ``Gauss(stages=2)``. A CustomForce has no part in the choice. ``Midpoint(kick="held")`` where noise is
+            drawn; with a tolerance, the cheapest of all. The check names a better one where the choice was not enough.
 
     Other Args:
         rng: Generator or seed of the Wiener increments. Without it, and without ``increments``, they are zero, with a
@@ -100,13 +96,12 @@ def simulate(
         increments: The increments themselves, (N, k) [s^0.5], or (N, K) as :attr:`Trajectory.dw` with those for slopes
             of linear controls, which are zero if left out, to replay or refine a path, see
             :mod:`varpin.mechanics.wiener`. 0 gives the motion without noise and without the warning.
-        check: Examine the finished motion for ``Trajectory.warnings`` and the log: does its energy balance close, do
-            its steps resolve it, is its control loop stable? The check takes about half as long as the motion where
-            the motion is clearly right, and 0.1 to 0.3 ms more where it is not; several times as long as the motion
-            where its steps are coarse, and twice as long where small disturbances may grow.
+        check: Find the error of the motion, ``Trajectory.error``, and what is doubtful, ``Trajectory.warnings``. Where
+            the record alone proves the motion right the check takes a third of the motion's time; else it repeats the
+            motion by a method of two stages more, which takes two to three times as long as the motion.
         progress: Called now and then with (steps done, steps in all). A function with three required arguments, such
             as :class:`varpin.LiveView`, also gets a :class:`varpin.Nodes` with the nodes since the last call, whose
-            last node comes first again. The count begins anew where a motion is repeated with another integrator.
+            last node comes first again.
 
     Returns:
         The trajectory, frozen.
@@ -127,44 +122,6 @@ def simulate(
         Interrupted: Ctrl-C; holds the trajectory so far. It is a KeyboardInterrupt; during the search of a tolerance
             a plain one is raised.
     """
-    trajectory, found = simulated(
-        scene,
-        q0,
-        v0,
-        dt=dt,
-        steps=steps,
-        duration=duration,
-        tolerance=tolerance,
-        controls=controls,
-        period=period,
-        integrator=integrator,
-        rng=rng,
-        increments=increments,
-        check=check,
-        progress=progress,
-    )
-    announce(logger, scene, trajectory.dt, found)
-    return trajectory
-
-
-def simulated(
-    scene: Scene,
-    q0: JointValues,
-    v0: JointValues,
-    *,
-    dt: float | None = None,
-    steps: int | None = None,
-    duration: float | None = None,
-    tolerance: float | Accuracy | None = None,
-    controls: Controls | ControlLaw = None,
-    period: int = 1,
-    integrator: Integrator | None = None,
-    rng: np.random.Generator | int | None = None,
-    increments: ArrayLike | None = None,
-    check: bool = True,
-    progress: Progress | None = None,
-) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """The motion of :func:`simulate`, and its findings, which are not logged."""
     joints = require_scene(scene).robot.joint_names
     q0, v0 = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
     if integrator is not None and not isinstance(integrator, Integrator):
@@ -172,7 +129,7 @@ def simulated(
     if controls is None and (scene.servo_joints or scene.inputs):
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
-    known: Steps = ()
+    error: Floats | None = None
     early = in_other_units(scene, q0, v0)
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
@@ -180,138 +137,106 @@ def simulated(
     if tolerance is not None:
         span = duration_for_tolerance(dt, steps, duration)
         chosen = steps_for_tolerance(scene, q0, v0, span, tolerance, controls, integrator)
-        integrator, steps, controls, accuracy, unmet, known = chosen
+        integrator, steps, controls, accuracy, unmet, error = chosen
         early = (*early, *unmet)
         dt = span / steps
     else:
         dt, steps = time_steps(dt, steps, duration, choosable=True)
     period, check = count("period", period, least=1), flag("check", check)
     _require_memory(scene, steps)
+    law = callable(controls)
+    if callable(controls):
+        require_law(controls)
+    elif period != 1:
+        raise InputError(
+            f"period = {period} applies to a control law only; arrays have one row a step, "
+            "a LinearPolicy has its own hold"
+        )
     on_lines = isinstance(controls, FirstOrderHold) or (isinstance(controls, LinearPolicy) and controls.linear)
     width = scene.increments(linear=on_lines)
     if increments is not None and as_floats("increments", increments).shape == (steps, scene.processes):
         # Given without those for slopes of the controls, which are zero then.
         width = scene.processes
     dw = wiener_increments(width, dt, steps, rng, increments)
-    reporter = Reporter(progress, steps, dt)
-    law = controls if callable(controls) else None
-    if law is not None:
-        require_law(law)
-    elif period != 1:
-        raise InputError(
-            f"period = {period} is of a control law, a function of (t, q, v); rows are given one a step, "
-            "and a LinearPolicy has a hold of its own"
-        )
-    # A law may depend on its earlier calls: its motion is integrated once.
-    replaceable = integrator is None and law is None and not len(dw) and changes_along(scene)
     if integrator is None:
-        integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0, ahead=law is not None)
-    task = _Task(scene, q0, v0, controls, period, dt, steps, dw, check)
-    while True:
-        record, hold, other, interrupted = _integrated(task, integrator, reporter, replaceable=replaceable, known=known)
-        if other is None:
-            break
-        integrator = other
+        integrator = usual_integrator(scene, q0, v0, dt, noisy=len(dw) > 0)
+    if isinstance(controls, OpenLoop) and not isinstance(controls, Sampled):
+        controls = Sampled(controls, scene, dt)
+    commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=period)
+    if not (callable(controls) or isinstance(controls, Sampled)):
+        commands = commands_of(scene, integrator, controls, steps, dt)
+    linear = len(commands.stage_times) > 0
+    # The check of a loop is for held controls.
+    hold = period if law else commands.hold if isinstance(controls, LinearPolicy) and not linear else None
+    state, (start,) = integrator.start(scene, q0[None], v0[None])
+    held = commands.hold > 1 and not law
+    record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)
+    interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), hold, check=check)
+    motion = record.trajectory()
     try:
-        try:
-            fed = None
-            if isinstance(controls, LinearPolicy) and hold is not None and record.steps == steps:
-                fed = commands_of(scene, integrator, controls, steps, dt)
-            trajectory, found = _checked(scene, integrator, record.trajectory(), hold, accuracy, fed, check=check)
-        except (CustomForceError, CustomConstraintError) as error:
-            # Steps that the check repeats may go where the function is not defined. The motion itself is valid.
-            sentence = f"the motion was not checked: {error}"
-            trajectory, found = record.trajectory(), (Finding("check", sentence),)
-        if check and isinstance(controls, OpenLoop):
-            # A tolerance is met with the function's values in finer steps, too.
-            right = accuracy is None and all(finding.kind in limits.KINDS for finding in found)
-            found = (*found, *undersampled(controls, scene, integrator, trajectory, right=right))
-        if check and isinstance(controls, OpenLoop | FirstOrderHold):
-            found = (*found, *begins_elsewhere(controls, scene, q0, v0))
+        found: list[Finding] = list(noise_forgotten(scene, rng, increments))
+        if check:
+            function = controls if isinstance(controls, Sampled) else None
+            whole = function is None or resolved(function, integrator)
+            given = None if callable(controls) or interrupted else controls
+            known = None if interrupted else error
+            motion = checked(scene, integrator, motion, given, resolved=whole, known=known)
+            loop = () if hold is None else unstable_loop(scene, motion, hold)
+            wrong = [finding for finding in motion.warnings if finding.kind == "error"]
+            found = [*loop, *wrong, *(unsettled(function) if function else ()), *found, *motion.warnings]
+            if isinstance(controls, OpenLoop | FirstOrderHold):
+                found += begins_elsewhere(controls, scene, q0, v0)
+        found += early
         if not any(finding.kind == "start in degrees" for finding in early):
             # Without controls servos hold the start.
-            early = (*early, *controls_in_degrees(scene, trajectory.u))
-        found = (*noise_forgotten(scene, rng, increments), *early, *found)
-        trajectory = with_warnings(trajectory, found)
-        if accuracy is not None:
-            trajectory = trajectory.changed(accuracy=accuracy)
+            found += controls_in_degrees(scene, motion.u)
+        # Values in wrong units explain all else.
+        found.sort(key=lambda told: not told.kind.endswith(("degrees", "degrees per second", "millimetres")))
+        motion = motion.changed(warnings=ranked(found), accuracy=accuracy)
     except KeyboardInterrupt:
-        raise Interrupted(replace(record.trajectory(), accuracy=accuracy)) from None
+        raise Interrupted(motion.changed(accuracy=accuracy)) from None
     if interrupted:
-        raise Interrupted(trajectory)
-    return trajectory, found
+        raise Interrupted(motion)
+    announce(logger, scene.announced, dt, motion.warnings)
+    return motion
 
 
-class _Task(NamedTuple):
-    """A motion to integrate, without its integrator; ``period`` is that of a law in steps."""
+def _roll(
+    record: MotionRecord,
+    state: object,
+    steps: int,
+    controls: Controls | ControlLaw,
+    commands: Commands,
+    reporter: Reporter,
+    hold: int | None,
+    *,
+    check: bool,
+) -> bool:
+    """Integrate the steps of a motion into its record; False if Ctrl-C ended them.
 
-    scene: Scene
-    q0: Floats
-    v0: Floats
-    controls: Controls | ControlLaw
-    period: int
-    dt: float
-    steps: int
-    dw: Floats
-    check: bool
-
-
-def _integrated(
-    task: _Task, integrator: Integrator, reporter: Reporter, *, replaceable: bool, known: Steps = ()
-) -> tuple[MotionRecord, int | None, Integrator | None, bool]:
-    """Integrate a motion, or take its ``known`` steps.
-
-    Returns:
-        The steps; the period of the feedback in steps, None for none; if ``replaceable``, another integrator that the
-        motion needs, with which it has to be repeated, else None; and whether Ctrl-C ended the motion.
+    ``hold`` is the period of the feedback in steps, None for none.
     """
-    scene, controls, dt, steps = task.scene, task.controls, task.dt, task.steps
-    if callable(controls) or isinstance(controls, OpenLoop):
-        commands = open_loop(np.zeros((0, scene.controls)))._replace(hold=task.period)
-    else:
-        commands = commands_of(scene, integrator, controls, steps, dt)
-    hold = task.period if callable(controls) else commands.hold if isinstance(controls, LinearPolicy) else None
-    state, (start,) = integrator.start(scene, task.q0[None], task.v0[None])
-    linear = bool(len(commands.stage_times))
-    if linear:
-        # The loop's check is for held controls.
-        hold = None
-    held = commands.hold > 1 and not callable(controls)
-    record = MotionRecord(scene, integrator, dt, task.dw, start, commands if linear else None, held=held)
+    scene = record.scene
     # The cost of a sweep is linear in the number of joints, that of an elimination cubic.
     n = scene.robot.dof
     chunk = max(1, _CHUNK // (n + n**3 // 100))
     # One step at a time where noise or forces call Python functions, to record the steps before one that fails.
     stepwise = scene.noise.diffusion is None or scene.custom is not None or bool(scene.bound_constraints.rows.customs)
     try:
-        reporter.begin(start)
-        for segment, block in known:
-            done = record.steps
-            record.add(segment, block.within)
-            reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
+        reporter.begin(record.last)
         while record.steps < steps:
             done = record.steps
             block = next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
             segment = _rolled_out(record, state, block)
-            if replaceable and (other := _better_integrator(record, segment, block)) is not None:
-                return record, hold, other, False
             record.add(segment, block.within)
             if segment.failure is not None:
                 # The last decision of a law is in no step of the record yet.
                 decided = (done, block.u) if callable(controls) else None
-                raise _step_failure(record, segment.failure, hold if task.check else None, decided)
+                raise _step_failure(record, segment.failure, hold if check else None, decided)
             reporter.add(segment, record.steps, due=done // chunk < record.steps // chunk)
     except KeyboardInterrupt:
-        return record, hold, None, True
-    return record, hold, None, False
-
-
-def _better_integrator(record: MotionRecord, segment: Segment, block: Commands) -> Integrator | None:
-    """The integrator that the steps of a segment after a record need, if it is not the record's."""
-    q, v = (np.concatenate([getattr(record.last, name)[-1:], getattr(segment, name)]) for name in ("q", "v"))
-    u = segment.u if len(segment.u) else block.u[:1]
-    other = integrator_along(record.scene, record.integrator, q, v, u, record.dt)
-    return None if other.same_map(record.integrator) else other
+        return False
+    return True
 
 
 def _rolled_out(record: MotionRecord, state: object, block: Commands) -> Segment:
@@ -349,29 +274,8 @@ def _step_failure(
         loop = unstable_loop(record.scene, node, hold)
         found = loop or outgrown(np.concatenate([node.u[:last:hold], u]), hold * record.dt)
         if found:
-            node, cause = with_warnings(node, found), found[0].sentence
+            node, cause = node.changed(warnings=found), found[0]
     return StepFailure(node.steps, node.t[-1], named(record.scene, failure), node, cause)
-
-
-def _checked(
-    scene: Scene,
-    integrator: Integrator,
-    trajectory: Trajectory,
-    hold: int | None,
-    accuracy: Accuracy | None,
-    commands: Commands | None,
-    *,
-    check: bool,
-) -> tuple[Trajectory, tuple[Finding, ...]]:
-    """A motion with its warnings.
-
-    ``hold`` is the period of its feedback in steps, None for none, and ``commands`` those of a linear feedback.
-    """
-    if check:
-        error = None if accuracy is None else accuracy.error
-        return examined_in_loop(scene, integrator, trajectory, hold, error, commands=commands)
-    found = findings_from_record(scene, integrator, trajectory)
-    return with_warnings(trajectory, found), found
 
 
 def noise_forgotten(
@@ -379,14 +283,13 @@ def noise_forgotten(
 ) -> tuple[Finding, ...]:
     """Warnings: the scene has noise, but neither seed nor increments; or there is a seed, but no noise."""
     if scene.processes and rng is None and increments is None:
-        sentence = (
-            "the scene has noise, and none was drawn: this is the motion without it. rng=0, or any other seed, draws "
-            "it (in a scene file, seed = 0 under [simulate]); increments=0 says that none is meant"
+        text = (
+            "no noise was applied, because rng= was not given. Pass rng=0 to draw it (seed = 0 in a scene file), "
+            "increments=0 to silence this"
         )
-        return (Finding("noise not drawn", sentence),)
+        return (Finding("noise not drawn", text),)
     if rng is not None and not scene.processes:
-        sentence = "rng was given, but the scene has no noise, so nothing is random: varpin.Scene(robot, noise=...) has"
-        return (Finding("nothing random", sentence),)
+        return (Finding("nothing random", "rng= has no effect: the scene has no noise, Scene(robot, noise=...)"),)
     return ()
 
 

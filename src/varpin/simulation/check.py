@@ -1,0 +1,308 @@
+"""The check of a finished motion: its error, from one repetition, and what is doubtful about it.
+
+A motion that is clearly right is let pass by :mod:`varpin.simulation.gate`. Any other motion is repeated as a whole
+from its start by a method of two stages more, under the same controls and the same noise. The distance between both is
+the error of the motion, up to the far smaller one of the repetition: :attr:`varpin.Trajectory.error`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Literal
+
+import numpy as np
+
+from varpin.arrays import Floats, Integers
+from varpin.core.arrays import Commands
+from varpin.errors import AssemblyError, SingularMassMatrix
+from varpin.finding import Finding
+from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, Reference, RungeKutta4
+from varpin.integrators.base import drifts, noise_impulses
+from varpin.integrators.collocation import MOST_STAGES
+from varpin.integrators.variational import Variational
+from varpin.mechanics.constraints import CustomConstraintError
+from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.scene import Scene
+from varpin.model import joint_unit
+from varpin.signals.commands import changing, in_parts, open_loop, rows
+from varpin.signals.inputs import in_parts_of_steps, prescribing
+from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
+from varpin.simulation.commands import Controls, commands_of
+from varpin.simulation.energy import energy_defects
+from varpin.simulation.gate import proven_error
+from varpin.simulation.limits import beyond_limits
+from varpin.simulation.scales import speed_scales, travel_scales
+from varpin.simulation.short_forces import short_forces
+from varpin.simulation.spectrum import fastest_rate
+from varpin.trajectory import Trajectory
+
+# Errors from which on a motion is told of: of q as a share of the largest travel of its kind, of v as a share of the
+# joint's largest speed. Motions off by 5 % are wrong and those off by 0.3 % are right for any use: between 0.5 and 4 %
+# the same of 400 random motions are told of.
+TOLD, TOLD_VELOCITY = 0.01, 0.25
+# The share that a better step should leave.
+_AIM = 0.2
+# Stages of the repetition beyond those of a motion of the same order.
+_MORE = 2
+# A repetition with a tolerance ten times as large is ten times as far off.
+_LOOSER = 10.0
+# Steps of one joint between two checks for Ctrl-C: a tenth of a second.
+_CHUNK = 100_000
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def check(
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    controls: Controls | Commands = None,
+    *,
+    resolved: bool = True,
+    restart: int = 0,
+    known: Floats | None = None,
+) -> Trajectory:
+    """The motion with its error and its warnings, the worst first.
+
+    Args:
+        scene: The scene of the motion.
+        integrator: The integrator of the motion.
+        trajectory: The motion, without warnings.
+        controls: What the controls were, where they are more than the motion has recorded: a function of time, lines
+            between nodes, or linear feedback, which acts on the repetition too. Others are those of the record, held.
+        resolved: Whether the polynomials of the record are nearly the function of time that the controls are.
+        restart: Steps after which the repetition begins anew at a node of the motion, where a controller has corrected
+            the errors before it; 0 for none.
+        known: The error, if it is known (N + 1, n): nothing is repeated.
+    """
+    if not integrator.variational and trajectory.steps:
+        defects = energy_defects(scene, integrator, trajectory)
+        defects.setflags(write=False)
+        trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
+    if known is not None:
+        return trajectory.with_error(known).changed(warnings=tuple(beyond_limits(scene, trajectory)))
+    held_mean = isinstance(controls, FirstOrderHold) and not integrator.stage_times
+    if noise_unknown(scene, integrator, trajectory):
+        return trajectory.changed(warnings=tuple(beyond_limits(scene, trajectory)))
+    proven = proven_error(scene, integrator, trajectory) if resolved and not held_mean else None
+    repeat = functools.partial(repeated, scene, integrator, trajectory, controls, restart)
+    found: tuple[Finding, ...] = ()
+    if proven is not None:
+        motion = trajectory.with_error(lambda: distance(repeat(), trajectory)[0], proven)
+    else:
+        try:
+            off, speed_off = distance(repeat(), trajectory)
+            found = error_findings(scene, integrator, trajectory, off, speed_off)
+            found = found or short_forces(scene, integrator, trajectory)
+        except (CustomForceError, CustomConstraintError) as error:
+            off = np.full_like(trajectory.q, np.nan)
+            found = (Finding("error", f"the error is not known: the repetition of the motion failed, {error}"),)
+        motion = trajectory.with_error(off)
+    return motion.changed(warnings=(*found, *beyond_limits(scene, trajectory)))
+
+
+def distance(again: tuple[Floats, Floats, float], trajectory: Trajectory) -> tuple[Floats, Floats]:
+    """Errors of q and v at all nodes (N + 1, n), from a repetition that has a share ``again[2]`` of them."""
+    q, v, left = again
+    share = abs(1.0 - left)
+    return np.abs(q - trajectory.q) / share, np.abs(v - trajectory.v) / share
+
+
+def closer(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Integrator, int, float]:
+    """The method of a repetition, its steps in one of the motion's, and the share of the motion's error that it has.
+
+    It has two stages more than a method of the motion's order has; Runge-Kutta's takes half of its step. Radau methods
+    damp what is faster than the step, so they do not share the ringing of others. They keep no constraints; those of
+    Gauss do.
+    """
+    # Steps that guards divided are as many shorter ones.
+    taken = np.maximum(trajectory.statistics.substeps, 1).sum() / max(trajectory.steps, 1)
+    parts = 1 << math.ceil(math.log2(max(1.0, taken)))
+    if isinstance(integrator, Reference):
+        return Reference(min(_LOOSER * integrator.rtol, 1e-2), integrator.atol), 1, _LOOSER
+    if isinstance(integrator, RungeKutta4) or (trajectory.noisy and isinstance(integrator, ExplicitEuler)):
+        # Explicit Euler's kicks come after the step.
+        return integrator, 2, 0.5**integrator.order
+    stages = (integrator.order + 1) // 2 + _MORE
+    if stages > MOST_STAGES:
+        stages, parts = MOST_STAGES, 2 * parts
+    kick = _kick(integrator)
+    return (Gauss(stages, kick=kick) if scene.constraints else Radau(stages, kick=kick)), parts, 0.0
+
+
+def _kick(integrator: Integrator) -> Literal["left", "split", "held"]:
+    return integrator.kick if isinstance(integrator, Variational) else "left"
+
+
+def repeated(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, controls: Controls | Commands = None, restart: int = 0
+) -> tuple[Floats, Floats, float]:
+    """A motion repeated by the method of :func:`closer`: q and v (N + 1, n), NaN where it failed; and its share.
+
+    The arguments are those of :func:`check`.
+    """
+    method, parts, left = closer(scene, integrator, trajectory)
+    q, v = np.full((2, *trajectory.q.shape), np.nan)
+    q[0], v[0] = trajectory.q[0], trajectory.v[0]
+    commands = _commands(scene, integrator, method, trajectory, controls, parts)
+    drawn, kicks = _noise(scene, integrator, method, trajectory, parts)
+    drift = method.drift_share * np.repeat(drifts(scene, trajectory), parts, axis=0)[None] if _drifts(scene) else None
+    try:
+        state, (last,) = method.start(scene, q[:1], v[:1])
+    except (SingularMassMatrix, AssemblyError):
+        return q, v, left
+    chunk = (restart or max(1, _CHUNK // (len(q[0]) * parts * commands.hold)) * commands.hold) * parts
+    done = 0
+    for first in range(0, trajectory.steps * parts, chunk):
+        taken = slice(first, first + chunk)
+        if restart and first:
+            state, _ = method.start(scene, trajectory.q[done : done + 1], trajectory.v[done : done + 1])
+        block = rows(
+            commands, first // commands.hold, -(-taken.stop // commands.hold), last.u[None, -1] if first else None
+        )
+        (last,) = method.rollout_compiled(
+            scene,
+            state,
+            block,
+            drawn[:, taken] if len(drawn) else drawn,
+            scene.no_drift if drift is None else np.ascontiguousarray(drift[:, taken]),
+            trajectory.dt / parts,
+            None if kicks is None else np.ascontiguousarray(kicks[:, taken]),
+        )
+        new = len(last.q) // parts
+        for nodes, values in ((q, last.q), (v, last.v)):
+            nodes[done + 1 : done + new + 1] = values[parts - 1 :: parts][:new]
+        done += new
+        if last.failure is not None:
+            break
+    return q, v, left
+
+
+def _drifts(scene: Scene) -> bool:
+    return bool(scene.noise.velocity_dependent)
+
+
+def _commands(
+    scene: Scene,
+    integrator: Integrator,
+    method: Integrator,
+    trajectory: Trajectory,
+    controls: Controls | Commands,
+    parts: int,
+) -> Commands:
+    """The controls of a motion for a repetition by another method, in so many parts of each step."""
+    dt, times = trajectory.dt / parts, method.stage_times
+    if trajectory.u_nodes.shape[1]:
+        controls = FirstOrderHold(trajectory.u_nodes)
+    if isinstance(controls, FirstOrderHold) and not scene.inputs:
+        return commands_of(scene, method, controls.refined(parts), trajectory.steps * parts, dt)
+    if isinstance(controls, OpenLoop):
+        return commands_of(scene, method, controls, trajectory.steps * parts, dt)
+    if isinstance(controls, LinearPolicy | Commands) and method.variational == integrator.variational:
+        fed = (
+            controls
+            if isinstance(controls, Commands)
+            else commands_of(scene, method, controls, trajectory.steps, trajectory.dt)
+        )
+        return fed._replace(hold=fed.hold * parts)
+    held = open_loop(in_parts_of_steps(scene, trajectory.u, trajectory.q[:-1], trajectory.v[:-1], trajectory.dt, parts))
+    if not trajectory.u_stages.shape[1]:
+        return held
+    within = in_parts(trajectory.u_stages, integrator.stage_times, parts, times)
+    return prescribing(scene, changing(within, times), held.u)
+
+
+def noise_unknown(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
+    """Whether a repetition cannot have the noise of a motion, so that its error stays unknown.
+
+    That is so under constraints for kicks of fields in Python, or of controls that change within steps.
+    """
+    if not (trajectory.noisy and scene.constraints) or _kick(integrator) == "held":
+        return False
+    return scene.noise.diffusion is None or trajectory.dw.shape[1] > scene.processes
+
+
+def _noise(
+    scene: Scene, integrator: Integrator, method: Integrator, trajectory: Trajectory, parts: int
+) -> tuple[Floats, Floats | None]:
+    """The noise of a motion for a repetition: increments (1, N parts, k), or impulses (1, N parts, 2, n)."""
+    if not trajectory.noisy:
+        return scene.silence, None
+    N, n = trajectory.steps, trajectory.q.shape[1]
+    if scene.constraints and not method.holds_noise:
+        drawn = np.zeros((1, N * parts, trajectory.dw.shape[1]))
+        drawn[0, ::parts] = trajectory.dw
+        return drawn, None
+    # Explicit Euler's kicks come after the step.
+    before = 0.0 if isinstance(integrator, ExplicitEuler) else integrator.left
+
+    def impulses(share: float, node: Integers) -> Floats:
+        at = trajectory.q[node], trajectory.v[node]
+        return share * noise_impulses(scene, trajectory, *at) if share else np.zeros((N, n))
+
+    found = np.zeros((N, parts, 2, n))
+    if method.holds_noise:
+        found[:, :, 0] = impulses(before, np.arange(N))[:, None] / parts
+    else:
+        found[:, 0, 0] = impulses(before, np.arange(N))
+        found[:, -1, 1] = impulses(1.0 - before, np.arange(1, N + 1))
+    return scene.silence, found.reshape(1, N * parts, 2, n)
+
+
+def error_findings(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, off: Floats, speed_off: Floats
+) -> tuple[Finding, ...]:
+    """The warning of a motion's error, if it is large, from errors of q and v at its nodes (N + 1, n)."""
+    known = np.asarray(np.isfinite(off).all(axis=1))
+    last = int(known.argmin()) if not known.all() else len(known)
+    names, t = trajectory.joint_names, trajectory.t
+    q, v = trajectory.q[:last], trajectory.v[:last]
+    travel, speed = travel_scales(scene, q), speed_scales(scene, v)
+    shares = off[:last] / travel
+    joint = int(shares.max(axis=0).argmax())
+    share = float(shares[:, joint].max())
+    if share > TOLD:
+        worst, first = int(shares[:, joint].argmax()), int((shares[:, joint] > TOLD).argmax())
+        unit = "m" if scene.robot.slides[joint] else "rad"
+        value = float(off[worst, joint])
+        part = f", {100.0 * share:.2g} % of the largest travel" if share < 1.0 else ""
+        text = (
+            f"q is off by up to {value:.2g} {unit}{part} (joint {names[joint]!r}, right until t = {t[first]:.3g} s). "
+        )
+        cure = _cure(scene, integrator, trajectory, share / TOLD)
+        return (Finding("error", text + cure, names[joint], time=float(t[first]), value=value, unit=unit),)
+    # A jump that comes a part of a step too late is no error of the motion.
+    lasting = np.minimum(speed_off[: last - 1], speed_off[1:last]) / speed
+    if len(lasting) and lasting.max() > TOLD_VELOCITY:
+        first, joint = divmod(int(lasting.argmax()), lasting.shape[1])
+        unit = joint_unit(scene.robot, joint, speed=True)
+        value = float(speed_off[first, joint])
+        text = (
+            f"the velocity of joint {names[joint]!r} is off by up to {value:.2g} {unit}, {100.0 * lasting.max():.2g} % "
+            f"of its largest (t = {t[first]:.3g} s). "
+        )
+        cure = _cure(scene, integrator, trajectory, float(lasting.max()) / TOLD_VELOCITY)
+        return (Finding("error", text + cure, names[joint], time=float(t[first]), value=value, unit=unit),)
+    if last < len(known):
+        text = (
+            f"the error is not known from t = {t[last]:.3g} s on: a method of more stages fails there. Use a smaller dt"
+        )
+        return (Finding("error", text, time=float(t[last])),)
+    return ()
+
+
+def _cure(scene: Scene, integrator: Integrator, trajectory: Trajectory, excess: float) -> str:
+    """What reduces an error that exceeds its threshold by a factor ``excess``."""
+    if not (integrator.l_stable or scene.constraints) and damped_faster(scene, trajectory):
+        return "Dampers are faster than the step: use integrator=varpin.Radau(4)"
+    times = (max(excess, 1.0) / _AIM) ** (1.0 / integrator.order)
+    step = trajectory.dt / (10.0 if not times < 10.0 else max(2.0, math.ceil(times)))
+    stages = (integrator.order + 1) // 2 + _MORE
+    family = "Radau" if integrator.l_stable else "Gauss"
+    other = f" or integrator=varpin.{family}({stages})" if stages <= MOST_STAGES else ""
+    return f"Use dt = {step:.2g} s{other}"
+
+
+def damped_faster(scene: Scene, trajectory: Trajectory, turns: float = 2.0) -> bool:
+    """Whether damping at one of some nodes is faster than ``turns`` a step."""
+    return fastest_rate(scene, trajectory.q, trajectory.v, trajectory.u, turns / trajectory.dt) > 0.0

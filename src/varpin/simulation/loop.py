@@ -1,0 +1,260 @@
+"""Stability of a digital control loop at its period, from a finished motion: the law is not called.
+
+By theory, where the record determines the law u = Kq q + Kv v + S L_q(q, 0) + c: the loop is linearized at the
+equilibrium next to the motion, under constraints on the tangent space. With the plant's exact step under a zero-order
+hold, x' = A x + B u, it is unstable if the spectral radius of A + B K exceeds one (Franklin, Powell and Workman 1998,
+section 4.3). Growth that the law would have in continuous time too, as in a falling pendulum, gives no warning.
+
+By the record, for other laws: a control goes from limit to limit every few periods, or grows while it does work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from varpin.arrays import Floats
+from varpin.errors import AssemblyError, LinearizationError, SingularMassMatrix
+from varpin.finding import Finding
+from varpin.mechanics.assembly import nearest
+from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.mechanics.scene import Scene
+from varpin.simulation.spectrum import first_order, linearized
+from varpin.trajectory import Trajectory
+
+KIND = "unstable loop"
+# Least nodes of a fit, spread over the motion, but four a joint at least: 30 to 300 give the same.
+_NODES = 100
+# Largest error of a fit by that of squares of the state: short smooth curves fit any function. 1e-9 to 1e-6: the same.
+_TELLING = 1e-6
+# Share of the largest below which a direction of the motion or the force at an equilibrium is zero: 1e-11 to 1e-6.
+_NOTHING = 1e-8
+# Least growth a period: rounding of fitted gains may split double eigenvalues by 3e-6. 0 to 1e-5: the same.
+_GROWTH = 1e-5
+# The period causes growth if its exponent exceeds that in continuous time by this factor: 1.1 to 3 give the same.
+_BY_PERIOD = 1.5
+# Least changes from limit to limit in a period: 1/7 to 1/5 give the same; stable laws with moving goals reach 1/8.
+_CHANGES = 1.0 / 7.0
+# Least growth of controls from the first quarter to the last (10 to 1000: the same), up to a failed step (3 to 100).
+_GREW, _OUTGROWN = 100.0, 10.0
+
+
+@dataclass(frozen=True)
+class Law:
+    """A control law from a record: u = K (q, v, L_q(q, 0)) + c, with the forces L_q(q, 0) of gravity and springs.
+
+    Attributes:
+        K: (m, 3n).
+        c: (m,).
+        directions: Of (q, v), in which the motion tells the law (2n, r).
+        near: A configuration of the motion (n,) [rad or m].
+    """
+
+    K: Floats
+    c: Floats
+    directions: Floats
+    near: Floats
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A plant with a law, linearized at rest; y are the f coordinates of the tangent space.
+
+    Attributes:
+        A: Rate of (y, y') by (y, y') (2f, 2f) [1/s].
+        B: By u (2f, m).
+        K: The law (m, 2f).
+        known: Orthonormal directions of (y, y') in which the law is known (2f, r).
+    """
+
+    A: Floats
+    B: Floats
+    K: Floats
+    known: Floats
+
+    def mode(self, period: float) -> tuple[float, Floats]:
+        """Spectral radius over a period [s] with zero-order hold, and sizes of the controls in that mode (m,)."""
+        size, m = self.B.shape
+        held = scipy.linalg.expm(period * np.block([[self.A, self.B], [np.zeros((m, size + m))]]))
+        step = held[:size, :size] + held[:size, size:] @ self.K
+        factors, modes = np.linalg.eig(self.known.T @ step @ self.known)
+        largest = int(np.argmax(np.abs(factors)))
+        return float(np.abs(factors[largest])), np.abs(self.K @ self.known @ modes[:, largest])
+
+
+def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[Finding, ...]:
+    """The warning of a control loop that is unstable at its period; empty if it is stable, or nothing is known.
+
+    Args:
+        scene: The scene.
+        trajectory: A motion under feedback.
+        hold: The period of the feedback in steps.
+    """
+    period, at = hold * trajectory.dt, np.arange(0, trajectory.steps, hold)
+    x, u = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at]
+    if len(at) < 3 or not np.ptp(u, axis=0).any():
+        return ()
+    with np.errstate(all="ignore"):
+        try:
+            law = None if scene.inputs else _law(scene, x, u)  # commands of inputs are positions
+            found = () if law is None else _by_theory(scene, law, period)
+        except (np.linalg.LinAlgError, LinearizationError):
+            law, found = None, ()
+        if law is None and not trajectory.dw.any():
+            found = _from_limit_to_limit(scene, u, trajectory.t[at], period)
+        return found or _by_growth(scene, trajectory, u, period)
+
+
+def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:
+    """The warning if controls (P, m), every period [s] up to a step that failed, have grown tenfold."""
+    size = np.abs(u).max(axis=1, initial=0.0)
+    first = size[size > 0.0][:1]
+    if not len(first) or not size[-1] >= _OUTGROWN * first[0]:
+        return ()
+    text = (
+        f"control loop may be unstable at its period of {period:.4g} s: controls grow from {first[0]:.3g} to "
+        f"{size[-1]:.3g} in {len(u) - 1} periods. Use a shorter period, or lower gains"
+    )
+    return (Finding(KIND, text, value=float(size[-1] / first[0])),)
+
+
+def _finding(scene: Scene, control: int, text: str, value: float, time: float | None = None) -> tuple[Finding, ...]:
+    joint = None if scene.control_joints is None else scene.control_joints[control]
+    return (Finding(KIND, text, joint=joint, time=time, value=value),)
+
+
+def _by_theory(scene: Scene, law: Law, period: float) -> tuple[Finding, ...]:
+    """The warning if the spectral radius of the loop exceeds one because of the period [s]."""
+    loop = loop_at_rest(scene, law)
+    if not loop.known.size:
+        return ()
+    radius, sizes = loop.mode(period)
+    rate = float(np.linalg.eigvals(loop.known.T @ (loop.A + loop.B @ loop.K) @ loop.known).real.max())
+    if not radius > 1.0 + _GROWTH or np.log(radius) <= _BY_PERIOD * max(rate, 0.0) * period:
+        return ()
+    stable = next((float(T) for T in period * 0.9 ** np.arange(1, 60) if loop.mode(T)[0] < 1.0), None)
+    advice = "lower gains" if stable is None else f"a period below {stable:.3g} s, or lower gains"
+    text = (
+        f"control loop is unstable at its period of {period:.4g} s: each period multiplies deviations by {radius:.4g}. "
+        f"Use {advice}"
+    )
+    return _finding(scene, int(np.argmax(sizes)), text, radius)
+
+
+def _from_limit_to_limit(scene: Scene, u: Floats, t: Floats, period: float) -> tuple[Finding, ...]:
+    """The warning if a control of u (P, m) goes from one end of its range to the other every few periods to the end."""
+    low, span = u.min(axis=0), np.ptp(u, axis=0)
+    sides = (u >= low + 0.75 * span).astype(np.int64) - (u <= low + 0.25 * span)
+    visits = [np.flatnonzero(side) for side in sides.T]
+    changes = [at[1:][side[at[1:]] != side[at[:-1]]] for at, side in zip(visits, sides.T, strict=True)]
+    late = np.array([(at >= len(u) // 2).sum() for at in changes])
+    worst = int(np.argmax(late))
+    calm = np.abs(sides[3 * len(u) // 4 :, worst]).mean() < 0.25
+    if calm or late[worst] < max(4.0, 0.5 * _CHANGES * len(u)):
+        return ()
+    text = (
+        f"control {worst} goes from limit to limit {len(changes[worst])} times in {len(u)} periods of {period:.4g} s: "
+        "the law is too fast for its period. Use a shorter period, or lower gains"
+    )
+    return _finding(scene, worst, text, float(len(changes[worst])), float(t[changes[worst][0]]))
+
+
+def _by_growth(scene: Scene, trajectory: Trajectory, u: Floats, period: float) -> tuple[Finding, ...]:
+    """The warning if a control of u (P, m) grows exponentially and by much, and the controls do work in the end."""
+    quarters = np.array([part.max(axis=0, initial=0.0) for part in np.array_split(np.abs(u), 4)])
+    ratios = quarters[1:] / quarters[:-1]
+    grew = np.where((ratios >= 2.0).all(axis=0) & (ratios[2] >= 0.5 * ratios[0]), quarters[3] / quarters[0], 0.0)
+    late = trajectory.part(3 * trajectory.steps // 4, trajectory.steps)
+    work = (late.u / np.abs(late.u).max()) * (np.diff(late.q, axis=0) @ scene.actuation)
+    worst = int(np.argmax(grew))
+    if not grew[worst] >= _GREW or not work.sum() > 0.0:
+        return ()
+    text = (
+        f"control loop is unstable at its period of {period:.4g} s: control {worst} grows by a factor of "
+        f"{grew[worst]:.3g}. Use a shorter period, or lower gains, or check the signs of the law"
+    )
+    return _finding(scene, worst, text, float(grew[worst]))
+
+
+def _law(scene: Scene, x: Floats, u: Floats) -> Law | None:
+    """The law from all nodes or, where it clips, of each control from the nodes at which it is inside its limits."""
+    law = fitted_law(scene, x, u)
+    clipped = np.any([end & (end.sum(axis=0) > 1) for end in (u == u.min(axis=0), u == u.max(axis=0))], axis=0)
+    if law is not None or not clipped.any():
+        return law
+    laws = [fitted_law(scene, x[~rows], u[~rows, k : k + 1]) for k, rows in enumerate(clipped.T)]
+    # Directions that one control does not know cannot be combined with those of another.
+    known = [law for law in laws if law is not None and law.directions.shape[1] >= x.shape[1]]
+    if len(known) < len(laws):
+        return None
+    K, c = np.concatenate([law.K for law in known]), np.concatenate([law.c for law in known])
+    return Law(K, c, known[0].directions, known[0].near)
+
+
+def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
+    """The law that gives u (P, m) at states (q, v) = x (P, 2n), if there is one that the record tells."""
+    n = x.shape[1] // 2
+    if len(x) < 3:
+        return None
+    # An odd interval: controls may alternate.
+    every = 1 + 2 * (len(x) // max(2 * _NODES, 8 * n))
+    x, u = x[::every], u[::every]
+    pulled = (np.append(state, lagrangian_jet(scene, state[:n], np.zeros(n)).Lq) for state in x)
+    fit = _affine(x, u) or _affine(np.array(list(pulled)), u)
+    if fit is None:
+        return None
+    K, c, directions = fit
+    return Law(np.pad(K, ((0, 0), (0, 3 * n - K.shape[1]))), c, directions[: 2 * n], x[0, :n])
+
+
+def _affine(x: Floats, u: Floats) -> tuple[Floats, Floats, Floats] | None:
+    """K (m, k), c (m,) of u = K x + c, if the record tells that, and directions (k, r) of x; the least of equal K."""
+    mean, mean_u = x.mean(axis=0), u.mean(axis=0)
+    size = np.std(x, axis=0)
+    moving = size > _NOTHING * size.max()
+    unit = np.where(moving, size, np.inf)
+    state, target = (x - mean) / unit, u - mean_u
+    left, sizes, right = np.linalg.svd(state, full_matrices=False)
+    known = sizes > _NOTHING * sizes[0]
+    if not moving.any() or len(x) < known.sum() + 2:
+        return None
+    left, directions = left[:, known], right[known].T
+    squares = state[:, moving] ** 2 - 1.0
+    missed = np.abs(squares - left @ (left.T @ squares)).max(axis=0) / np.abs(squares).max(axis=0)
+    off = np.abs(target - left @ (left.T @ target)).max()
+    if off > _TELLING * np.median(missed) * np.abs(target).max():
+        return None
+    K = ((directions / sizes[known]) @ (left.T @ target)).T / unit
+    return K, mean_u - K @ mean, directions * np.where(moving, size, 0.0)[:, None]
+
+
+def loop_at_rest(scene: Scene, law: Law) -> Loop:
+    """The loop at the equilibrium that Newton's method finds from ``law.near``; if there is none, at ``law.near``."""
+    q = law.near
+    for _ in range(30):
+        try:
+            loop, off, way = _linearized(scene, law, nearest(scene, q) if scene.constraints else q)
+        except (AssemblyError, SingularMassMatrix):
+            break
+        if off <= _NOTHING:
+            return loop
+        q = q + way / max(1.0, np.abs(way).max())
+    return _linearized(scene, law, law.near)[0]
+
+
+def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, float, Floats]:
+    """The loop at rest at q (n,), its acceleration as a share of its terms, and Newton's step to zero (n,)."""
+    n = len(q)
+    jet, (Kq, Kv, S) = lagrangian_jet(scene, q, np.zeros(n)), np.split(law.K, 3, axis=1)
+    force = scene.actuation @ (Kq @ q + S @ jet.Lq + law.c)
+    a, aq, av, af, Z, onto = (part[0] for part in linearized(scene, q[None], np.zeros((1, n)), force[None]))
+    pushed = af @ scene.actuation
+    A, B = first_order(aq[None], av[None])[0], np.concatenate([np.zeros_like(pushed), pushed])
+    gains = np.concatenate([(Kq + S @ jet.Lqq) @ Z, Kv @ Z], axis=1)
+    way = Z @ np.linalg.lstsq(aq + pushed @ gains[:, : len(a)], -a, rcond=None)[0]
+    terms = np.abs(pushed) @ (np.abs(Kq) @ np.abs(q) + np.abs(law.c)) + np.abs(af) @ np.abs(jet.Lq)
+    off = float(np.abs(a).max(initial=0.0) / max(terms.max(initial=0.0), 1e-300))
+    known, sizes, _ = np.linalg.svd(np.concatenate([onto @ part for part in np.split(law.directions, 2)]), False)
+    return Loop(A, B, gains, known[:, sizes > _NOTHING * sizes.max(initial=0.0)]), off, way

@@ -1,0 +1,189 @@
+"""How fast the modes of a scene are: its linearized motion, and what is damped faster than a step.
+
+A motion linearized at one of its states: d/dt (dq, dv) = (dv, aq dq + av dv). Under constraints dq = Z y on the tangent
+space, with Z'MZ = 1 and C Z = 0, and y follows the same equation: the constraint forces C' lam are constant to first
+order in it, but for their curvature lam . g_qq.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from varpin.arrays import Floats
+from varpin.core import fastest_damping
+from varpin.errors import LinearizationError
+from varpin.integrators.explicit import accelerations
+from varpin.mechanics.forces import dissipates, limited_servos, of_kind
+from varpin.mechanics.scene import Scene
+
+# Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
+_RANK = 1e-9
+# Nodes at which rates along a motion are looked for, beside those where joints are slowest or in their stops.
+_NODES = 12
+# Rates below count as zero [1/s].
+_SLOWEST = 1e-6
+
+
+class Linearized(NamedTuple):
+    """Motions linearized at K states, in f coordinates y of their tangent spaces, with dq = Z y; y = q without any."""
+
+    a: Floats  # accelerations of y (K, f)
+    aq: Floats  # their derivatives in y (K, f, f)
+    av: Floats  # in the rate of y (K, f, f)
+    af: Floats  # in a force (K, f, n)
+    Z: Floats  # (K, n, f)
+    onto: Floats  # the rate of y is onto @ v (K, f, n)
+
+
+def linearized(scene: Scene, q: Floats, v: Floats, forces: Floats, accelerated: Floats | None = None) -> Linearized:
+    """Linearize the motions at states q, v (K, n) under constant forces (K, n).
+
+    Args:
+        scene: The scene.
+        q: Configurations (K, n), on the constraints [rad or m].
+        v: Velocities (K, n) that the constraints allow.
+        forces: (K, n) [N m or N].
+        accelerated: Accelerations of the joints (K, n), read for those with kinematic inputs; zero if left out.
+
+    Raises:
+        LinearizationError: A mass matrix is not positive definite, or a matrix of the constraints is not finite.
+    """
+    a, aq, av, af = accelerations(scene, q, v, forces)
+    if not scene.constraints:
+        unit = np.broadcast_to(np.eye(q.shape[1]), aq.shape)
+        return Linearized(a, aq, av, af, unit, unit)
+    C = scene.core.constraints(np.ascontiguousarray(q))[2]
+    try:
+        at = [
+            _onto_constraints(scene, q[k], v[k], C[k], a[k], af[k], None if accelerated is None else accelerated[k])
+            for k in range(len(q))
+        ]
+    except np.linalg.LinAlgError:
+        raise LinearizationError(0, 0.0, "the constraints cannot be linearized") from None
+    if len({each.Z.shape for each in at}) > 1:
+        raise LinearizationError(0, 0.0, "the constraints have another rank at each node")
+    lam = np.array([each.lam for each in at])
+    a, aq, av, af = accelerations(scene, q, v, forces + np.einsum("kri,kr->ki", C, lam))
+    Z = np.array([each.Z for each in at])
+    M = np.linalg.inv(af)
+    onto = np.swapaxes(Z, 1, 2) @ M
+    curved = np.array([scene.core.constraint_curvature(x, y, x)[0] for x, y in zip(q, lam, strict=True)])
+    # A velocity stays on the constraints: its part across them changes with y.
+    turned = -np.array([each.across @ each.bend for each in at]) @ Z
+    by_place = onto @ (aq + af @ curved) @ Z + onto @ av @ turned
+    return Linearized((onto @ a[:, :, None])[:, :, 0], by_place, onto @ av @ Z, onto @ af, Z, onto)
+
+
+def first_order(aq: Floats, av: Floats) -> Floats:
+    """Matrices (K, 2n, 2n) of the linearized motion from derivatives of the accelerations (K, n, n)."""
+    n = aq.shape[-1]
+    A = np.zeros((len(aq), 2 * n, 2 * n))
+    A[:, range(n), range(n, 2 * n)] = 1.0
+    A[:, n:, :n], A[:, n:, n:] = aq, av
+    return A
+
+
+class _Node(NamedTuple):
+    lam: Floats  # the constraint forces (c,)
+    Z: Floats  # (n, f)
+    across: Floats  # the velocity (n, c) across the tangent space for a velocity of each row
+    bend: Floats  # g_qq v (c, n)
+
+
+def _onto_constraints(
+    scene: Scene, q: Floats, v: Floats, C: Floats, a: Floats, af: Floats, accelerated: Floats | None
+) -> _Node:
+    """The tangent space at a state, and the constraint forces beside the accelerations a (n,) without them."""
+    root = np.linalg.cholesky(af)
+    left, sizes, right = np.linalg.svd(C @ root)
+    rank = int((sizes > _RANK * sizes.max(initial=0.0)).sum())
+    left, sizes = left[:, :rank], sizes[:rank]
+    bend = scene.core.constraint_curvature(q, np.zeros(len(C)), v)[1]
+    wanted = -bend @ v
+    for row, c in scene.inputs.items():
+        wanted[row] = 0.0 if accelerated is None else accelerated[c]
+    lam = left @ ((left.T @ (wanted - C @ a)) / sizes**2)
+    return _Node(lam, root @ right[rank:].T, root @ (right[:rank].T / sizes) @ left.T, bend)
+
+
+def masses(scene: Scene, q: Floats) -> Floats:
+    """M (K, n, n) at configurations (K, n)."""
+    q = np.ascontiguousarray(q)
+    return scene.core.jets(q, np.zeros_like(q))[0]
+
+
+def damping_matrices(scene: Scene, q: Floats, v: Floats, forces: Floats) -> Floats:
+    """D (K, n, n) of M w' = -D w, of what acts at joints and between links, without custom forces.
+
+    At states q, v (K, n) under constant forces (K, n); symmetric.
+    """
+    q, v = np.ascontiguousarray(q), np.ascontiguousarray(v)
+    dampers = -np.minimum(scene.core.forces(q, v, np.ascontiguousarray(forces))[2], 0.0)
+    D: Floats = dampers[:, :, None] * np.eye(q.shape[1])
+    if scene.couplings:
+        slopes = scene.core.coupled_forces(q, v)[2]
+        D -= 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
+    return D
+
+
+def rate_at_rest(scene: Scene, q: Floats) -> float:
+    """The fastest rate of damping [1/s] at a configuration (n,) with all joints at rest, where friction is steepest.
+
+    Servos are told to stay there: a drive at its limit would damp nothing.
+    """
+    if not any(map(dissipates, scene.elements)) and not any(map(dissipates, scene.couplings)):
+        return 0.0
+    still, force = np.zeros((1, q.size)), np.zeros((1, q.size))
+    for servo in limited_servos(scene.elements):
+        force[0, servo.coordinate] = servo.values[0] * q[servo.coordinate]
+    return float(fastest_damping(scene.core, np.ascontiguousarray(q[None]), still, force, _SLOWEST))
+
+
+def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) -> float:
+    """The fastest rate of damping along a motion [1/s]; 0 where none is faster than ``least``.
+
+    It is looked for at some nodes, where dry friction is steepest, as joints come to rest or turn back, and in the
+    stops that joints reach.
+
+    Args:
+        scene: The scene.
+        q: Configurations (N + 1, n) [rad or m].
+        v: Velocities (N + 1, n) [rad/s or m/s].
+        u: Controls (N, m).
+        least: [1/s].
+    """
+    if not scene.dissipates or not len(u):
+        return 0.0
+    at = np.unique(np.linspace(0, len(u), _NODES).astype(np.int64))
+    states = [(q[at], v[at], at)]
+    for friction in of_kind(scene.elements, "CoulombFriction"):
+        c = friction.coordinate
+        node = np.array([int(np.abs(v[:, c]).argmin())])
+        still = v[node]
+        if v[:, c].min() < 0.0 < v[:, c].max():
+            still[:, c] = 0.0
+        states.append((q[node], still, node))
+    for stop in of_kind(scene.elements, "JointStop"):
+        c, (lower, upper, *_, width) = stop.coordinate, stop.values
+        for deepest, end, side in ((int(q[:, c].argmin()), lower, -1.0), (int(q[:, c].argmax()), upper, 1.0)):
+            if np.isfinite(end) and side * (q[deepest, c] - end) > 0.0:
+                pressed = q[deepest][None].copy()
+                pressed[0, c] = end + side * max(side * (q[deepest, c] - end), width)
+                states.append((pressed, v[deepest][None], np.array([deepest])))
+    q, v, at = (np.concatenate(rows) for rows in zip(*states, strict=True))
+    forces = np.ascontiguousarray(u[np.minimum(at, len(u) - 1)] @ scene.actuation.T)
+    return float(fastest_damping(scene.core, q, v, forces, least))
+
+
+def stops_ahead(scene: Scene, q: Floats) -> Floats:
+    """Configurations (K, n): ``q`` (n,) with one joint each in a stop, deep enough for the stop's full stiffness."""
+    rows = []
+    for own in of_kind(scene.elements, "JointStop"):
+        lower, upper, *_, width = own.values
+        for end in (lower - width, upper + width):
+            if np.isfinite(end):
+                rows.append(q.copy())
+                rows[-1][own.coordinate] = end
+    return np.array(rows).reshape(-1, q.size)

@@ -1,0 +1,312 @@
+"""Plain answers to hold the library against: continuous motions, forces by their formulas, central differences.
+
+Everything is written on Pinocchio's own calls and SciPy, in the coordinates of ``robot.joint_names``. Nothing here
+takes a step of the library.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+
+WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}  # of eighth-order central differences
+Force = Callable[[float], np.ndarray]
+Path = Callable[[float], tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+def slope(f: Callable[[np.ndarray], np.ndarray], x: np.ndarray, along: np.ndarray, size: float) -> np.ndarray:
+    """d f(x + s along) / ds at s = 0 by differences of eighth order with steps ``size``."""
+    return sum(w * (f(x + k * size * along) - f(x - k * size * along)) for k, w in WEIGHTS.items()) / size
+
+
+def order_of(counts: Sequence[float], errors: Sequence[float]) -> float:
+    """The order of convergence: minus the slope of log error over log count, by least squares."""
+    return -float(np.polyfit(np.log(counts), np.log(errors), 1)[0])
+
+
+class Motion(NamedTuple):
+    """A continuous motion at times: q, v (N + 1, n), energy and work of forces without potential (N + 1,)."""
+
+    q: np.ndarray
+    v: np.ndarray
+    energy: np.ndarray
+    work: np.ndarray
+
+
+class Mechanism:
+    """The equations M a = F(t, q, v) - bias + C' y, C a = -dC/dt v of a scene, by Pinocchio.
+
+    The motion of a joint with a :class:`varpin.KinematicInput` is ``path``: its position, rate and acceleration, one
+    entry for each input.
+    """
+
+    def __init__(self, scene: vp.Scene, path: Path | None = None) -> None:
+        robot = scene.robot
+        self.scene, self.path, self.names = scene, path, list(robot.joint_names)
+        self.model = robot.free_model.copy()
+        self.model.gravity.linear = scene.gravity
+        self.data, self.n = self.model.createData(), robot.dof
+        # Coordinates to joints: leaders, and followers of mimic joints; a continuous joint is cos and sin.
+        self.G, self.offset = np.zeros((self.model.nv, self.n)), np.zeros(self.model.nv)
+        ties = {tie.follower: tie for tie in robot.ties}
+        self.rotor = np.zeros(self.n)
+        for joint in range(1, self.model.njoints):
+            tie, row = ties.get(joint), self.model.joints[joint].idx_v
+            c = self.names.index(self.model.names[tie.leader if tie else joint])
+            self.G[row, c], self.offset[row] = (tie.ratio, tie.offset) if tie else (1.0, 0.0)
+            self.rotor[c] += 0.0 if tie else self.model.armature[row]
+        self.model.armature = np.zeros(self.model.nv)
+        for own in scene.forces:
+            if isinstance(own, vp.Armature):
+                self.rotor = self.rotor + self.per_joint(own.inertia, 0.0)
+        self.round = [joint for joint in self.model.joints if joint.nq == 2]
+
+    def per_joint(self, value: object, missing: float) -> np.ndarray:
+        """A parameter as (n,): one number, an array, or numbers by joint name."""
+        if hasattr(value, "keys"):
+            return np.array([float(value[name]) if name in value else missing for name in self.names])
+        return np.broadcast_to(np.asarray(value, float), (self.n,)).copy()
+
+    def positions(self, q: np.ndarray) -> np.ndarray:
+        """Pinocchio's configuration."""
+        angles = self.G @ q + self.offset
+        if not self.round:
+            return angles
+        found = np.zeros(self.model.nq)
+        for joint in list(self.model.joints)[1:]:
+            angle = angles[joint.idx_v]
+            found[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+        return found
+
+    def place(self, q: np.ndarray, v: np.ndarray | None = None) -> None:
+        """Update every frame, its Jacobian and its acceleration at zero joint accelerations."""
+        rate = self.G @ (np.zeros(self.n) if v is None else v)
+        at = self.positions(q)
+        pin.computeJointJacobians(self.model, self.data, at)
+        pin.forwardKinematics(self.model, self.data, at, rate, np.zeros(self.model.nv))
+        pin.updateFramePlacements(self.model, self.data)
+
+    def point(self, end: object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Place (3,), rotation (3, 3), Jacobian (6, n) and bias acceleration (6,) of a point, world axes."""
+        name, shift = end if isinstance(end, tuple) else (end, np.zeros(3))
+        if not isinstance(name, str):
+            return np.asarray(end, float), np.eye(3), np.zeros((6, self.n)), np.zeros(6)
+        f = self.model.getFrameId(name)
+        R, x = self.data.oMf[f].rotation.copy(), self.data.oMf[f].translation.copy()
+        J = pin.getFrameJacobian(self.model, self.data, f, WORLD) @ self.G
+        a = pin.getFrameClassicalAcceleration(self.model, self.data, f, WORLD).vector.copy()
+        w = pin.getFrameVelocity(self.model, self.data, f, WORLD).angular
+        r = R @ np.asarray(shift, float)
+        a[:3] += np.cross(a[3:], r) + np.cross(w, np.cross(w, r))
+        J[:3] -= pin.skew(r) @ J[3:]
+        return x + r, R, J, a
+
+    def mass_matrix(self, q: np.ndarray) -> np.ndarray:
+        """M (n, n), rotors included."""
+        full = pin.crba(self.model, self.data, self.positions(q))
+        full = np.triu(full) + np.triu(full, 1).T
+        return self.G.T @ full @ self.G + np.diag(self.rotor)
+
+    def forces(self, q: np.ndarray, v: np.ndarray, drive: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Energy of springs and loads, its force -dV/dq (n,), and all other forces (n,), under ``drive`` (n,)."""
+        V, pull, rest, drive = 0.0, np.zeros(self.n), np.zeros(self.n), drive.copy()
+        placed = False
+        for own in self.scene.forces:
+            if isinstance(own, vp.FrameSpring | vp.FrameDamper | vp.FrameWrench):
+                if not placed:
+                    self.place(q, v)
+                    placed = True
+                energy, of_energy, other = self._frame_force(own, v)
+                V, pull, rest = V + energy, pull + of_energy, rest + other
+            elif isinstance(own, vp.JointSpring):
+                k, at = self.per_joint(own.stiffness, 0.0), self.per_joint(own.rest, 0.0)
+                V, pull = V + 0.5 * float(k @ (q - at) ** 2), pull - k * (q - at)
+            elif isinstance(own, vp.JointDamper):
+                rest -= self.per_joint(own.damping, 0.0) * v
+            elif isinstance(own, vp.CoulombFriction):
+                level, width = self.per_joint(own.level, 0.0), self.per_joint(own.width, 1.0)
+                if own.breakaway is not None:
+                    fading = self.per_joint(own.stribeck_velocity, 1.0)
+                    level = level + (self.per_joint(own.breakaway, 0.0) - level) * np.exp(-((v / fading) ** 2))
+                rest -= level * np.tanh(v / width)
+            elif isinstance(own, vp.JointStop):
+                energy, of_energy, other = self._stop(own, q, v)
+                V, pull, rest = V + energy, pull + of_energy, rest + other
+            elif isinstance(own, vp.PositionServo):
+                k, d = self.per_joint(own.stiffness, 0.0), self.per_joint(own.damping, 0.0)
+                most, driven = self.per_joint(own.effort, np.inf), k > 0.0
+                drive[driven] = saturated(drive - k * q - d * v, most)[driven]
+            elif isinstance(own, vp.CustomForce):
+                rest += own.f(q, v)
+            elif not isinstance(own, vp.Armature):
+                raise NotImplementedError(own)
+        return V, pull, rest + drive
+
+    def _stop(self, own: vp.JointStop, q: np.ndarray, v: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        k, d = self.per_joint(own.stiffness, 0.0), self.per_joint(own.damping, 0.0)
+        w, limits = self.per_joint(own.width, 1.0), self.scene.robot.position_limits
+        lower = limits[0] if own.lower is None else self.per_joint(own.lower, -np.inf)
+        upper = limits[1] if own.upper is None else self.per_joint(own.upper, np.inf)
+        V, pull, drag = 0.0, np.zeros(self.n), np.zeros(self.n)
+        for depth, side in ((q - upper, -1.0), (lower - q, 1.0)):
+            x = np.maximum(depth, 0.0)
+            y = np.minimum(x / w, 1.0)
+            # Integrals of the share 3 y^2 - 2 y^3 over the depth, once and twice.
+            first = w * (y**3 - y**4 / 2.0) + np.maximum(x - w, 0.0)
+            second = w**2 * (y**4 / 4.0 - y**5 / 10.0) + np.maximum(x - w, 0.0) * x / 2.0
+            V, pull, drag = V + float(k @ second), pull + side * k * first, drag - d * (3.0 * y**2 - 2.0 * y**3) * v
+        return V, pull, drag
+
+    def _frame_force(self, own: vp.Force, v: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        none = np.zeros(self.n)
+        if isinstance(own, vp.FrameWrench):
+            x, R, J, _ = self.point(own.frame)
+            f, m = np.split(np.asarray(own.wrench, float), 2)
+            if own.axes == "frame":
+                return 0.0, none, J[:3].T @ (R @ f) + J[3:].T @ (R @ m)
+            return -float(f @ x), J[:3].T @ f, J[3:].T @ m
+        (x, R, J, _), (y, S, K, _) = self.point(own.a), self.point(own.b)
+        d, J = x - y, J - K
+        if isinstance(own, vp.FrameDamper):
+            turning = 0.0 if own.rotational_damping is None else own.rotational_damping
+            return 0.0, none, -J[:3].T @ (own.damping * (J[:3] @ v)) - J[3:].T @ (turning * (J[3:] @ v))
+        k, rest = np.asarray(own.stiffness, float), np.asarray(own.rest, float)
+        if rest.ndim == 0 and rest > 0.0:
+            length = np.linalg.norm(d)
+            V, pull = 0.5 * k * (length - rest) ** 2, -J[:3].T @ (k * (length - rest) * d / length)
+        else:
+            V, pull = 0.5 * np.sum(k * (d - rest) ** 2), -J[:3].T @ (k * (d - rest))
+        if own.rotational_stiffness is not None:
+            about = np.broadcast_to(own.rotational_stiffness, (3,))
+            T = S if own.rest_rotation is None else S @ own.rest_rotation
+            g = 0.5 * about.sum() - about
+            V += float(g @ (1.0 - np.sum(R * T, axis=0)))
+            pull += J[3:].T @ (np.cross(R.T, T.T).T @ g)
+        return float(V), pull, none
+
+    def rows(self, t: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the constraints: C (m, n), the right sides of C v = b and C a = c."""
+        C, b, c = [np.zeros((0, self.n))], [np.zeros(0)], [np.zeros(0)]
+
+        def add(row: np.ndarray, rate: np.ndarray, second: np.ndarray) -> None:
+            for parts, part in zip((C, b, c), (np.atleast_2d(row), np.atleast_1d(rate), second), strict=True):
+                parts.append(np.atleast_1d(part) if part.ndim < 2 else part)
+
+        self.place(q, v)
+        moved = 0
+        for own in self.scene.constraints:
+            if isinstance(own, vp.KinematicInput):
+                _, rate, second = self.path(t)
+                add(np.eye(self.n)[self.names.index(own.joint)], rate[moved], second[moved])
+                moved += 1
+                continue
+            if isinstance(own, vp.JointTie):
+                p = np.polynomial.Polynomial(own.coefficients)
+                i, j = self.names.index(own.joint), self.names.index(own.leader)
+                row = np.eye(self.n)[i] - p.deriv()(q[j]) * np.eye(self.n)[j]
+                add(row, np.zeros(1), np.atleast_1d(p.deriv(2)(q[j]) * v[j] ** 2))
+                continue
+            (x, _, J, a), (y, _, K, e) = self.point(own.a), self.point(own.b)
+            d, J, a = x - y, J - K, a - e
+            if isinstance(own, vp.FrameOnFrame):
+                # Both ends turn alike, and a keeps its place on b: d turns with b.
+                w = K[3:] @ v
+                J[:3] += pin.skew(d) @ K[3:]
+                a[:3] += np.cross(d, e[3:]) - np.cross(w, np.cross(w, d))
+                add(J, np.zeros(6), -a)
+            elif isinstance(own, vp.Distance):
+                add(d @ J[:3], np.zeros(1), -np.atleast_1d(d @ a[:3] + (J[:3] @ v) @ (J[:3] @ v)))
+            else:
+                N = normals(own)
+                add(N @ J[:3], np.zeros(len(N)), -N @ a[:3])
+        return np.concatenate(C), np.concatenate(b), np.concatenate(c)
+
+    def tangent(self, q: np.ndarray, v: np.ndarray, t: float = 0.0) -> np.ndarray:
+        """The velocity nearest to ``v`` in kinetic energy that the constraints allow."""
+        C, b, _ = self.rows(t, q, v)
+        root = np.linalg.inv(np.linalg.cholesky(self.mass_matrix(q)))
+        return v - root.T @ np.linalg.pinv(C @ root.T, rcond=1e-9) @ (C @ v - b)
+
+    def acceleration(self, t: float, q: np.ndarray, v: np.ndarray, F: np.ndarray) -> np.ndarray:
+        """(n,) under generalized forces F beside gravity."""
+        at, rate = self.positions(q), self.G @ v
+        if len(self.G) == self.n and not self.rotor.any() and not self.scene.constraints:
+            return self.G.T @ pin.aba(self.model, self.data, at, rate, self.G @ F)
+        free = F - self.G.T @ pin.nonLinearEffects(self.model, self.data, at, rate)
+        M = self.mass_matrix(q)
+        if not self.scene.constraints:
+            return np.linalg.solve(M, free)
+        C, _, c = self.rows(t, q, v)
+        root = np.linalg.inv(np.linalg.cholesky(M))
+        B, a = C @ root.T, root @ free
+        return root.T @ (a - np.linalg.pinv(B, rcond=1e-9) @ (B @ a - c))
+
+    def energy(self, q: np.ndarray, v: np.ndarray) -> float:
+        """Kinetic and potential energy, springs and loads included [J]."""
+        weight = pin.computePotentialEnergy(self.model, self.data, self.positions(q))
+        return 0.5 * float(v @ self.mass_matrix(q) @ v) + weight + self.forces(q, v, np.zeros(self.n))[0]
+
+
+def normals(own: vp.Constraint) -> np.ndarray:
+    """Directions (k, 3) along which two points of a constraint coincide."""
+    if isinstance(own, vp.PointOnPoint):
+        return np.eye(3)[["xyz".index(axis) for axis in own.axes]]
+    if isinstance(own, vp.PointOnPlane):
+        return np.atleast_2d(np.asarray(own.normal, float) / np.linalg.norm(own.normal))
+    along = np.asarray(own.direction, float) / np.linalg.norm(own.direction)
+    return np.linalg.svd(along[None])[2][1:]
+
+
+def saturated(wanted: np.ndarray, most: np.ndarray) -> np.ndarray:
+    """A drive's force: as wanted up to 0.9 of the limit, bent smoothly to the limit at 1.1."""
+    y = np.abs(wanted) / most
+    bent = np.where(y < 1.1, y - 2.5 * np.maximum(y - 0.9, 0.0) ** 2, 1.0)
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(most), np.sign(wanted) * most * bent, wanted)
+
+
+def exact(
+    scene: vp.Scene,
+    q0: np.ndarray,
+    v0: np.ndarray,
+    times: Sequence[float],
+    signal: Callable[[int, np.ndarray, np.ndarray], Force] | None = None,
+    *,
+    path: Path | None = None,
+    stiff: bool = False,
+) -> Motion:
+    """The continuous motion at ``times``, by DOP853 or, stiff, by SciPy's Radau.
+
+    Between times k and k + 1 the controls are the function of time that ``signal(k, q, v)`` returns at the state of
+    time k: rows, laws and policies are constant over an interval, open loops are not. None holds servos at ``q0``.
+    """
+    own, n = Mechanism(scene, path), scene.robot.dof
+    x = np.concatenate([q0, v0, [0.0]])
+    rows = [x]
+    for k, (begin, end) in enumerate(itertools.pairwise(times)):
+        force = None if signal is None else signal(k, x[:n], x[n : 2 * n])
+        resting = np.zeros(n)
+        if force is None:
+            for each in scene.forces:
+                if isinstance(each, vp.PositionServo):
+                    resting += own.per_joint(each.stiffness, 0.0) * q0
+
+        def rate(t: float, y: np.ndarray, force=force, resting=resting) -> np.ndarray:
+            q, v = y[:n], y[n : 2 * n]
+            _, pull, rest = own.forces(q, v, resting if force is None else scene.actuation @ force(t))
+            return np.concatenate([v, own.acceleration(t, q, v, pull + rest), [v @ rest]])
+
+        method, rtol = ("Radau", 1e-11) if stiff else ("DOP853", 1e-12)
+        x = solve_ivp(rate, (begin, end), x, method, rtol=rtol, atol=1e-3 * rtol).y[:, -1]
+        rows.append(x)
+    y = np.array(rows)
+    q, v = y[:, :n], y[:, n : 2 * n]
+    return Motion(q, v, np.array([own.energy(*state) for state in zip(q, v, strict=True)]), y[:, -1])

@@ -1,0 +1,419 @@
+"""What a motion tells about itself: its error against SciPy on Pinocchio's aba, its warnings, and the log."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import logging
+import pickle
+import re
+import signal
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from findings import about
+from mechanisms import slider
+from refusals import refused, unnamed
+from scipy.integrate import solve_ivp
+
+import varpin as vp
+
+CHAIN, FREE = vp.planar_chain(3), vp.Scene(vp.planar_chain(3))
+Q0, V0 = np.array([0.3, 0.2, -0.4]), np.array([0.5, 0.0, 1.0])
+EULER, RK4, MIDPOINT = vp.SemiImplicitEuler(), vp.RungeKutta4(), vp.Midpoint()
+D, K, REST = np.array([2.0, 1.0, 0.5]), np.array([300.0, 100.0, 50.0]), np.array([0.2, 0.0, 0.3])
+TOLD = 0.01
+
+
+def exact(scene, force, u, dt, steps, start=(Q0, V0)):
+    """q and v at the nodes by SciPy; forces are force(q, v, u) with the row of the step or the function of time."""
+    model, n = scene.robot.model.copy(), len(start[0])
+    model.gravity.linear = scene.gravity
+    data, states = model.createData(), [np.concatenate(start)]
+    for k in range(steps):
+
+        def slope(t, x, k=k):
+            row = u(k * dt + t) if callable(u) else u[k]
+            return np.append(x[n:], pin.aba(model, data, x[:n], x[n:], force(x[:n], x[n:], row)))
+
+        states.append(solve_ivp(slope, (0.0, dt), states[-1], "DOP853", rtol=1e-11, atol=1e-13).y[:, -1])
+    return np.split(np.array(states), 2, axis=1)
+
+
+def servo(q, v, u):
+    """A servo whose drive of 60 N m bends from 0.9 of it on."""
+    wanted = (K * (u - q) - 0.1 * K * v) / 60.0
+    lost = 2.5 * np.clip(np.abs(wanted) - 0.9, 0.0, 0.2) ** 2 + np.maximum(np.abs(wanted) - 1.1, 0.0)
+    return 60.0 * (wanted - np.sign(wanted) * lost)
+
+
+def stops(q, v, u):
+    """Stops at +-0.6 rad."""
+    for side in (1.0, -1.0):
+        depth = side * q - 0.6
+        y = np.clip(depth / 0.02, 0.0, 1.0)
+        u = u - side * 3e3 * (0.02 * (y**3 - 0.5 * y**4) + np.maximum(depth - 0.02, 0.0))
+        u = u - 20.0 * (3.0 * y**2 - 2.0 * y**3) * v
+    return u
+
+
+def waves(t):
+    return np.array([8.0, 4.0, 2.0]) * np.sin(5.0 * t + np.arange(3))
+
+
+ROWS = np.random.default_rng(1).normal(size=(40, 3)) * [8.0, 4.0, 2.0]
+GOALS = 0.2 * np.random.default_rng(2).normal(size=(4, 3)).repeat(10, axis=0)
+CASES = {
+    "free": ({}, lambda q, v, u: u, 0.0 * ROWS),
+    "torques": ({}, lambda q, v, u: u, ROWS),
+    "of time": ({}, lambda q, v, u: u, waves),
+    "damped": ({"damping": D}, lambda q, v, u: u - D * v, ROWS),
+    "stiff": ({"damping": 50.0 * D}, lambda q, v, u: u - 50.0 * D * v, ROWS),
+    "sprung": ({"stiffness": K, "rest": REST}, lambda q, v, u: u - K * (q - REST), 0.0 * ROWS),
+    "servo": ({"forces": vp.PositionServo(K, 0.1 * K, 60.0)}, servo, GOALS),
+    "stop": ({"forces": vp.JointStop(3e3, 20.0, -0.6, 0.6, 0.02)}, stops, 0.0 * ROWS),
+    "friction": ({"forces": vp.CoulombFriction(1.0, 0.2)}, lambda q, v, u: u - np.tanh(v / 0.2), 0.0 * ROWS),
+}
+
+
+def moved(scene, integrator=None, *, dt=0.02, steps=40, controls=None, start=(Q0, V0), **options):
+    return vp.simulate(scene, *start, dt=dt, steps=steps, controls=controls, integrator=integrator, **options)
+
+
+def finer(scene, motion, controls=None, parts=16, integrator=None, start=(Q0, V0)):
+    """The nodes of the same motion in many more steps."""
+    options = {"dt": motion.dt / parts, "steps": motion.steps * parts, "controls": controls, "start": start}
+    return moved(scene, integrator or vp.Gauss(4), check=False, **options).q[::parts]
+
+
+def agree(motion, q, rel=0.05, least=1e-10):
+    """The error of a motion is its distance from q; returns that as a share of the travel."""
+    off = np.abs(motion.q - q)
+    np.testing.assert_allclose(motion.error.max(), off.max(), rtol=rel, atol=least)
+    assert np.abs(motion.error - off).max() < 2.0 * rel * off.max() + least
+    assert motion.error_bound is None or motion.error_bound > off.max() - least
+    return off.max() / np.ptp(q, axis=0).max()
+
+
+@functools.cache
+def case(name, dt, steps):
+    """A scene, its controls, and its true motion."""
+    options, force, u = CASES[name]
+    scene = vp.Scene(CHAIN, **options)
+    return scene, vp.OpenLoop(u) if callable(u) else u[:steps], exact(scene, force, u, dt, steps)
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("integrator", [None, MIDPOINT, vp.Gauss(3), vp.Radau(3), RK4, EULER, vp.ExplicitEuler()])
+def test_error(name, integrator):
+    """The error is the distance from the true motion; it is told from 1 % of the travel on, and is not below 0.7 %."""
+    hard = name in ("stiff", "stop", "servo")
+    if integrator in (RK4, EULER, vp.ExplicitEuler()) and (hard or name == "sprung"):
+        pytest.skip("unstable")
+    for dt, steps in ((0.04, 20), (0.02, 40)):
+        scene, controls, (q, v) = case(name, dt, steps)
+        motion = moved(scene, integrator, dt=dt, steps=steps, controls=controls)
+        share = agree(motion, q, rel=0.5 if hard else 0.1, least=1e-9)
+        assert not motion.error.flags.writeable
+        told, v_off = about(motion.warnings, "error"), np.abs(motion.v - v).max(axis=0)
+        fast = (v_off / np.abs(v).max(axis=0)).max() > 0.2
+        assert told or not share > 1.05 * TOLD
+        assert not told or share > 0.7 * TOLD or fast
+
+
+def right():
+    """A motion that the gate lets pass, whose error is not yet computed."""
+    motion = moved(FREE, dt=0.005, steps=100)
+    assert "error below" in repr(motion)
+    assert 0.0 < motion.error_bound < 1e-4
+    return motion
+
+
+def test_lazy_error(tmp_path):
+    """It is computed when it is asked for, the same however the motion got there."""
+    motion, own = right(), right()
+    known = motion.error
+    assert f"error {known.max():.2g}" in repr(motion)
+    assert 0.0 < known.max() < motion.error_bound
+    assert motion.error is known
+    assert own.changed(warnings=()).error.tobytes() == known.tobytes()
+    part = own.part(20, 60)
+    assert "error below" in repr(part)
+    assert "error below" in repr(own)
+    assert part.error.tobytes() == known[20:61].tobytes()
+    assert right().part(10, 90).part(10, 50).error.tobytes() == known[20:61].tobytes()
+    for again in (pickle.loads(pickle.dumps(right())), vp.Trajectory.load(right().save(tmp_path / "motion.npz"))):
+        assert again.error.tobytes() == known.tobytes()
+        assert again.error_bound == motion.error_bound
+        assert repr(again) == repr(motion)
+
+
+def test_no_check():
+    """Without a check there is no error and no warning about it."""
+    coarse = moved(FREE, EULER, check=False)
+    assert coarse.error is None
+    assert coarse.error_bound is None
+    assert coarse.warnings == ()
+    assert "error" not in repr(coarse)
+    assert about(moved(FREE, EULER).warnings, "error")
+    assert moved(FREE, steps=0).warnings == ()
+    assert moved(FREE, start=([0.5 * np.pi, 0.0, 0.0], np.zeros(3))).error.max() < 1e-9
+
+
+@pytest.mark.parametrize("integrator", [MIDPOINT, vp.Midpoint(kick="held"), vp.Gauss(2), vp.Radau(3), RK4, EULER])
+def test_noise(integrator):
+    """The repetition has the same increments: against the same path in many more steps."""
+    scene = vp.Scene(CHAIN, damping=0.5, noise=vp.AdditiveNoise(0.5))
+    dw, parts = np.sqrt(0.02) * np.random.default_rng(0).normal(size=(40, 3)), 32
+    held = getattr(integrator, "kick", "left") == "held"
+    fine = np.kron(dw, np.full((parts, 1), 1.0 / parts) if held else np.eye(parts, 1))
+    fine = {"increments": fine, "dt": 0.02 / parts, "steps": 40 * parts, "check": False}
+    truth = moved(scene, vp.Gauss(4, kick="held" if held else "left"), **fine).q[::parts]
+    agree(moved(scene, integrator, increments=dw), truth)
+
+
+@pytest.mark.parametrize("integrator", [MIDPOINT, vp.Gauss(2), vp.Radau(3), RK4], ids=str)
+def test_lines_loops_and_forces_in_python(integrator):
+    lines = vp.FirstOrderHold(np.random.default_rng(2).normal(size=(41, 3)))
+    agree(motion := moved(FREE, integrator, controls=lines), finer(FREE, motion, lines.refined(16)))
+    scene = vp.Scene(CHAIN, forces=vp.CustomForce(lambda q, v: -0.5 * v**3))
+    agree(motion := moved(scene, integrator, steps=5), finer(scene, motion, parts=8), rel=0.3)
+    if integrator in (MIDPOINT, vp.Gauss(2)):
+        scene = vp.Scene(CHAIN, constraints=vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz"))
+        start = vp.assemble(scene, [-1.5, 1.5, 1.5]), np.zeros(3)
+        agree(motion := moved(scene, integrator, start=start), finer(scene, motion, start=start))
+
+
+def test_kinematic_inputs():
+    """A joint moved by hand moves evenly within the steps of the motion, in its repetition too."""
+    scene = vp.Scene(CHAIN, constraints=vp.KinematicInput("joint1"), actuation=["joint1"])
+    t, start = 0.02 * np.arange(41), (Q0, np.array([1.2, 0.0, 1.0]))
+    motion = moved(scene, MIDPOINT, controls=vp.OpenLoop(lambda t: [0.3 + 0.3 * np.sin(4.0 * t)]), start=start)
+    # They take the values at the ends of steps.
+    np.testing.assert_allclose(motion.q[1:, 0], 0.3 + 0.3 * np.sin(4.0 * t[1:]), atol=1e-14)
+    line = vp.OpenLoop(lambda s: [np.interp(s, t, 0.3 + 0.3 * np.sin(4.0 * t))])
+    agree(motion, finer(scene, motion, line, start=start))
+
+
+@pytest.mark.parametrize("integrator", [MIDPOINT, vp.Gauss(2), RK4], ids=str)
+def test_feedback(integrator):
+    """A policy acts on its repetition: its error is that of the closed loop. A law's recorded values are held."""
+    gains = -np.hstack([np.diag([20.0, 10.0, 3.0]), np.diag([8.0, 4.0, 1.0])])
+    on, goal = ("momentum" if integrator.variational else "velocity"), np.zeros((20, 6))
+    policies = [
+        vp.LinearPolicy(np.zeros((20, 3)), np.tile(gains, (20, 1, 1)), goal, hold=2 * parts, on=on) for parts in (1, 16)
+    ]
+    motion = moved(FREE, integrator, controls=policies[0])
+    agree(motion, finer(FREE, motion, policies[1], integrator=vp.Gauss(4) if integrator.variational else RK4))
+    motion = moved(FREE, integrator, controls=lambda t, q, v: gains @ np.append(q, v))
+    agree(motion, finer(FREE, motion, np.repeat(motion.u, 16, axis=0)))
+
+
+def test_upright():
+    """A plan stands an arm up and keeps it there, where errors grow: told wherever it is off by more than 1 %."""
+    scene, up, N, dt = vp.Scene(vp.planar_chain(2)), np.array([-0.5 * np.pi, 0.0]), 150, 0.02
+    cost = vp.TrackingCost(up, 1.0) + vp.VelocityCost(0.1) + vp.ControlCost(1e-4)
+    cost += vp.Terminal(vp.TrackingCost(up, 100.0) + vp.VelocityCost(10.0))
+    start = 0.6 * up, np.zeros(2)
+    u = vp.solve(vp.OptimalControlProblem(scene, cost, *start, dt=dt, steps=N), check=False).controls
+    (q, _), seen = exact(scene, lambda q, v, u: u, u, dt, N, start), set()
+    for parts, integrator in itertools.product((1, 2, 4, 8, 16), (None, MIDPOINT, vp.Gauss(4))):
+        controls = np.repeat(u, parts, axis=0)
+        motion = moved(scene, integrator, dt=dt / parts, steps=N * parts, controls=controls, start=start)
+        share = np.abs(motion.q[::parts] - q).max() / np.ptp(q, axis=0).max()
+        told = bool(about(motion.warnings, "error"))
+        assert told == (share > TOLD) or 0.8 < share / TOLD < 1.2, (parts, integrator, share)
+        seen.add(told)
+    assert seen == {True, False}
+
+
+@pytest.mark.parametrize("integrator", [None, MIDPOINT, vp.Gauss(2), vp.Gauss(4)])
+def test_servos_on_moving_targets(integrator):
+    stiff = np.array([3000.0, 1000.0, 500.0])
+    scene = vp.Scene(CHAIN, forces=vp.PositionServo(stiff, 0.05 * stiff))
+    target, start = vp.OpenLoop(lambda t: Q0 + 0.3 * np.sin(6.0 * t + np.arange(3))), (Q0, np.zeros(3))
+    motion = moved(scene, integrator, controls=target, start=start)
+    share = agree(motion, finer(scene, motion, target, parts=32, integrator=vp.Radau(4), start=start), rel=0.2)
+    assert bool(about(motion.warnings, "error")) == (integrator == MIDPOINT)
+    assert integrator is not None or share < 1e-3
+
+
+def test_chaos():
+    """Told with the time until which the motion is right."""
+    scene, start = vp.Scene(vp.planar_chain(2)), (np.zeros(2), np.zeros(2))
+    motion = moved(scene, dt=0.01, steps=2000, start=start)
+    (told,) = motion.warnings
+    share = np.abs(motion.q - finer(scene, motion, parts=8, start=start)).max(axis=1) / np.ptp(motion.q, axis=0).max()
+    assert told.kind == "error"
+    assert told.time == pytest.approx(motion.t[int((share > TOLD).argmax())], abs=0.3)
+    assert motion.error.max() > 1.0
+    late = int(told.time / 0.01) - 50
+    assert share[:late].max() < TOLD < share.max()
+
+
+def test_unknown_error():
+    """Where the repetition fails the error is not a number, and that is told."""
+    done = []
+
+    def force(q, v):
+        if done:
+            raise ValueError("no more")
+        return -0.1 * v
+
+    scene = vp.Scene(CHAIN, forces=vp.CustomForce(force))
+    motion = moved(scene, progress=lambda k, steps: done.append(k) if k == steps else None)
+    (told,) = motion.warnings
+    assert told.kind == "error"
+    assert not unnamed(told, "not known", "no more")
+    assert np.isnan(motion.error).all()
+    assert "error unknown" in repr(motion)
+
+
+def test_interruption():
+    options = {"dt": 0.3, "steps": 100_000, "progress": lambda done, steps: signal.raise_signal(signal.SIGINT)}
+    with pytest.raises(vp.Interrupted) as caught:
+        moved(vp.Scene(vp.planar_chain(1)), EULER, start=([0.0], [0.0]), **options)
+    assert about(caught.value.trajectory.warnings, "error")
+
+
+@pytest.mark.parametrize(
+    ("options", "integrator", "dt"),
+    [
+        ({}, MIDPOINT, 0.05),
+        ({}, EULER, 0.01),
+        ({}, vp.ExplicitEuler(), 0.004),
+        ({}, RK4, 0.1),
+        ({"stiffness": 30.0 * K}, vp.Gauss(2), 0.02),
+        ({"damping": 50.0 * D}, MIDPOINT, 0.02),
+    ],
+)
+def test_advice(options, integrator, dt):
+    """What a sentence advises makes a motion of which nothing is told; a small method may need its advice again."""
+    scene, steps = vp.Scene(CHAIN, **options), round(0.8 / dt)
+    unit = "rad/s" if "damping" in options else "rad"
+    (told,) = about(moved(scene, integrator, dt=dt, steps=steps).warnings, "error")
+    assert len(told) <= 240
+    assert told.unit == unit
+    assert not unnamed(told, f"{told.value:.2g} {unit}", f"'{told.joint}'", f"t = {told.time:.3g} s")
+    family, stages = re.search(r"integrator=varpin\.(\w+)\((\d)\)", told).groups()
+    better = moved(scene, getattr(vp, family)(int(stages)), dt=dt, steps=steps)
+    assert not about(better.warnings, "error")
+    for _ in range(3):
+        if "dt = " not in told:
+            return
+        steps = round(0.8 / float(re.search(r"Use dt = (\S+) s", told).group(1)))
+        found = about(moved(scene, integrator, dt=0.8 / steps, steps=steps).warnings, "error")
+        if not found:
+            return
+        (told,) = found
+    pytest.fail(told)
+
+
+def test_limits():
+    """One warning for each kind, about the joint that passes it by most, and the number of the others."""
+    scene = vp.Scene(vp.load_robot("ur5"), gravity=False)
+    robot, push = scene.robot, np.array([400.0, 0.0, 0.0, 40.0, 50.0, 60.0])
+    motion = moved(scene, dt=1e-3, start=(np.full(6, 7.0), np.arange(1.0, 7.0)), controls=push)
+    for kind, values, limit, unit in (
+        ("position limits", motion.q, robot.position_limits[1], "rad"),
+        ("velocity limits", np.abs(motion.v), robot.velocity_limit, "rad/s"),
+        ("effort limits", np.abs(motion.u), robot.effort_limit, "N m"),
+    ):
+        (told,), excess = about(motion.warnings, kind), values - limit
+        worst = int(excess.max(axis=0).argmax())
+        assert (told.joint, told.unit) == (robot.joint_names[worst], unit)
+        assert told.value == pytest.approx(excess.max())
+        assert told.time == pytest.approx(motion.t[int((excess[:, worst] > 0.0).argmax())])
+        count = int((excess.max(axis=0) > 1e-6).sum()) - 1
+        assert not unnamed(told, f"'{told.joint}'", f"{limit[worst]:.4g} {unit}", f"by {told.value:.3g}")
+        assert told.endswith((f"{count} more joint does", f"{count} more joints do") if count else "")
+        assert len(told) <= 240
+
+
+def test_log(caplog):
+    """One line: the worst and the number of the others; nothing twice for a scene and a step; silent if asked to."""
+    scene, start = vp.Scene(vp.load_robot("ur5"), gravity=False), (np.full(6, 7.0), np.arange(1.0, 7.0))
+
+    def lines(scene=scene, **options):
+        caplog.clear()
+        motion = moved(scene, EULER, start=start, **options)
+        return motion, caplog.messages
+
+    with caplog.at_level(logging.WARNING, "varpin"):
+        motion, said = lines()
+        assert said == [f"{motion.warnings[0]} ({len(motion.warnings) - 1} more in .warnings)"]
+        assert len({told.kind for told in motion.warnings}) == len(motion.warnings) > 2
+        again, said = lines()
+        assert said == []
+        assert again.warnings == motion.warnings
+        assert len(lines(dt=0.01)[1]) == 1
+        assert len(lines(scene=vp.Scene(scene.robot, gravity=False))[1]) == 1
+    with caplog.at_level(logging.ERROR, "varpin"):
+        assert lines(scene=vp.Scene(scene.robot, gravity=False))[1] == []
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["breaks", "no breaks"])
+@pytest.mark.parametrize("integrator", [None, MIDPOINT, vp.Gauss(3), vp.Radau(3), RK4])
+def test_blows(given, integrator):
+    """A mass of 1 kg under a blow of 1 N s of 0.5 to 20 ms: its velocity and place behind it."""
+    scene, rng = vp.Scene(slider(1.0), gravity=False), np.random.default_rng(0)
+    for width in np.repeat([5e-4, 1e-3, 4e-3, 2e-2] if given else [1e-3, 4e-3, 2e-2], 6):
+        end = (begin := rng.uniform(0.05, 0.9)) + width
+        f = lambda t, a=begin, b=end: ((a <= t) & (t < b))[:, None] / (b - a)  # noqa: E731
+        push = vp.OpenLoop(f, vectorized=True, breaks=(begin, end) if given else ())
+        motion = moved(scene, integrator, dt=0.01, steps=100, controls=push, start=([0.0], [0.0]))
+        after = motion.t > end
+        assert motion.v[after, 0] == pytest.approx(1.0, abs=1e-10 if given else 1e-3)
+        off = np.abs(motion.q[after, 0] - motion.t[after] + 0.5 * (begin + end))
+        # A control that is constant over the step acts in its middle, which is its error.
+        assert off.max() < (0.006 if integrator == MIDPOINT else 1e-10 if given else 1e-3)
+        assert integrator != MIDPOINT or motion.error[after].max() == pytest.approx(off.max(), rel=0.1, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "steps", "order"),
+    [(vp.Gauss(s), n, 2 * s) for s, n in ((1, 64), (2, 32), (3, 24), (4, 12))]
+    + [(vp.Radau(s), n, 2 * s - 1) for s, n in ((2, 64), (3, 32), (4, 24))]
+    + [(RK4, 64, 4)],
+    ids=str,
+)
+def test_order(integrator, steps, order):
+    """Functions of time that are smooth keep the order of a method."""
+    options = {"controls": vp.OpenLoop(waves), "check": False}
+    end = moved(FREE, vp.Gauss(6), dt=0.64 / 192, steps=192, **options).q[-1]
+    ends = [moved(FREE, integrator, dt=0.64 / n, steps=n, **options).q[-1] for n in (steps, 2 * steps)]
+    coarse, fine = np.abs(ends - end).max(axis=1)
+    assert np.log2(coarse / fine) > order - 0.5, (coarse, fine)
+
+
+def test_unsettled_functions():
+    (told,) = moved(FREE, controls=vp.OpenLoop(lambda t: np.sin(1e9 * t * t) * np.ones(3)), steps=2).warnings
+    assert (told.kind, told.value, told.unit) == ("fast controls", 2.0, "steps")
+    assert not unnamed(told, "2 steps", "breaks=")
+
+
+def test_a_function_that_fails():
+    """The motion so far is in the error."""
+    failing = vp.OpenLoop(lambda t: np.ones(3) if t < 0.123 else 1 / 0)
+    for integrator in (None, MIDPOINT, RK4):
+        with refused(vp.ControlError, "division by zero") as caught:
+            moved(FREE, integrator, dt=0.01, controls=failing)
+        assert caught.value.step == caught.value.trajectory.steps == 12
+        same = moved(FREE, integrator, dt=0.01, steps=12, controls=np.ones(3), check=False)
+        np.testing.assert_allclose(caught.value.trajectory.q, same.q, atol=1e-12)
+
+
+def test_findings(tmp_path):
+    """A warning is a sentence with numbers, which pickling and saving keep."""
+    own = vp.Finding("error", "too far", "joint2", time=0.5, value=0.1, unit="rad")
+    numbers = {"kind": "error", "joint": "joint2", "time": 0.5, "value": 0.1, "unit": "rad"}
+    assert own == "too far"
+    assert vars(own) == vars(pickle.loads(pickle.dumps(own))) == numbers
+    assert (own.about("path 3: "), vars(own.about("path 3: "))) == ("path 3: too far", numbers)
+    motion = moved(FREE, EULER, start=(Q0, 5.0 * V0))
+    assert motion.warnings
+    loaded = vp.Trajectory.load(motion.save(tmp_path / "motion.npz")).warnings
+    for again in (loaded, pickle.loads(pickle.dumps(motion)).warnings):
+        assert again == motion.warnings
+        assert [vars(told) for told in again] == [vars(told) for told in motion.warnings]

@@ -1,0 +1,250 @@
+"""A control loop that is unstable at its period is told of, and no other."""
+
+import logging
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from findings import about
+from refusals import naming, refused
+from scipy.linalg import expm
+from scipy.optimize import fsolve
+
+import varpin as vp
+from varpin.simulation.loop import KIND, outgrown, unstable_loop
+
+ROD, PENDULUM = vp.Scene(vp.planar_chain(1), gravity=False), vp.Scene(vp.planar_chain(1))
+INERTIA = 1.0 / 3.0  # of the rod about its joint
+
+
+def told(motion):
+    """The warnings of a motion about its control loop; a motion that cannot go on has them, too."""
+    by_kind = [text for text in motion.warnings if getattr(text, "kind", "") == KIND]
+    return by_kind or about(motion.warnings, "unstable loop", "period too long")
+
+
+def run(scene, q, v, law, **options):
+    """The motion, up to a step that fails."""
+    try:
+        return vp.simulate(scene, q, v, controls=law, **options)
+    except vp.StepFailure as failure:
+        return failure.trajectory
+
+
+def pd(kp, kd, goal=1.0, limit=np.inf):
+    return lambda t, q, v: np.clip(-kp * (q - goal) - kd * v, -limit, limit)
+
+
+def radius(scene, K, period, guess):
+    """Spectral radius at the equilibrium next to a guess under u = K (q - guess, v): Pinocchio, differences, expm."""
+    model, n, h = scene.robot.model.copy(), scene.robot.dof, 1e-5
+    model.gravity.linear = scene.gravity
+    data, still = model.createData(), np.zeros(n)
+
+    def acceleration(q, v, u):
+        return pin.aba(model, data, scene.robot.configuration(q), v, u - scene.damping * v).copy()
+
+    rest = fsolve(lambda q: acceleration(q, still, K[:, :n] @ (q - guess)), guess)
+    u = K[:, :n] @ (rest - guess)
+    changes = h * np.eye(3 * n)
+    moved = [acceleration(rest + d[:n], d[n : 2 * n], u + d[2 * n :]) for d in np.concatenate([changes, -changes])]
+    rates = np.zeros((3 * n, 3 * n))
+    rates[:n, n : 2 * n] = np.eye(n)
+    rates[n : 2 * n] = (np.array(moved[: 3 * n]) - np.array(moved[3 * n :])).T / (2.0 * h)
+    step = expm(period * rates)[: 2 * n]
+    return np.abs(np.linalg.eigvals(step[:, : 2 * n] + step[:, 2 * n :] @ K)).max()
+
+
+@pytest.mark.parametrize("share", [0.9, 0.995, 1.005, 1.1])
+@pytest.mark.parametrize("period", [1, 3])
+def test_a_damper_is_stable_up_to_two_inertias_a_period(share, period):
+    """A double integrator with zero-order hold: v is multiplied by 1 - kd h / I."""
+    kd = 2.0 * share * INERTIA / (4e-3 * period)
+    motion = run(ROD, [0.3], [0.2], pd(0.0, kd), dt=4e-3, steps=60 * period, period=period)
+    assert bool(told(motion)) == (share > 1.0), motion.warnings
+    assert len(naming(told(motion), f"{2.0 * share - 1.0:.4g}", f"{4e-3 * period:.4g} s")) == (share > 1.0)
+
+
+@pytest.mark.parametrize(("kp", "kd"), [(10, 30), (300, 1), (300, 1.4), (300, 1.6), (300, 66), (300, 67), (9e3, 60)])
+def test_jury_conditions(kp, kd):
+    """z^2 - (2 - b - a / 2) z + 1 - b + a / 2 with a = kp h^2 / I, b = kd h / I: stable for a / 2 < b < 2."""
+    h = 1e-2
+    a, b = kp * h**2 / INERTIA, kd * h / INERTIA
+    size = np.abs(np.roots([1.0, -(2.0 - b - 0.5 * a), 1.0 - b + 0.5 * a])).max()
+    assert (size < 1.0) == (0.5 * a < b < 2.0)
+    motion = run(ROD, [0.3], [0.0], pd(kp, kd), dt=h, steps=150)
+    assert bool(told(motion)) == (size > 1.0), (size, motion.warnings)
+    for finding in unstable_loop(ROD, motion):
+        assert finding.kind == KIND
+        assert finding.joint == "joint1"
+        np.testing.assert_allclose(finding.value, size, rtol=1e-6)
+        # The period that is stable, at most a tenth short.
+        limit = min(2.0 * INERTIA / kd, 2.0 * kd / kp)
+        stable = float(finding.split("below ")[1].split(" s")[0])
+        assert 0.89 * limit < stable < 1.001 * limit
+
+
+@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.RungeKutta4()], ids=str)
+def test_random_loops_of_chains(integrator):
+    rng, seen = np.random.default_rng(14), {True: 0, False: 0}
+    for _ in range(20):
+        n, kp, kd, dt = int(rng.integers(1, 4)), *10 ** rng.uniform([1, 0, -3], [4, 2.5, -1.7])
+        scene = vp.Scene(vp.planar_chain(n), gravity=bool(rng.integers(2)))
+        size = radius(scene, np.hstack([-kp * np.eye(n), -kd * np.eye(n)]), dt, np.ones(n))
+        motion = run(scene, np.zeros(n), np.zeros(n), pd(kp, kd), dt=dt, steps=200, integrator=integrator)
+        if size > 1.0 or motion.steps == 200:
+            assert bool(told(motion)) == (size > 1.0), (n, kp, kd, dt, size, motion.warnings)
+            seen[size > 1.0] += 1
+    assert min(seen.values()) > 3
+
+
+@pytest.mark.parametrize("share", [0.8, 2.6])
+@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("limit", [np.inf, 25.0])
+def test_six_joints(share, compensated, limit):
+    """The fastest direction loses a share of its speed a period; limits of torque cut the start off."""
+    scene, n, h = vp.Scene(vp.load_robot("ur5"), damping=0.05), 6, 2e-3
+    goal = np.array([0.3, -1.0, 1.2, -0.8, 0.5, 0.7])
+    jet = vp.lagrangian_jet(scene, goal, np.zeros(n))
+    diagonal = np.diag(jet.Lvv)
+    kd = diagonal * share / h / np.linalg.eigvals(np.linalg.solve(jet.Lvv, np.diag(diagonal))).real.max()
+
+    def law(t, q, v):
+        pull = vp.lagrangian_jet(scene, q, np.zeros(n)).Lq if compensated else jet.Lq
+        return np.clip(-pull - 50.0 * kd * (q - goal) - kd * v, -limit - 60.0, limit + 60.0)
+
+    motion = run(scene, goal + 0.05, np.zeros(n), law, dt=h, steps=300)
+    assert bool(told(motion)) == (share > 2.0), motion.warnings
+
+
+def test_a_law_is_read_off_where_it_does_not_clip():
+    """Four of 300 periods are inside the limits."""
+    scene, kp, kd = vp.Scene(vp.planar_chain(1), gravity=False, damping=0.01), 22161.0, 6.8
+    size = radius(scene, np.array([[-kp, -kd]]), 2 * 5.33e-3, np.ones(1))
+    motion = run(scene, [1.0003], [0.0], pd(kp, kd, limit=20.0), dt=5.33e-3, steps=600, period=2)
+    assert (np.abs(motion.u[::2]) < 20.0).sum() < 10
+    assert naming(told(motion), f"{size:.4g}")
+
+
+@pytest.mark.parametrize(
+    ("n", "period", "kp", "kd", "limit", "gravity"),
+    [(1, 5e-3, 100, 200, 5, False), (2, 0.015, 100, 200, 20, False), (2, 0.023, 480, 66, 3.2, True),
+     (2, 0.029, 850, 19, 5.7, False), (2, 0.013, 1100, 91, 6.5, True)],
+)  # fmt: skip
+def test_an_unstable_loop_that_clips_is_told(n, period, kp, kd, limit, gravity):
+    """It cannot grow beyond its limits, and goes from one to the other, in bursts or for ever."""
+    scene = vp.Scene(vp.planar_chain(n), gravity=gravity)
+    motion = run(scene, np.zeros(n), np.zeros(n), pd(kp, kd, limit=limit), dt=period / 2, steps=298, period=2)
+    assert radius(scene, np.hstack([-kp * np.eye(n), -kd * np.eye(n)]), period, np.ones(n)) > 1.0
+    assert told(motion)
+    assert not told(run(scene, np.zeros(n), np.zeros(n), pd(50.0, 0.1 / period, 1.0, limit), dt=period / 2, steps=298))
+
+
+def test_the_count_of_changes():
+    motion = run(ROD, [0.0], [0.5], lambda t, q, v: -5.0 * np.sign(v), dt=1e-2, steps=300)
+    (finding,) = unstable_loop(ROD, motion)
+    assert finding.value > 290
+    assert 0.0 < finding.time < 0.3
+    assert naming([finding], "control 0", f"{finding.value:.0f} times", "300 periods", "0.01 s")
+
+
+def swing_up(t, q, v):
+    """It pumps from limit to limit, catches the pendulum upright and holds it."""
+    if np.sin(q[0]) < -0.8:
+        return np.clip(-60.0 * np.arctan2(np.cos(q), -np.sin(q)) - 10.0 * v, -6.0, 6.0)
+    return -2.0 * np.sign(v * (v**2 / 6.0 - 0.5 * 9.81 * (np.sin(q) + 1.0)) + 1e-12)
+
+
+TWO = vp.Scene(vp.planar_chain(2))
+ONE_OF_TWO = vp.Scene(vp.planar_chain(2), actuation=[[1.0], [0.0]])
+STABLE = {
+    "clipped, goal that swings": (ROD, 0, lambda t, q, v: np.clip(-1e3 * (q - 3 * np.sin(6 * t)) - 50 * v, -10, 10)),
+    "clipped, goal that jumps": (ROD, 0, lambda t, q, v: np.clip(-300 * (q - np.sign(np.sin(9 * t))) - 20 * v, -5, 5)),
+    "bang-bang plan": (ROD, 0, lambda t, q, v: 10.0 * np.sign(np.sin(9.0 * t)) * np.ones(1)),
+    "swing-up": (PENDULUM, 0.1 + np.pi / 2, swing_up),
+    "clipped": (PENDULUM, 0, pd(1e3, 50.0, limit=20.0)),
+    "falls, weak damping": (PENDULUM, np.pi / 2 - 1e-6, lambda t, q, v: -0.1 * v),
+    "falls, weak springs": (PENDULUM, np.pi / 2 - 1e-6, pd(1.0, 0.1, np.pi / 2)),
+    "goal that swings": (TWO, 0, lambda t, q, v: -300 * (q - np.sin(3 * t)) - 30 * v),
+    "goal that runs away": (ROD, 0, lambda t, q, v: -100 * (q - t**3) - 10 * (v - 3 * t**2)),
+    "gravity alone compensated": (TWO, 0.3, lambda t, q, v: -vp.lagrangian_jet(TWO, q, np.zeros(2)).Lq - 2.0 * v),
+    "velocity goal": (ROD, 0, lambda t, q, v: -30 * (v - 5)),
+    "drag": (ROD, 0, lambda t, q, v: -100 * (q - 1) - 20 * v * np.abs(v)),
+    "one joint of two": (ONE_OF_TWO, 0, lambda t, q, v: -100 * (q[:1] - 1) - 20 * v[:1]),
+}
+UNSTABLE = {
+    "velocity goal, too fast": (ROD, 0, lambda t, q, v: -335 * (v - 5)),
+    "drag that alternates": (ROD, 0.1, lambda t, q, v: -100 * q - 340 * v - v * np.abs(v)),
+    "one joint of two, too fast": (ONE_OF_TWO, 0, lambda t, q, v: -100 * (q[:1] - 1) - 1000 * v[:1]),
+    "moving goal": (TWO, 0, lambda t, q, v: -300 * (q - np.sin(3 * t)) - 300 * v),
+    "near its goal": (ROD, 1 + 1e-6, pd(1e3, 340.0)),
+    "nonlinear": (ROD, 0, lambda t, q, v: 400.0 * np.sin(-0.1 * (q - 1) - 1.0 * v)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [*STABLE, *UNSTABLE])
+def test_laws(name):
+    scene, q, law = (STABLE | UNSTABLE)[name]
+    motion = run(scene, np.full(scene.robot.dof, q), np.zeros(scene.robot.dof), law, dt=2e-3, steps=700)
+    assert bool(told(motion)) == (name in UNSTABLE), motion.warnings
+
+
+@pytest.mark.parametrize(("kd", "unstable"), [(40.0, False), (70.0, True)])
+def test_a_law_with_a_memory(kd, unstable):
+    total = 0.0
+
+    def law(t, q, v):
+        nonlocal total
+        total = total + 1e-2 * (q - 1.0)
+        return -300.0 * (q - 1.0) - 100.0 * total - kd * v
+
+    assert bool(told(run(PENDULUM, [0.0], [0.0], law, dt=1e-2, steps=300))) == unstable
+
+
+@pytest.mark.parametrize(("kd", "unstable"), [(10.0, False), (60.0, True)])
+def test_noise_hides_nothing(kd, unstable):
+    scene = vp.Scene(vp.planar_chain(2), noise=vp.AdditiveNoise(0.1))
+    assert bool(told(run(scene, [0, 0], [0, 0], pd(300.0, kd), dt=1e-2, steps=200, rng=0))) == unstable
+
+
+@pytest.mark.parametrize(("kd", "unstable"), [(1.0, True), (40.0, False)])
+def test_a_four_bar(kd, unstable):
+    """The spring of a sampled law pumps energy in: within constraints as without."""
+    joint = vp.PointOnPoint("tip", (1.3, 0.0, 0.2), axes="xz")
+    scene = vp.Scene(vp.planar_chain(3), damping=0.05, constraints=joint, actuation=["joint1"])
+    goal = vp.assemble(scene, [-1.5, 1.5, 1.5])
+    start = vp.assemble(scene, goal + 0.02 * np.arange(1, 4))
+    law = pd(300.0, kd, goal[:1])
+    motion = run(scene, start, np.zeros(3), lambda t, q, v: law(t, q[:1], v[:1]), dt=1e-2, steps=80, period=2)
+    assert bool(told(motion)) == unstable, motion.warnings
+
+
+def test_policies():
+    """Constant gains beyond their period are told, the gains of a plan for its horizon are not."""
+    for kd, unstable in ((50.0, False), (80.0, True)):
+        gains, goals = np.tile([[-1e3, -kd]], (100, 1, 1)), np.tile([1.0, 0.0], (100, 1))
+        policy = vp.LinearPolicy(np.zeros((100, 1)), gains, goals, on="velocity")
+        assert bool(told(run(ROD, [0], [0], policy, dt=1e-2, steps=100, integrator=vp.RungeKutta4()))) == unstable
+    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, 0.3], 1e4) + vp.VelocityCost(1e2))
+    plan = vp.solve(vp.OptimalControlProblem(TWO, cost, [0, 0], [0, 0], dt=1e-2, steps=100, integrator=vp.Gauss(2)))
+    motion = run(TWO, [0.05, -0.03], [0, 0], plan.policy, dt=1e-2, steps=100, integrator=vp.Gauss(2))
+    assert not told(motion), motion.warnings
+
+
+def test_the_sentence(caplog):
+    with caplog.at_level(logging.WARNING, "varpin"):
+        (sentence,) = run(ROD, [0], [0], pd(1e4, 200.0), dt=5e-3, steps=50).warnings
+    assert naming([sentence], "unstable", "0.005 s", "2.136", "lower gains")
+    assert len(sentence) <= 240
+    assert [record.getMessage() for record in caplog.records] == [sentence]
+    assert not run(ROD, [0], [0], pd(1e4, 200.0), dt=5e-3, steps=50, check=False).warnings
+    assert not any(told(run(PENDULUM, [0], [0], pd(10.0, 1.0), dt=1e-3, steps=steps)) for steps in range(6))
+
+
+@pytest.mark.parametrize("kd", [1e3, 1e5])
+def test_a_step_that_fails_names_the_loop(kd):
+    with refused(vp.StepFailure, "unstable") as caught:
+        vp.simulate(TWO, [0, 0], [0, 0], dt=5e-3, steps=400, controls=pd(1e5, kd))
+    assert told(caught.value.trajectory)
+    assert outgrown(np.array([[0.0], [1.0], [-50.0]]), 0.01)[0].value == 50.0
+    assert outgrown(np.array([[1.0], [-5.0]]), 0.01) == outgrown(np.zeros((3, 1)), 0.01) == ()
