@@ -48,8 +48,8 @@ struct Propagated {
 
 class Clearance {
   public:
-    // `wide` is a stretch of two steps, or null. `damping` are rates of dampers along single steps, in units of 1 / h, at
-    // `damped_at` nodes; above them the errors are not known.
+    // `wide` is a stretch of two steps, or null. `damping` are rates of dampers along single steps, in units of 1 / h,
+    // at `damped_at` nodes; above them the errors are not known.
     Clearance(const Mechanism& mechanism, const Record& record, const double* within, const Stretch& narrow,
               const Stretch* wide, double damping, std::int64_t damped_at)
         : mechanism_(mechanism),
