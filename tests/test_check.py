@@ -196,7 +196,7 @@ def test_kinematic_inputs():
     agree(motion, finer(scene, motion, line, start=start))
 
 
-@pytest.mark.parametrize("integrator", [MIDPOINT, vp.Gauss(2), RK4], ids=str)
+@pytest.mark.parametrize("integrator", [MIDPOINT, vp.Gauss(2), RK4, EULER], ids=str)
 def test_feedback(integrator):
     """A policy acts on its repetition: its error is that of the closed loop. A law's recorded values are held."""
     gains = -np.hstack([np.diag([20.0, 10.0, 3.0]), np.diag([8.0, 4.0, 1.0])])
@@ -302,7 +302,7 @@ def test_advice(options, integrator, dt):
     for _ in range(3):
         if "dt = " not in told:
             return
-        steps = round(0.8 / float(re.search(r"Use dt = (\S+) s", told).group(1)))
+        steps = round(0.8 / float(re.search(r"dt = (\S+) s", told).group(1)))
         found = about(moved(scene, integrator, dt=0.8 / steps, steps=steps).warnings, "error")
         if not found:
             return
@@ -369,6 +369,15 @@ def test_blows(given, integrator):
         # A control that is constant over the step acts in its middle, which is its error.
         assert off.max() < (0.006 if integrator == MIDPOINT else 1e-10 if given else 1e-3)
         assert integrator != MIDPOINT or motion.error[after].max() == pytest.approx(off.max(), rel=0.1, abs=1e-3)
+
+
+@pytest.mark.parametrize("early", [30e-6, 1e-6, 0.0, -20e-6])
+def test_a_blow_beside_a_node(early):
+    """It begins between the last point of a step's quadrature and its end."""
+    begin = 0.2 - early
+    push = vp.OpenLoop(lambda t: [float(begin <= t < begin + 1e-3) / 1e-3])
+    motion = moved(vp.Scene(slider(1.0), gravity=False), None, dt=0.01, steps=40, controls=push, start=([0.0], [0.0]))
+    assert motion.v[-1, 0] == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(

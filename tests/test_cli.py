@@ -135,7 +135,7 @@ def test_split_steps_are_flagged_in_the_table(arm, capsys):
     assert main(["simulate", arm, "--integrator", "midpoint", "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
     out, err = capsys.readouterr()
     assert re.search(r"split steps +│ \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", out)
-    assert re.search(r"^varpin: warning: q is off by up to \S+ rad, .* Use dt = ", err, re.MULTILINE)
+    assert re.search(r"^varpin: warning: q is off by up to \S+ rad, .* Use integrator=.* or dt = ", err, re.MULTILINE)
 
 
 def test_forced_motion_has_an_energy_change_and_no_error(arm, capsys):

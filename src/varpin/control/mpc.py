@@ -60,8 +60,7 @@ class Plant:
     Attributes:
         scene: Its scene, with the controls of the planned one; masses, friction and noise may differ.
         integrator: Any of varpin's. By default each run takes the one that :func:`varpin.simulate` chooses at the
-            plant's step for the start and along the first plan, all joint stops included; ``motion.integrator`` names
-            it, and a warning the tick from which on the plant needs another.
+            plant's step for the start, all joint stops included; ``motion.integrator`` names it.
         substeps: Steps per decision of the controller.
     """
 

@@ -28,6 +28,8 @@ _PANEL, _POINTS = 0.01, 20
 # A panel has settled where the last few coefficients of its Legendre series, times its share of the step, are below a
 # share of the largest value: jumps are then found to 1e-9 of a step. From 1e-7 to 1e-11 motions agree to that.
 _TAIL, _SETTLED = 6, 1e-9
+# Distance of a panel's outermost values from its ends, as a share of its half: jumps at the ends are beyond them.
+_INSIDE = 1e-9
 # Halvings of a panel, and evaluations of a step on average, after which it counts as unsettled.
 _HALVINGS, _MOST = 40, 2000
 
@@ -78,16 +80,20 @@ def moments_of(values: Values, first: int, count: int, dt: float, breaks: Sequen
     step, begin, width = _panels(first, count, dt, np.array(breaks, dtype=np.float64))
     total, square, largest, spent = np.zeros((0, 0, 0)), np.zeros((0, 0)), 0.0, 0
     unsettled = np.zeros(0, dtype=np.int64)
-    x, weights, to_series = _rule(_POINTS)
+    x, weights, to_series, to_ends = _rule(_POINTS)
     for halving in range(_HALVINGS + 1):
         inside = begin[:, None] + width[:, None] * x
-        found = values(((first + step)[:, None] + inside).ravel() * dt, np.repeat(first + step, _POINTS))
-        found = found.reshape(len(step), _POINTS, -1)
-        largest, spent = max(largest, float(np.abs(found).max(initial=0.0))), spent + len(step) * _POINTS
+        found = values(((first + step)[:, None] + inside).ravel() * dt, np.repeat(first + step, len(x)))
+        found = found.reshape(len(step), len(x), -1)
+        largest, spent = max(largest, float(np.abs(found).max(initial=0.0))), spent + len(step) * len(x)
         if not total.size:
             total = np.zeros((count, MOMENTS, found.shape[2]))
             square = np.zeros((count, found.shape[2]))
+        # The gaps between the outermost points and the ends have values of their own.
+        inside, ends, found = inside[:, 1:-1], found[:, [0, -1]], found[:, 1:-1]
         tail = np.abs(np.einsum("kp,jpm->jkm", to_series[-_TAIL:], found)).max(axis=(1, 2), initial=0.0)
+        beside = np.abs(np.einsum("ep,jpm->jem", to_ends, found) - ends).max(axis=(1, 2), initial=0.0)
+        tail = np.maximum(tail, x[1] * beside)
         last = halving == _HALVINGS or spent > _MOST * count + _MOST * 50
         open_ = tail * width > _SETTLED * largest
         done = np.ones_like(open_) if last else ~open_
@@ -129,9 +135,14 @@ def _panels(first: int, count: int, dt: float, breaks: Floats) -> tuple[Integers
 
 
 @functools.cache
-def _rule(points: int) -> tuple[Floats, Floats, Floats]:
-    """Gauss-Legendre points and weights (p,) on a unit panel, and the matrix (p, p) to its Legendre series."""
+def _rule(points: int) -> tuple[Floats, Floats, Floats, Floats]:
+    """Gauss-Legendre points on a unit panel between its ends (p + 2,), their weights (p,), and two matrices.
+
+    The matrices lead to the Legendre series (p, p), and to its values at the ends (2, p).
+    """
     x, w = np.polynomial.legendre.leggauss(points)
     degrees = np.arange(points)
     to_series = (0.5 * (2.0 * degrees + 1.0))[:, None] * (legvander(x, points - 1) * w[:, None]).T
-    return 0.5 * (1.0 + x), 0.5 * w, to_series
+    ends = np.array([_INSIDE - 1.0, 1.0 - _INSIDE])
+    at = 0.5 * (1.0 + np.concatenate([ends[:1], x, ends[1:]]))
+    return at, 0.5 * w, to_series, legvander(ends, points - 1) @ to_series

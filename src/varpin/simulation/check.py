@@ -83,7 +83,10 @@ def check(
         return trajectory.with_error(known).changed(warnings=tuple(beyond_limits(scene, trajectory)))
     held_mean = isinstance(controls, FirstOrderHold) and not integrator.stage_times
     if noise_unknown(scene, integrator, trajectory):
-        return trajectory.changed(warnings=tuple(beyond_limits(scene, trajectory)))
+        text = (
+            "the error is not known: under constraints, a repetition has no kicks that Python or linear controls give"
+        )
+        return trajectory.changed(warnings=(Finding("error", text), *beyond_limits(scene, trajectory)))
     proven = proven_error(scene, integrator, trajectory) if resolved and not held_mean else None
     repeat = functools.partial(repeated, scene, integrator, trajectory, controls, restart)
     found: tuple[Finding, ...] = ()
@@ -96,7 +99,8 @@ def check(
             found = found or short_forces(scene, integrator, trajectory)
         except (CustomForceError, CustomConstraintError) as error:
             off = np.full_like(trajectory.q, np.nan)
-            found = (Finding("error", f"the error is not known: the repetition of the motion failed, {error}"),)
+            text = f"the error is not known: a function of the scene fails in the repetition, {error.__cause__!r:.80}"
+            found = (Finding("error", text),)
         motion = trajectory.with_error(off)
     return motion.changed(warnings=(*found, *beyond_limits(scene, trajectory)))
 
@@ -108,12 +112,14 @@ def distance(again: tuple[Floats, Floats, float], trajectory: Trajectory) -> tup
     return np.abs(q - trajectory.q) / share, np.abs(v - trajectory.v) / share
 
 
-def closer(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Integrator, int, float]:
+def closer(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, *, fed: bool = False
+) -> tuple[Integrator, int, float]:
     """The method of a repetition, its steps in one of the motion's, and the share of the motion's error that it has.
 
     It has two stages more than a method of the motion's order has; Runge-Kutta's takes half of its step. Radau methods
     damp what is faster than the step, so they do not share the ringing of others. They keep no constraints; those of
-    Gauss do.
+    Gauss do. Feedback on (q, v), of controls that are ``fed`` back, needs a method on it: Runge-Kutta's.
     """
     # Steps that guards divided are as many shorter ones.
     taken = np.maximum(trajectory.statistics.substeps, 1).sum() / max(trajectory.steps, 1)
@@ -123,6 +129,8 @@ def closer(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tupl
     if isinstance(integrator, RungeKutta4) or (trajectory.noisy and isinstance(integrator, ExplicitEuler)):
         # Explicit Euler's kicks come after the step.
         return integrator, 2, 0.5**integrator.order
+    if fed and not integrator.variational:
+        return RungeKutta4(), 2 * parts, 0.0
     stages = (integrator.order + 1) // 2 + _MORE
     if stages > MOST_STAGES:
         stages, parts = MOST_STAGES, 2 * parts
@@ -141,7 +149,8 @@ def repeated(
 
     The arguments are those of :func:`check`.
     """
-    method, parts, left = closer(scene, integrator, trajectory)
+    fed = isinstance(controls, LinearPolicy) or (isinstance(controls, Commands) and len(controls.gains) > 0)
+    method, parts, left = closer(scene, integrator, trajectory, fed=fed)
     q, v = np.full((2, *trajectory.q.shape), np.nan)
     q[0], v[0] = trajectory.q[0], trajectory.v[0]
     commands = _commands(scene, integrator, method, trajectory, controls, parts)
@@ -299,8 +308,8 @@ def _cure(scene: Scene, integrator: Integrator, trajectory: Trajectory, excess: 
     step = trajectory.dt / (10.0 if not times < 10.0 else max(2.0, math.ceil(times)))
     stages = (integrator.order + 1) // 2 + _MORE
     family = "Radau" if integrator.l_stable else "Gauss"
-    other = f" or integrator=varpin.{family}({stages})" if stages <= MOST_STAGES else ""
-    return f"Use dt = {step:.2g} s{other}"
+    other = f"integrator=varpin.{family}({stages}) or " if stages <= MOST_STAGES else ""
+    return f"Use {other}dt = {step:.2g} s"
 
 
 def damped_faster(scene: Scene, trajectory: Trajectory, turns: float = 2.0) -> bool:
