@@ -198,6 +198,8 @@ class Ladder:
                 break
             self.climb(probe, probe.steps_for(math.inf))
         if probe.telling:
+            # Coarser ones divide steps, or fail: they are no choice.
+            probe.trials = probe.trials[-1:]
             for rung in self.rungs:
                 rung.first = probe.trials[-1].steps
 

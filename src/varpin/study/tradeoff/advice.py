@@ -202,7 +202,8 @@ def _timed(setting: Setting, integrator: Integrator, steps: int) -> Trial:
     scene, start, dt = setting.scene, (setting.q0, setting.v0), setting.duration / steps
     motion, failure = rollout(scene, integrator, *start, open_loop(setting.rows(steps)), dt)
     off = math.inf if failure is not None else float(distance(repeated(scene, integrator, motion), motion)[0].max())
-    return Trial(steps, off if math.isfinite(off) else math.inf, min(seconds))
+    whole = outcome.split_steps == 0
+    return Trial(steps, off if math.isfinite(off) else math.inf, min(seconds), whole=whole)
 
 
 def _largest_step(setting: Setting, rungs: Sequence[Rung]) -> float:
