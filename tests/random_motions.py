@@ -260,7 +260,7 @@ class Verdict(NamedTuple):
     labels: frozenset[str]
     told: tuple[str, ...] = ()  # warnings about its error
     share: tuple[float, float] = (np.nan, np.nan)  # error of q by travel, of v by speed
-    factor: float = np.nan  # estimated by true error, under recorded controls
+    factor: float = np.nan  # estimated by true error, of a law under its recorded controls
     seconds: tuple[float, float] = (0.0, 0.0)  # without and with the check
 
     def __str__(self) -> str:
@@ -286,6 +286,10 @@ def judge(case: Case, motion: vp.Trajectory, real: Truth | None, held: Truth | N
     for limit, after in ((WRONG, ""), (STRICT, " 1%")):
         labels |= {f"off{after}", *([] if told else [f"untold{after}"])} if (share > limit).any() else set()
     estimate, true, factor = getattr(motion, "error", None), alone[0].max(), np.nan
+    # The check gives that under the law where the recorded controls alone lead far off.
+    true = (
+        off[0].max() if held is not None and right and not told and not (alone[0] / size[0]).max() < RIGHT[0] else true
+    )
     if estimate is not None and true > max(1e-8, 5.0 * doubt_alone[0].max()):
         factor = float(np.max(estimate) / true)
     return Verdict(frozenset(labels if (doubt < 0.2 * WRONG).all() else {"unknown"}), told, tuple(share), factor)

@@ -32,6 +32,7 @@ from varpin.simulation.commands import Controls, commands_of
 from varpin.simulation.energy import energy_defects
 from varpin.simulation.gate import proven_error
 from varpin.simulation.limits import beyond_limits
+from varpin.simulation.loop import Law, law_of
 from varpin.simulation.scales import speed_scales, travel_scales
 from varpin.simulation.short_forces import short_forces
 from varpin.simulation.spectrum import fastest_rate
@@ -61,6 +62,7 @@ def check(
     resolved: bool = True,
     restart: int = 0,
     known: Floats | None = None,
+    hold: int = 0,
 ) -> Trajectory:
     """The motion with its error and its warnings, the worst first.
 
@@ -74,6 +76,8 @@ def check(
         restart: Steps after which the repetition begins anew at a node of the motion, where a controller has corrected
             the errors before it; 0 for none.
         known: The error, if it is known (N + 1, n): nothing is repeated.
+        hold: The period of a control law in steps, 0 for none. Where a repetition under the recorded controls is far
+            off, and the record tells the law, another one has its feedback.
     """
     if not integrator.variational and trajectory.steps:
         defects = energy_defects(scene, integrator, trajectory)
@@ -96,6 +100,9 @@ def check(
         try:
             off, speed_off = distance(repeat(), trajectory)
             found = error_findings(scene, integrator, trajectory, off, speed_off)
+            if found and hold and (law := law_of(scene, trajectory, hold)) is not None:
+                off, speed_off = distance(_under_law(scene, integrator, trajectory, law, hold), trajectory)
+                found = error_findings(scene, integrator, trajectory, off, speed_off)
             found = found or short_forces(scene, integrator, trajectory)
         except (CustomForceError, CustomConstraintError) as error:
             off = np.full_like(trajectory.q, np.nan)
@@ -219,6 +226,41 @@ def _commands(
         return held
     within = in_parts(trajectory.u_stages, integrator.stage_times, parts, times)
     return prescribing(scene, changing(within, times), held.u)
+
+
+def _under_law(
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, law: Law, hold: int
+) -> tuple[Floats, Floats, float]:
+    """:func:`repeated` under a law that acts on the states of the repetition, within the limits of the record."""
+    method, parts, left = closer(scene, integrator, trajectory)
+    q, v = np.full((2, *trajectory.q.shape), np.nan)
+    q[0], v[0], u = trajectory.q[0], trajectory.v[0], trajectory.u
+    low, high = (
+        np.where((u == end).sum(axis=0) > hold, end, far)
+        for end, far in ((u.min(axis=0), -np.inf), (u.max(axis=0), np.inf))
+    )
+    drawn, kicks = _noise(scene, integrator, method, trajectory, parts)
+    state, _ = method.start(scene, q[:1], v[:1])
+    for first in range(0, trajectory.steps, hold):
+        steps = min(hold, trajectory.steps - first)
+        taken = slice(first * parts, (first + steps) * parts)
+        command = np.clip(law.control(scene, q[first], v[first]), low, high)
+        (last,) = method.rollout_compiled(
+            scene,
+            state,
+            open_loop(command[None])._replace(hold=steps * parts),
+            np.ascontiguousarray(drawn[:, taken]) if len(drawn) else drawn,
+            scene.no_drift,
+            trajectory.dt / parts,
+            None if kicks is None else np.ascontiguousarray(kicks[:, taken]),
+        )
+        if last.failure is not None:
+            break
+        q[first + 1 : first + steps + 1], v[first + 1 : first + steps + 1] = (
+            last.q[parts - 1 :: parts],
+            last.v[parts - 1 :: parts],
+        )
+    return q, v, left
 
 
 def noise_unknown(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:

@@ -57,6 +57,11 @@ class Law:
     directions: Floats
     near: Floats
 
+    def control(self, scene: Scene, q: Floats, v: Floats) -> Floats:
+        """The control (m,) at a state (n,), (n,), not limited."""
+        found: Floats = self.K @ np.concatenate([q, v, lagrangian_jet(scene, q, np.zeros_like(q)).Lq]) + self.c
+        return found
+
 
 @dataclass(frozen=True)
 class Loop:
@@ -105,6 +110,18 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
         if law is None and not trajectory.dw.any():
             found = _from_limit_to_limit(scene, u, trajectory.t[at], period)
         return found or _by_growth(scene, trajectory, u, period)
+
+
+def law_of(scene: Scene, trajectory: Trajectory, hold: int) -> Law | None:
+    """The law of a motion under feedback every ``hold`` steps, if its record tells it."""
+    at = np.arange(0, trajectory.steps, hold)
+    if scene.inputs or len(at) < 3:
+        return None
+    with np.errstate(all="ignore"):
+        try:
+            return _law(scene, np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at])
+        except np.linalg.LinAlgError:
+            return None
 
 
 def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:

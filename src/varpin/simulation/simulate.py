@@ -180,7 +180,7 @@ def simulate(
             whole = function is None or resolved(function, integrator)
             given = None if callable(controls) or interrupted else controls
             known = None if interrupted else error
-            motion = checked(scene, integrator, motion, given, resolved=whole, known=known)
+            motion = checked(scene, integrator, motion, given, resolved=whole, known=known, hold=period if law else 0)
             loop = () if hold is None else unstable_loop(scene, motion, hold)
             wrong = [finding for finding in motion.warnings if finding.kind == "error"]
             found = [*loop, *wrong, *(unsettled(function) if function else ()), *found, *motion.warnings]
