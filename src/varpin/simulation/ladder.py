@@ -43,8 +43,9 @@ SAFETY = 1.5
 SENSIBLE = 1.0
 # Accumulated rounding, relative to q: the smallest error that is aimed at.
 ROUNDING = 200.0 * float(np.finfo(np.float64).eps)
-# Largest factor between the steps of a trial and the next, and up to which an error is extrapolated.
-REACH = 16.0
+# Largest factor between the steps of a trial and the next, and up to which an error is extrapolated. Of 34 random
+# motions 9 % cost more than twice the cheapest choice with 16, and 3 % with 4, whose search takes 1.4 times as long.
+REACH = 4.0
 # A trial with fewer than this share of the error of the one before makes progress; two without any end a method.
 _PROGRESS, _IDLE = 0.7, 2
 # Halvings of the first step in which a method may divide steps or fail: of 30 scenes none needed more than four.

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
+import numpy as np
+
 from varpin.errors import InputError
 from varpin.integrators import Guard, Integrator, Reference, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -22,6 +24,7 @@ from varpin.simulation.record import rollout
 from varpin.study.tradeoff.setting import Setting, integrators_of
 from varpin.support.checks import JointValues, positive
 from varpin.support.markup import facts, table
+from varpin.trajectory import Trajectory
 
 # Headings of a choice's entries in a table.
 COLUMNS = ("integrator", "dt [s]", "steps", "predicted time [s]", "predicted error in q", "note")
@@ -199,11 +202,18 @@ def _timed(setting: Setting, integrator: Integrator, steps: int) -> Trial:
         seconds.append(setting.run(integrator, steps).seconds)
     if outcome.failure:
         return Trial(steps, math.inf, min(seconds))
-    scene, start, dt = setting.scene, (setting.q0, setting.v0), setting.duration / steps
-    motion, failure = rollout(scene, integrator, *start, open_loop(setting.rows(steps)), dt)
-    off = math.inf if failure is not None else float(distance(repeated(scene, integrator, motion), motion)[0].max())
-    whole = outcome.split_steps == 0
+    motion = _motion(setting, integrator, steps)
+    if motion.steps < steps:
+        return Trial(steps, math.inf, min(seconds))
+    off = float(distance(repeated(setting.scene, integrator, motion), motion)[0].max())
+    whole = motion.statistics.split_steps == 0
     return Trial(steps, off if math.isfinite(off) else math.inf, min(seconds), whole=whole)
+
+
+def _motion(setting: Setting, integrator: Integrator, steps: int) -> Trajectory:
+    """The motion in so many steps, up to one that fails."""
+    dt, commands = setting.duration / steps, open_loop(setting.rows(steps))
+    return rollout(setting.scene, integrator, setting.q0, setting.v0, commands, dt)[0]
 
 
 def _largest_step(setting: Setting, rungs: Sequence[Rung]) -> float:
@@ -212,16 +222,12 @@ def _largest_step(setting: Setting, rungs: Sequence[Rung]) -> float:
     if not able or setting.scene.constraints:
         return math.nan
     method = max(able, key=lambda rung: (rung.integrator.order, rung.trials[-1].steps))
-    rows, last = len(setting.controls), method.trials[-1].steps
-    parts = last // rows
-    samples = rows * max(k for k in range(1, max(1, _NODES // rows) + 1) if parts % k == 0)
-    motion = setting.run(method.integrator, last, samples=samples)
-    margin = Guard().branch_margin
-    bounds = []
-    for q, v in zip(motion.q, motion.v, strict=True):
-        jet = lagrangian_jet(setting.scene, q, v)
-        bounds.append(largest_step(jet.Lvv, jet.Lqq, margin))
-    return min(bounds)
+    motion = _motion(setting, method.integrator, method.trials[-1].steps)
+    jets = (
+        lagrangian_jet(setting.scene, motion.q[node], motion.v[node])
+        for node in np.linspace(0, motion.steps, _NODES).astype(np.int64)
+    )
+    return min(largest_step(jet.Lvv, jet.Lqq, Guard().branch_margin) for jet in jets)
 
 
 def _reason(
