@@ -265,9 +265,11 @@ class Trajectory(Frozen):
         if name != "error":
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         repeat = vars(self).get("_repeat")
-        vars(self)["error"] = None if repeat is None else _sealed(repeat())
+        # Another thread may have the error by now.
+        found = vars(self).get("error") if repeat is None else _sealed(repeat())
+        found = vars(self).setdefault("error", found)
         vars(self).pop("_repeat", None)
-        return vars(self)["error"]
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
         _ = self.error

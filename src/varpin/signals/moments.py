@@ -23,11 +23,12 @@ Values = Callable[[Floats, Integers], Floats]
 # Number of moments: one for each stage of the method with the most.
 MOMENTS = 8
 # Length of a panel [s] and its points: none of them are more than 0.8 ms apart, so that no blow of a millisecond is
-# missed. Halves of a panel have as many, so that they see what the panel has seen at its ends.
-_PANEL, _POINTS = 0.01, 20
+# missed; those of steps of at most 2.5 ms, which are as near to each other. Halves of a panel have as many points, so
+# that they see what the panel has seen at its ends.
+_PANEL, _POINTS, _SHORT, _FEW = 0.01, 20, 2.5e-3, 8
 # A panel has settled where the last few coefficients of its Legendre series, times its share of the step, are below a
 # share of the largest value: jumps are then found to 1e-9 of a step. From 1e-7 to 1e-11 motions agree to that.
-_TAIL, _SETTLED = 6, 1e-9
+_SETTLED = 1e-9
 # Distance of a panel's outermost values from its ends, as a share of its half: jumps at the ends are beyond them.
 _INSIDE = 1e-9
 # Halvings of a panel, and evaluations of a step on average, after which it counts as unsettled.
@@ -80,7 +81,8 @@ def moments_of(values: Values, first: int, count: int, dt: float, breaks: Sequen
     step, begin, width = _panels(first, count, dt, np.array(breaks, dtype=np.float64))
     total, square, largest, spent = np.zeros((0, 0, 0)), np.zeros((0, 0)), 0.0, 0
     unsettled = np.zeros(0, dtype=np.int64)
-    x, weights, to_series, to_ends = _rule(_POINTS)
+    points = _POINTS if dt > _SHORT else _FEW
+    x, weights, to_series, to_ends = _rule(points)
     for halving in range(_HALVINGS + 1):
         inside = begin[:, None] + width[:, None] * x
         found = values(((first + step)[:, None] + inside).ravel() * dt, np.repeat(first + step, len(x)))
@@ -91,7 +93,7 @@ def moments_of(values: Values, first: int, count: int, dt: float, breaks: Sequen
             square = np.zeros((count, found.shape[2]))
         # The gaps between the outermost points and the ends have values of their own.
         inside, ends, found = inside[:, 1:-1], found[:, [0, -1]], found[:, 1:-1]
-        tail = np.abs(np.einsum("kp,jpm->jkm", to_series[-_TAIL:], found)).max(axis=(1, 2), initial=0.0)
+        tail = np.abs(np.einsum("kp,jpm->jkm", to_series[-(points // 3) :], found)).max(axis=(1, 2), initial=0.0)
         beside = np.abs(np.einsum("ep,jpm->jem", to_ends, found) - ends).max(axis=(1, 2), initial=0.0)
         tail = np.maximum(tail, x[1] * beside)
         last = halving == _HALVINGS or spent > _MOST * count + _MOST * 50

@@ -20,6 +20,7 @@ from varpin.finding import Finding
 from varpin.integrators import ExplicitEuler, Gauss, Integrator, Radau, Reference, RungeKutta4
 from varpin.integrators.base import drifts, noise_impulses
 from varpin.integrators.collocation import MOST_STAGES
+from varpin.integrators.reference import TIGHTEST
 from varpin.integrators.variational import Variational
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
@@ -46,8 +47,6 @@ TOLD, TOLD_VELOCITY = 0.01, 0.25
 _AIM = 0.2
 # Stages of the repetition beyond those of a motion of the same order.
 _MORE = 2
-# A repetition with a tolerance ten times as large is ten times as far off.
-_LOOSER = 10.0
 # Steps of one joint between two checks for Ctrl-C: a tenth of a second.
 _CHUNK = 100_000
 
@@ -79,7 +78,10 @@ def check(
         hold: The period of a control law in steps, 0 for none. Where a repetition under the recorded controls is far
             off, and the record tells the law, another one has its feedback.
     """
-    if not integrator.variational and trajectory.steps:
+    if not trajectory.steps:
+        nothing = trajectory.with_error(np.zeros_like(trajectory.q))
+        return nothing.changed(warnings=tuple(beyond_limits(scene, trajectory)))
+    if not integrator.variational:
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
         trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
@@ -87,19 +89,21 @@ def check(
         return trajectory.with_error(known).changed(warnings=tuple(beyond_limits(scene, trajectory)))
     held_mean = isinstance(controls, FirstOrderHold) and not integrator.stage_times
     if noise_unknown(scene, integrator, trajectory):
-        text = (
-            "the error is not known: under constraints, a repetition has no kicks that Python or linear controls give"
-        )
+        text = "the error is not known: a repetition cannot have this noise. Use kick='held'"
         return trajectory.changed(warnings=(Finding("error", text), *beyond_limits(scene, trajectory)))
     proven = proven_error(scene, integrator, trajectory) if resolved and not held_mean else None
     repeat = functools.partial(repeated, scene, integrator, trajectory, controls, restart)
     found: tuple[Finding, ...] = ()
+    if isinstance(controls, OpenLoop) and closer(scene, integrator, trajectory, sampled=True)[1] > 1:
+        # Its function would be called again, at whatever time the error is asked for.
+        proven = None
     if proven is not None:
         motion = trajectory.with_error(lambda: distance(repeat(), trajectory)[0], proven)
     else:
         try:
             off, speed_off = distance(repeat(), trajectory)
-            found = error_findings(scene, integrator, trajectory, off, speed_off)
+            fed = isinstance(controls, LinearPolicy) and not integrator.variational
+            found = error_findings(scene, integrator, trajectory, off, speed_off, fed=fed)
             if found and hold and (law := law_of(scene, trajectory, hold)) is not None:
                 off, speed_off = distance(_under_law(scene, integrator, trajectory, law, hold), trajectory)
                 found = error_findings(scene, integrator, trajectory, off, speed_off)
@@ -120,7 +124,7 @@ def distance(again: tuple[Floats, Floats, float], trajectory: Trajectory) -> tup
 
 
 def closer(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, *, fed: bool = False
+    scene: Scene, integrator: Integrator, trajectory: Trajectory, *, fed: bool = False, sampled: bool = False
 ) -> tuple[Integrator, int, float]:
     """The method of a repetition, its steps in one of the motion's, and the share of the motion's error that it has.
 
@@ -132,8 +136,12 @@ def closer(
     taken = np.maximum(trajectory.statistics.substeps, 1).sum() / max(trajectory.steps, 1)
     parts = 1 << math.ceil(math.log2(max(1.0, taken)))
     if isinstance(integrator, Reference):
-        return Reference(min(_LOOSER * integrator.rtol, 1e-2), integrator.atol), 1, _LOOSER
-    if isinstance(integrator, RungeKutta4) or (trajectory.noisy and isinstance(integrator, ExplicitEuler)):
+        factor = 0.1 if 0.1 * integrator.rtol >= TIGHTEST else 10.0
+        other = Reference(factor * integrator.rtol, None if integrator.atol is None else factor * integrator.atol)
+        return other, 1, factor
+    if (isinstance(integrator, RungeKutta4) and not sampled) or (
+        trajectory.noisy and isinstance(integrator, ExplicitEuler)
+    ):
         # Explicit Euler's kicks come after the step.
         return integrator, 2, 0.5**integrator.order
     if fed and not integrator.variational:
@@ -157,7 +165,7 @@ def repeated(
     The arguments are those of :func:`check`.
     """
     fed = isinstance(controls, LinearPolicy) or (isinstance(controls, Commands) and len(controls.gains) > 0)
-    method, parts, left = closer(scene, integrator, trajectory, fed=fed)
+    method, parts, left = closer(scene, integrator, trajectory, fed=fed, sampled=isinstance(controls, OpenLoop))
     q, v = np.full((2, *trajectory.q.shape), np.nan)
     q[0], v[0] = trajectory.q[0], trajectory.v[0]
     commands = _commands(scene, integrator, method, trajectory, controls, parts)
@@ -212,8 +220,9 @@ def _commands(
         controls = FirstOrderHold(trajectory.u_nodes)
     if isinstance(controls, FirstOrderHold) and not scene.inputs:
         return commands_of(scene, method, controls.refined(parts), trajectory.steps * parts, dt)
+    held = open_loop(in_parts_of_steps(scene, trajectory.u, trajectory.q[:-1], trajectory.v[:-1], trajectory.dt, parts))
     if isinstance(controls, OpenLoop):
-        return commands_of(scene, method, controls, trajectory.steps * parts, dt)
+        return prescribing(scene, commands_of(scene, method, controls, trajectory.steps * parts, dt), held.u)
     if isinstance(controls, LinearPolicy | Commands) and method.variational == integrator.variational:
         fed = (
             controls
@@ -221,7 +230,6 @@ def _commands(
             else commands_of(scene, method, controls, trajectory.steps, trajectory.dt)
         )
         return fed._replace(hold=fed.hold * parts)
-    held = open_loop(in_parts_of_steps(scene, trajectory.u, trajectory.q[:-1], trajectory.v[:-1], trajectory.dt, parts))
     if not trajectory.u_stages.shape[1]:
         return held
     within = in_parts(trajectory.u_stages, integrator.stage_times, parts, times)
@@ -266,9 +274,14 @@ def _under_law(
 def noise_unknown(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
     """Whether a repetition cannot have the noise of a motion, so that its error stays unknown.
 
-    That is so under constraints for kicks of fields in Python, or of controls that change within steps.
+    That is so under constraints for kicks of fields in Python, or of controls that change within steps, and for split
+    kicks of fields that depend on the velocity, which the record has after the kick alone.
     """
-    if not (trajectory.noisy and scene.constraints) or _kick(integrator) == "held":
+    if not trajectory.noisy or _kick(integrator) == "held":
+        return False
+    if scene.noise.velocity_dependent and _kick(integrator) == "split":
+        return True
+    if not scene.constraints:
         return False
     return scene.noise.diffusion is None or trajectory.dw.shape[1] > scene.processes
 
@@ -301,9 +314,18 @@ def _noise(
 
 
 def error_findings(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, off: Floats, speed_off: Floats
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    off: Floats,
+    speed_off: Floats,
+    *,
+    fed: bool = False,
 ) -> tuple[Finding, ...]:
-    """The warning of a motion's error, if it is large, from errors of q and v at its nodes (N + 1, n)."""
+    """The warning of a motion's error, if it is large, from errors of q and v at its nodes (N + 1, n).
+
+    ``fed``: its controls are a policy on (q, v).
+    """
     known = np.asarray(np.isfinite(off).all(axis=1))
     last = int(known.argmin()) if not known.all() else len(known)
     names, t = trajectory.joint_names, trajectory.t
@@ -313,14 +335,13 @@ def error_findings(
     joint = int(shares.max(axis=0).argmax())
     share = float(shares[:, joint].max())
     if share > TOLD:
-        worst, first = int(shares[:, joint].argmax()), int((shares[:, joint] > TOLD).argmax())
+        worst, first = int(shares[:, joint].argmax()), int((shares > TOLD).any(axis=1).argmax())
         unit = "m" if scene.robot.slides[joint] else "rad"
         value = float(off[worst, joint])
         part = f", {100.0 * share:.2g} % of the largest travel" if share < 1.0 else ""
-        text = (
-            f"q is off by up to {value:.2g} {unit}{part} (joint {names[joint]!r}, right until t = {t[first]:.3g} s). "
-        )
-        cure = _cure(scene, integrator, trajectory, share / TOLD)
+        where = f"(joint {names[joint]!r}, right until t = {t[first - 1]:.3g} s)"
+        text = f"q is off by up to {value:.2g} {unit}{part} {where}. "
+        cure = _cure(scene, integrator, trajectory, share / TOLD, fed=fed)
         return (Finding("error", text + cure, names[joint], time=float(t[first]), value=value, unit=unit),)
     # A jump that comes a part of a step too late is no error of the motion.
     lasting = np.minimum(speed_off[: last - 1], speed_off[1:last]) / speed
@@ -332,7 +353,7 @@ def error_findings(
             f"the velocity of joint {names[joint]!r} is off by up to {value:.2g} {unit}, {100.0 * lasting.max():.2g} % "
             f"of its largest (t = {t[first]:.3g} s). "
         )
-        cure = _cure(scene, integrator, trajectory, float(lasting.max()) / TOLD_VELOCITY)
+        cure = _cure(scene, integrator, trajectory, float(lasting.max()) / TOLD_VELOCITY, fed=fed)
         return (Finding("error", text + cure, names[joint], time=float(t[first]), value=value, unit=unit),)
     if last < len(known):
         text = (
@@ -342,15 +363,21 @@ def error_findings(
     return ()
 
 
-def _cure(scene: Scene, integrator: Integrator, trajectory: Trajectory, excess: float) -> str:
-    """What reduces an error that exceeds its threshold by a factor ``excess``."""
+def _cure(scene: Scene, integrator: Integrator, trajectory: Trajectory, excess: float, *, fed: bool) -> str:
+    """What reduces an error that exceeds its threshold by a factor ``excess``.
+
+    A policy on (q, v), which is ``fed`` back, takes no other method.
+    """
     if not (integrator.l_stable or scene.constraints) and damped_faster(scene, trajectory):
         return "Dampers are faster than the step: use integrator=varpin.Radau(4)"
+    if isinstance(integrator, Reference):
+        return "Use a smaller rtol"
     times = (max(excess, 1.0) / _AIM) ** (1.0 / integrator.order)
     step = trajectory.dt / (10.0 if not times < 10.0 else max(2.0, math.ceil(times)))
     stages = (integrator.order + 1) // 2 + _MORE
     family = "Radau" if integrator.l_stable else "Gauss"
-    other = f"integrator=varpin.{family}({stages}) or " if stages <= MOST_STAGES else ""
+    named = stages <= MOST_STAGES and not fed
+    other = f"integrator=varpin.{family}({stages}) or " if named else ""
     return f"Use {other}dt = {step:.2g} s"
 
 

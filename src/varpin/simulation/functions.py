@@ -79,8 +79,11 @@ class Sampled(OpenLoop):
             def at(times: Floats, steps: Integers) -> Floats:
                 return values(self.f, self.scene, times, steps, record)
 
-            self.parts.append(moments_of(at, self.done, last - self.done, self.dt, self.breaks))
-            vars(self)["done"] = last
+            fresh = moments_of(at, self.done, last - self.done, self.dt, self.breaks)
+            self.parts.append(fresh)
+            before, vars(self)["done"] = self.done, last
+            if first == before:
+                return fresh
         return joined(self.parts).part(first, last)
 
 

@@ -37,6 +37,8 @@ _GROWTH = 1e-5
 _BY_PERIOD = 1.5
 # Least changes from limit to limit in a period: 1/7 to 1/5 give the same; stable laws with moving goals reach 1/8.
 _CHANGES = 1.0 / 7.0
+# Least share of the sides that a linear function of the state tells for them to be feedback: random ones have 2n / P.
+_FOLLOWS = 0.3
 # Least growth of controls from the first quarter to the last (10 to 1000: the same), up to a failed step (3 to 100).
 _GREW, _OUTGROWN = 100.0, 10.0
 
@@ -108,7 +110,7 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
         except (np.linalg.LinAlgError, LinearizationError):
             law, found = None, ()
         if law is None and not trajectory.dw.any():
-            found = _from_limit_to_limit(scene, u, trajectory.t[at], period)
+            found = _from_limit_to_limit(scene, x, u, trajectory.t[at], period)
         return found or _by_growth(scene, trajectory, u, period)
 
 
@@ -160,7 +162,7 @@ def _by_theory(scene: Scene, law: Law, period: float) -> tuple[Finding, ...]:
     return _finding(scene, int(np.argmax(sizes)), text, radius)
 
 
-def _from_limit_to_limit(scene: Scene, u: Floats, t: Floats, period: float) -> tuple[Finding, ...]:
+def _from_limit_to_limit(scene: Scene, x: Floats, u: Floats, t: Floats, period: float) -> tuple[Finding, ...]:
     """The warning if a control of u (P, m) goes from one end of its range to the other every few periods to the end."""
     low, span = u.min(axis=0), np.ptp(u, axis=0)
     sides = (u >= low + 0.75 * span).astype(np.int64) - (u <= low + 0.25 * span)
@@ -170,6 +172,13 @@ def _from_limit_to_limit(scene: Scene, u: Floats, t: Floats, period: float) -> t
     worst = int(np.argmax(late))
     calm = np.abs(sides[3 * len(u) // 4 :, worst]).mean() < 0.25
     if calm or late[worst] < max(4.0, 0.5 * _CHANGES * len(u)):
+        return ()
+    # What flips whatever the state is excitation, not feedback.
+    half = len(u) // 2
+    side = sides[half:, worst].astype(np.float64)
+    fit = np.column_stack([x[half:], np.ones(len(side))])
+    left = side - fit @ np.linalg.lstsq(fit, side, rcond=None)[0]
+    if not left @ left < (1.0 - _FOLLOWS) * len(side) * side.var():
         return ()
     text = (
         f"control {worst} goes from limit to limit {len(changes[worst])} times in {len(u)} periods of {period:.4g} s: "

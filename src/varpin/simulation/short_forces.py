@@ -13,7 +13,7 @@ from varpin.trajectory import Trajectory
 
 # Points of a step at which the force is looked at: none are more than 8 % of the step's travel apart.
 _POINTS = 20
-# Steps that are looked at: each takes as many calls of the function as it has points.
+# Most steps that are looked at, evenly spaced: each takes as many calls of the function as it has points.
 _MOST = 2000
 # Error of q by the impulse that stages miss, as a share of the largest travel, from which on it is told: see
 # :data:`varpin.simulation.check.TOLD`.
@@ -30,14 +30,14 @@ def short_forces(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         CustomForceError: The function fails between the nodes.
     """
     force = scene.custom
-    if force is None or not trajectory.steps or trajectory.steps > _MOST:
+    if force is None or not trajectory.steps:
         return ()
     times = integrator.stage_times or (0.5,)
     x, weights = np.polynomial.legendre.leggauss(_POINTS)
     c = np.concatenate([np.array(times), 0.5 * (1.0 + x)])[:, None]
     q, v, dt = trajectory.q, trajectory.v, trajectory.dt
     missed = np.zeros((trajectory.steps, q.shape[1]))
-    for k in range(trajectory.steps):
+    for k in np.unique(np.linspace(0, trajectory.steps - 1, _MOST).astype(np.int64)).tolist():
         way = (q[k + 1] - q[k]) / dt
         at = q[k] + dt * (c * (1.0 - c) ** 2 * v[k] - c**2 * (1.0 - c) * v[k + 1] + c**2 * (3.0 - 2.0 * c) * way)
         rate = (1.0 - c) * (1.0 - 3.0 * c) * v[k] + c * (3.0 * c - 2.0) * v[k + 1] + 6.0 * c * (1.0 - c) * way

@@ -167,7 +167,13 @@ def simulate(
         commands = commands_of(scene, integrator, controls, steps, dt)
     linear = len(commands.stage_times) > 0
     # The check of a loop is for held controls.
-    hold = period if law else commands.hold if isinstance(controls, LinearPolicy) and not linear else None
+    hold = (
+        period
+        if law
+        else commands.hold
+        if isinstance(controls, LinearPolicy) and controls.gains.any() and not linear
+        else None
+    )
     state, (start,) = integrator.start(scene, q0[None], v0[None])
     held = commands.hold > 1 and not law
     record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)

@@ -25,6 +25,7 @@ from varpin.simulation.failures import ToleranceError
 from varpin.simulation.functions import ControlLaw, Sampled, require_law
 from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, candidates, first_steps
 from varpin.simulation.record import Motions, located
+from varpin.simulation.short_forces import short_forces
 from varpin.support.checks import positive
 from varpin.trajectory import Accuracy
 
@@ -113,6 +114,8 @@ class _Search:
             self.steps, self.evaluations = self.steps + motion.steps, self.evaluations + int(work)
             if failure is not None:
                 return Trial(steps, math.inf, float(work) * steps / max(motion.steps, 1))
+            if short_forces(self.scene, integrator, motion):
+                return Trial(steps, math.inf, float(work))
             again = repeated(self.scene, integrator, motion, controls)
             # A repetition takes about twice the evaluations.
             self.steps, self.evaluations = self.steps + steps, self.evaluations + 2 * int(work)
