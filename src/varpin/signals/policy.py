@@ -38,7 +38,8 @@ class OpenLoop:
     Runge-Kutta's method order 4, and a blow within a step acts with its whole impulse. Moments come from a quadrature
     that is refined until it settles, of 22 values for each 10 ms of a step at least, and of 10 for a step of up to
     2.5 ms; a blow of less than 0.8 ms is found for certain only with ``breaks``. A method with one stage holds the
-    mean. If a guard divides a step, its parts take the same polynomial. ``Trajectory.u`` holds the mean over each step, ``Trajectory.u_stages`` the values.
+    mean. If a guard divides a step, its parts take the same polynomial.
+    ``Trajectory.u`` holds the mean over each step, ``Trajectory.u_stages`` the values.
 
     The function must depend on time alone: it is called for many steps ahead of the motion, and not in order of time.
     Controls that depend on the state are a control law, a function of (t, q, v).

@@ -222,7 +222,7 @@ def _commands(
         return commands_of(scene, method, controls.refined(parts), trajectory.steps * parts, dt)
     held = open_loop(in_parts_of_steps(scene, trajectory.u, trajectory.q[:-1], trajectory.v[:-1], trajectory.dt, parts))
     if isinstance(controls, OpenLoop):
-        return prescribing(scene, commands_of(scene, method, controls, trajectory.steps * parts, dt), held.u)
+        return commands_of(scene, method, controls, trajectory.steps * parts, dt)
     if isinstance(controls, LinearPolicy | Commands) and method.variational == integrator.variational:
         fed = (
             controls
@@ -342,7 +342,7 @@ def error_findings(
         where = f"(joint {names[joint]!r}, right until t = {t[first - 1]:.3g} s)"
         text = f"q is off by up to {value:.2g} {unit}{part} {where}. "
         cure = _cure(scene, integrator, trajectory, share / TOLD, fed=fed)
-        return (Finding("error", text + cure, names[joint], time=float(t[first]), value=value, unit=unit),)
+        return (Finding("error", text + cure, names[joint], time=float(t[first - 1]), value=value, unit=unit),)
     # A jump that comes a part of a step too late is no error of the motion.
     lasting = np.minimum(speed_off[: last - 1], speed_off[1:last]) / speed
     if len(lasting) and lasting.max() > TOLD_VELOCITY:

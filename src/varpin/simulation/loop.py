@@ -38,7 +38,7 @@ _BY_PERIOD = 1.5
 # Least changes from limit to limit in a period: 1/7 to 1/5 give the same; stable laws with moving goals reach 1/8.
 _CHANGES = 1.0 / 7.0
 # Least share of the sides that a linear function of the state tells for them to be feedback: random ones have 2n / P.
-_FOLLOWS = 0.3
+_FOLLOWS = 0.15
 # Least growth of controls from the first quarter to the last (10 to 1000: the same), up to a failed step (3 to 100).
 _GREW, _OUTGROWN = 100.0, 10.0
 
