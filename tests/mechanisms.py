@@ -50,6 +50,23 @@ def slider(mass: float = 1.0) -> vp.Robot:
     return vp.load_robot(model)
 
 
+def crank_and_slider() -> vp.Robot:
+    """A crank of 0.3 m, a connecting rod of 1 m; and a block on rails along x."""
+    model = pin.Model()
+    model.name = "slider-crank"
+    place, joint = pin.SE3.Identity(), 0
+    for k, length in enumerate((0.3, 1.0)):
+        joint = model.addJoint(joint, pin.JointModelRY(), place, f"joint{k}")
+        rod = pin.Inertia(1.0, np.array([0.5 * length, 0.0, 0.0]), np.diag([0.0, 1.0, 1.0]) * length**2 / 12.0)
+        model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
+        place = pin.SE3(np.eye(3), np.array([length, 0.0, 0.0]))
+    model.addFrame(pin.Frame("tip", joint, 0, place, pin.FrameType.OP_FRAME))
+    block = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "block")
+    model.appendBodyToJoint(block, pin.Inertia(2.0, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
+    model.addFrame(pin.Frame("pin", block, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+    return vp.load_robot(model)
+
+
 def random_inertia(rng: np.random.Generator) -> pin.Inertia:
     """Mass, centre and inertia of a cloud of points, so that a body could have them."""
     points, masses = rng.normal(0.0, 0.1, (8, 3)), rng.uniform(0.05, 0.5, 8)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from mechanisms import random_tree, slider
+from mechanisms import crank_and_slider, random_tree, slider
 from oracles import Mechanism, Path
 
 import varpin as vp
@@ -112,21 +112,6 @@ def cart() -> vp.Robot:
         model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
         place = pin.SE3(np.eye(3), np.array([0.6, 0.0, 0.0]))
     model.addFrame(pin.Frame("tip", joint, 0, place, pin.FrameType.OP_FRAME))
-    return vp.load_robot(model)
-
-
-def crank_and_block() -> vp.Robot:
-    """A crank of 0.3 m and a connecting rod of 1 m; beside them a block on rails along x."""
-    model, place, joint = pin.Model(), pin.SE3.Identity(), 0
-    for k, length in enumerate((0.3, 1.0)):
-        joint = model.addJoint(joint, pin.JointModelRY(), place, f"joint{k}")
-        rod = pin.Inertia(1.0, np.array([0.5 * length, 0.0, 0.0]), np.diag([0.0, 1.0, 1.0]) * length**2 / 12.0)
-        model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
-        place = pin.SE3(np.eye(3), np.array([length, 0.0, 0.0]))
-    model.addFrame(pin.Frame("tip", joint, 0, place, pin.FrameType.OP_FRAME))
-    block = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "block")
-    model.appendBodyToJoint(block, pin.Inertia(2.0, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
-    model.addFrame(pin.Frame("pin", block, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
     return vp.load_robot(model)
 
 
@@ -242,7 +227,7 @@ TIP = (1.3, 0.0, 0.2)
 FOUR, FIVE = {"q": (-1.5, 1.5, 1.5), "v": (1.0, 0.0, 0.0)}, {"q": (-1.0, 1.0, 1.0, 1.0), "v": 1.0}
 add("four-bar", chain(3, constraints=vp.PointOnPoint("tip", TIP, "xz")), **FOUR)
 add("five-bar", chain(4, damping=0.3, constraints=vp.PointOnPoint("tip", (1.6, 0.0, 0.3), "xz")), **FIVE)
-add("crank and block", lambda: vp.Scene(crank_and_block(), constraints=vp.PointOnPoint("tip", "pin", "xz")),
+add("crank and block", lambda: vp.Scene(crank_and_slider(), constraints=vp.PointOnPoint("tip", "pin", "xz")),
     (0.7, -0.9, 1.2), (3.0, 0.0, 0.0), 0.01)  # fmt: skip
 add("rod", chain(3, constraints=vp.Distance("tip", (0.5, 0.0, 0.5), 1.2)), (-1.0, 0.6, 0.5), 1.0)
 add("cam", chain(3, constraints=vp.JointTie("joint3", "joint1", (0.1, 0.5, -0.3, 0.2))), (-1.0, 0.6, 0.5), 1.0)

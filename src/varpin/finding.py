@@ -79,9 +79,7 @@ def ranked(found: Iterable[Finding]) -> tuple[Finding, ...]:
     return tuple(kinds.values())
 
 
-def announce(
-    logger: logging.Logger, told: set[tuple[str, float, str | None]], dt: float, found: Sequence[Finding]
-) -> None:
+def announce(logger: logging.Logger, told: Told, dt: float, found: Sequence[Finding]) -> None:
     """Log one line: the worst finding, the first, and how many there are; each is told once for a scene and a step.
 
     ``told`` is :attr:`varpin.Scene.announced`, ``dt`` the time step [s].

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
+from mechanisms import crank_and_slider
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
@@ -244,23 +245,6 @@ def delta(place: float = 0.25) -> vp.Robot:
         model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
         end = pin.SE3(np.eye(3), np.array([0.5, 0.0, 0.0]))
         model.addFrame(pin.Frame(f"end{k}", joint, 0, end, pin.FrameType.OP_FRAME))
-    return vp.load_robot(model)
-
-
-def crank_and_slider() -> vp.Robot:
-    """A crank of 0.3 m, a connecting rod of 1 m; and a block on rails along x."""
-    model = pin.Model()
-    model.name = "slider-crank"
-    place, joint = pin.SE3.Identity(), 0
-    for k, length in enumerate((0.3, 1.0)):
-        joint = model.addJoint(joint, pin.JointModelRY(), place, f"joint{k}")
-        rod = pin.Inertia(1.0, np.array([0.5 * length, 0.0, 0.0]), np.diag([0.0, 1.0, 1.0]) * length**2 / 12.0)
-        model.appendBodyToJoint(joint, rod, pin.SE3.Identity())
-        place = pin.SE3(np.eye(3), np.array([length, 0.0, 0.0]))
-    model.addFrame(pin.Frame("tip", joint, 0, place, pin.FrameType.OP_FRAME))
-    block = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "block")
-    model.appendBodyToJoint(block, pin.Inertia(2.0, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity())
-    model.addFrame(pin.Frame("pin", block, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
     return vp.load_robot(model)
 
 

@@ -54,9 +54,9 @@ Stretch stretch_of(In<3> curves, In<3> sums, In<2> places) {
         copied(places)};
 }
 
-std::tuple<Out, Out> propagated_errors(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within, double dt,
-                                       const Stretch& narrow, const Stretch* wide, double damping,
-                                       std::int64_t damped_at, In<1> most_q, In<1> most_v) {
+Out propagated_errors(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within, double dt,
+                      const Stretch& narrow, const Stretch* wide, double damping, std::int64_t damped_at, In<1> most_q,
+                      In<1> most_v) {
     const auto n = static_cast<std::size_t>(mechanism.dof()), m = static_cast<std::size_t>(mechanism.controls);
     const std::size_t steps = u.shape(0), stages = within.shape(1);
     for (const auto& [array, name] : {std::pair{&q, "q"}, {&v, "v"}}) require(*array, name, {steps + 1, n});
@@ -69,14 +69,14 @@ std::tuple<Out, Out> propagated_errors(const Mechanism& mechanism, In<2> q, In<2
     if (static_cast<std::size_t>(narrow.stages) != stages || (wide && wide->stages != narrow.stages))
         throw std::invalid_argument("narrow and wide must have the stages of the controls");
     if (damped_at < 2) throw std::invalid_argument("damped_at must be at least 2");
-    Propagated found;
+    std::vector<double> found;
     {
         nb::gil_scoped_release release;
         const Record record{static_cast<std::int64_t>(steps), q.data(), v.data(), u.data(), dt};
         Clearance clearance(mechanism, record, stages > 0 ? within.data() : nullptr, narrow, wide, damping, damped_at);
         found = clearance.errors(most_q.data(), most_v.data());
     }
-    return {array_of(found.q.data(), {n}), array_of(found.v.data(), {n})};
+    return array_of(found.data(), {n});
 }
 
 std::tuple<bool, bool, bool> inside_bounds(const Mechanism& mechanism, In<2> q, In<2> v, In<2> u, In<3> within,

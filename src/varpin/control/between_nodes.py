@@ -16,8 +16,9 @@ import numpy as np
 from varpin.arrays import Floats, Integers, Mask
 from varpin.control.constraints import BoundBetween, BoundConstraint, BoundOnCubics, Horizon, PlanConstraint
 from varpin.control.parts import Parts
-from varpin.control.problem import OptimalControlProblem, cubics
+from varpin.control.problem import OptimalControlProblem
 from varpin.mechanics.scene import quiet
+from varpin.signals.commands import cubics
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
 

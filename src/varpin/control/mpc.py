@@ -514,7 +514,8 @@ def _whole_ticks(duration: float, ticks: int, period: float) -> tuple[Finding, .
 
 def _so_far(plant: Plant, parts: Sequence[Trajectory], found: tuple[Finding, ...]) -> Trajectory:
     """The plant's motion so far, with its warnings and those of ``found``."""
-    return chained(parts).changed(warnings=(*beyond_limits(plant.scene, chained(parts)), *found))
+    motion = chained(parts)
+    return motion.changed(warnings=(*beyond_limits(plant.scene, motion), *found))
 
 
 def _behind(seconds: Floats, period: float) -> tuple[Finding, ...]:

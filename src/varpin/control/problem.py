@@ -37,6 +37,7 @@ from varpin.integrators import Gauss, Integrator, Radau
 from varpin.integrators.same_scene import require_motion
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
+from varpin.signals.commands import cubics
 from varpin.signals.inputs import as_moved
 from varpin.signals.policy import LinearPolicy, OpenLoop
 from varpin.simulation.choice import usual_kick
@@ -835,16 +836,6 @@ def _rule(sampling: str, dt: float, *, cubic: bool) -> tuple[Floats, Floats]:
         inner, outer = np.sqrt((1.0 + np.array([-2.0, 2.0]) / np.sqrt(5.0)) / 3.0)
         places = 0.5 + 0.5 * np.array([-outer, -inner, inner, outer])
     return places, np.column_stack([np.full(len(places), 1.0 / len(places)), cubics(places, dt)])
-
-
-def cubics(places: Floats, dt: float) -> Floats:
-    """Coefficients (s, 8) of (q0, v0, q1, v1) for q, then for v, at ``places`` (s,) on the cubic through a step."""
-    rows = []
-    for s in places:
-        position = [(1 + 2 * s) * (1 - s) ** 2, dt * s * (1 - s) ** 2, s**2 * (3 - 2 * s), dt * s**2 * (s - 1)]
-        slope = 6 * s * (1 - s) / dt
-        rows.append([*position, -slope, (1 - s) * (1 - 3 * s), slope, s * (3 * s - 2)])
-    return np.array(rows)
 
 
 def _times(places: Floats, steps: int, dt: float) -> Floats:

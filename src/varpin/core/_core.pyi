@@ -642,13 +642,13 @@ def propagated_errors(
     damped_at: int,
     most_q: Floats,
     most_v: Floats,
-) -> tuple[Floats, Floats]:
-    """The largest errors of q and v (n,) at the nodes (N + 1, n) of a motion, from the defects of its steps.
+) -> Floats:
+    """The largest errors of q (n,) at the nodes (N + 1, n) of a motion, from the defects of its steps.
 
-    They are infinite where they are not known or exceed ``most_q`` and ``most_v`` (n,). The controls are u (N, m), and
-    those at the stages of each step ``within`` (N, s, m), s = 0 for controls that are constant over each; ``narrow`` is
-    a stretch of one step, ``wide`` of two. Along single steps errors are not known where one of ``damped_at`` nodes has
-    dampers faster than ``damping`` / dt.
+    They are infinite where they are not known, or where those of q exceed ``most_q`` or those of v ``most_v`` (n,). The
+    controls are u (N, m), and those at the stages of each step ``within`` (N, s, m), s = 0 for controls that are
+    constant over each; ``narrow`` is a stretch of one step, ``wide`` of two. Along single steps errors are not known
+    where one of ``damped_at`` nodes has dampers faster than ``damping`` / dt.
     """
 
 def inside_bounds(

@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core import Watch
@@ -121,13 +120,6 @@ class Integrator(ABC):
         A method with one stage holds the control at the middle of the step.
         """
         return ()
-
-    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128] | None:  # noqa: ARG002 - as others'
-        """The factor (k,) of one step of h on the mode exp(lambda t) of a linear system, at z = h lambda (k,).
-
-        The exact factor is exp(z). None where it is unknown.
-        """
-        return None
 
     @property
     def left(self) -> float:

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.integrators.tableau import stability
 from varpin.integrators.variational import Guard, Variational
 from varpin.support.checks import count
 
@@ -45,11 +43,6 @@ class Collocation(Variational):
 
     def _times(self) -> Floats:
         return self._coefficients()[2]
-
-    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """See :meth:`Integrator.amplification`."""
-        a, b, _ = self._coefficients()
-        return stability(a, b, z)
 
     def after_held(self, Z: Floats) -> Floats:
         """Derivatives (n, n) of momenta after a step in an impulse that is held over it.

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin import core
 from varpin.arrays import Floats
@@ -202,15 +201,6 @@ class SemiImplicitEuler(_Explicit):
     method: ClassVar[ExplicitMethod] = ExplicitMethod.semi_implicit
     order = 1
 
-    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """See :meth:`Integrator.amplification`; of v' = (z + z~) v - z z~ q, the root that is closest to exp(z)."""
-        damped, pulled = 2.0 * z.real, np.abs(z) ** 2
-        half = 0.5 * (2.0 + damped - pulled)
-        root = np.sqrt((half**2 - 1.0 - damped).astype(np.complex128))
-        both = np.array([half + root, half - root])
-        nearest = np.abs(both - np.exp(z)).argmin(axis=0)
-        return np.asarray(both[nearest, np.arange(len(z))])
-
 
 @dataclass(frozen=True)
 class RungeKutta4(_Explicit):
@@ -219,10 +209,6 @@ class RungeKutta4(_Explicit):
     method: ClassVar[ExplicitMethod] = ExplicitMethod.runge_kutta
     order = 4
     stage_times = (0.0, 0.5, 1.0)
-
-    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """See :meth:`Integrator.amplification`."""
-        return 1.0 + z * (1.0 + z / 2.0 * (1.0 + z / 3.0 * (1.0 + z / 4.0)))
 
     def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize_with_ramps`."""

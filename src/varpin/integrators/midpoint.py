@@ -10,7 +10,6 @@ from typing import Literal
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.core import Tableau
@@ -81,7 +80,3 @@ class Midpoint(Variational):
 
     def _times(self) -> Floats:
         return np.array([float(self.alpha)])
-
-    def amplification(self, z: NDArray[np.complex128]) -> NDArray[np.complex128] | None:
-        """See :meth:`Integrator.amplification`; None unless alpha = 1/2."""
-        return (1.0 + 0.5 * z) / (1.0 - 0.5 * z) if self.alpha == 0.5 else None

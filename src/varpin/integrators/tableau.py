@@ -4,7 +4,6 @@ import functools
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.core import Tableau
@@ -102,10 +101,3 @@ def lobatto_places(stages: int) -> Floats:
     places[-1] = weights
     places.setflags(write=False)
     return places
-
-
-def stability(a: Floats, b: Floats, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """The stability function 1 + z b' (1 - z A)^-1 1 (k,) of a Runge-Kutta method at z (k,)."""
-    stages = np.linalg.solve(np.eye(len(b)) - z[:, None, None] * a, np.ones((len(z), len(b), 1)))
-    values: NDArray[np.complex128] = 1.0 + z * (stages[..., 0] @ b)
-    return values

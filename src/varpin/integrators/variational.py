@@ -42,7 +42,7 @@ from varpin.integrators.base import (
 )
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
-from varpin.signals.commands import contiguous, control_of, ends_of, first_of, steps_of
+from varpin.signals.commands import contiguous, control_of, cubics, ends_of, first_of, steps_of
 from varpin.signals.inputs import in_parts_of_steps, prescribing, with_ends
 from varpin.support.checks import count, fraction, is_one_of, positive
 from varpin.trajectory import MOST_HALVINGS, Bytes, Trajectory
@@ -504,15 +504,13 @@ class Variational(Integrator):
 
         With noise that step starts from another momentum, so the guess is the velocity at its start.
         """
-        q, v, c = trajectory.q, trajectory.v, self._times()[None, :, None]
+        v, moved, times = trajectory.v, np.diff(trajectory.q, axis=0), self._times()
         if trajectory.noisy:
-            return v[:-1, None] + np.zeros_like(c)
-        mean = ((q[1:] - q[:-1]) / trajectory.dt)[:, None]
-        if c.size == 1:
-            return mean  # the exact root for one stage
-        guess: Floats = (
-            (1.0 - c) * (1.0 - 3.0 * c) * v[:-1, None] + c * (3.0 * c - 2.0) * v[1:, None] + 6.0 * c * (1.0 - c) * mean
-        )
+            return np.repeat(v[:-1, None], len(times), axis=1)
+        if len(times) == 1:
+            return (moved / trajectory.dt)[:, None]  # the exact root for one stage
+        along = cubics(times, trajectory.dt)[:, 5:]
+        guess: Floats = np.einsum("se,kne->ksn", along, np.stack([v[:-1], moved, v[1:]], axis=2))
         return guess
 
     @abstractmethod

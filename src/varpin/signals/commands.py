@@ -57,12 +57,11 @@ class Lines(NamedTuple):
 def lines(commands: Commands, ends: Floats, times: Sequence[float]) -> Lines:
     """The controls within each step of ``commands`` that are linear between nodes.
 
-    ``ends`` (N, m) are the recorded controls at the end of each step's decision, ``times`` are
-    those of the method's stages.
+    ``ends`` (N, m) are the recorded controls at the end of each step's decision, ``times`` those of
+    the method's stages.
     """
     steps = np.arange(len(ends))
     begins = np.vstack([commands.before[:1], ends])[steps - steps % commands.hold]
-
     mean, after = on_lines(begins, ends, commands.hold, (0.5, 1.0)).swapaxes(0, 1)
     return Lines(mean.copy(), on_lines(begins, ends, commands.hold, times), np.vstack([commands.before[:1], after]))
 
@@ -160,6 +159,16 @@ def interpolation(nodes: Floats, at: Floats) -> Floats:
             if k != j:
                 values[:, j] *= (at - nodes[k]) / (nodes[j] - nodes[k])
     return values
+
+
+def cubics(places: Floats, dt: float) -> Floats:
+    """Coefficients (s, 8) of (q0, v0, q1, v1) for q, then for v, at ``places`` (s,) on the cubic through a step."""
+    rows = []
+    for s in places:
+        position = [(1 + 2 * s) * (1 - s) ** 2, dt * s * (1 - s) ** 2, s**2 * (3 - 2 * s), dt * s**2 * (s - 1)]
+        slope = 6 * s * (1 - s) / dt
+        rows.append([*position, -slope, (1 - s) * (1 - 3 * s), slope, s * (3 * s - 2)])
+    return np.array(rows)
 
 
 @functools.cache

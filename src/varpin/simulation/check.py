@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -91,12 +92,11 @@ def check(
     if noise_unknown(scene, integrator, trajectory):
         text = "the error is not known: a repetition cannot have this noise. Use kick='held'"
         return trajectory.changed(warnings=(Finding("error", text), *beyond_limits(scene, trajectory)))
-    proven = proven_error(scene, integrator, trajectory) if resolved and not held_mean else None
+    # A function of time would be called again for parts of a step, at whatever time the error is asked for.
+    calls = isinstance(controls, OpenLoop) and closer(scene, integrator, trajectory, sampled=True)[1] > 1
+    proven = proven_error(scene, integrator, trajectory) if resolved and not (held_mean or calls) else None
     repeat = functools.partial(repeated, scene, integrator, trajectory, controls, restart)
     found: tuple[Finding, ...] = ()
-    if isinstance(controls, OpenLoop) and closer(scene, integrator, trajectory, sampled=True)[1] > 1:
-        # Its function would be called again, at whatever time the error is asked for.
-        proven = None
     if proven is not None:
         motion = trajectory.with_error(lambda: distance(repeat(), trajectory)[0], proven)
     else:
@@ -105,7 +105,7 @@ def check(
             fed = isinstance(controls, LinearPolicy) and not integrator.variational
             found = error_findings(scene, integrator, trajectory, off, speed_off, fed=fed)
             if found and hold and (law := law_of(scene, trajectory, hold)) is not None:
-                off, speed_off = distance(_under_law(scene, integrator, trajectory, law, hold), trajectory)
+                off, speed_off = distance(repeat(law=_limited(scene, law, trajectory, hold), hold=hold), trajectory)
                 found = error_findings(scene, integrator, trajectory, off, speed_off)
             found = found or short_forces(scene, integrator, trajectory)
         except (CustomForceError, CustomConstraintError) as error:
@@ -158,11 +158,18 @@ def _kick(integrator: Integrator) -> Literal["left", "split", "held"]:
 
 
 def repeated(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, controls: Controls | Commands = None, restart: int = 0
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    controls: Controls | Commands = None,
+    restart: int = 0,
+    law: Callable[[Floats, Floats], Floats] | None = None,
+    hold: int = 1,
 ) -> tuple[Floats, Floats, float]:
     """A motion repeated by the method of :func:`closer`: q and v (N + 1, n), NaN where it failed; and its share.
 
-    The arguments are those of :func:`check`.
+    The arguments are those of :func:`check`. A ``law`` of q and v (n,) replaces the controls: it acts on the states of
+    the repetition, every ``hold`` steps.
     """
     fed = isinstance(controls, LinearPolicy) or (isinstance(controls, Commands) and len(controls.gains) > 0)
     method, parts, left = closer(scene, integrator, trajectory, fed=fed, sampled=isinstance(controls, OpenLoop))
@@ -170,26 +177,30 @@ def repeated(
     q[0], v[0] = trajectory.q[0], trajectory.v[0]
     commands = _commands(scene, integrator, method, trajectory, controls, parts)
     drawn, kicks = _noise(scene, integrator, method, trajectory, parts)
-    drift = method.drift_share * np.repeat(drifts(scene, trajectory), parts, axis=0)[None] if _drifts(scene) else None
+    drift = scene.no_drift
+    if scene.noise.velocity_dependent:
+        drift = method.drift_share * np.repeat(drifts(scene, trajectory), parts, axis=0)[None]
     try:
         state, (last,) = method.start(scene, q[:1], v[:1])
     except (SingularMassMatrix, AssemblyError):
         return q, v, left
-    chunk = (restart or max(1, _CHUNK // (len(q[0]) * parts * commands.hold)) * commands.hold) * parts
-    done = 0
-    for first in range(0, trajectory.steps * parts, chunk):
-        taken = slice(first, first + chunk)
+    longest = max(1, _CHUNK // (len(q[0]) * parts * commands.hold)) * commands.hold
+    chunk, steps, done = (restart or (longest if law is None else hold)) * parts, trajectory.steps * parts, 0
+    for first in range(0, steps, chunk):
+        taken = slice(first, min(first + chunk, steps))
         if restart and first:
             state, _ = method.start(scene, trajectory.q[done : done + 1], trajectory.v[done : done + 1])
-        block = rows(
-            commands, first // commands.hold, -(-taken.stop // commands.hold), last.u[None, -1] if first else None
-        )
+        if law is not None:
+            block = open_loop(law(q[done], v[done])[None])._replace(hold=taken.stop - first)
+        else:
+            before = last.u[None, -1] if first else None
+            block = rows(commands, first // commands.hold, -(-taken.stop // commands.hold), before)
         (last,) = method.rollout_compiled(
             scene,
             state,
             block,
-            drawn[:, taken] if len(drawn) else drawn,
-            scene.no_drift if drift is None else np.ascontiguousarray(drift[:, taken]),
+            np.ascontiguousarray(drawn[:, taken]) if len(drawn) else drawn,
+            np.ascontiguousarray(drift[:, taken]) if len(drift) else drift,
             trajectory.dt / parts,
             None if kicks is None else np.ascontiguousarray(kicks[:, taken]),
         )
@@ -200,10 +211,6 @@ def repeated(
         if last.failure is not None:
             break
     return q, v, left
-
-
-def _drifts(scene: Scene) -> bool:
-    return bool(scene.noise.velocity_dependent)
 
 
 def _commands(
@@ -236,39 +243,14 @@ def _commands(
     return prescribing(scene, changing(within, times), held.u)
 
 
-def _under_law(
-    scene: Scene, integrator: Integrator, trajectory: Trajectory, law: Law, hold: int
-) -> tuple[Floats, Floats, float]:
-    """:func:`repeated` under a law that acts on the states of the repetition, within the limits of the record."""
-    method, parts, left = closer(scene, integrator, trajectory)
-    q, v = np.full((2, *trajectory.q.shape), np.nan)
-    q[0], v[0], u = trajectory.q[0], trajectory.v[0], trajectory.u
+def _limited(scene: Scene, law: Law, trajectory: Trajectory, hold: int) -> Callable[[Floats, Floats], Floats]:
+    """A law within the limits of the record: the ends of its range, where it is there for more than a period."""
+    u = trajectory.u
     low, high = (
         np.where((u == end).sum(axis=0) > hold, end, far)
         for end, far in ((u.min(axis=0), -np.inf), (u.max(axis=0), np.inf))
     )
-    drawn, kicks = _noise(scene, integrator, method, trajectory, parts)
-    state, _ = method.start(scene, q[:1], v[:1])
-    for first in range(0, trajectory.steps, hold):
-        steps = min(hold, trajectory.steps - first)
-        taken = slice(first * parts, (first + steps) * parts)
-        command = np.clip(law.control(scene, q[first], v[first]), low, high)
-        (last,) = method.rollout_compiled(
-            scene,
-            state,
-            open_loop(command[None])._replace(hold=steps * parts),
-            np.ascontiguousarray(drawn[:, taken]) if len(drawn) else drawn,
-            scene.no_drift,
-            trajectory.dt / parts,
-            None if kicks is None else np.ascontiguousarray(kicks[:, taken]),
-        )
-        if last.failure is not None:
-            break
-        q[first + 1 : first + steps + 1], v[first + 1 : first + steps + 1] = (
-            last.q[parts - 1 :: parts],
-            last.v[parts - 1 :: parts],
-        )
-    return q, v, left
+    return lambda q, v: np.clip(law.control(scene, q, v), low, high)
 
 
 def noise_unknown(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> bool:
@@ -336,7 +318,7 @@ def error_findings(
     share = float(shares[:, joint].max())
     if share > TOLD:
         worst, first = int(shares[:, joint].argmax()), int((shares > TOLD).any(axis=1).argmax())
-        unit = "m" if scene.robot.slides[joint] else "rad"
+        unit = joint_unit(scene.robot, joint)
         value = float(off[worst, joint])
         part = f", {100.0 * share:.2g} % of the largest travel" if share < 1.0 else ""
         where = f"(joint {names[joint]!r}, right until t = {t[first - 1]:.3g} s)"

@@ -9,7 +9,7 @@ from varpin.integrators import Integrator
 from varpin.integrators.base import noise_impulses
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import shares
+from varpin.signals.commands import cubics, shares
 from varpin.trajectory import Trajectory
 
 
@@ -43,13 +43,12 @@ def _works(
     h, before, after = trajectory.dt, trajectory.v[:-1] + kicked, trajectory.v[1:]
     with np.errstate(over="ignore", invalid="ignore"):
         displacement = np.diff(trajectory.q, axis=0)
-        force = _applied(scene, trajectory)
+        force = np.ascontiguousarray(trajectory.u @ scene.actuation.T)
         work = force * displacement
         if trajectory.u_stages.shape[1]:
-            c = np.array(integrator.stage_times)[:, None]
             rest = (trajectory.u_stages - trajectory.u[:, None]) @ scene.actuation.T
-            speed = (1.0 - c) * (1.0 - 3.0 * c) * before[:, None] + c * (3.0 * c - 2.0) * after[:, None]
-            speed = speed + 6.0 * c * (1.0 - c) * (displacement / h)[:, None]
+            along = cubics(np.array(integrator.stage_times), h)[:, 5:]
+            speed = np.einsum("se,ekn->ksn", along, np.stack([before, displacement, after]))
             work = work + h * np.einsum("s,ksn->kn", shares(integrator.stage_times), rest * speed)
         even = (displacement / h) ** 2
         heat = h * np.minimum((before**2 + before * after + after**2) / 3.0, even) * scene.damping
@@ -67,8 +66,3 @@ def _kicks(scene: Scene, trajectory: Trajectory) -> tuple[Floats | float, Floats
     impulse = noise_impulses(scene, trajectory, q, v)
     change = np.einsum("kij,kj->ki", accelerations(scene, q, v, np.zeros_like(q))[3], impulse)
     return change, impulse * (v + 0.5 * change)
-
-
-def _applied(scene: Scene, trajectory: Trajectory) -> Floats:
-    """Constant forces of the controls in each step (N, n)."""
-    return np.ascontiguousarray(trajectory.u @ scene.actuation.T)

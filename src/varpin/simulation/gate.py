@@ -51,7 +51,7 @@ def proven_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         return None
     times = integrator.stage_times if trajectory.u_stages.shape[1] else ()
     narrow, wide = _stretches(times, integrator.order <= _SHORT_STEPS)
-    off, _ = propagated_errors(
+    off = propagated_errors(
         scene.core,
         trajectory.q,
         trajectory.v,

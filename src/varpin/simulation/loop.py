@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.errors import AssemblyError, LinearizationError, SingularMassMatrix
 from varpin.finding import Finding
 from varpin.mechanics.assembly import nearest
@@ -99,16 +99,16 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
         trajectory: A motion under feedback.
         hold: The period of the feedback in steps.
     """
-    period, at = hold * trajectory.dt, np.arange(0, trajectory.steps, hold)
-    x, u = np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at]
+    period, (at, x, u) = hold * trajectory.dt, _decisions(trajectory, hold)
     if len(at) < 3 or not np.ptp(u, axis=0).any():
         return ()
+    law = law_of(scene, trajectory, hold)
+    found: tuple[Finding, ...] = ()
     with np.errstate(all="ignore"):
         try:
-            law = None if scene.inputs else _law(scene, x, u)  # commands of inputs are positions
             found = () if law is None else _by_theory(scene, law, period)
         except (np.linalg.LinAlgError, LinearizationError):
-            law, found = None, ()
+            law = None
         if law is None and not trajectory.dw.any():
             found = _from_limit_to_limit(scene, x, u, trajectory.t[at], period)
         return found or _by_growth(scene, trajectory, u, period)
@@ -116,14 +116,21 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
 
 def law_of(scene: Scene, trajectory: Trajectory, hold: int) -> Law | None:
     """The law of a motion under feedback every ``hold`` steps, if its record tells it."""
-    at = np.arange(0, trajectory.steps, hold)
+    at, x, u = _decisions(trajectory, hold)
+    # Commands of kinematic inputs are positions.
     if scene.inputs or len(at) < 3:
         return None
     with np.errstate(all="ignore"):
         try:
-            return _law(scene, np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at])
-        except np.linalg.LinAlgError:
+            return _law(scene, x, u)
+        except (np.linalg.LinAlgError, LinearizationError):
             return None
+
+
+def _decisions(trajectory: Trajectory, hold: int) -> tuple[Integers, Floats, Floats]:
+    """The nodes (P,) at which a period begins, the states (q, v) (P, 2n) there, and the controls (P, m)."""
+    at = np.arange(0, trajectory.steps, hold)
+    return at, np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at]
 
 
 def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:

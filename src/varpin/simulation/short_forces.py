@@ -7,7 +7,7 @@ import numpy as np
 from varpin.finding import Finding
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import shares
+from varpin.signals.commands import cubics, shares
 from varpin.simulation.scales import travel_scales
 from varpin.trajectory import Trajectory
 
@@ -34,13 +34,12 @@ def short_forces(scene: Scene, integrator: Integrator, trajectory: Trajectory) -
         return ()
     times = integrator.stage_times or (0.5,)
     x, weights = np.polynomial.legendre.leggauss(_POINTS)
-    c = np.concatenate([np.array(times), 0.5 * (1.0 + x)])[:, None]
     q, v, dt = trajectory.q, trajectory.v, trajectory.dt
+    along = cubics(np.concatenate([np.array(times), 0.5 * (1.0 + x)]), dt)
     missed = np.zeros((trajectory.steps, q.shape[1]))
     for k in np.unique(np.linspace(0, trajectory.steps - 1, _MOST).astype(np.int64)).tolist():
-        way = (q[k + 1] - q[k]) / dt
-        at = q[k] + dt * (c * (1.0 - c) ** 2 * v[k] - c**2 * (1.0 - c) * v[k + 1] + c**2 * (3.0 - 2.0 * c) * way)
-        rate = (1.0 - c) * (1.0 - 3.0 * c) * v[k] + c * (3.0 * c - 2.0) * v[k + 1] + 6.0 * c * (1.0 - c) * way
+        ends = np.stack([v[k], q[k + 1] - q[k], v[k + 1]])
+        at, rate = q[k] + along[:, 1:4] @ ends, along[:, 5:] @ ends
         found = np.array([force(*state, False)[0] for state in zip(at, rate, strict=True)])
         missed[k] = dt * (0.5 * weights @ found[len(times) :] - shares(times) @ found[: len(times)])
     speeds = np.abs(np.linalg.solve(scene.core.jets(q[:-1].copy(), v[:-1].copy())[0], missed[:, :, None])[:, :, 0])

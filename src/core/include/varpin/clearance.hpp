@@ -40,12 +40,6 @@ struct Stretch {
     int node(int j) const { return j * (points - 1) / steps; }
 };
 
-// Largest errors of q and of v at the nodes of a motion (n), from the defects of its steps. Infinite where they are not
-// known, as along steps that dampers outpace.
-struct Propagated {
-    std::vector<double> q, v;
-};
-
 class Clearance {
   public:
     // `wide` is a stretch of two steps, or null. `damping` are rates of dampers along single steps, in units of 1 / h,
@@ -80,11 +74,12 @@ class Clearance {
         for (auto* rows : {&step_q_, &step_v_}) rows->resize(steps * n_);
     }
 
-    // The errors, as long as none exceeds `most_q` and `most_v` (n): a motion that is that wrong is not clearly right.
-    Propagated errors(const double* most_q, const double* most_v) {
-        Propagated found = propagated(most_q, most_v);
+    // The largest errors of q at the nodes (n), from the defects of the steps. Infinite where they are not known, as
+    // along steps that dampers outpace, or where some exceed `most_q` or, of v, `most_v` (n).
+    std::vector<double> errors(const double* most_q, const double* most_v) {
+        std::vector<double> found = propagated(most_q, most_v);
         // Controls may have kinks at the nodes.
-        if (!(found.q.empty() || std::isfinite(found.q[0])) && wide_ && within_) {
+        if (!(found.empty() || std::isfinite(found[0])) && wide_ && within_) {
             wide_ = nullptr;
             found = propagated(most_q, most_v);
         }
@@ -132,10 +127,9 @@ class Clearance {
 
     // The error e of the motion from its defects l: e -> Phi e + l, with the flow Phi of the motion linearized in the
     // middle of each few steps, by the implicit midpoint rule.
-    Propagated propagated(const double* most_q, const double* most_v) {
-        const double unknown = std::numeric_limits<double>::infinity();
-        const Propagated none{std::vector<double>(n_, unknown), std::vector<double>(n_, unknown)};
-        Propagated found{std::vector<double>(n_, 0.0), std::vector<double>(n_, 0.0)};
+    std::vector<double> propagated(const double* most_q, const double* most_v) {
+        const std::vector<double> none(n_, std::numeric_limits<double>::infinity());
+        std::vector<double> found(n_, 0.0);
         std::fill(error_q_.begin(), error_q_.end(), 0.0);
         std::fill(error_v_.begin(), error_v_.end(), 0.0);
         from_ = until_ = -1;
@@ -146,9 +140,8 @@ class Clearance {
             for (int c = 0; c < n_; ++c) {
                 error_q_[c] += step_q_[(k - from_) * n_ + c];
                 error_v_[c] += step_v_[(k - from_) * n_ + c];
-                found.q[c] = larger(found.q[c], std::abs(error_q_[c]));
-                found.v[c] = larger(found.v[c], std::abs(error_v_[c]));
-                if (!(found.q[c] <= most_q[c] && found.v[c] <= most_v[c])) return none;
+                found[c] = larger(found[c], std::abs(error_q_[c]));
+                if (!(found[c] <= most_q[c] && std::abs(error_v_[c]) <= most_v[c])) return none;
             }
         }
         return found;
