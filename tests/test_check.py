@@ -125,7 +125,7 @@ def test_error(name, integrator):
 def right():
     """A motion that the gate lets pass, whose error is not yet computed."""
     motion = moved(FREE, dt=0.005, steps=100)
-    assert "error below" in repr(motion)
+    assert "error about" in repr(motion)
     assert 0.0 < motion.error_bound < 1e-4
     return motion
 
@@ -139,8 +139,8 @@ def test_lazy_error(tmp_path):
     assert motion.error is known
     assert own.changed(warnings=()).error.tobytes() == known.tobytes()
     part = own.part(20, 60)
-    assert "error below" in repr(part)
-    assert "error below" in repr(own)
+    assert "error about" in repr(part)
+    assert "error about" in repr(own)
     assert part.error.tobytes() == known[20:61].tobytes()
     assert right().part(10, 90).part(10, 50).error.tobytes() == known[20:61].tobytes()
     for again in (pickle.loads(pickle.dumps(right())), vp.Trajectory.load(right().save(tmp_path / "motion.npz"))):
@@ -209,6 +209,31 @@ def test_feedback(integrator):
     if integrator != EULER:  # so far off that the check repeats it under the law, not under what was recorded
         motion = moved(FREE, integrator, controls=lambda t, q, v: gains @ np.append(q, v))
         agree(motion, finer(FREE, motion, np.repeat(motion.u, 16, axis=0)))
+
+
+@pytest.mark.parametrize(
+    ("robot", "force", "integrator", "dt", "speed"),
+    [
+        ("ur5", vp.CoulombFriction(0.5), RK4, 0.005, 1.0),
+        ("ur5", vp.JointStop(1e3, 5.0, -0.8, 0.8), None, 0.02, 2.0),
+        ("ur5", vp.JointStop(1e3, 5.0, -0.8, 0.8), RK4, 0.005, 2.0),
+        ("xarm7", vp.PositionServo(2e3, 20.0), None, 0.01, 0.0),
+    ],
+)
+def test_forces_sharper_than_the_step(robot, force, integrator, dt, speed):
+    """More stages resolve neither kinks nor the begin of a fast response: the repetition must not be off alike."""
+    scene = vp.Scene(vp.load_robot(robot), damping=0.2, friction=0, forces=force)
+    n = scene.robot.dof
+    controls = np.full(n, 0.7) if scene.servo_joints else None
+    for seed in range(4):
+        start = np.full(n, 0.5), speed * np.random.default_rng(seed).uniform(-1.0, 1.0, n)
+        motion = vp.simulate(scene, *start, dt=dt, steps=50, controls=controls, integrator=integrator)
+        fine = vp.simulate(
+            scene, *start, dt=dt / 64, steps=3200, controls=controls, integrator=vp.Radau(4), check=False
+        )
+        true = np.abs(motion.q - fine.q[::64]).max()
+        assert true > 1e-6
+        assert 0.8 < motion.error.max() / true < 1.25
 
 
 def test_upright():

@@ -1,7 +1,7 @@
 """The check of a finished motion: its error, from one repetition, and what is doubtful about it.
 
 A motion that is clearly right is let pass by :mod:`varpin.simulation.gate`. Any other motion is repeated as a whole
-from its start by a method of two stages more, under the same controls and the same noise. The distance between both is
+from its start by the method of :func:`closer`, under the same controls and the same noise. The distance between both is
 the error of the motion, up to the far smaller one of the repetition: :attr:`varpin.Trajectory.error`.
 """
 
@@ -103,10 +103,10 @@ def check(
         try:
             off, speed_off = distance(repeat(), trajectory)
             fed = isinstance(controls, LinearPolicy) and not integrator.variational
-            found = error_findings(scene, integrator, trajectory, off, speed_off, fed=fed)
+            found = error_findings(scene, integrator, trajectory, off, speed_off, fed=fed, hold=hold)
             if found and hold and (law := law_of(scene, trajectory, hold)) is not None:
                 off, speed_off = distance(repeat(law=_limited(scene, law, trajectory, hold), hold=hold), trajectory)
-                found = error_findings(scene, integrator, trajectory, off, speed_off)
+                found = error_findings(scene, integrator, trajectory, off, speed_off, hold=hold)
             found = found or short_forces(scene, integrator, trajectory)
         except (CustomForceError, CustomConstraintError) as error:
             off = np.full_like(trajectory.q, np.nan)
@@ -128,24 +128,26 @@ def closer(
 ) -> tuple[Integrator, int, float]:
     """The method of a repetition, its steps in one of the motion's, and the share of the motion's error that it has.
 
-    It has two stages more than a method of the motion's order has; Runge-Kutta's takes half of its step. Radau methods
-    damp what is faster than the step, so they do not share the ringing of others. They keep no constraints; those of
-    Gauss do. Feedback on (q, v), of controls that are ``fed`` back, needs a method on it: Runge-Kutta's.
+    It has two stages more than a method of the motion's order has. Radau methods damp what is faster than the step, so
+    they do not share the ringing of others. They keep no constraints; those of Gauss do. More stages resolve neither
+    kinks of forces nor what dampers take faster than the step, so scenes with forces and L-stable methods are repeated
+    in half steps, too. Runge-Kutta's method halves its step, and is the one for controls that are ``fed`` back on
+    (q, v); but functions of time that are ``sampled`` are not called again for it.
     """
     # Steps that guards divided are as many shorter ones.
     taken = np.maximum(trajectory.statistics.substeps, 1).sum() / max(trajectory.steps, 1)
-    parts = 1 << math.ceil(math.log2(max(1.0, taken)))
+    sharp = integrator.l_stable or scene.elements or scene.couplings or scene.custom is not None
+    parts = (2 if sharp else 1) << math.ceil(math.log2(max(1.0, taken)))
     if isinstance(integrator, Reference):
         factor = 0.1 if 0.1 * integrator.rtol >= TIGHTEST else 10.0
         other = Reference(factor * integrator.rtol, None if integrator.atol is None else factor * integrator.atol)
         return other, 1, factor
-    if (isinstance(integrator, RungeKutta4) and not sampled) or (
-        trajectory.noisy and isinstance(integrator, ExplicitEuler)
-    ):
-        # Explicit Euler's kicks come after the step.
-        return integrator, 2, 0.5**integrator.order
-    if fed and not integrator.variational:
-        return RungeKutta4(), 2 * parts, 0.0
+    if trajectory.noisy and isinstance(integrator, ExplicitEuler):
+        # Its kicks come after the step.
+        return integrator, 2, 0.5
+    own = isinstance(integrator, RungeKutta4)
+    if (own and not sampled) or (fed and not integrator.variational):
+        return RungeKutta4(), 2 * parts, (2.0 * parts) ** -integrator.order if own else 0.0
     stages = (integrator.order + 1) // 2 + _MORE
     if stages > MOST_STAGES:
         stages, parts = MOST_STAGES, 2 * parts
@@ -303,11 +305,13 @@ def error_findings(
     speed_off: Floats,
     *,
     fed: bool = False,
+    hold: int = 0,
 ) -> tuple[Finding, ...]:
     """The warning of a motion's error, if it is large, from errors of q and v at its nodes (N + 1, n).
 
-    ``fed``: its controls are a policy on (q, v).
+    ``fed``: its controls are a policy on (q, v). ``hold`` is the period of its control law in steps, 0 for none.
     """
+    cure = functools.partial(_cure, scene, integrator, trajectory, fed=fed, hold=hold)
     known = np.asarray(np.isfinite(off).all(axis=1))
     last = int(known.argmin()) if not known.all() else len(known)
     names, t = trajectory.joint_names, trajectory.t
@@ -323,8 +327,9 @@ def error_findings(
         part = f", {100.0 * share:.2g} % of the largest travel" if share < 1.0 else ""
         where = f"(joint {names[joint]!r}, right until t = {t[first - 1]:.3g} s)"
         text = f"q is off by up to {value:.2g} {unit}{part} {where}. "
-        cure = _cure(scene, integrator, trajectory, share / TOLD, fed=fed)
-        return (Finding("error", text + cure, names[joint], time=float(t[first - 1]), value=value, unit=unit),)
+        return (
+            Finding("error", text + cure(share / TOLD), names[joint], time=float(t[first - 1]), value=value, unit=unit),
+        )
     # A jump that comes a part of a step too late is no error of the motion.
     lasting = np.minimum(speed_off[: last - 1], speed_off[1:last]) / speed
     if len(lasting) and lasting.max() > TOLD_VELOCITY:
@@ -335,8 +340,8 @@ def error_findings(
             f"the velocity of joint {names[joint]!r} is off by up to {value:.2g} {unit}, {100.0 * lasting.max():.2g} % "
             f"of its largest (t = {t[first]:.3g} s). "
         )
-        cure = _cure(scene, integrator, trajectory, float(lasting.max()) / TOLD_VELOCITY, fed=fed)
-        return (Finding("error", text + cure, names[joint], time=float(t[first]), value=value, unit=unit),)
+        text += cure(float(lasting.max()) / TOLD_VELOCITY)
+        return (Finding("error", text, names[joint], time=float(t[first]), value=value, unit=unit),)
     if last < len(known):
         text = (
             f"the error is not known from t = {t[last]:.3g} s on: a method of more stages fails there. Use a smaller dt"
@@ -345,22 +350,23 @@ def error_findings(
     return ()
 
 
-def _cure(scene: Scene, integrator: Integrator, trajectory: Trajectory, excess: float, *, fed: bool) -> str:
+def _cure(scene: Scene, integrator: Integrator, trajectory: Trajectory, excess: float, *, fed: bool, hold: int) -> str:
     """What reduces an error that exceeds its threshold by a factor ``excess``.
 
-    A policy on (q, v), which is ``fed`` back, takes no other method.
+    A policy on (q, v), which is ``fed`` back, takes no other method. A law with a period of ``hold`` steps keeps it.
     """
     if not (integrator.l_stable or scene.constraints) and damped_faster(scene, trajectory):
         return "Dampers are faster than the step: use integrator=varpin.Radau(4)"
     if isinstance(integrator, Reference):
         return "Use a smaller rtol"
     times = (max(excess, 1.0) / _AIM) ** (1.0 / integrator.order)
-    step = trajectory.dt / (10.0 if not times < 10.0 else max(2.0, math.ceil(times)))
+    parts = 10 if not times < 10.0 else max(2, math.ceil(times))
     stages = (integrator.order + 1) // 2 + _MORE
     family = "Radau" if integrator.l_stable else "Gauss"
     named = stages <= MOST_STAGES and not fed
     other = f"integrator=varpin.{family}({stages}) or " if named else ""
-    return f"Use {other}dt = {step:.2g} s"
+    period = f" with period={hold * parts}" if hold else ""
+    return f"Use {other}dt = {trajectory.dt / parts:.2g} s{period}"
 
 
 def damped_faster(scene: Scene, trajectory: Trajectory, turns: float = 2.0) -> bool:

@@ -22,8 +22,8 @@ from varpin.simulation.scales import speed_scales, travel_scales
 from varpin.trajectory import Trajectory
 
 # Largest propagated errors of q and v of a motion that is let pass, as shares of the travel and of the largest speed: a
-# third of what is told of. Of 152 random motions, and of chains by the midpoint rule, none had a true error above
-# 3.5 times the propagated one.
+# third of what is told of. Of 2142 random motions 2.7 % had a true error above four times the propagated one, in fast
+# chaotic ones up to 64 times, and none above 1 % of the travel.
 _TRAVEL, _SPEED, _SURE = 3e-3, 0.05, 4.0
 # Rates of dampers along single steps, in units of 1 / dt, and the number of nodes at which they are looked at.
 _RATE, _DAMPERS = 1.8, 6
@@ -39,10 +39,10 @@ _SHORT_STEPS = 4
 
 
 def proven_error(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> float | None:
-    """A bound of a motion's error [rad or m], if it is small beside the travel; None where that is not proven.
+    """Four times a motion's error to first order [rad or m], if it is small beside the travel; None where not known.
 
-    It is not under constraints and noise, with forces that have kinks or are in Python, and for integrators that choose
-    their own steps.
+    It is not known under constraints and noise, with forces that have kinks or are in Python, and for integrators that
+    choose their own steps.
     """
     if isinstance(integrator, Reference) or not trajectory.steps or scene.robot.dof > _JOINTS:
         return None

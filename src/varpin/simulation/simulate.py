@@ -97,8 +97,9 @@ def simulate(
             of linear controls, which are zero if left out, to replay or refine a path, see
             :mod:`varpin.mechanics.wiener`. 0 gives the motion without noise and without the warning.
         check: Find the error of the motion, ``Trajectory.error``, and what is doubtful, ``Trajectory.warnings``. Where
-            the record alone proves the motion right the check takes a third of the motion's time; else it repeats the
-            motion by a method of two stages more, which takes two to three times as long as the motion.
+            the record alone shows the motion right the check takes half of the motion's time; else it repeats the
+            motion by a method of two stages more, with forces and stiff methods in half steps, which takes two to five
+            times as long as the motion.
         progress: Called now and then with (steps done, steps in all). A function with three required arguments, such
             as :class:`varpin.LiveView`, also gets a :class:`varpin.Nodes` with the nodes since the last call, whose
             last node comes first again.
@@ -130,6 +131,7 @@ def simulate(
         controls = scene.command_at(q0)
     accuracy: Accuracy | None = None
     error: Floats | None = None
+    unmet: tuple[Finding, ...] = ()
     early = in_other_units(scene, q0, v0)
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
@@ -138,7 +140,6 @@ def simulate(
         span = duration_for_tolerance(dt, steps, duration)
         chosen = steps_for_tolerance(scene, q0, v0, span, tolerance, controls, integrator)
         integrator, steps, controls, accuracy, unmet, error = chosen
-        early = (*early, *unmet)
         dt = span / steps
     else:
         dt, steps = time_steps(dt, steps, duration, choosable=True)
@@ -180,7 +181,7 @@ def simulate(
     interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), hold, check=check)
     motion = record.trajectory()
     try:
-        found: list[Finding] = list(noise_forgotten(scene, rng, increments))
+        found: list[Finding] = [*unmet, *noise_forgotten(scene, rng, increments)]
         if check:
             function = controls if isinstance(controls, Sampled) else None
             whole = function is None or resolved(function, integrator)

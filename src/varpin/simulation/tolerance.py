@@ -19,7 +19,7 @@ from varpin.mechanics.scene import Scene
 from varpin.signals.commands import open_loop
 from varpin.signals.inputs import held_in_parts
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.check import distance, repeated
+from varpin.simulation.check import closer, distance, repeated
 from varpin.simulation.commands import Controls, commands_of, held_rows
 from varpin.simulation.failures import ToleranceError
 from varpin.simulation.functions import ControlLaw, Sampled, require_law
@@ -117,8 +117,9 @@ class _Search:
             if short_forces(self.scene, integrator, motion):
                 return Trial(steps, math.inf, float(work))
             again = repeated(self.scene, integrator, motion, controls)
-            # A repetition takes about twice the evaluations.
-            self.steps, self.evaluations = self.steps + steps, self.evaluations + 2 * int(work)
+            # Each step of a repetition takes about twice the evaluations.
+            parts = closer(self.scene, integrator, motion)[1]
+            self.steps, self.evaluations = self.steps + parts * steps, self.evaluations + 2 * parts * int(work)
         except (CustomForceError, CustomConstraintError, VarpinError) as error:
             if not isinstance(error, CustomForceError | CustomConstraintError) and not hasattr(error, "trajectory"):
                 raise
