@@ -452,3 +452,82 @@ def test_findings(tmp_path):
     for again in (loaded, pickle.loads(pickle.dumps(motion)).warnings):
         assert again == motion.warnings
         assert [vars(told) for told in again] == [vars(told) for told in motion.warnings]
+
+
+SLIDER = vp.Scene(slider(1.0), gravity=False)
+
+
+@pytest.mark.parametrize("method", [EULER, vp.Radau(1)], ids=str)
+def test_a_law_that_its_record_tells_acts_on_the_repetition(method):
+    scene, gains = vp.Scene(vp.planar_chain(1)), np.array([-20.0, -1.0])
+
+    def law(t, q, v):
+        return [gains @ [q[0], v[0]]]
+
+    motion = vp.simulate(scene, [1.0], [0.0], dt=0.04, steps=50, controls=law, integrator=method)
+    fine = vp.simulate(
+        scene, [1.0], [0.0], dt=0.0025, steps=800, controls=law, period=16, integrator=vp.Gauss(4), check=False
+    )
+    np.testing.assert_allclose(motion.error, np.abs(motion.q - fine.q[::16]), rtol=1e-2, atol=1e-6)
+
+
+def test_the_second_part_of_a_split_kick_has_the_field_at_the_end_of_its_step():
+    scene = vp.Scene(vp.planar_chain(2), noise=vp.StateNoise(3.0, center=np.zeros(2)))
+    kicked = vp.Gauss(5, kick="split")
+    motion = vp.simulate(scene, [0.3, 0.2], [1.0, 2.0], dt=0.01, steps=20, integrator=kicked, rng=1)
+    assert motion.error.max() < 1e-9
+
+
+def test_friction_that_turns_in_a_step_is_repeated_on_either_side():
+    scene = vp.Scene(slider(1.0), gravity=False, forces=vp.CoulombFriction(0.01, 0.1))
+    for speed in (1.0, -1.0):
+        motion = vp.simulate(scene, [0.0], [speed], dt=0.05, steps=20, controls=[-2.0 * speed])
+        assert motion.error_bound is None
+
+
+def test_one_step_has_a_bound():
+    scene = vp.Scene(slider(1.0), gravity=False, stiffness=30.0)
+    motion = vp.simulate(scene, [0.3], [1.0], dt=0.01, steps=1, integrator=RK4)
+    assert motion.error.max() < motion.error_bound < 10.0 * motion.error.max()
+
+
+def test_a_joint_that_hardly_turns_is_measured_by_the_others():
+    scene = vp.Scene(vp.planar_chain(2), gravity=False, stiffness=[0.0, 1e3])
+    assert not vp.simulate(scene, [0.0, 4e-5], [1.0, 0.0], dt=0.02, steps=50, integrator=MIDPOINT).warnings
+
+
+@pytest.mark.parametrize("begin", [0.0037, 0.2037])
+def test_a_blow_of_50_microseconds_has_its_impulse_with_breaks(begin):
+    """A force in Python takes one step at a time: breaks are counted from the start of the motion."""
+
+    def f(t):
+        return ((begin <= t) & (t < begin + 5e-5))[:, None] / 5e-5
+
+    push = vp.OpenLoop(f, vectorized=True, breaks=(begin, begin + 5e-5))
+    scene = vp.Scene(slider(1.0), gravity=False, forces=vp.CustomForce(lambda q, v: 0.0 * v))
+    motion = vp.simulate(scene, [0.0], [0.0], dt=0.01, steps=40, controls=push)
+    assert motion.v[-1, 0] == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_blow_of_a_millisecond_amid_a_long_step_has_its_impulse():
+    push = vp.OpenLoop(lambda t: [1e3 * (abs(t - 0.0665) < 5e-4)])
+    motion = vp.simulate(SLIDER, [0.0], [0.0], dt=0.019, steps=10, controls=push)
+    assert motion.v[-1, 0] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_ramp_is_the_polynomial_of_two_stages():
+    """Nothing has to be repeated."""
+    ramp = vp.OpenLoop(lambda t: [t - 0.5])
+    motion = vp.simulate(SLIDER, [0.3], [0.0], dt=0.1, steps=10, controls=ramp, integrator=vp.Gauss(2))
+    assert motion.error_bound is not None
+
+
+def test_efforts_within_a_step_are_told_on_either_side():
+    scene, told = vp.Scene(vp.load_robot("ur5"), gravity=False), []
+    for sign in (1.0, -1.0):
+        push = vp.OpenLoop(lambda t, sign=sign: sign * np.array([0, 0, 0, 0, 0, 28.0 + 400.0 * (t % 0.01)]))
+        rest = np.zeros(6)
+        motion = vp.simulate(scene, rest, rest, dt=0.01, steps=3, controls=push, integrator=vp.Gauss(3))
+        told.append([finding.value for finding in about(motion.warnings, "effort limits")])
+    assert told[0]
+    assert told[0] == pytest.approx(told[1])

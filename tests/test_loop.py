@@ -248,3 +248,12 @@ def test_a_step_that_fails_names_the_loop(kd):
     assert told(caught.value.trajectory)
     assert outgrown(np.array([[0.0], [1.0], [-50.0]]), 0.01)[0].value == 50.0
     assert outgrown(np.array([[1.0], [-5.0]]), 0.01) == outgrown(np.zeros((3, 1)), 0.01) == ()
+
+
+def test_a_law_that_comes_to_rest_but_for_blips_does_not_go_from_limit_to_limit():
+    def law(t, q, v):
+        k = round(t / 0.01)
+        return [(-1.0) ** k if k < 150 or k in (160, 175, 188) else 0.1 * np.sin(7.0 * t * t)]
+
+    motion = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.3], [0.0], dt=0.01, steps=200, controls=law)
+    assert not about(motion.warnings, KIND)

@@ -16,6 +16,7 @@ import varpin as vp
 from varpin.cli import main
 from varpin.integrators import integrator_of
 from varpin.simulation import tolerance as search
+from varpin.simulation.ladder import Rung, Trial
 
 REST = np.zeros(3)
 
@@ -303,3 +304,18 @@ def test_many_random_motions(script):
     assert len(verdicts) > 25
     assert np.mean([verdict.met for verdict in verdicts]) >= 0.95
     assert np.mean([verdict.ratio <= 2.0 for verdict in verdicts]) >= 0.95
+
+
+@pytest.mark.parametrize("duration", [0.3, 0.7])
+def test_an_earlier_step_that_divides_the_duration_is_taken(duration):
+    steps = next(n for n in range(5, 999) if duration / (duration / n) > n)
+    known = vp.Accuracy(1e-2, 1e-3, "Gauss(stages=3)", duration / steps, 0, 0)
+    motion = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.3], [0.0], duration=duration, tolerance=known)
+    assert motion.steps == steps
+
+
+def test_the_order_is_that_of_the_last_two_trials():
+    rung = Rung(vp.Gauss(2), 8, 1)
+    for steps, error in ((8, 1e-2), (16, 1e-2), (32, 1e-2 / 16)):
+        rung.add(Trial(steps, error, steps))
+    assert rung.order == pytest.approx(4.0)
