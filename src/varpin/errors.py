@@ -32,10 +32,12 @@ class RobotNotFound(RobotError):
         self.name = name
         known = sorted(known)
         self.matches = difflib.get_close_matches(name.lower(), known, n=5, cutoff=0.5)
-        hint = f"close matches: {', '.join(self.matches)}" if self.matches else f"known names: {', '.join(known)}"
+        hints = [f"close matches: {', '.join(self.matches)}"] if self.matches else []
+        if not (note or self.matches):
+            hints = ["varpin.robot_names() lists the names, such as " + ", ".join(known[:5])]
         if more and name.lower() not in known:
-            hint += f"; {more}"
-        super().__init__(f"no robot or URDF file {name!r}{note}; {hint}")
+            hints.append(more)
+        super().__init__("; ".join([f"no robot or URDF file {name[:100]!r}{note}", *hints]))
 
 
 class UnknownJoint(RobotError):
@@ -81,20 +83,20 @@ class SingularMassMatrix(RobotError):
         negative: Whether the inertia is negative.
     """
 
-    def __init__(self, joints: Iterable[str], q: object, *, negative: bool = False) -> None:
+    def __init__(
+        self, joints: Iterable[str], q: object = None, *, negative: bool = False, cause: str = "", hint: str = ""
+    ) -> None:
         self.joints = tuple(joints)
         self.negative = negative
-        moving = f"motion of {', '.join(map(repr, self.joints))} carries"
-        if negative:
-            super().__init__(
-                f"the mass matrix is not positive definite at q = {q}: {moving} negative inertia; correct the masses "
-                "and inertias of the links it moves, add armature to the joint, or lock it"
-            )
-        else:
-            super().__init__(
-                f"the mass matrix is singular at q = {q}: {moving} no inertia; give the links it moves mass and "
-                "inertia, add armature to the joint, or lock it"
-            )
+        more = f" and {len(self.joints) - 3} more" if len(self.joints) > 3 else ""
+        names = ", ".join(map(repr, self.joints[:3])) + more
+        kind, lack = ("not positive definite", "negative") if negative else ("singular", "no")
+        why = cause or (
+            f"motion of {names} carries {lack} inertia; "
+            + (hint or "give the links it moves mass and inertia, give the joint an armature, or lock it")
+        )
+        at = "" if q is None else f" at q = {q}"
+        super().__init__(f"the mass matrix is {kind}{at}: {why}")
 
 
 class InputError(VarpinError, ValueError):

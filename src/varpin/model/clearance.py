@@ -8,19 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
-from varpin.errors import InputError, RobotError
+from varpin.errors import InputError
 from varpin.model.hull import Hull, hull_around, mesh_points
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
 from varpin.model.robot import Robot, geometry
 from varpin.model.tree import place_of_frame, z_to
-from varpin.model.urdf import decoded, parsed
+from varpin.model.urdf import read_xml
 from varpin.support.checks import finite_array, over_time, positive, rotation_matrix
 from varpin.support.frozen import Frozen
 
@@ -427,10 +426,7 @@ def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
     """Pairs of links that an SRDF file excludes from collision checks."""
     if srdf is None:
         return set()
-    try:
-        root = parsed(decoded(srdf)[0])
-    except expat.ExpatError as error:
-        raise RobotError(f"{srdf} is not an SRDF: it is not well-formed XML: {error}") from None
+    root, _ = read_xml(srdf)
     pairs = {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
     links = {link for pair in pairs for link in pair}
     unknown = sorted(links - {frame.name for frame in robot.free_model.frames})

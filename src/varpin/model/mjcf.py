@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
-from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import RobotError
 from varpin.model.equalities import Closure, End, Equality, Gear
-from varpin.model.urdf import captured_stderr, decoded, parsed
+from varpin.model.urdf import captured_stderr, read_xml
 
 logger = logging.getLogger(__name__)
 
@@ -156,8 +155,8 @@ def root_tag(path: Path) -> str:
         FileError: The file cannot be read.
     """
     try:
-        return parsed(decoded(path)[0]).tag
-    except expat.ExpatError:
+        return read_xml(path)[0].tag
+    except RobotError:
         return ""
 
 
@@ -246,7 +245,7 @@ def build_mjcf_shapes(path: Path, looks: str, model: pin.Model) -> pin.GeometryM
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
     """
-    root = parsed(looks)
+    root, _ = read_xml(path, looks)
     files = {part.get("name", ""): part.get("file", "") for part in root.iterfind("asset/mesh")}
     absent = {name: file for name, file in files.items() if file and not Path(file).is_file()}
     lacking = {
@@ -279,10 +278,7 @@ def _included(path: Path, folder: Path, above: tuple[Path, ...]) -> ET.Element:
     """The root element of a file, with its includes expanded."""
     if path in above:
         raise RobotError(f"{path} includes itself")
-    try:
-        root = parsed(decoded(path)[0])
-    except expat.ExpatError as error:
-        raise RobotError(f"{path} is not an MJCF: it is not well-formed XML: {error}") from None
+    root, _ = read_xml(path)
     if root.tag not in ("mujoco", "mujocoinclude"):
         raise RobotError(f"{path} is not an MJCF: its root element is <{root.tag}>, not <mujoco>")
     for parent in root.iter():

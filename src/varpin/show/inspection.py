@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, product
 from typing import Literal
 
 import numpy as np
@@ -15,12 +16,12 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Guard, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.model import Robot, build_robot, check_inertia
+from varpin.model import Robot, build_robot, check_inertia, readable_geometry
 from varpin.model.additions import Base
-from varpin.model.inertia import fault, principal_moments
+from varpin.model.inertia import fault, one_of_each, principal_moments
 from varpin.model.mimic import joint_index
 from varpin.model.tree import is_unbounded, joint_axis
-from varpin.model.urdf import Urdf, read_urdf
+from varpin.model.urdf import Inertial, Urdf, listed, read_inertials, read_urdf
 from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
 from varpin.support.checks import JointValues, joint_array
 
@@ -33,6 +34,11 @@ CONDITION = 1e6
 # for an arm with all joints in one place.
 LENGTH_RATIO = 2.0
 LENGTH = 10.0
+# A radius of gyration beyond this multiple of the distance of a link's farthest point from its centre of mass is
+# impossible; motors may be left out of a shape, hence not 1.
+SIZE_RATIO = 1.5
+# Largest plausible extent of a link's shapes as a multiple of the arm's reach, and the least reach that counts [m].
+MESH_RATIO, LEAST_REACH = 10.0, 0.1
 # Density of osmium, the densest element [kg/m^3].
 DENSITY = 22_600.0
 
@@ -42,6 +48,7 @@ def inspect_robot(
     *,
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     lock: Mapping[str, ArrayLike] | None = None,
+    keep: Sequence[str] | None = None,
     mimic: Literal["tied", "free"] = "tied",
     q: JointValues | None = None,
     v: JointValues | None = None,
@@ -54,6 +61,7 @@ def inspect_robot(
     Main args:
         source: A source as for :func:`varpin.load_robot`, or a loaded robot.
         lock: Joints to lock, as for :func:`varpin.load_robot`.
+        keep: Joints that stay, as for :func:`varpin.load_robot`.
         q: Configuration of the report: one number, (n,) or by joint name [rad or m]; 0 if left out.
         v: Velocity of the report, likewise [rad/s or m/s]; 0 if left out.
 
@@ -70,13 +78,15 @@ def inspect_robot(
             given with a loaded robot.
     """
     if isinstance(source, Robot):
-        if lock or package_dirs or mimic != "tied" or base is not None or armature is not None:
+        if lock or keep or package_dirs or mimic != "tied" or base is not None or armature is not None:
             raise InputError(
-                "lock, package_dirs, mimic, base and armature are options of loading; the given robot is already loaded"
+                "lock, keep, package_dirs, mimic, base and armature are options of loading; the robot is already loaded"
             )
         robot = source
     else:
-        robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic, base=base, armature=armature)
+        robot = build_robot(
+            source, package_dirs=package_dirs, lock=lock, keep=keep, mimic=mimic, base=base, armature=armature
+        )
     scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
     velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
@@ -87,18 +97,18 @@ def inspect_robot(
     margin = Guard().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
     urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
-    joints, links = _joints(robot), _links(robot, urdf)
+    inertials, lacks = ((), ()) if urdf is None else read_inertials(urdf)
+    joints, links = _joints(robot), _links(robot, inertials)
     warnings = [
-        *(() if urdf is None else urdf.remarks),
-        *_mass_warnings(robot),
-        *_inertia_warnings(robot, links),
-        *_ratio_warnings(robot),
+        *(() if urdf is None else (*urdf.remarks, *urdf.notes)),
+        *lacks,
+        *robot.limit_remarks(),
+        *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links), _ratio_warnings(robot))),
         *_matrix_warnings(robot, scaled),
-        *_limit_warnings(joints, robot, None if q is None else configuration),
-        *_mimic_warnings(robot, urdf, joints, tied=mimic == "tied"),
+        *one_of_each(_limit_warnings(joints, robot, None if q is None else configuration)),
+        *one_of_each(_mimic_warnings(robot, urdf, joints, tied=mimic == "tied")),
         *_damping_warnings(robot),
         *_loop_warnings(robot),
-        *(f"joint {name!r} is locked at {_position(at)}" for name, at in robot.locked.items()),
     ]
     return RobotReport(
         robot=robot,
@@ -166,8 +176,8 @@ def _limit(value: float) -> float:
     return float(np.copysign(np.inf, value)) if abs(value) >= 1e300 else float(value)
 
 
-def _links(robot: Robot, urdf: Urdf | None) -> tuple[LinkReport, ...]:
-    if urdf is None or urdf.root is None:
+def _links(robot: Robot, inertials: Sequence[Inertial]) -> tuple[LinkReport, ...]:
+    if not inertials:
         bodies = range(1, robot.free_model.njoints)
         return tuple(_body(robot, joint) for joint in bodies)
     # The links of the URDF: Pinocchio merges links on fixed joints into one body, which can hide a faulty inertia.
@@ -182,7 +192,7 @@ def _links(robot: Robot, urdf: Urdf | None) -> tuple[LinkReport, ...]:
             inertia=link.inertia,
             moments=principal_moments(link.inertia),
         )
-        for link in urdf.inertials
+        for link in inertials
         if link.link in joints
     )
 
@@ -228,48 +238,87 @@ def _body_name(robot: Robot, joint: int) -> str:
     return str(robot.free_model.names[joint])
 
 
-def _mass_warnings(robot: Robot) -> Iterator[str]:
+def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str]]:
     for body, mass in enumerate(robot.tree.mass):
+        name, joint = _body_name(robot, body + 1), robot.free_model.names[body + 1]
         if mass == 0.0:
-            name, joint = _body_name(robot, body + 1), robot.free_model.names[body + 1]
             carries = "only the links that it carries give the joint inertia"
             if body not in robot.tree.parent:
                 carries = "and it carries nothing"
-            yield f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
+            yield "massless", f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
         elif not np.array(robot.free_model.inertias[body + 1].inertia).any():
-            name = _body_name(robot, body + 1)
-            yield f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
+            yield "point mass", f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
 
 
-def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[str]:
-    length = LENGTH_RATIO * _reach(robot) or LENGTH
+def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tuple[str, str]]:
+    length, sizes = LENGTH_RATIO * _reach(robot) or LENGTH, _sizes(robot, links)
     for link in links:
         if not link.joint or not link.inertia.any():
             continue
-        if warning := fault(link.name, link.mass, link.moments):
-            yield warning
-        elif link.mass > 0.0:
-            # A ball has the least inertia of all bodies of a given mass and density.
-            moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
-            radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
-            gyration = float(np.sqrt(link.moments[-1] / link.mass))
-            if link.moments.sum() < 1.2 * link.mass * radius**2:
-                yield (
+        kind, sentence = fault(link.name, link.mass, link.moments)
+        if kind or link.mass <= 0.0:
+            yield kind, sentence
+            continue
+        # A ball has the least inertia of all bodies of a given mass and density.
+        moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
+        radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
+        gyration, size = float(np.sqrt(link.moments[-1] / link.mass)), sizes.get(link.name, np.inf)
+        if link.moments.sum() < 1.2 * link.mass * radius**2:
+            yield (
+                "small",
+                (
                     f"link {link.name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
                     f"{moments} kg m^2 would be denser than osmium"
-                )
-            elif gyration > length:
-                yield (
+                ),
+            )
+        elif gyration > min(length, SIZE_RATIO * size):
+            yield (
+                "large",
+                (
                     f"link {link.name!r} has an implausibly large inertia: its radius of gyration is {gyration:.3g} m, "
-                    f"{_against_reach(robot)}"
-                )
+                    + (
+                        f"and it reaches {size:.2g} m from its centre of mass"
+                        if SIZE_RATIO * size < length
+                        else _against_reach(robot)
+                    )
+                ),
+            )
     for link in links:
         away = float(np.linalg.norm(link.center))
         if link.joint and away > length:
             yield (
-                f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, {_against_reach(robot)}; "
-                "are these millimetres?"
+                "away",
+                (
+                    f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, "
+                    f"{_against_reach(robot)}; are these millimetres?"
+                ),
             )
+    for name, size in sizes.items():
+        if size > MESH_RATIO * max(_reach(robot), LEAST_REACH):
+            yield (
+                "shape",
+                (
+                    f"the shape of link {name!r} reaches {size:.3g} m, {_against_reach(robot)}: "
+                    "is its mesh in other units?"
+                ),
+            )
+
+
+def _sizes(robot: Robot, links: Sequence[LinkReport]) -> dict[str, float]:
+    """Distance [m] of the farthest point of each link's shapes from its centre of mass, where shapes can be read."""
+    sizes: dict[str, float] = {}
+    centers = {link.name: link.center for link in links}
+    model = robot.free_model
+    for shape in readable_geometry(robot)[0].geometryObjects:
+        frame = model.frames[shape.parentFrame]
+        center = frame.placement.act(centers.get(frame.name, np.zeros(3)))
+        shape.geometry.computeLocalAABB()
+        box = shape.geometry.aabb_local
+        corners = np.array(list(product(*zip(box.min_, box.max_, strict=True))))
+        points = corners @ shape.placement.rotation.T + shape.placement.translation
+        size = float(np.linalg.norm(points - center, axis=1).max())
+        sizes[frame.name] = max(size, sizes.get(frame.name, 0.0))
+    return sizes
 
 
 def _reach(robot: Robot) -> float:
@@ -286,7 +335,7 @@ def _against_reach(robot: Robot) -> str:
     return f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
 
 
-def _ratio_warnings(robot: Robot) -> Iterator[str]:
+def _ratio_warnings(robot: Robot) -> Iterator[tuple[str, str]]:
     tree = robot.tree
     moments = [np.linalg.eigvalsh(np.array(body.inertia))[-1] for body in list(robot.free_model.inertias)[1:]]
     for body, parent in enumerate(tree.parent):
@@ -300,8 +349,11 @@ def _ratio_warnings(robot: Robot) -> Iterator[str]:
             light, heavy = sorted((values[parent], values[body]))
             if light > 0.0 and heavy > most * light:
                 yield (
-                    f"the {what} of neighbouring links {pair} differ by a factor of {heavy / light:.1g}: "
-                    f"{values[parent]:.3g} and {values[body]:.3g} {unit}"
+                    what,
+                    (
+                        f"the {what} of neighbouring links {pair} differ by a factor of {heavy / light:.1g}: "
+                        f"{values[parent]:.3g} and {values[body]:.3g} {unit}"
+                    ),
                 )
 
 
@@ -318,7 +370,7 @@ def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
         )
 
 
-def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[str]:
+def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[tuple[str, str]]:
     bounded = [joint for joint in joints if joint.kind in ("revolute", "prismatic")]
     driven = [joint for joint in joints if joint.kind != "mimic"]
     missing = {
@@ -328,39 +380,48 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
     }
     for what, names in missing.items():
         if names:
-            yield f"no {what} limit, or one of 0: {', '.join(map(repr, names))}"
+            yield what, f"no {what} limit, or one of 0: {listed(map(repr, names), 'joints')}"
     for joint in bounded:
         if joint.lower == joint.upper == 0.0:
             yield (
-                f"joint {joint.name!r} has the limits 0 and 0, which count as none, as in a URDF without limits; "
-                "lock a joint to keep it from moving"
+                "zeros",
+                (
+                    f"joint {joint.name!r} has the limits 0 and 0, which count as none, as in a URDF without limits; "
+                    "lock a joint to keep it from moving"
+                ),
             )
         elif joint.lower >= joint.upper:
-            yield f"joint {joint.name!r} has no room to move: limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
+            words = f"limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
+            yield "no room", f"joint {joint.name!r} has no room to move: {words}"
     at_zero = q is None
     for name, at, low, high in zip(
         robot.joint_names, np.zeros(robot.dof) if q is None else q, *robot.position_limits, strict=True
     ):
         if low < high and not low <= at <= high:
             where = f"q = 0 is no posture of joint {name!r}: it is" if at_zero else f"q puts joint {name!r} at {at:g},"
-            yield f"{where} outside its limits {low:g} and {high:g}"
+            yield "outside", f"{where} outside its limits {low:g} and {high:g}"
 
 
-def _mimic_warnings(robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool) -> Iterator[str]:
+def _mimic_warnings(
+    robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool
+) -> Iterator[tuple[str, str]]:
     for joint in joints:
         if joint.follows:
-            yield f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}; it is not a coordinate"
+            yield "tied", f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}: no coordinate"
     if urdf is None:
         return
     index = joint_index(robot.free_model)
-    moving = {joint.get("name") for joint in urdf.elements("joint") if joint.get("type") not in (None, "fixed")}
+    moving = {joint.get("name") for joint in urdf.root.findall("joint") if joint.get("type") not in (None, "fixed")}
     for name, mimic in urdf.mimics.items():
         if name not in index:
             continue
         if mimic.leader not in moving:
-            yield f"joint {name!r} mimics {mimic.leader!r}, which is not a moving joint of the robot: it stays free"
+            yield (
+                "alone",
+                (f"joint {name!r} mimics {mimic.leader!r}, which is not a moving joint of the robot: it stays free"),
+            )
         elif not tied:
-            yield f"joint {name!r} mimics {mimic.leader!r}, but mimic='free' makes it free"
+            yield "free", f"joint {name!r} mimics {mimic.leader!r}, but mimic='free' makes it free"
 
 
 def _damping_warnings(robot: Robot) -> Iterator[str]:
@@ -373,19 +434,15 @@ def _damping_warnings(robot: Robot) -> Iterator[str]:
             "which a scene uses with friction='robot'",
         ),
     ):
-        given = ", ".join(f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value)
+        given = [f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value]
         if given:
-            yield f"the description gives joint {what} [{unit}], {usage}: {given}"
+            yield f"the description gives joint {what} [{unit}], {usage}: {listed(given, 'joints')}"
 
 
 def _loop_warnings(robot: Robot) -> Iterator[str]:
     if robot.loops:
-        pairs = ", ".join(f"{a!r} on {b!r}" for a, b in robot.loops)
+        pairs = listed((f"{a!r} on {b!r}" for a, b in robot.loops), "pairs")
         yield f"the description has loops, which the tree leaves open for a scene's constraints to close: {pairs}"
     if robot.equalities:
-        named = ", ".join(equality.name for equality in robot.equalities)
+        named = listed((equality.name for equality in robot.equalities), "of them")
         yield f"the description has equality constraints, which a scene uses with constraints='robot': {named}"
-
-
-def _position(value: float | tuple[float, ...]) -> str:
-    return f"{value:g}" if isinstance(value, float) else f"({', '.join(f'{x:g}' for x in value)})"

@@ -183,7 +183,7 @@ def requirements(layout: Layout, whole: Layout, idle: Sequence[str], scene: Scen
 
 def _terms(layout: Layout) -> dict[str, str]:
     spec = layout.spec
-    gravity = spec.gravity if isinstance(spec.gravity, tuple) else (0.0, 0.0, -9.81 if spec.gravity else 0.0)
+    gravity = spec.gravity if isinstance(spec.gravity, tuple) else layout.robot.model.gravity.linear * spec.gravity
     joints = layout.robot.joint_names
 
     def of(values: Floats, names: Sequence[str]) -> str:
