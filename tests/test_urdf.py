@@ -393,7 +393,7 @@ class TestPackages:
         assert geometry(vp.load_robot(path)).ngeoms == 1
         moved = tmp_path / "elsewhere.urdf"
         moved.write_text(path.read_text())
-        for folder in (tmp_path, tmp_path / "ws", tmp_path / "ws" / "Some-Repo"):
+        for folder in (tmp_path / "ws", tmp_path / "ws" / "Some-Repo"):
             if "://" in mesh or "$" in mesh:
                 assert geometry(vp.load_robot(moved, package_dirs=[folder])).ngeoms == 1
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from varpin.support.frozen import Frozen
 
-# Folders of packages below a given folder, as in src/repository/package of a ROS workspace.
-_MANIFESTS = ("package.xml", "*/package.xml", "*/*/package.xml")
+# A given folder is a package, or contains packages.
+_MANIFESTS = ("package.xml", "*/package.xml")
 _FIND = re.compile(r"\$\(find ([^)]+)\)/?")
 
 

@@ -273,16 +273,14 @@ def missing_meshes(urdf: Urdf, package_dirs: Sequence[str]) -> dict[str, tuple[s
 def missing_meshes_message(urdf: Urdf, missing: Mapping[str, Sequence[str]], package_dirs: Sequence[str]) -> str:
     """The error message for meshes from :func:`missing_meshes`."""
     packages = Packages(urdf.path, tuple(package_dirs))
-    link, (file, *_) = next(iter(missing.items()))
-    more = sum(map(len, missing.values())) - 1
-    others = f" and {more} more meshes" if more else ""
-    where = f"{urdf.path}: mesh {file} of link {link!r}{others}"
-    if other := packages.in_other_case(file):
-        return f"{where} not found; {other.name} is there, in other upper and lower case ({other.parent})"
-    if "://" not in file and "$(find" not in file:
-        return f"{where} not found beside the file"
-    places = listed(map(str, packages.places), "folders") or "no folder"
-    return f"{where} not found in {places}; package_dirs=[...] adds folders that contain packages"
+    links = listed((f"link {link!r}: {', '.join(files)}" for link, files in missing.items()), "links")
+    first = next(iter(missing.values()), ("",))[0]
+    if there := packages.in_other_case(first):
+        return f"meshes of {urdf.path} are missing: {links}; {there} is there, in other upper and lower case"
+    places = ", ".join(map(str, packages.places)) or "no folder"
+    return (
+        f"meshes of {urdf.path} are missing: {links}; looked beside the file and in {places} (package_dirs=[...] adds)"
+    )
 
 
 def _mended(content: bytes) -> str:
@@ -387,7 +385,7 @@ def _remarks(root: ET.Element) -> Iterator[str]:
     if degrees:
         yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
     if ignored:
-        yield f"limits of continuous joints have no effect, revolute ones have some: {listed(ignored, 'joints')}"
+        yield f"limits of continuous joints have no effect (only revolute ones have limits): {listed(ignored, 'joints')}"
     if named := _joints_with(root, "joint_properties"):
         yield f"<joint_properties> has no effect, URDF calls it <dynamics>: {listed(named, 'joints')}"
 
