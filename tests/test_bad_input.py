@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pinocchio as pin
@@ -718,3 +720,15 @@ def test_what_is_no_flag_function_list_or_record(robot, call, facts):
 @pytest.mark.parametrize("value", [True, np.True_])
 def test_what_is_a_flag(scene, value):
     assert vp.simulate(scene, *REST, **FREE, check=value).steps == 2
+
+
+@pytest.mark.parametrize("content", ["", "from nose import tools\n"])
+def test_another_package_of_pinocchio_s_name(tmp_path, content):
+    (tmp_path / "nose").mkdir()
+    (tmp_path / "nose" / "tools.py").touch()
+    (tmp_path / "pinocchio.py").write_text(content)
+    paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    run = [sys.executable, "-S", "-c", "import varpin"]
+    found = subprocess.run(run, env={"PYTHONPATH": paths}, capture_output=True, text=True, check=False)
+    assert found.returncode == 1
+    assert "pip uninstall -y pinocchio" in found.stderr.splitlines()[-1]

@@ -12,6 +12,7 @@ Load an arm, integrate it variationally, replay it:
 
 from typing import TYPE_CHECKING
 
+from varpin._pinocchio import pinocchio as _pinocchio  # noqa: F401
 from varpin._version import __version__ as __version__
 from varpin.errors import AssemblyError as AssemblyError
 from varpin.errors import FileError as FileError

@@ -385,7 +385,7 @@ def _remarks(root: ET.Element) -> Iterator[str]:
     if degrees:
         yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
     if ignored:
-        yield f"limits of continuous joints have no effect (only revolute ones have limits): {listed(ignored, 'joints')}"
+        yield f"limits of continuous joints have no effect (type revolute has limits): {listed(ignored, 'joints')}"
     if named := _joints_with(root, "joint_properties"):
         yield f"<joint_properties> has no effect, URDF calls it <dynamics>: {listed(named, 'joints')}"
 

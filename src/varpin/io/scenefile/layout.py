@@ -292,6 +292,7 @@ def _one(given: RobotKeys, table: Table, held: Mapping[str, float]) -> Robot:
             given.source,
             package_dirs=given.package_dirs,
             lock={**given.lock, **held},
+            keep=None if given.keep is None else [name for name in given.keep if name not in held],
             mimic="free" if given.mimic == "free" else "tied",
             payload=given.payload,
             xacro_args=given.xacro_args or None,
@@ -304,7 +305,8 @@ def _one(given: RobotKeys, table: Table, held: Mapping[str, float]) -> Robot:
     except RobotNotFound as error:
         raise table.error("source", str(error)) from None
     except UnknownJoint as error:
-        key = "armature" if isinstance(given.armature, Mapping) and error.joint in given.armature else "lock"
+        where = {"armature": given.armature if isinstance(given.armature, Mapping) else (), "keep": given.keep or ()}
+        key = next((key for key, names in where.items() if error.joint in names), "lock")
         raise table.error(
             f"{key}.{error.joint}", f"there is no such joint; {suggestion(error.joint, error.joints, 'joints')}"
         ) from None

@@ -142,6 +142,7 @@ class RobotKeys(Keys):
 
     source: Annotated[str | Path, checked(TEXT, _robot_source)]
     lock: dict[str, Annotated[Any, _LOCK]] = Field(default_factory=dict)
+    keep: Annotated[tuple[str, ...] | None, _distinct(TEXT)] = None
     mimic: Annotated[str, word("tied", "free")] = "tied"
     package_dirs: Annotated[tuple[str, ...], _distinct(checked(TEXT, _folder))] = ()
     xacro_args: dict[str, Annotated[Any, _ARGUMENT]] = Field(default_factory=dict)
