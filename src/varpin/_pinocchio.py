@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import pinocchio as pinocchio
+import pinocchio
+
+__all__ = ["pinocchio"]
 
 if not hasattr(pinocchio, "buildModelFromUrdf"):
     raise ImportError(
