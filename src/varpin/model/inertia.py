@@ -49,14 +49,20 @@ def fault(link: str, mass: float, moments: Floats) -> tuple[str, str]:
     return "", ""
 
 
-def one_of_each(found: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """The first sentence of each kind, and how many more there are; entries without a sentence are left out."""
-    sentences: dict[str, list[str]] = {}
-    for kind, sentence in found:
-        sentences.setdefault(kind, []).append(sentence)
-    for several in sentences.values():
-        if several[0]:
-            yield several[0] + (f" ({len(several) - 1} more of this kind)" if len(several) > 1 else "")
+def one_of_each(found: Iterable[tuple[str, str, str]]) -> Iterator[str]:
+    """The first sentence of each kind, and which others it is true of.
+
+    Args:
+        found: Kinds, names and sentences; those without a sentence are left out.
+    """
+    kinds: dict[str, list[tuple[str, str]]] = {}
+    for kind, name, sentence in found:
+        if sentence:
+            kinds.setdefault(kind, []).append((name, sentence))
+    for (_, sentence), *others in kinds.values():
+        names = ", ".join(repr(name) for name, _ in others[:2]) + (f", {len(others) - 2} more" if others[2:] else "")
+        also = f"also {names}" if len(sentence) + len(names) < 230 else f"{len(others)} more"
+        yield sentence + (f" ({also})" if others else "")
 
 
 def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
@@ -72,5 +78,8 @@ def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
         bodies = [(names.get(j, model.names[j]), model.inertias[j]) for j in range(1, model.njoints)]
         found = [(name, body.mass, np.array(body.inertia)) for name, body in bodies]
     return one_of_each(
-        fault(name, mass, principal_moments(inertia)) for name, mass, inertia in found if np.isfinite(inertia).all()
+        (kind, name, sentence)
+        for name, mass, inertia in found
+        if np.isfinite(inertia).all()
+        for kind, sentence in [fault(name, mass, principal_moments(inertia))]
     )

@@ -238,87 +238,75 @@ def _body_name(robot: Robot, joint: int) -> str:
     return str(robot.free_model.names[joint])
 
 
-def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str]]:
+def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
     for body, mass in enumerate(robot.tree.mass):
         name, joint = _body_name(robot, body + 1), robot.free_model.names[body + 1]
         if mass == 0.0:
             carries = "only the links that it carries give the joint inertia"
             if body not in robot.tree.parent:
                 carries = "and it carries nothing"
-            yield "massless", f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
+            yield "massless", name, f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
         elif not np.array(robot.free_model.inertias[body + 1].inertia).any():
-            yield "point mass", f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
+            yield "point mass", name, f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
 
 
-def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tuple[str, str]]:
-    length, sizes = LENGTH_RATIO * _reach(robot) or LENGTH, _sizes(robot, links)
+def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tuple[str, str, str]]:
+    length, corners = LENGTH_RATIO * _reach(robot) or LENGTH, _corners(robot)
+    frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
         if not link.joint or not link.inertia.any():
             continue
-        kind, sentence = fault(link.name, link.mass, link.moments)
+        name, frame = link.name, frames.get(link.name)
+        kind, sentence = fault(name, link.mass, link.moments)
         if kind or link.mass <= 0.0:
-            yield kind, sentence
+            yield kind, name, sentence
             continue
         # A ball has the least inertia of all bodies of a given mass and density.
-        moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
         radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
-        gyration, size = float(np.sqrt(link.moments[-1] / link.mass)), sizes.get(link.name, np.inf)
+        gyration, against, size = float(np.sqrt(link.moments[-1] / link.mass)), _against_reach(robot), np.inf
+        near = [points for _, joint, points in corners if frame is not None and joint == frame.parentJoint]
+        if frame is not None and near:
+            size = float(np.linalg.norm(np.vstack(near) - frame.placement.act(link.center), axis=1).max())
+        if SIZE_RATIO * size < length:
+            against = f"and its body reaches {size:.2g} m from its centre of mass"
         if link.moments.sum() < 1.2 * link.mass * radius**2:
-            yield (
-                "small",
-                (
-                    f"link {link.name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
-                    f"{moments} kg m^2 would be denser than osmium"
-                ),
+            moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
+            sentence = (
+                f"link {name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
+                f"{moments} kg m^2 would be denser than osmium"
             )
+            yield "small", name, sentence
         elif gyration > min(length, SIZE_RATIO * size):
-            yield (
-                "large",
-                (
-                    f"link {link.name!r} has an implausibly large inertia: its radius of gyration is {gyration:.3g} m, "
-                    + (
-                        f"and it reaches {size:.2g} m from its centre of mass"
-                        if SIZE_RATIO * size < length
-                        else _against_reach(robot)
-                    )
-                ),
+            large = (
+                f"link {name!r} has an implausibly large inertia: its radius of gyration is {gyration:.3g} m, {against}"
             )
+            yield "large", name, large
     for link in links:
         away = float(np.linalg.norm(link.center))
         if link.joint and away > length:
-            yield (
-                "away",
-                (
-                    f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, "
-                    f"{_against_reach(robot)}; are these millimetres?"
-                ),
-            )
-    for name, size in sizes.items():
+            far = f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, {_against_reach(robot)}"
+            yield "away", link.name, f"{far}; are these millimetres?"
+    for name, _, points in corners:
+        size = float(np.ptp(points, axis=0).max())
         if size > MESH_RATIO * max(_reach(robot), LEAST_REACH):
-            yield (
-                "shape",
-                (
-                    f"the shape of link {name!r} reaches {size:.3g} m, {_against_reach(robot)}: "
-                    "is its mesh in other units?"
-                ),
-            )
+            large = f"the shape of link {name!r} is {size:.3g} m large, {_against_reach(robot)}: is its mesh in other units?"
+            yield "shape", name, f"{large}: is its mesh in other units?"
 
 
-def _sizes(robot: Robot, links: Sequence[LinkReport]) -> dict[str, float]:
-    """Distance [m] of the farthest point of each link's shapes from its centre of mass, where shapes can be read."""
-    sizes: dict[str, float] = {}
-    centers = {link.name: link.center for link in links}
-    model = robot.free_model
+def _corners(robot: Robot) -> list[tuple[str, int, Floats]]:
+    """The link, the joint and the corners (8, 3) [m], in the joint's frame, of the box around each readable shape."""
+    found = []
     for shape in readable_geometry(robot)[0].geometryObjects:
-        frame = model.frames[shape.parentFrame]
-        center = frame.placement.act(centers.get(frame.name, np.zeros(3)))
-        shape.geometry.computeLocalAABB()
-        box = shape.geometry.aabb_local
-        corners = np.array(list(product(*zip(box.min_, box.max_, strict=True))))
-        points = corners @ shape.placement.rotation.T + shape.placement.translation
-        size = float(np.linalg.norm(points - center, axis=1).max())
-        sizes[frame.name] = max(size, sizes.get(frame.name, 0.0))
-    return sizes
+        if isinstance(shape.geometry, pin.coal.BVHModelBase):
+            vertices = np.asarray(shape.geometry.vertices(), dtype=np.float64)
+            low, high = vertices.min(axis=0), vertices.max(axis=0)
+        else:
+            shape.geometry.computeLocalAABB()
+            low, high = shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_
+        corners = np.array(list(product(*zip(low, high, strict=True))))
+        placed = corners @ shape.placement.rotation.T + shape.placement.translation
+        found.append((robot.free_model.frames[shape.parentFrame].name, shape.parentJoint, placed))
+    return found
 
 
 def _reach(robot: Robot) -> float:
@@ -335,7 +323,7 @@ def _against_reach(robot: Robot) -> str:
     return f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
 
 
-def _ratio_warnings(robot: Robot) -> Iterator[tuple[str, str]]:
+def _ratio_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
     tree = robot.tree
     moments = [np.linalg.eigvalsh(np.array(body.inertia))[-1] for body in list(robot.free_model.inertias)[1:]]
     for body, parent in enumerate(tree.parent):
@@ -350,6 +338,7 @@ def _ratio_warnings(robot: Robot) -> Iterator[tuple[str, str]]:
             if light > 0.0 and heavy > most * light:
                 yield (
                     what,
+                    _body_name(robot, body + 1),
                     (
                         f"the {what} of neighbouring links {pair} differ by a factor of {heavy / light:.1g}: "
                         f"{values[parent]:.3g} and {values[body]:.3g} {unit}"
@@ -370,7 +359,7 @@ def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
         )
 
 
-def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[tuple[str, str]]:
+def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[tuple[str, str, str]]:
     bounded = [joint for joint in joints if joint.kind in ("revolute", "prismatic")]
     driven = [joint for joint in joints if joint.kind != "mimic"]
     missing = {
@@ -380,11 +369,12 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
     }
     for what, names in missing.items():
         if names:
-            yield what, f"no {what} limit, or one of 0: {listed(map(repr, names), 'joints')}"
+            yield what, "", f"no {what} limit, or one of 0: {listed(map(repr, names), 'joints')}"
     for joint in bounded:
         if joint.lower == joint.upper == 0.0:
             yield (
                 "zeros",
+                joint.name,
                 (
                     f"joint {joint.name!r} has the limits 0 and 0, which count as none, as in a URDF without limits; "
                     "lock a joint to keep it from moving"
@@ -392,22 +382,26 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
             )
         elif joint.lower >= joint.upper:
             words = f"limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
-            yield "no room", f"joint {joint.name!r} has no room to move: {words}"
+            yield "no room", joint.name, f"joint {joint.name!r} has no room to move: {words}"
     at_zero = q is None
     for name, at, low, high in zip(
         robot.joint_names, np.zeros(robot.dof) if q is None else q, *robot.position_limits, strict=True
     ):
         if low < high and not low <= at <= high:
             where = f"q = 0 is no posture of joint {name!r}: it is" if at_zero else f"q puts joint {name!r} at {at:g},"
-            yield "outside", f"{where} outside its limits {low:g} and {high:g}"
+            yield "outside", name, f"{where} outside its limits {low:g} and {high:g}"
 
 
 def _mimic_warnings(
     robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool
-) -> Iterator[tuple[str, str]]:
+) -> Iterator[tuple[str, str, str]]:
     for joint in joints:
         if joint.follows:
-            yield "tied", f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}: no coordinate"
+            yield (
+                "tied",
+                joint.name,
+                f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}: no coordinate",
+            )
     if urdf is None:
         return
     index = joint_index(robot.free_model)
@@ -418,10 +412,11 @@ def _mimic_warnings(
         if mimic.leader not in moving:
             yield (
                 "alone",
+                name,
                 (f"joint {name!r} mimics {mimic.leader!r}, which is not a moving joint of the robot: it stays free"),
             )
         elif not tied:
-            yield "free", f"joint {name!r} mimics {mimic.leader!r}, but mimic='free' makes it free"
+            yield "free", name, f"joint {name!r} mimics {mimic.leader!r}, but mimic='free' makes it free"
 
 
 def _damping_warnings(robot: Robot) -> Iterator[str]:
