@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from varpin.arrays import Floats
 from varpin.errors import VarpinError
 from varpin.integrators.base import Failure
 from varpin.mechanics.scene import Scene
@@ -120,7 +119,7 @@ class StepFailure(VarpinError, RuntimeError):
         time: Its start [s].
         residual: The last residual, in units of the rounding error of its terms.
         reason: What stopped the last attempt.
-        problem: The step, the reason and the state, in words.
+        problem: The step and the reason, in words.
         advice: The cause if one is known, or what to try.
         q: Configuration at the start of the step (n,) [rad or m].
         v: Velocity there (n,).
@@ -135,12 +134,9 @@ class StepFailure(VarpinError, RuntimeError):
         self.reason = failure.reason
         self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
         self.trajectory = trajectory
-        self.advice = cause or "a smaller dt may go further"
-        self.problem = (
-            f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
-            f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}"
-        )
-        super().__init__(f"{self.problem}. What came before is in error.trajectory; {self.advice}")
+        self.advice = cause or "Use a smaller dt"
+        self.problem = f"step {step} (t = {time:.6g} s) failed: {failure.reason}"
+        super().__init__(f"{self.problem}. {self.advice}. The motion so far is in error.trajectory")
 
 
 def named(scene: Scene, failure: Failure) -> Failure:
@@ -149,8 +145,3 @@ def named(scene: Scene, failure: Failure) -> Failure:
         return failure
     what = f"CustomForce {scene.custom.names} may be the reason, where it jumps or its derivatives are wrong"
     return replace(failure, reason=f"{failure.reason} ({what})")
-
-
-def _row(values: Floats) -> str:
-    """A vector on one line."""
-    return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"

@@ -67,6 +67,11 @@ class Sampled(OpenLoop):
         # The frozen dataclass refuses assignments.
         vars(self).update(scene=scene, dt=dt, parts=[], done=0)
 
+    @property
+    def extremes(self) -> Floats | None:
+        """The least and the largest controls in each step so far (2, N, m)."""
+        return joined(self.parts).extremes if self.parts else None
+
     def moments(self, first: int, last: int, record: MotionRecord | None) -> Moments:
         """The moments over steps first .. last, which begin at a step that is known or the next one.
 
@@ -118,16 +123,20 @@ def of_time(
     )
 
 
-def unsettled(controls: Sampled) -> tuple[Finding, ...]:
-    """A warning if the quadrature of a function of time has not settled in some steps."""
+def function_findings(controls: Sampled, duration: float) -> tuple[Finding, ...]:
+    """Warnings: the quadrature of a function of time has not settled in some steps, or no break is in the motion."""
+    found: list[Finding] = []
     steps = joined(controls.parts).unsettled.tolist() if controls.parts else []
-    if not steps:
-        return ()
-    text = (
-        f"the controls of OpenLoop change too fast in {len(steps)} steps for their impulse to be known "
-        f"(from t = {steps[0] * controls.dt:.3g} s). Name the instants of jumps, OpenLoop(f, breaks=[...])"
-    )
-    return (Finding("fast controls", text, time=steps[0] * controls.dt, value=float(len(steps)), unit="steps"),)
+    if steps:
+        text = (
+            f"the controls of OpenLoop change too fast in {len(steps)} steps for their impulse to be known "
+            f"(from t = {steps[0] * controls.dt:.3g} s). Name the instants of jumps, OpenLoop(f, breaks=[...])"
+        )
+        found.append(Finding("fast controls", text, time=steps[0] * controls.dt, value=float(len(steps)), unit="steps"))
+    if controls.breaks and not any(0.0 <= at <= duration for at in controls.breaks):
+        text = f"breaks of OpenLoop are from {controls.breaks[0]:.4g} s on, outside the motion: they are in [s]"
+        found.append(Finding("breaks outside", text, time=controls.breaks[0]))
+    return tuple(found)
 
 
 def resolved(controls: Sampled, integrator: Integrator) -> bool:

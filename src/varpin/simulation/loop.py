@@ -35,8 +35,13 @@ _NOTHING = 1e-8
 _GROWTH = 1e-5
 # The period causes growth if its exponent exceeds that in continuous time by this factor: 1.1 to 3 give the same.
 _BY_PERIOD = 1.5
+# Ratio of the periods that are tried for a stable one.
+_SHORTER = 0.9
 # Least changes from limit to limit in a period: 1/7 to 1/5 give the same; stable laws with moving goals reach 1/8.
 _CHANGES = 1.0 / 7.0
+# Share of a control's range within which it is at a limit: half of the range is at neither. A control that is at one in
+# less than this share of the last quarter of the motion is calm.
+_AT, _CALM = 0.25, 0.25
 # Least share of the sides that a linear function of the state tells for them to be feedback: random ones have 2n / P.
 _FOLLOWS = 0.15
 # Least growth of controls from the first quarter to the last (10 to 1000: the same), up to a failed step (3 to 100).
@@ -160,7 +165,7 @@ def _by_theory(scene: Scene, law: Law, period: float) -> tuple[Finding, ...]:
     rate = float(np.linalg.eigvals(loop.known.T @ (loop.A + loop.B @ loop.K) @ loop.known).real.max())
     if not radius > 1.0 + _GROWTH or np.log(radius) <= _BY_PERIOD * max(rate, 0.0) * period:
         return ()
-    stable = next((float(T) for T in period * 0.9 ** np.arange(1, 60) if loop.mode(T)[0] < 1.0), None)
+    stable = next((float(T) for T in period * _SHORTER ** np.arange(1, 60) if loop.mode(T)[0] < 1.0), None)
     advice = "lower gains" if stable is None else f"a period below {stable:.3g} s, or lower gains"
     text = (
         f"control loop is unstable at its period of {period:.4g} s: each period multiplies deviations by {radius:.4g}. "
@@ -172,12 +177,12 @@ def _by_theory(scene: Scene, law: Law, period: float) -> tuple[Finding, ...]:
 def _from_limit_to_limit(scene: Scene, x: Floats, u: Floats, t: Floats, period: float) -> tuple[Finding, ...]:
     """The warning if a control of u (P, m) goes from one end of its range to the other every few periods to the end."""
     low, span = u.min(axis=0), np.ptp(u, axis=0)
-    sides = (u >= low + 0.75 * span).astype(np.int64) - (u <= low + 0.25 * span)
+    sides = (u >= low + (1.0 - _AT) * span).astype(np.int64) - (u <= low + _AT * span)
     visits = [np.flatnonzero(side) for side in sides.T]
     changes = [at[1:][side[at[1:]] != side[at[:-1]]] for at, side in zip(visits, sides.T, strict=True)]
     late = np.array([(at >= len(u) // 2).sum() for at in changes])
     worst = int(np.argmax(late))
-    calm = np.abs(sides[3 * len(u) // 4 :, worst]).mean() < 0.25
+    calm = np.abs(sides[3 * len(u) // 4 :, worst]).mean() < _CALM
     if calm or late[worst] < max(4.0, 0.5 * _CHANGES * len(u)):
         return ()
     # What flips whatever the state is excitation, not feedback.

@@ -23,7 +23,7 @@ from varpin.simulation.check import check as checked
 from varpin.simulation.choice import usual_integrator
 from varpin.simulation.commands import Controls, commands_of, next_block
 from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, named
-from varpin.simulation.functions import ControlLaw, Sampled, begins_elsewhere, require_law, resolved, unsettled
+from varpin.simulation.functions import ControlLaw, Sampled, begins_elsewhere, function_findings, require_law, resolved
 from varpin.simulation.loop import outgrown, unstable_loop
 from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import MotionRecord, function_error
@@ -180,19 +180,22 @@ def simulate(
     record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)
     interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), hold, check=check)
     motion = record.trajectory()
+    known = None if interrupted else error
     try:
         found: list[Finding] = [*unmet, *noise_forgotten(scene, rng, increments)]
         if check:
             function = controls if isinstance(controls, Sampled) else None
             whole = function is None or resolved(function, integrator)
             given = None if callable(controls) or interrupted else controls
-            known = None if interrupted else error
             motion = checked(scene, integrator, motion, given, resolved=whole, known=known, hold=period if law else 0)
             loop = () if hold is None else unstable_loop(scene, motion, hold)
             wrong = [finding for finding in motion.warnings if finding.kind == "error"]
-            found = [*loop, *wrong, *(unsettled(function) if function else ()), *found, *motion.warnings]
+            of_function = function_findings(function, motion.duration) if function else ()
+            found = [*loop, *wrong, *of_function, *found, *motion.warnings]
             if isinstance(controls, OpenLoop | FirstOrderHold):
                 found += begins_elsewhere(controls, scene, q0, v0)
+        elif known is not None:
+            motion = motion.with_error(known)
         found += early
         if not any(finding.kind == "start in degrees" for finding in early):
             # Without controls servos hold the start.
