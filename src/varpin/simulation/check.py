@@ -34,8 +34,8 @@ from varpin.simulation.commands import Controls, commands_of
 from varpin.simulation.energy import energy_defects
 from varpin.simulation.functions import Sampled
 from varpin.simulation.gate import proven_error
+from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
-from varpin.simulation.loop import Law, law_of
 from varpin.simulation.scales import speed_scales, travel_scales
 from varpin.simulation.short_forces import short_forces
 from varpin.simulation.spectrum import fastest_rate

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
@@ -21,17 +21,16 @@ from varpin.signals.moments import Moments, joined, moments_of
 from varpin.signals.policy import FirstOrderHold, OpenLoop
 from varpin.simulation.failures import ControlError
 from varpin.simulation.record import MotionRecord
-from varpin.support.checks import JointValues, control_values, finite_array, takes
+from varpin.support.checks import JointValues, control_values, finite_array, require_finite, takes
+from varpin.trajectory import Trajectory
 
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Root mean square of what a step's polynomial leaves of a function of time, as a share of its largest value, up to
 # which the motion's own residual shows its error: a third order of it is lost.
 _RESOLVED = 0.02
+_OF_STATE = "controls(t, q, v)"
 # Distance of a kinematic input from its control at the start [rad or m, rad/s or m/s] without a warning.
 _ELSEWHERE = 1e-6
-# Name of a function of time in errors.
-_OF_TIME = "OpenLoop: f(t)"
-_OF_TIMES = "OpenLoop, vectorized=True: f(t) of times t (K,)"
 
 
 def require_law(law: ControlLaw) -> None:
@@ -51,7 +50,7 @@ def decision(law: ControlLaw, record: MotionRecord) -> Floats:
     k = record.steps
     time = k * record.dt
     state = record.last.q[-1].copy(), record.last.v[-1].copy()
-    return _called("controls(t, q, v)", lambda: law(time, *state), record.scene, k, time, record)[None]
+    return _called(_OF_STATE, lambda: law(time, *state), _reader(_OF_STATE, record.scene), k, time, record)[None]
 
 
 class Sampled(OpenLoop):
@@ -79,10 +78,9 @@ class Sampled(OpenLoop):
             ControlError: The function failed.
         """
         if last > self.done:
-            values = _at_all_times if self.vectorized else _at_times
 
             def at(times: Floats, steps: Integers) -> Floats:
-                return values(self.f, self.scene, times, steps, record)
+                return _values(self, self.scene, times, steps, record)
 
             fresh = moments_of(at, self.done, last - self.done, self.dt, self.breaks)
             self.parts.append(fresh)
@@ -117,9 +115,8 @@ def of_time(
     if not len(scene.prescribed):
         return commands
     steps = np.arange(first, first + len(found.series))
-    values = _at_all_times if controls.vectorized else _at_times
     return prescribing(
-        scene, commands, values(controls.f, scene, np.float64(controls.dt) * (steps + 1.0), steps, record)
+        scene, commands, _values(controls, scene, np.float64(controls.dt) * (steps + 1.0), steps, record)
     )
 
 
@@ -148,59 +145,33 @@ def resolved(controls: Sampled, integrator: Integrator) -> bool:
     return bool(rest.max(initial=0.0) <= _RESOLVED * found.largest) and not len(found.unsettled)
 
 
-def _at_times(
-    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: MotionRecord | None
-) -> Floats:
+def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers, record: MotionRecord | None) -> Floats:
     """Controls (K, m) from a function of time at times (K,) [s] within ``steps`` (K,).
 
     Raises:
         ControlError: The function raised, or returned something else.
     """
-    found = np.empty((len(times), scene.controls))
-    shape, isfinite = found.shape[1:], math.isfinite
-    for k, at in enumerate(times.tolist()):
-        try:
-            value = f(at)
-        except Exception as error:
-            raise _error_raised(_OF_TIME, error, int(steps[k]), at, record) from error
-        # The common case, without the checks of _control: these take longer than many functions.
-        if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == shape:
-            found[k] = value
-            if isfinite(value.dot(value)):
-                continue
-        found[k] = _control(_OF_TIME, value, scene, int(steps[k]), at, record)
-    return found
-
-
-def _at_all_times(
-    f: Callable[..., Any], scene: Scene, times: Floats, steps: NDArray[np.int64], record: MotionRecord | None
-) -> Floats:
-    """:func:`_at_times` for a vectorized function.
-
-    The first time is evaluated alone, so that rows and columns cannot be confused. If the call for all others fails,
-    each is evaluated alone to find the first that fails.
-    """
-    m = scene.controls
+    f: Callable[..., Any] = controls.f
+    at, m = list(zip(steps.tolist(), times.tolist(), strict=True)), scene.controls
+    if not controls.vectorized:
+        name = "OpenLoop: f(t)"
+        read = _reader(name, scene)
+        found = [_called(name, functools.partial(f, time), read, step, time, record) for step, time in at]
+        return np.array(found).reshape(len(at), m)
+    name = "OpenLoop, vectorized=True: f(t) of times t (K,)"
+    # The first time alone, so that rows and columns cannot be confused.
     parts = [part for part in (times[:1], times[1:]) if len(part)]
     try:
-        values = [finite_array(_OF_TIMES, f(part.copy()), (len(part), m)) for part in parts]
+        return np.concatenate(
+            [np.zeros((0, m)), *(finite_array(name, f(part.copy()), (len(part), m)) for part in parts)]
+        )
     except Exception as failure:
-        for step, at in zip(steps.tolist(), times.tolist(), strict=True):
-            try:
-                value = f(np.array([at]))
-            except Exception as error:
-                raise _error_raised(_OF_TIMES, error, step, at, record) from error
-            try:
-                finite_array(_OF_TIMES, value, (1, m))
-            except InputError as error:
-                raise _control_error(step, at, str(error), record) from None
-        raise _control_error(
-            int(steps[0]),
-            float(times[0]),
-            f"{_OF_TIMES} fails for {len(times)} times at once, and for none of them alone: {failure}",
-            record,
-        ) from failure
-    return np.concatenate(values) if values else np.zeros((0, m))
+        # Each alone, to find the first that fails.
+        for step, time in at:
+            alone = functools.partial(f, np.array([time]))
+            _called(name, alone, lambda value: finite_array(name, value, (1, m)), step, time, record)
+        problem = f"{name} fails for {len(times)} times at once, and for none of them alone: {failure}"
+        raise ControlError(*at[0], problem, _so_far(record)) from failure
 
 
 def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floats, v0: Floats) -> tuple[Finding, ...]:
@@ -208,8 +179,7 @@ def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floa
     if not scene.inputs:
         return ()
     if isinstance(controls, OpenLoop):
-        values = _at_all_times if controls.vectorized else _at_times
-        first = values(controls.f, scene, np.zeros(1), np.zeros(1, dtype=np.int64), None)[0]
+        first = _values(controls, scene, np.zeros(1), np.zeros(1, dtype=np.int64), None)[0]
     else:
         first = controls.u[0]
     found = []
@@ -223,40 +193,42 @@ def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floa
     return tuple(found)
 
 
+def _reader(name: str, scene: Scene) -> Callable[[JointValues], Floats]:
+    """The function from what a user's function returns to the control (m,)."""
+    shape, joints, isfinite = (scene.controls,), scene.control_joints, math.isfinite
+
+    def read(value: JointValues) -> Floats:
+        # The common case: all checks take longer than many functions.
+        if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == shape:
+            own: Floats = value.copy()
+            return own if isfinite(own.dot(own)) else require_finite(name, own)
+        return control_values(name, value, joints, *shape)
+
+    return read
+
+
 def _called(
-    name: str, call: Callable[[], JointValues], scene: Scene, step: int, time: float, record: MotionRecord | None
+    name: str,
+    call: Callable[[], Any],
+    read: Callable[[Any], Floats],
+    step: int,
+    time: float,
+    record: MotionRecord | None,
 ) -> Floats:
-    """The control (m,) that a user's function returns.
+    """What a user's function returns, as ``read`` takes it.
 
     Raises:
-        ControlError: The function raised, or returned no control.
+        ControlError: The function raised, or returned something else.
     """
     try:
         value = call()
     except Exception as error:
-        raise _error_raised(name, error, step, time, record) from error
-    return _control(name, value, scene, step, time, record)
-
-
-def _control(
-    name: str, value: JointValues, scene: Scene, step: int, time: float, record: MotionRecord | None
-) -> Floats:
-    """The value of a user's function as a control (m,).
-
-    Raises:
-        ControlError: The value is no control.
-    """
+        raise ControlError(step, time, f"{name} raised {error!r}", _so_far(record)) from error
     try:
-        return control_values(name, value, scene.control_joints, scene.controls)
+        return read(value)
     except (InputError, UnknownJoint) as error:
-        raise _control_error(step, time, str(error), record) from None
+        raise ControlError(step, time, str(error), _so_far(record)) from None
 
 
-def _error_raised(name: str, error: Exception, step: int, time: float, record: MotionRecord | None) -> ControlError:
-    """The error of a user's function that raised."""
-    return _control_error(step, time, f"{name} raised {error!r}", record)
-
-
-def _control_error(step: int, time: float, problem: str, record: MotionRecord | None) -> ControlError:
-    """The error of a user's function, with the motion before it."""
-    return ControlError(step, time, problem, None if record is None else record.trajectory())
+def _so_far(record: MotionRecord | None) -> Trajectory | None:
+    return None if record is None else record.trajectory()
