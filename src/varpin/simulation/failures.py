@@ -29,9 +29,9 @@ class StepError(VarpinError, ValueError):
     """A user's function failed in a step.
 
     Attributes:
-        step: Index of the step.
-        time: Time of the call [s].
-        trajectory: The motion before; None where the function is called before the motion begins.
+        step: Index of the step that it was called for.
+        time: The time it was called with, or the start of that step [s].
+        trajectory: The motion before; None where the function is called before the motion begins, as in an ensemble.
     """
 
     def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory | None) -> None:
@@ -53,43 +53,19 @@ def _restored(kind: type[StepError], message: str, values: dict[str, Any]) -> St
 
 
 class ControlError(StepError):
-    """A control law or the function of an OpenLoop raised, or returned something that is no control.
-
-    Attributes:
-        step: Index of the step it was called for.
-        time: The time it was called with [s].
-        trajectory: The motion before; None from an ensemble, which evaluates its controls before it begins.
-    """
+    """A control law or the function of an OpenLoop raised, or returned something that is no control."""
 
 
 class NoiseError(StepError):
-    """A function of a custom noise raised, or returned something that is no field.
-
-    Attributes:
-        step: Index of the step it was called in.
-        time: The start of that step [s].
-        trajectory: The motion before.
-    """
+    """A function of a custom noise raised, or returned something that is no field."""
 
 
 class ForceError(StepError):
-    """A function of a custom force raised, or returned something that is no force.
-
-    Attributes:
-        step: Index of the step it was called in.
-        time: The start of that step [s].
-        trajectory: The motion before.
-    """
+    """A function of a custom force raised, or returned something that is no force."""
 
 
 class ConstraintError(StepError):
-    """A function of a custom constraint raised, or returned something that is no value of it.
-
-    Attributes:
-        step: Index of the step it was called in.
-        time: The start of that step [s].
-        trajectory: The motion before.
-    """
+    """A function of a custom constraint raised, or returned something that is no value of it."""
 
 
 class ToleranceError(VarpinError, RuntimeError):

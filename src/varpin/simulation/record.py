@@ -210,13 +210,13 @@ class Motions:
             increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
 
         Raises:
-            ForceError: A function of a CustomForce failed.
+            ForceError: A function of a CustomForce failed; so for a ConstraintError.
         """
         drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
         state = self.integrator.fork(self._state)
         try:
             (segment,) = self.integrator.rollout(self.scene, state, commands, drawn, self.dt)
-        except CustomForceError as error:
+        except (CustomForceError, CustomConstraintError) as error:
             given = self.scene, self.integrator, self._start, commands, self.dt, increments
             raise located(*given, error) from error
         done = len(segment.u)
