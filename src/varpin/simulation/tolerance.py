@@ -10,19 +10,19 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
-from varpin.errors import InputError, VarpinError
+from varpin.errors import InputError, StepError, VarpinError
 from varpin.finding import Finding
 from varpin.integrators import Integrator, Reference, integrator_of
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import open_loop
+from varpin.signals.controls import Controls, commands_of, held_rows
+from varpin.signals.functions import ControlLaw, Sampled, require_law
 from varpin.signals.inputs import held_in_parts
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import closer, distance, repeated
-from varpin.simulation.commands import Controls, commands_of, held_rows
-from varpin.simulation.failures import StepError, ToleranceError
-from varpin.simulation.functions import ControlLaw, Sampled, require_law
+from varpin.simulation.failures import ToleranceError
 from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, candidates, first_steps
 from varpin.simulation.record import Motions
 from varpin.simulation.short_forces import short_forces

@@ -11,24 +11,19 @@ import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
-from varpin.errors import InputError, UnknownJoint
+from varpin.errors import ControlError, InputError, UnknownJoint
 from varpin.finding import Finding
-from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import changing, open_loop
+from varpin.signals.commands import Times, changing, open_loop
 from varpin.signals.inputs import as_moved, prescribing
 from varpin.signals.moments import Moments, joined, moments_of
 from varpin.signals.policy import FirstOrderHold, OpenLoop
-from varpin.simulation.failures import ControlError
-from varpin.simulation.record import MotionRecord
 from varpin.support.checks import JointValues, control_values, finite_array, require_finite, takes
-from varpin.trajectory import Trajectory
 
 ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Root mean square of what a step's polynomial leaves of a function of time, as a share of its largest value, up to
 # which the motion's own residual shows its error: a third order of it is lost.
 _RESOLVED = 0.02
-_OF_STATE = "controls(t, q, v)"
 # Distance of a kinematic input from its control at the start [rad or m, rad/s or m/s] without a warning.
 _ELSEWHERE = 1e-6
 
@@ -45,12 +40,14 @@ def require_law(law: ControlLaw) -> None:
     raise InputError("controls must be a function of (t, q, v): it cannot be called with three arguments")
 
 
-def decision(law: ControlLaw, record: MotionRecord) -> Floats:
-    """The control (1, m) of the period that begins at the last node."""
-    k = record.steps
-    time = k * record.dt
-    state = record.last.q[-1].copy(), record.last.v[-1].copy()
-    return _called(_OF_STATE, lambda: law(time, *state), _reader(_OF_STATE, record.scene), k, time, record)[None]
+def decision(law: ControlLaw, scene: Scene, step: int, time: float, q: Floats, v: Floats) -> Floats:
+    """The control (1, m) of the period that begins with a step, at its time [s] and state (n,), (n,).
+
+    Raises:
+        ControlError: The law failed.
+    """
+    read = _reader("controls(t, q, v)", scene)
+    return _called("controls(t, q, v)", lambda: law(time, q.copy(), v.copy()), read, step, time)[None]
 
 
 class Sampled(OpenLoop):
@@ -71,53 +68,36 @@ class Sampled(OpenLoop):
         """The least and the largest controls in each step so far (2, N, m)."""
         return joined(self.parts).extremes if self.parts else None
 
-    def moments(self, first: int, last: int, record: MotionRecord | None) -> Moments:
+    def moments(self, first: int, last: int) -> Moments:
         """The moments over steps first .. last, which begin at a step that is known or the next one.
 
         Raises:
             ControlError: The function failed.
         """
         if last > self.done:
-
-            def at(times: Floats, steps: Integers) -> Floats:
-                return _values(self, self.scene, times, steps, record)
-
-            fresh = moments_of(at, self.done, last - self.done, self.dt, self.breaks)
+            values = functools.partial(_values, self, self.scene)
+            fresh = moments_of(values, self.done, last - self.done, self.dt, self.breaks)
             self.parts.append(fresh)
             before, vars(self)["done"] = self.done, last
             if first == before:
                 return fresh
         return joined(self.parts).part(first, last)
 
+    def commands(self, first: int, steps: int, times: Times) -> Commands:
+        """The controls of ``steps`` steps from ``first`` on, for stages at ``times`` of a step.
 
-def sampled(controls: Sampled, record: MotionRecord, steps: int) -> Commands:
-    """Controls of the next steps up to the first for which the function fails.
+        Kinematic inputs move to the values at the ends of the steps.
 
-    Raises:
-        ControlError: It fails for the first of them.
-    """
-    first = record.steps
-    try:
-        found = controls.moments(first, first + steps, record)
-    except ControlError as error:
-        if error.step == first:
-            raise
-        found = controls.moments(first, error.step, record)
-    return of_time(controls, found, record.integrator, first, record)
-
-
-def of_time(
-    controls: Sampled, found: Moments, integrator: Integrator, first: int = 0, record: MotionRecord | None = None
-) -> Commands:
-    """The controls of steps from ``first`` on with given moments; kinematic inputs move to the values at their ends."""
-    times, scene = integrator.stage_times, controls.scene
-    commands = changing(found.at(times), times) if times else open_loop(found.mean)
-    if not len(scene.prescribed):
-        return commands
-    steps = np.arange(first, first + len(found.series))
-    return prescribing(
-        scene, commands, _values(controls, scene, np.float64(controls.dt) * (steps + 1.0), steps, record)
-    )
+        Raises:
+            ControlError: The function failed.
+        """
+        found = self.moments(first, first + steps)
+        commands = changing(found.at(times), times) if times else open_loop(found.mean)
+        if not len(self.scene.prescribed):
+            return commands
+        at = np.arange(first, first + steps)
+        ends = _values(self, self.scene, np.float64(self.dt) * (at + 1.0), at)
+        return prescribing(self.scene, commands, ends)
 
 
 def function_findings(controls: Sampled, duration: float) -> tuple[Finding, ...]:
@@ -136,16 +116,16 @@ def function_findings(controls: Sampled, duration: float) -> tuple[Finding, ...]
     return tuple(found)
 
 
-def resolved(controls: Sampled, integrator: Integrator) -> bool:
-    """Whether the polynomials that a method takes are nearly the function itself in all steps."""
+def resolved(controls: Sampled, times: Times) -> bool:
+    """Whether the polynomials of a method with stages at ``times`` are nearly the function itself in all steps."""
     if not controls.parts:
         return True
     found = joined(controls.parts)
-    rest = found.rest[:, max(1, len(integrator.stage_times)) - 1]
+    rest = found.rest[:, max(1, len(times)) - 1]
     return bool(rest.max(initial=0.0) <= _RESOLVED * found.largest) and not len(found.unsettled)
 
 
-def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers, record: MotionRecord | None) -> Floats:
+def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers) -> Floats:
     """Controls (K, m) from a function of time at times (K,) [s] within ``steps`` (K,).
 
     Raises:
@@ -156,7 +136,7 @@ def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers, re
     if not controls.vectorized:
         name = "OpenLoop: f(t)"
         read = _reader(name, scene)
-        found = [_called(name, functools.partial(f, time), read, step, time, record) for step, time in at]
+        found = [_called(name, functools.partial(f, time), read, step, time) for step, time in at]
         return np.array(found).reshape(len(at), m)
     name = "OpenLoop, vectorized=True: f(t) of times t (K,)"
     # The first time alone, so that rows and columns cannot be confused.
@@ -169,9 +149,9 @@ def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers, re
         # Each alone, to find the first that fails.
         for step, time in at:
             alone = functools.partial(f, np.array([time]))
-            _called(name, alone, lambda value: finite_array(name, value, (1, m)), step, time, record)
+            _called(name, alone, lambda value: finite_array(name, value, (1, m)), step, time)
         problem = f"{name} fails for {len(times)} times at once, and for none of them alone: {failure}"
-        raise ControlError(*at[0], problem, _so_far(record)) from failure
+        raise ControlError(*at[0], problem) from failure
 
 
 def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floats, v0: Floats) -> tuple[Finding, ...]:
@@ -179,7 +159,7 @@ def begins_elsewhere(controls: OpenLoop | FirstOrderHold, scene: Scene, q0: Floa
     if not scene.inputs:
         return ()
     if isinstance(controls, OpenLoop):
-        first = _values(controls, scene, np.zeros(1), np.zeros(1, dtype=np.int64), None)[0]
+        first = _values(controls, scene, np.zeros(1), np.zeros(1, dtype=np.int64))[0]
     else:
         first = controls.u[0]
     found = []
@@ -213,7 +193,6 @@ def _called(
     read: Callable[[Any], Floats],
     step: int,
     time: float,
-    record: MotionRecord | None,
 ) -> Floats:
     """What a user's function returns, as ``read`` takes it.
 
@@ -223,12 +202,8 @@ def _called(
     try:
         value = call()
     except Exception as error:
-        raise ControlError(step, time, f"{name} raised {error!r}", _so_far(record)) from error
+        raise ControlError(step, time, f"{name} raised {error!r}") from error
     try:
         return read(value)
     except (InputError, UnknownJoint) as error:
-        raise ControlError(step, time, str(error), _so_far(record)) from None
-
-
-def _so_far(record: MotionRecord | None) -> Trajectory | None:
-    return None if record is None else record.trajectory()
+        raise ControlError(step, time, str(error)) from None
