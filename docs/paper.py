@@ -1,6 +1,6 @@
-"""The claims and figures of docs/paper.md, from a folder that ``varpin paper`` wrote.
+"""The claims and figures of docs/paper.md, from a folder of results.
 
-varpin paper --out paper
+python benchmarks/paper paper
 python docs/paper.py paper
 """
 

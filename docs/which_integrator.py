@@ -35,12 +35,12 @@ from matplotlib.ticker import LogLocator, NullFormatter
 import varpin as vp
 from varpin import plots
 from varpin.mechanics.wiener import coarsen
-from varpin.study.paper import cases
 
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent / "benchmarks"))
 import peers  # noqa: E402
 from pages import fill  # noqa: E402
+from paper import cases  # noqa: E402
 
 PAGE = "which-integrator.md"
 Run = Callable[[], np.ndarray]
