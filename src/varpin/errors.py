@@ -10,6 +10,16 @@ from typing import Any, Self
 class VarpinError(Exception):
     """Base of all errors that varpin raises."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), str(self), vars(self).copy())
+
+
+def _restored(kind: type[VarpinError], message: str, values: dict[str, Any]) -> VarpinError:
+    """An unpickled error."""
+    error = kind.__new__(kind, message)
+    vars(error).update(values)
+    return error
+
 
 class RobotError(VarpinError, ValueError):
     """A robot description cannot be used."""
@@ -226,16 +236,6 @@ class StepError(VarpinError, ValueError):
     def after(self, trajectory: Any) -> Self:
         """The same error with the motion before it."""
         return type(self)(self.step, self.time, self.problem, trajectory)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (type(self), str(self), vars(self).copy())
-
-
-def _restored(kind: type[StepError], message: str, values: dict[str, Any]) -> StepError:
-    """An unpickled error."""
-    error = kind.__new__(kind, message)
-    vars(error).update(values)
-    return error
 
 
 class ControlError(StepError):
