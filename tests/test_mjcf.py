@@ -172,7 +172,7 @@ def test_robot_is_mujoco_s(tmp_path, kind, caplog):
     robot, (model, data) = vp.load_robot(path), compiled(path)
     assert not caplog.records
     assert list(robot.joint_names) == [model.joint(k).name for k in range(model.njnt)]
-    scene = vp.Scene(robot, damping=robot.damping, gravity=robot.model.gravity.linear)
+    scene = vp.Scene(robot, damping=robot.damping)
     rng = np.random.default_rng(0)
     for _ in range(2):
         q, v = rng.uniform(-0.9, 0.9, (2, robot.dof))

@@ -389,8 +389,8 @@ def load_robot(
         UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
         UnknownJoint: ``lock`` or ``armature`` names a joint that the robot does not have.
         UnknownFrame: A payload names a frame that the robot does not have.
-        MissingDependency: A xacro file needs the package xacro (extra ``xacro``); a name needs robot_descriptions
-            (extra ``descriptions``).
+        MissingDependency: A xacro file needs the package xacro (extra ``xacro``), an MJCF file mujoco (extra
+            ``mjcf``), a name robot_descriptions (extra ``descriptions``).
         InputError: A xacro file has no argument of that name, or a base or an armature is invalid.
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
