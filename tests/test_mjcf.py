@@ -189,6 +189,16 @@ def test_robot_is_mujoco_s(tmp_path, kind, caplog):
     np.testing.assert_allclose(limits[1], np.where(limited, model.jnt_range[:, 1], np.inf))
 
 
+@pytest.mark.parametrize("name", ["other words/ärm.mjcf", "ARM.XML"])
+def test_files_of_other_names(tmp_path, name):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    text = one(f'<include file="tip.xml"/><geom type="mesh" mesh="tet"/>{BOX}', MESH)
+    written(path.parent, one()).unlink()
+    path.write_text(text)
+    assert vp.load_robot(path).joint_names == ("ja", "jtip")
+
+
 def test_keyframes_are_postures(tmp_path):
     keys = '<keyframe><key name="home" qpos="0.1 -0.2"/><key time="1"/></keyframe>'
     robot = vp.load_robot(written(tmp_path, one(MASS + TIP, keys)))

@@ -58,7 +58,7 @@ class Mjcf:
 
 def is_mjcf(path: Path) -> bool:
     """Whether a file is an MJCF by its root element; only ``.xml`` and ``.mjcf`` files are opened."""
-    return path.suffix in (".xml", ".mjcf") and root_tag(path) in ("mujoco", "mujocoinclude")
+    return path.suffix.lower() in (".xml", ".mjcf") and root_tag(path) in ("mujoco", "mujocoinclude")
 
 
 def root_tag(path: Path) -> str:
@@ -116,7 +116,9 @@ class _Walk:
         try:
             with captured_stderr() as complaints, warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                spec = mujoco.MjSpec.from_file(str(path))
+                # Its parser takes no other suffix.
+                name = str(path.with_suffix(".xml"))
+                spec = mujoco.MjSpec.from_file(name, include={name: path.read_bytes()})
                 # Both keep the motion: bodies without joints have their names, geoms without contacts are drawn.
                 spec.compiler.fusestatic = spec.compiler.discardvisual = False
                 m = spec.compile()
