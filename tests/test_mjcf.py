@@ -258,9 +258,14 @@ def test_joints_of_several_coordinates_are_named_and_may_be_locked(tmp_path, joi
 SEEN = (
     f'<site name="spot" pos="0.1 0.2 0.3"/>{BALL} name="ball" rgba="1 0 0 0.5"/>{BOX}<geom name="hidden" size="1" '
     'group="3"/><geom name="tet" type="mesh" mesh="tet" pos="0.1 0.2 0" euler="0.3 0 0.1" material="blue"/>'
-    '<geom name="rod" type="capsule" size="0.02" fromto="0 0 0 0.1 0.2 0.3" contype="0" conaffinity="0" group="4"/>'
+    '<geom name="rod" type="capsule" size="0.02" fromto="0 0 0 0.1 0.2 0.3" contype="0" conaffinity="0" group="4" '
+    'material="grass"/>'
 )
-BLUE = MESH.replace("</asset>", '<material name="blue" rgba="0 0 1 1"/></asset>')
+BLUE = MESH.replace(
+    "</asset>",
+    '<texture name="grass" type="2d" builtin="flat" rgb1="0 1 0" width="4" height="4"/><material name="grass" '
+    'texture="grass"/><material name="blue" rgba="0 0 1 1"/></asset>',
+)
 
 
 def test_shapes_and_sites_are_where_mujoco_has_them(tmp_path):
@@ -285,7 +290,8 @@ def test_shapes_and_sites_are_where_mujoco_has_them(tmp_path):
     expected = [where.act(np.array(corner)) for corner in ([0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.4])]
     # MuJoCo keeps vertices in single precision.
     np.testing.assert_allclose(sorted(corners.tolist()), sorted(np.array(expected).tolist()), rtol=0, atol=1e-7)
-    assert [shapes[name].meshColor.tolist() for name in ("ball", "tet")] == [[1, 0, 0, 0.5], [0, 0, 1, 1]]
+    colors = {"ball": [1.0, 0.0, 0.0, 0.5], "tet": [0.0, 0.0, 1.0, 1.0], "rod": [0.0, 1.0, 0.0, 1.0]}
+    assert {name: shapes[name].meshColor.tolist() for name in colors} == colors
 
 
 def _euler(*angles):

@@ -208,6 +208,7 @@ class _Walk:
                 model.referenceConfigurations[name] = m.key_qpos[key][order]
         for name, what in _LEFT_OUT.items():
             self.left_out[what] += int(np.atleast_2d(np.transpose(getattr(m, name, 0))).any(axis=0).sum())
+        self.left_out["forces of plugins"] += int((m.body_plugin >= 0).sum())
         self.left_out["forces of a fluid"] += int(m.opt.density != 0.0 or m.opt.viscosity != 0.0)
 
     def _add_drives(self, joint: int, v: int) -> None:
