@@ -20,9 +20,9 @@ from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import children
+from varpin.signals.controls import commands_of
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.choice import stronger, usual_integrator
-from varpin.simulation.commands import commands_of
 from varpin.simulation.start import in_other_units, on_constraints
 from varpin.simulation.time_steps import time_steps
 from varpin.support.checks import (
