@@ -72,9 +72,8 @@ CASES = {
     ),
     vp.UnsupportedJoint: (
         lambda _: freeflyer(),
-        "joint 'root' is a JointModelFreeFlyer, which has no single coordinate in R; varpin takes revolute, prismatic, "
-        "continuous, fixed and mimic joints: fix it to the base with lock={'root': [7 numbers]}, or describe it as a "
-        "chain of one-axis joints",
+        "joint 'root' is a JointModelFreeFlyer, which has no single coordinate in R: hold it with "
+        "lock={'root': [7 numbers]}, or describe it as a chain of revolute and prismatic joints",
     ),
     vp.SingularMassMatrix: (
         lambda _: massless(),

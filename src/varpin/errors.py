@@ -78,9 +78,8 @@ class UnsupportedJoint(RobotError):
         self.kind = kind
         value = "position" if numbers == 1 else f"[{numbers} numbers]"
         super().__init__(
-            f"joint {joint!r} is a {kind}, which has no single coordinate in R; varpin takes revolute, prismatic, "
-            f"continuous, fixed and mimic joints: fix it to the base with lock={{{joint!r}: {value}}}, "
-            "or describe it as a chain of one-axis joints"
+            f"joint {joint!r} is a {kind}, which has no single coordinate in R: hold it with lock={{{joint!r}: {value}}}, "
+            "or describe it as a chain of revolute and prismatic joints"
         )
 
 
