@@ -78,8 +78,8 @@ class UnsupportedJoint(RobotError):
         self.kind = kind
         value = "position" if numbers == 1 else f"[{numbers} numbers]"
         super().__init__(
-            f"joint {joint!r} is a {kind}, which has no single coordinate in R: hold it with lock={{{joint!r}: {value}}}, "
-            "or describe it as a chain of revolute and prismatic joints"
+            f"joint {joint!r} is a {kind}, which has no single coordinate in R: hold it with "
+            f"lock={{{joint!r}: {value}}}, or describe it as a chain of revolute and prismatic joints"
         )
 
 
