@@ -1,6 +1,6 @@
 """Prints energy errors of an undamped planar chain at coarse steps, and what the guards of the midpoint step cost.
 
-    python benchmarks/guards.py
+python benchmarks/guards.py
 """
 
 import logging
