@@ -48,8 +48,6 @@ Run = Callable[[], np.ndarray]
 BLOCKS = 20
 # Errors [rad] from which on a motion is another one.
 LOST = 1.0
-# What a table says of a motion that is not finite, or another one.
-GONE = "lost"
 
 STYLES = {
     "Midpoint": ("#0072b2", "o", "-"),
@@ -423,56 +421,45 @@ def long(scale: Scale) -> tuple[str, Figure]:
 # Optimal control ----------------------------------------------------------------------------------------------------
 
 
-PLAN_COLUMNS = ("start", "integrator", "dt [s]", "solve [ms]", "iterations", "planned cost", "true, open loop",
-                "true, feedback")  # fmt: skip
-# Time steps [s] of plans that the table has; the figure has all.
-PLAN_SHOWN = (1e-2, 4e-3)
 PLAN_STARTS = ("on the reference", "off it")
-# The two true costs, in the order of the table's last columns.
+# The two true costs.
 PLAN_MARKS: dict[str, dict[str, Any]] = {
     "open loop": {"marker": "o", "markersize": 4, "linestyle": "none"},
     "with feedback": {"marker": "s", "markersize": 9, "linestyle": "none", "markerfacecolor": "none"},
 }
 
 
-def control(scale: Scale) -> tuple[str, Figure]:
+def control(scale: Scale) -> tuple[None, Figure]:
     """True cost of the finger's plans against solve time."""
-    lines = [f"| {' | '.join(PLAN_COLUMNS)} |", "|" + "---|" * len(PLAN_COLUMNS)]
     # Off the reference most solve times are those of searches that do not converge: once is enough.
     settings = ((cases.MAIN, 3, 0.0), (cases.VARIATIONS[0], 1, 2e-3))
+    members: tuple[tuple[str, Sequence[vp.Integrator]], ...] = (
+        ("variational", (vp.ExplicitEuler(), vp.Midpoint())),
+        # Running costs at the Gauss points: of fourth order, for who is.
+        (cases.FOURTH_ORDER, (vp.RungeKutta4(), vp.Gauss(2))),
+    )
+    runs: dict[str, list[vp.OptimalControlRun]] = {}
     for start, (setting, repeats, least_step) in zip(PLAN_STARTS, settings, strict=True):
-        members: tuple[tuple[str, Sequence[vp.Integrator]], ...] = (
-            ("variational", (vp.ExplicitEuler(), vp.Midpoint())),
-            # Running costs at the Gauss points: of fourth order, for who is.
-            (cases.FOURTH_ORDER, (vp.RungeKutta4(), vp.Gauss(2))),
-        )
-        runs: list[vp.OptimalControlRun] = []
+        runs[start] = []
         for method, integrators in members:
             problem = cases.problem(setting, None, method, scale.control_steps[0])
             dts = [dt for dt in scale.control_steps if _divides(dt, cases.DURATION) and dt >= least_step]
-            runs += vp.optimal_control_tradeoff(problem, integrators, dts, repeats=repeats).runs
-        for run in runs:
-            costs = (run.planned_cost, run.open_loop_cost, run.closed_loop_cost)
-            cells = " | ".join(f"{cost:.5g}" if np.isfinite(cost) else GONE for cost in costs)
-            name = name_of_text(run.integrator)
-            lines.append(f"| {start} | {name} | {run.dt:g} | {1e3 * run.seconds:.1f} | {run.iterations} | {cells} |")
-    shown = [line for line in lines[2:] if line.split(" | ")[2] in {f"{dt:g}" for dt in PLAN_SHOWN}]
-    return "\n".join([*lines[:2], *shown]), plans_figure(lines)
+            runs[start] += vp.optimal_control_tradeoff(problem, integrators, dts, repeats=repeats).runs
+    return None, plans_figure(runs)
 
 
-def plans_figure(lines: Iterable[str]) -> Figure:
-    """A panel for each method and start, from the lines of the table."""
-    rows = [[word.strip() for word in line.strip("| \n").split("|")] for line in lines]
-    rows = [row for row in rows if len(row) == len(PLAN_COLUMNS) and row[0] in PLAN_STARTS]
-    names = list(dict.fromkeys(row[1] for row in rows))
+def plans_figure(runs: dict[str, list[vp.OptimalControlRun]]) -> Figure:
+    """A panel for each method and start."""
+    names = list(dict.fromkeys(name_of_text(run.integrator) for own in runs.values() for run in own))
     figure = Figure(figsize=(11, 6), layout="constrained")
-    panels = figure.subplots(len(PLAN_STARTS), len(names), sharex="row", sharey="row", squeeze=False)
-    for start, line_of_panels in zip(PLAN_STARTS, panels, strict=True):
+    panels = figure.subplots(len(runs), len(names), sharex="row", sharey="row", squeeze=False)
+    for (start, own), line_of_panels in zip(runs.items(), panels, strict=True):
         for name, axes in zip(names, line_of_panels, strict=True):
             # No lines: a finer step is not always a slower solve.
-            for column, (label, style) in enumerate(PLAN_MARKS.items(), 6):
-                points = [(float(row[3]), float(row[column])) for row in rows
-                          if row[:2] == [start, name] and row[column] != GONE]  # fmt: skip
+            shown = [run for run in own if name_of_text(run.integrator) == name]
+            for label, style in PLAN_MARKS.items():
+                costs = [run.open_loop_cost if label == "open loop" else run.closed_loop_cost for run in shown]
+                points = [(1e3 * run.seconds, y) for run, y in zip(shown, costs, strict=True) if np.isfinite(y)]
                 axes.loglog(
                     [x for x, _ in points], [y for _, y in points], color=STYLES[name][0], label=label, **style
                 )  # fmt: skip
@@ -500,8 +487,6 @@ def name_of_text(text: str) -> str:
 
 # Noise --------------------------------------------------------------------------------------------------------------
 
-# The table has steps of 2**-SHOWN_STEP s.
-SHOWN_STEP = 6
 NOISY: dict[str, vp.Integrator] = {
     "Euler-Maruyama": vp.ExplicitEuler(),
     "Midpoint": vp.Midpoint(),
@@ -511,7 +496,7 @@ NOISY: dict[str, vp.Integrator] = {
 }
 
 
-def noise(scale: Scale) -> tuple[str, Figure]:
+def noise(scale: Scale) -> tuple[None, Figure]:
     """Strong and weak errors on the same Brownian paths."""
     scene = vp.Scene(vp.planar_chain(2), damping=0.3, noise=vp.AdditiveNoise(0.5))
     rest = np.zeros(2)
@@ -536,7 +521,6 @@ def noise(scale: Scale) -> tuple[str, Figure]:
             array[path] = end(NOISY[name], coarsen(dw, fine // 2**k))
     figure = Figure(figsize=(10, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    lines = ["| method | dt [s] | strong error [rad] | weak error of q1^2 [rad^2] |", "|---|---|---|---|"]
     for name in NOISY:
         colour, marker, stroke = STYLES[name]
         dts, strong, weak, bars = [], [], [], []
@@ -547,8 +531,6 @@ def noise(scale: Scale) -> tuple[str, Figure]:
             strong.append(np.sqrt((off**2).mean()))
             weak.append(abs(gap.mean()))
             bars.append(gap.std(ddof=1) / np.sqrt(scale.paths))
-            if k == SHOWN_STEP:
-                lines.append(f"| {name} | 1/{2**k} | {strong[-1]:.1e} | {weak[-1]:.1e} ± {2 * bars[-1]:.0e} |")
         left.loglog(dts, strong, color=colour, marker=marker, linestyle=stroke, label=name)
         right.errorbar(dts, weak, yerr=2.0 * np.array(bars), color=colour, marker=marker, linestyle=stroke, capsize=2)
     right.set(yscale="log", xlabel="dt [s]", ylabel="weak error of q1² after 1 s [rad²]", title="weak")
@@ -557,14 +539,12 @@ def noise(scale: Scale) -> tuple[str, Figure]:
         axes.set_xscale("log", base=2)
         plots.apply_style(axes)
     figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return "\n".join(lines), figure
+    return None, figure
 
 
 # Stiffness ----------------------------------------------------------------------------------------------------------
 
 PRODUCTS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-# Those that the tables have; the figure has all.
-SHOWN_PRODUCTS = (0.1, 1.0, 10.0, 100.0)
 STIFF_STEP = 1e-2
 
 
@@ -582,14 +562,13 @@ def stiff_case(kind: str, product: float) -> peers.Case:
     return peers.Case(f"stiff {kind}, {product:g}", scene, rest, rest, rest)
 
 
-def stiff(scale: Scale) -> tuple[str, Figure]:
+def stiff(scale: Scale) -> tuple[None, Figure]:
     """Errors of the first two joints at one step, over the stiffness of the third."""
     own: tuple[vp.Integrator, ...] = (
         vp.ExplicitEuler(), vp.SemiImplicitEuler(), vp.RungeKutta4(), vp.Midpoint(), vp.Gauss(2), vp.Gauss(3),
     )  # fmt: skip
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
-    tables = []
     handles: dict[str, object] = {}
     for kind, axes in zip(("spring", "damper"), panels, strict=True):
         curves: dict[str, list[Point]] = {}
@@ -612,26 +591,18 @@ def stiff(scale: Scale) -> tuple[str, Figure]:
             for point in race(slow, exact[:2], scale):
                 curves.setdefault(f"{point.method}, {point.setting}", []).append(point)
         heading = "dt omega" if kind == "spring" else "dt times rate"
-        lines = [
-            f"| stiff {kind}: {heading} = | {' | '.join(f'{p:g}' for p in SHOWN_PRODUCTS)} |",
-            "|---" * (len(SHOWN_PRODUCTS) + 1) + "|",
-        ]
         for label, points in curves.items():
-            shown = [p for product, p in zip(PRODUCTS, points, strict=True) if product in SHOWN_PRODUCTS]
-            cells = [f"{p.error:.0e} ({p.microseconds:.0f})" if p.error < LOST else GONE for p in shown]
-            lines.append(f"| {label} | {' | '.join(cells)} |")
             colour, marker, stroke = STYLES[points[0].method]
             good = [(x, p.error) for x, p in zip(PRODUCTS, points, strict=True) if p.error < LOST]
             if good:
                 (handles[label],) = axes.loglog(
                     *zip(*good, strict=True), color=colour, marker=marker, linestyle=stroke, markersize=5
                 )
-        tables.append("\n".join(lines))
         axes.set(xlabel=heading, title=f"stiff {kind} at the last of three joints")
         plots.apply_style(axes)
     panels[0].set_ylabel("error of the first two joints after 1 s [rad]")
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return "\n\n".join(tables), figure
+    return None, figure
 
 
 # Real arms ----------------------------------------------------------------------------------------------------------
@@ -792,7 +763,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
     for name, section in sections.items():
         if options.only is not None and name not in options.only:
             continue
-        parts[name], figures[name], *raced = section(scale)
+        text, figures[name], *raced = section(scale)
+        parts |= {} if text is None else {name: text}
         rows += raced[0] if raced else []
         _tell(name, begin)
     for name, figure in figures.items():
