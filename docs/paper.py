@@ -26,7 +26,7 @@ def main() -> None:
     with (folder / "claims.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     table = ["| verdict | source | sentence |", "|---|---|---|"]
-    table += [f"| {r['verdict']} | {r['source']} | {r['sentence']} |" for r in rows]
+    table += [f"| {r['verdict']} | {r['source']} | {r['sentence']} |" for r in rows if r["source"].startswith("paper")]
     fill(DOCUMENT, {"claims": "\n".join(table)})
 
 
