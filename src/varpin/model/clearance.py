@@ -455,7 +455,7 @@ def _vertices(robot: Robot) -> dict[str, Floats]:
     for shape in geometry(robot).geometryObjects:
         frame = model.frames[shape.parentFrame]
         place = frame.placement.inverse() * shape.placement
-        corners = _corners(shape.geometry) * np.asarray(shape.meshScale)
+        corners = _corners(shape.geometry)
         found.setdefault(frame.name, []).append(corners @ place.rotation.T + place.translation)
     return {name: np.vstack(parts) for name, parts in found.items()}
 
