@@ -199,6 +199,7 @@ FILES = {
     "triangles.obj": (wavefront(faces=TRIANGLES), "1 1 1"),
     "mixed.obj": (wavefront(faces=[*QUADS[:3], *TRIANGLES[3:6], *TRIANGLES[9:]]), "1 1 1"),
     "relative.obj": (relative_wavefront(), "1 1 1"),
+    "comments.obj": (wavefront().replace("\nf 1", " # right-hand\nf 1").replace("8 6\n", "8 6 # a-side\n"), "1 1 1"),
     "unused.obj": (wavefront(np.vstack([CORNERS, [[9.0, 9.0, 9.0]]])), "1 1 1"),
     "materials.obj": (
         MATERIALS + wavefront(faces=QUADS[:2]) + "usemtl red\n" + wavefront(faces=QUADS[2:4] + 8)
@@ -328,3 +329,15 @@ def test_scales_are_three_numbers(tmp_path, scale):
     (tmp_path / "a.obj").write_text(wavefront())
     with refused(vp.RobotError, "'l2'", "a.obj", repr(scale)):
         vp.load_robot(arm(tmp_path, "a.obj", scale), inertia="meshes")
+
+
+@pytest.mark.parametrize(
+    ("scale", "told"), [("1 1 1", False), ("1000 1000 1000", True), ("39.4 39.4 39.4", True), ("1e-3 1e-3 1e-3", True)]
+)
+def test_a_mesh_in_other_units_is_told(tmp_path, scale, told):
+    (tmp_path / "a.stl").write_bytes(binary_stl())
+    shape = f'<visual><geometry><mesh filename="a.stl" scale="{scale}"/></geometry></visual>'
+    path = write_urdf(tmp_path, link("l1", extra=shape), link("l2"), joint("j1", "base", "l1"), joint("j2", "l1", "l2"))
+    warnings = vp.inspect_robot(path).warnings
+    assert bool(naming(warnings, "mesh 'a.stl'", "'l1'", "scale=")) == told
+    assert all(len(warning) <= 240 for warning in warnings)

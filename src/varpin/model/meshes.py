@@ -66,13 +66,17 @@ class MeshPart:
 
     def moved(self, matrix: Floats) -> MeshPart:
         """The part under a linear map and a translation (4, 4); a mirror image keeps its outside."""
+        if (matrix == np.eye(4)).all():
+            return self
         turn = matrix[:3, :3]
         faces = self.faces if np.linalg.det(turn) >= 0.0 else self.faces[:, ::-1]
         normals = self.normals
         if normals is not None:
-            normals = normals @ np.linalg.pinv(turn)
-            normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
-        return replace(self, vertices=self.vertices @ turn.T + matrix[:3, 3], faces=faces, normals=normals)
+            normals = np.einsum("ij,jk->ik", normals, np.linalg.pinv(turn))
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
+        # einsum, as threads of linear algebra take longer.
+        vertices = np.einsum("ij,kj->ik", self.vertices, turn) + matrix[:3, 3]
+        return replace(self, vertices=vertices, faces=faces, normals=normals)
 
 
 Reader = Callable[[str], tuple[MeshPart, ...]]
@@ -147,9 +151,8 @@ def _read_wavefront(file: Path, content: bytes) -> list[MeshPart]:
     from trimesh.geometry import triangulate_quads  # noqa: PLC0415 - as above
 
     text = content.decode("utf-8", errors="replace").replace("\\\n", " ")
-    text = re.sub(r"^[ \t]+|(?<=\d)\s*#.*$", "", text, flags=re.MULTILINE)
-    if re.search(r"^f\s.*-", text, re.MULTILINE):
-        text = _counted_from_one(text)
+    if re.search(r"^[ \t]|^f.*-|^[fv].*#", text, re.MULTILINE):
+        text = _simplified(text)
     mention = re.compile(r"^mtllib\s+(.*)$", re.MULTILINE)
     library = _Library(file, mention.findall(text))
     loaded = load_obj(io.StringIO("mtllib all\n" + mention.sub("", text)), resolver=library)
@@ -178,16 +181,17 @@ def _read_wavefront(file: Path, content: bytes) -> list[MeshPart]:
     return parts[::-1]
 
 
-def _counted_from_one(text: str) -> str:
-    """A Wavefront text whose faces name corners from the first on; trimesh counts back from the last of the file."""
+def _simplified(text: str) -> str:
+    """A Wavefront text without what trimesh misreads: blanks before words, comments behind numbers, negative numbers."""
     seen = {"v": 0, "vt": 0, "vn": 0}
 
     def counted(line: str) -> str:
-        word, *corners = line.split() or [""]
-        if word in seen:
-            seen[word] += 1
+        word, *corners = line.partition("#")[0].split() or [""]
+        if word != "f" and word not in seen:
+            return line.lstrip()
         if word != "f":
-            return line
+            seen[word] += 1
+            return " ".join([word, *corners])
         pairs = (zip(corner.split("/"), seen.values(), strict=False) for corner in corners)
         return "f " + " ".join(
             "/".join(str(count + 1 + int(number)) if number[:1] == "-" else number for number, count in corner)
