@@ -210,6 +210,10 @@ FILES = {
     "mirrored.obj": (wavefront(CORNERS * [1.0, -1.0, 1.0], QUADS[:, ::-1]), "1 -1 1"),
     "through_a_point.obj": (wavefront(-CORNERS, QUADS[:, ::-1]), "-1 -1 -1"),
     "millimetres.obj": (wavefront(1000.0 * CORNERS), "0.001 0.001 1e-3"),
+    "box.off": (
+        f"OFF\n8 12 0\n{chr(10).join(map(words, CORNERS))}\n{chr(10).join(f'3 {words(face)}' for face in TRIANGLES)}\n",
+        "1 1 1",
+    ),
     "ascii.stl": (ascii_stl(), "1 1 1"),
     "two_solids.stl": (ascii_stl(TRIANGLES[:5]) + ascii_stl(TRIANGLES[5:], "rest"), "1 1 1"),
     "binary.STL": (binary_stl(), "1 1 1"),
@@ -308,6 +312,7 @@ def test_parts_have_the_looks_of_their_materials(tmp_path):
     [
         ("a.stl", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", ("Git LFS", "pull")),
         ("a.stl", b"no mesh", "no triangles"),
+        ("a.step", b"ISO-10303-21;", ".stl"),
         ("a.dae", b"<COLLADA", "cannot be read"),
         ("a.dae", collada(unit='<unit meter="0"/>').encode(), "<unit>"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\n", "no triangles"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import logging
 import re
+import textwrap
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,13 +31,15 @@ coal = pin.coal
 
 # The first words of a file that Git LFS has not fetched.
 _POINTER = b"version https://git-lfs"
+# Longest text of a reader's own in an error.
+_REASON = 100
 # Suffixes of images that browsers can show.
 _PICTURES = frozenset([".png", ".jpg", ".jpeg", ".gif", ".bmp", ".webp"])
 # What a Collada file may have besides triangles; a fault in it costs the colours, not the shape.
 _BESIDE = frozenset(
     f"{kind}_{what}"
     for kind in ("library", "instance")
-    for what in ("animations", "camera", "cameras", "controller", "controllers", "effects", "images", "light", "lights")
+    for what in ("animations", "camera", "cameras", "effects", "images", "light", "lights")
 ) | {"bind_material", "library_materials", "lines", "linestrips"}
 
 
@@ -83,7 +86,7 @@ Reader = Callable[[str], tuple[MeshPart, ...]]
 
 
 def read_mesh(path: str) -> tuple[MeshPart, ...]:
-    """Read a mesh file: Collada (.dae), Wavefront (.obj), STL and others, such as PLY.
+    """Read a mesh file: Collada, Wavefront (.obj), STL, PLY, OFF or glTF.
 
     Lengths of a Collada file are in its unit; its ``<up_axis>`` is ignored, as RViz, MoveIt and Gazebo do.
 
@@ -96,8 +99,9 @@ def read_mesh(path: str) -> tuple[MeshPart, ...]:
     file = Path(path)
     if not is_file(file):
         raise FileError(f"no mesh file {path!r}")
-    suffix = file.suffix.lower()
-    read = _read_collada if suffix == ".dae" else _read_wavefront if suffix == ".obj" else _read_plain
+    read = _READERS.get(file.suffix.lower())
+    if read is None:
+        raise FileError(f"the mesh {path} is of a kind that is not read: convert it to one of {', '.join(_READERS)}")
     try:
         content = file.read_bytes()
         if content.startswith(_POINTER):
@@ -106,7 +110,7 @@ def read_mesh(path: str) -> tuple[MeshPart, ...]:
     except FileError:
         raise
     except Exception as error:  # Readers of damaged files fail in many ways.
-        raise FileError(f"the mesh {path} cannot be read: {error}") from None
+        raise FileError(f"the mesh {path} cannot be read: {textwrap.shorten(str(error), _REASON)}") from None
     if not parts:
         raise FileError(f"the mesh {path} has no triangles")
     if not all(np.isfinite(part.vertices).all() for part in parts):
@@ -114,12 +118,11 @@ def read_mesh(path: str) -> tuple[MeshPart, ...]:
     return parts
 
 
-def _read_plain(file: Path, content: bytes) -> list[MeshPart]:
+def _read_plain(file: Path, content: bytes) -> list[MeshPart]:  # noqa: ARG001
     """The triangles of a file without materials."""
     import trimesh  # noqa: PLC0415 - takes a while
 
-    scene = trimesh.load_scene(io.BytesIO(content), file_type=file.suffix.lower().removeprefix("."), process=False)
-    mesh = scene.to_mesh()
+    mesh = trimesh.load_scene(str(file), process=False).to_mesh()
     return [joined([MeshPart(_floats(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64))])]
 
 
@@ -182,7 +185,7 @@ def _read_wavefront(file: Path, content: bytes) -> list[MeshPart]:
 
 
 def _simplified(text: str) -> str:
-    """A Wavefront text without what trimesh misreads: blanks before words, comments behind numbers, negative numbers."""
+    """A Wavefront text without what trimesh misreads: blanks before words, comments behind and negative numbers."""
     seen = {"v": 0, "vt": 0, "vn": 0}
 
     def counted(line: str) -> str:
@@ -293,6 +296,15 @@ def _texture(name: str, file: Path) -> Path | None:
     else:
         return path
     return None
+
+
+# Readers by suffix; lengths of the files of trimesh are metres.
+_READERS: Mapping[str, Callable[[Path, bytes], list[MeshPart]]] = {
+    ".dae": _read_collada,
+    ".zae": _read_collada,
+    ".obj": _read_wavefront,
+    **dict.fromkeys((".stl", ".ply", ".off", ".glb", ".gltf"), _read_plain),
+}
 
 
 def joined(parts: Sequence[MeshPart]) -> MeshPart:

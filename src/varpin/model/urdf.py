@@ -219,10 +219,10 @@ def build_shapes(
             scale = [number for word in look.scale.split() if (number := _finite(word))]
             try:
                 if len(scale) != len(look.scale.split()) or len(scale) != 3:
-                    raise FileError(f"its mesh {look.mesh} has the scale {look.scale!r}, not three numbers but 0")
+                    raise FileError(f"mesh {look.mesh} has the scale {look.scale!r}: give three numbers other than 0")
                 put_mesh(shape, str(_located(look.mesh, urdf.path, package_dirs)), scale, read)
             except FileError as error:
-                faults[look.link] = f"link {look.link!r} of {urdf.path}: {error}"
+                faults[look.link] = f"link {look.link!r}: {error}"
     found = pin.GeometryModel()
     for shape in with_own_meshes(shapes, read).geometryObjects:
         if shape.name not in looks or looks[shape.name].link not in faults:

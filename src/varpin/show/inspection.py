@@ -323,8 +323,8 @@ def _mesh_warnings(robot: Robot) -> Iterator[str]:
     if not MESH_RATIOS[0] * reach <= size <= MESH_RATIOS[1] * reach:
         name, link = Path(shape.meshPath).name or shape.name, robot.free_model.frames[shape.parentFrame].name
         yield (
-            f"mesh {name!r} of link {link!r} is {size:.3g} m long, where the arm reaches {reach:.3g} m: if it is not in "
-            "metres, its scale= must make it so"
+            f"mesh {name!r} of link {link!r} is {size:.3g} m long, where the arm reaches {reach:.3g} m: if it is not "
+            "in metres, its scale= must make it so"
         )
 
 
