@@ -221,7 +221,8 @@ def _read_collada(file: Path, content: bytes) -> list[MeshPart]:
     if not 0.0 < unit < np.inf:
         raise FileError(f"the mesh {file} has a <unit> of {unit:g} m")
     scale = np.diag([unit, unit, unit, 1.0])
-    found = [instance for node in document.scene.nodes for instance in _instances(node, scale)]
+    scenes = [document.scene] if document.scene is not None else document.scenes
+    found = [instance for scene in scenes for node in scene.nodes for instance in _instances(node, scale)]
     parts = []
     for geometry, bound, matrix in found:
         effects = {material.symbol: material.target.effect for material in bound}

@@ -602,7 +602,7 @@ def geometry(robot: Robot) -> pin.GeometryModel:
     for _, what in faulty.values():
         raise RobotError(what)
     for shape in shapes.geometryObjects:
-        if isinstance(shape.geometry, pin.coal.BVHModelBase):
+        if getattr(shape.geometry, "build_state", None) == pin.coal.BVHBuildState.BVH_BUILD_STATE_BEGUN:
             shape.geometry.endModel()
     return shapes
 
