@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, product
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,7 +17,7 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Guard, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.model import Robot, build_robot, check_inertia, readable_geometry
+from varpin.model import Robot, build_robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.additions import Base
 from varpin.model.inertia import fault, one_of_each, principal_moments
 from varpin.model.mimic import joint_index
@@ -37,8 +38,9 @@ LENGTH = 10.0
 # A radius of gyration beyond this multiple of the distance of a link's farthest point from its centre of mass is
 # impossible; motors may be left out of a shape, hence not 1.
 SIZE_RATIO = 1.5
-# Largest plausible extent of a link's shapes as a multiple of the arm's reach, and the least reach that counts [m].
-MESH_RATIO, LEAST_REACH = 10.0, 0.1
+# Plausible sizes of the largest mesh of a moving link, as multiples of the arm's reach: inches taken for metres are 39
+# times too large. Those of the robots of example-robot-data are 0.25 to 1.2.
+MESH_RATIOS = (0.01, 10.0)
 # Density of osmium, the densest element [kg/m^3].
 DENSITY = 22_600.0
 
@@ -104,6 +106,7 @@ def inspect_robot(
         *lacks,
         *robot.limit_remarks(),
         *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links), _ratio_warnings(robot))),
+        *_mesh_warnings(robot),
         *_matrix_warnings(robot, scaled),
         *one_of_each(_limit_warnings(joints, robot, None if q is None else configuration)),
         *one_of_each(_mimic_warnings(robot, urdf, joints, tied=mimic == "tied")),
@@ -286,11 +289,6 @@ def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tup
         if link.joint and away > length:
             far = f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, {_against_reach(robot)}"
             yield "away", link.name, f"{far}; are these millimetres?"
-    for name, _, points in corners:
-        size = float(np.ptp(points, axis=0).max())
-        if size > MESH_RATIO * max(_reach(robot), LEAST_REACH):
-            large = f"the shape of link {name!r} is {size:.3g} m large, {_against_reach(robot)}: is its mesh in other units?"
-            yield "shape", name, f"{large}: is its mesh in other units?"
 
 
 def _corners(robot: Robot) -> list[tuple[str, int, Floats]]:
@@ -344,6 +342,24 @@ def _ratio_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
                         f"{values[parent]:.3g} and {values[body]:.3g} {unit}"
                     ),
                 )
+
+
+def _mesh_warnings(robot: Robot) -> Iterator[str]:
+    sizes = {
+        shape: float(np.ptp(shape.geometry.vertices(), axis=0).max())
+        for shape in readable_geometry(robot)[0].geometryObjects
+        if shape.parentJoint and isinstance(shape.geometry, pin.coal.BVHModelBase)
+    }
+    reach = longest_reach(robot)
+    if not sizes or not 0.0 < reach < np.inf:
+        return
+    shape, size = max(sizes.items(), key=lambda own: own[1])
+    if not MESH_RATIOS[0] * reach <= size <= MESH_RATIOS[1] * reach:
+        name, link = Path(shape.meshPath).name or shape.name, robot.free_model.frames[shape.parentFrame].name
+        yield (
+            f"mesh {name!r} of link {link!r} is {size:.3g} m long, where the arm reaches {reach:.3g} m: if it is not "
+            "in metres, its scale= must make it so"
+        )
 
 
 def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
