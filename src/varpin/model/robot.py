@@ -19,6 +19,7 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoi
 from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
 from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
+from varpin.model.kinematics import place_on_body
 from varpin.model.meshes import Reader, read_mesh, with_own_meshes
 from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model
 from varpin.model.mjcf import mjcf_shapes
@@ -27,11 +28,9 @@ from varpin.model.sources import Description, describe, hang_shapes
 from varpin.model.srdf import Posture, of_joints
 from varpin.model.tree import (
     flatten,
-    frame_index,
-    frame_on_body,
     is_unbounded,
     joint_axis,
-    place_on_body,
+    place_of_frame,
     to_pinocchio,
     tree_mass_matrix,
 )
@@ -223,13 +222,8 @@ class Robot(Frozen):
         if q.ndim not in (1, 2) or q.shape[-1] != self.dof:
             raise InputError(f"q must have shape (N, {self.dof}) or ({self.dof},), got {q.shape}")
         name = self.end_effector if frame is None else frame
-        found = self.free_model.frames[frame_index(self.free_model, name, self.name)]
-        rows = np.atleast_2d(q)
-        if found.parentJoint == 0:
-            positions = np.tile(found.placement.translation, (len(rows), 1))
-        else:
-            body, _, place = frame_on_body(self.free_model, name, self.name)
-            positions = place_on_body(self.tree, rows, body, place)
+        body, _, place = place_of_frame(self.free_model, name, self.name)
+        positions = place_on_body(self.tree, np.atleast_2d(q), body, place)
         return np.asarray(positions.reshape(*q.shape[:-1], 3), dtype=np.float64)
 
     @property
