@@ -179,7 +179,7 @@ class TestSources:
         assert geometry(robot).ngeoms == 0
 
     @pytest.mark.parametrize("gravity", [(0.0, 0.0, -1.62), (0.0, 0.0, 0.0), (3.0, -9.0, 0.5)])
-    def test_gravity_of_a_model_is_the_scene_s_unless_given(self, gravity):
+    def test_gravity_of_a_model_is_the_scene_s_unless_given(self, load, caplog, gravity):
         model = random_tree(0, branching=False)
         model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
         q = np.ones(7)
@@ -194,6 +194,8 @@ class TestSources:
         for backend in ("compiled", "pinocchio"):
             jet = vp.lagrangian_jet(vp.Scene(robot, gravity=False), q, np.zeros(7), backend=backend)
             assert np.abs(jet.Lq).max() == 0.0
+        vp.combine(robot, load("xarm7"))
+        assert naming(caplog.messages, "gravity", f"'{robot.name}'")
         for kept in (vp.load_robot(model, lock={model.names[1]: 0.1}), vp.combine(robot, robot)):
             assert vp.Scene(kept).gravity.tolist() == list(gravity)
 

@@ -294,6 +294,7 @@ class TestLimits:
             ('lower="-1e16" upper="1e16" velocity="3" effort="3"', (-np.inf, np.inf, 3, 3), (NONE, "1e16")),
             ('lower="-170" upper="172.5" velocity="3" effort="3"', (-170, 172.5, 3, 3), ("degrees", "-170 to 172.5")),
             ('lower="-6.28" upper="6.28" velocity="3" effort="3"', (-6.28, 6.28, 3, 3), ""),
+            ('lower="1" upper="-1" velocity="3" effort="3"', (1, -1, 3, 3), ("no room", "1 to -1 of 'j1'")),
             ('lower=" -1" upper="1 " velocity="3" effort="3"', (-1, 1, 3, 3), ""),
         ],
     )
@@ -359,6 +360,11 @@ class TestFaultyNumbers:
         with refused(vp.SingularMassMatrix, "'b'", "6e+09 kg", "millimetres"):
             vp.load_robot(path)
         assert naming(vp.inspect_robot(path).warnings, "'b'", "6e+09 kg")
+
+    def test_a_xacro_file_that_was_not_expanded(self, tmp_path):
+        text = arm(tmp_path).read_text().partition("<link")[0] + '<link name="world"/><xacro:arm/></robot>'
+        with refused(vp.RobotError, "no joint that moves", "<xacro:arm>"):
+            vp.load_robot(written(tmp_path, text))
 
     def test_a_git_lfs_pointer(self, tmp_path):
         text = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 123\n"

@@ -6,6 +6,9 @@ import difflib
 from collections.abc import Iterable
 from typing import Any, Self
 
+# Names that fit a message of two lines.
+_MOST_NAMES = 8
+
 
 class VarpinError(Exception):
     """Base of all errors that varpin raises."""
@@ -29,6 +32,11 @@ def _meant(name: str, known: tuple[str, ...]) -> tuple[list[str], str]:
     """The known names similar to ``name``, and a hint with them; both are empty if there are none."""
     matches = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
     return matches, f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
+
+
+def _some(names: tuple[str, ...]) -> str:
+    """The first of many names, and how many more there are; all names have their attribute."""
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {len(names) - _MOST_NAMES} more" if names[_MOST_NAMES:] else "")
 
 
 class RobotNotFound(RobotError):
@@ -64,7 +72,7 @@ class UnknownJoint(RobotError):
         self.joint = joint
         self.joints = tuple(joints)
         self.matches, hint = _meant(joint, self.joints)
-        super().__init__(f"{where}: {lack} {joint!r}; {hint}joints: {', '.join(self.joints)}")
+        super().__init__(f"{where}: {lack} {joint!r}; {hint}joints: {_some(self.joints)}")
 
 
 class UnsupportedJoint(RobotError):
@@ -156,7 +164,7 @@ class UnknownFrame(InputError):
         self.matches, hint = _meant(frame, self.frames)
         owner = f"robot {robots[0]!r} has" if len(robots) == 1 else f"robots {', '.join(map(repr, robots))} have"
         where = f"{option}: " if option else ""
-        super().__init__(f"{where}{owner} no frame {frame!r}; {hint}frames: {', '.join(self.frames)}")
+        super().__init__(f"{where}{owner} no frame {frame!r}; {hint}frames: {_some(self.frames)}")
 
 
 class UnknownPosture(InputError):

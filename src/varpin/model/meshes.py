@@ -23,14 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import FileError
+from varpin.model.packages import LFS_POINTER
 from varpin.support.checks import is_file
 
 logger = logging.getLogger(__name__)
 
 coal = pin.coal
 
-# The first words of a file that Git LFS has not fetched.
-_POINTER = b"version https://git-lfs"
 # Longest text of a reader's own in an error.
 _REASON = 100
 # Suffixes of images that browsers can show.
@@ -104,7 +103,7 @@ def read_mesh(path: str) -> tuple[MeshPart, ...]:
         raise FileError(f"the mesh {path} is of a kind that is not read: convert it to one of {', '.join(_READERS)}")
     try:
         content = file.read_bytes()
-        if content.startswith(_POINTER):
+        if content.startswith(LFS_POINTER):
             raise FileError(f"the mesh {path} is a pointer of Git LFS: fetch the file itself, by 'git lfs pull'")
         parts = tuple(part for part in read(file, content) if len(part.faces))
     except FileError:

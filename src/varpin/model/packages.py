@@ -13,6 +13,9 @@ from pathlib import Path
 
 from varpin.support.frozen import Frozen
 
+# The first words of a file that Git LFS has not fetched.
+LFS_POINTER = b"version https://git-lfs"
+
 # A given folder is a package, or contains packages.
 _MANIFESTS = ("package.xml", "*/package.xml")
 _FIND = re.compile(r"\$\(find ([^)]+)\)/?")

@@ -492,7 +492,8 @@ def _built(
     followers = {tie.follower for tie in ties}
     coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
     if not coordinates:
-        raise RobotError(f"robot {description.name!r} has no joint that moves")
+        why = "".join(f"; {remark}" for remark in description.remarks[:1])
+        raise RobotError(f"robot {description.name!r} has no joint that moves{why}")
     with_rotors(model, armature, coordinates, tuple(locked))
     tree = flatten(model, ties, coordinates)
     robot = Robot(

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import FileError, RobotError
 from varpin.model.meshes import Reader, put_mesh, read_mesh, with_own_meshes
-from varpin.model.packages import Packages
+from varpin.model.packages import LFS_POINTER, Packages
 from varpin.model.units import NO_LIMIT, limits_in_degrees
 
 logger = logging.getLogger(__name__)
@@ -247,8 +247,8 @@ def build_shapes(
             shapes = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, [*package_dirs])
         except (ValueError, RuntimeError, IndexError) as error:
             raise RobotError(f"the shapes in {urdf.path} cannot be read: {error}") from None
-        for line in complaints():
-            logger.warning("%s: %s", urdf.path, line)
+        if lines := complaints():
+            logger.warning("%s: shapes are read in part: %s", urdf.path, "; ".join(lines)[:120])
     absent = missing_meshes(urdf, package_dirs)
     faults = dict.fromkeys(absent, missing_meshes_message(urdf, absent, package_dirs))
     for shape in shapes.geometryObjects:
@@ -321,7 +321,7 @@ def read_xml(path: Path, text: str | None = None) -> tuple[ET.Element, str]:
         raise FileError(f"cannot read {path}: {error.strerror}") from None
     if not content.strip(b"\0 \t\r\n"):
         raise RobotError(f"{path} is empty")
-    if content.startswith(b"version https://git-lfs"):
+    if content.startswith(LFS_POINTER):
         raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
     # Comments often contain "--", which XML forbids. Their line breaks stay, for line numbers.
     content = _COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), content.lstrip(b" \t\r\n"))
@@ -368,7 +368,7 @@ def _remarks(root: ET.Element) -> Iterator[str]:
     """How limits and elements without effect are read, one sentence a kind. Limits that mean none become none."""
     if left := _xacro(root):
         yield f"leftover xacro elements have no effect: {listed(left, 'kinds')}"
-    none, degrees, ignored = [], [], []
+    none, degrees, ignored, crossed = [], [], [], []
     for joint in root.findall("joint"):
         name, kind = repr(joint.get("name", "")), joint.get("type")
         limit = joint.find("limit")
@@ -379,6 +379,8 @@ def _remarks(root: ET.Element) -> Iterator[str]:
         low, high = (_number(limit.get(key)) for key in ("lower", "upper"))
         if kind == "continuous" and low < high and high - low < NO_LIMIT:
             ignored.append(name)
+        if kind != "continuous" and low > high:
+            crossed.append(f"{low:g} to {high:g} of {name}")
         if kind == "revolute" and limits_in_degrees(low, high):
             degrees.append(f"{low:g} to {high:g} of {name}")
         # Before version 1.2, a bound that is missing is 0, and two bounds of 0 are none.
@@ -389,12 +391,14 @@ def _remarks(root: ET.Element) -> Iterator[str]:
             unread = key not in limit.attrib or (drive and value < 0.0) or math.isinf(value)
             if key in limit.attrib and (unread or (not drive and abs(value) > NO_LIMIT)):
                 none.append(f"{key} {limit.attrib[key]} of {name}")
-            elif unread and drive and not stated:
+            elif unread and not (drive and stated):
                 none.append(f"no {key} of {name}")
             if unread and not (drive and stated and key not in limit.attrib):
                 limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)
     if none:
         yield f"limits that are missing, infinite, negative or huge count as none: {listed(none, 'limits')}"
+    if crossed:
+        yield f"limits whose lower bound is above the upper one leave no room: {listed(crossed, 'joints')}"
     if degrees:
         yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
     if ignored:

@@ -14,7 +14,7 @@ from typing import Any
 from xml.parsers import expat
 
 from varpin.errors import InputError, MissingDependency, RobotError
-from varpin.model.packages import Packages
+from varpin.model.packages import LFS_POINTER, Packages
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +74,8 @@ def expand(
         RobotError: The file cannot be expanded.
     """
     xacro, substitution = _package(path)
+    if path.read_bytes().startswith(LFS_POINTER):
+        raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
     given = _Arguments({name: _word(value) for name, value in arguments.items()})
     notes = io.StringIO()
     with _LOCK, contextlib.redirect_stderr(notes), _finding(substitution, path, package_dirs, packages or {}):
