@@ -361,6 +361,12 @@ class TestFaultyNumbers:
             vp.load_robot(path)
         assert naming(vp.inspect_robot(path).warnings, "'b'", "6e+09 kg")
 
+    def test_in_a_shape_are_told(self, tmp_path, caplog):
+        shape = '<visual><geometry><box size="0,1 0.1 0.1"/></geometry></visual>'
+        path = write_urdf(tmp_path, link("l1", extra=shape), joint("j1", "base", "l1"))
+        assert geometry(vp.load_robot(path)).ngeoms == 0
+        assert naming(caplog.messages, "read in part", "made_up.urdf")
+
     def test_a_xacro_file_that_was_not_expanded(self, tmp_path):
         text = arm(tmp_path).read_text().partition("<link")[0] + '<link name="world"/><xacro:arm/></robot>'
         with refused(vp.RobotError, "no joint that moves", "<xacro:arm>"):

@@ -247,8 +247,9 @@ def build_shapes(
             shapes = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, [*package_dirs])
         except (ValueError, RuntimeError, IndexError) as error:
             raise RobotError(f"the shapes in {urdf.path} cannot be read: {error}") from None
-        if lines := complaints():
-            logger.warning("%s: shapes are read in part: %s", urdf.path, "; ".join(lines)[:120])
+        lines = complaints()
+    if lines:
+        logger.warning("%s: shapes are read in part: %s", urdf.path, "; ".join(lines)[:120])
     absent = missing_meshes(urdf, package_dirs)
     faults = dict.fromkeys(absent, missing_meshes_message(urdf, absent, package_dirs))
     for shape in shapes.geometryObjects:
