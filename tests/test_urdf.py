@@ -64,7 +64,7 @@ def test_published_robots_are_as_pinocchio_reads_them(name):
     frames = {frame.name: frame for frame in expected.frames if frame.type == pin.FrameType.BODY}
     # Links that hang on one another for good, taken together, are the bodies.
     bodies = np.zeros((expected.njoints, 6, 6))
-    for part in read_inertials(urdf)[0]:
+    for part in read_inertials(urdf, expected)[0]:
         lever, place = part.mass * pin.skew(part.center), frames[part.link].placement
         body = np.block([[part.mass * np.eye(3), -lever], [lever, part.inertia - lever @ pin.skew(part.center)]])
         bodies[frames[part.link].parentJoint] += place.toDualActionMatrix() @ body @ place.toActionMatrixInverse()
@@ -248,7 +248,7 @@ class TestVersions:
         turned = robot.free_model.jointPlacements[1].rotation
         expected = np.eye(3) if version == "1.0" else pin.rpy.rpyToMatrix(np.pi / 2, 0, 0)
         np.testing.assert_allclose(turned, expected, atol=1e-12)
-        for inertial in read_inertials(read_urdf(path))[0]:
+        for inertial in read_inertials(read_urdf(path), build_model(read_urdf(path)))[0]:
             np.testing.assert_allclose(inertial.inertia, expected @ np.diag([0.1, 0.2, 0.25]) @ expected.T, atol=1e-12)
 
     def test_turns_of_shapes(self, tmp_path):

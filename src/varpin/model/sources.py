@@ -25,7 +25,7 @@ from varpin.model.mimic import (
 from varpin.model.mjcf import is_mjcf, read_mjcf, root_tag
 from varpin.model.packages import Packages
 from varpin.model.srdf import Posture, beside, read_postures, read_rotors, reference_postures
-from varpin.model.urdf import Inertial, build_model, differences, read_inertials, read_urdf
+from varpin.model.urdf import Inertial, compared_model, read_inertials, read_urdf
 from varpin.model.xacro import expand, is_xacro, plain_name
 
 logger = logging.getLogger(__name__)
@@ -322,9 +322,9 @@ def _of_urdf(
     path: Path, name: str, folders: tuple[str, ...], *, mimic: bool, expanded: str | None = None
 ) -> Description:
     urdf = read_urdf(path, expanded)
-    model = build_model(urdf)
-    inertials, lacks = read_inertials(urdf)
-    remarks = (*urdf.remarks, *differences(urdf, expanded, model))
+    model, differences = compared_model(urdf, expanded)
+    inertials, lacks = read_inertials(urdf, model)
+    remarks = (*urdf.remarks, *differences)
     for note in urdf.notes:
         logger.info("robot %r: %s", name, note)
     ties: tuple[Tie, ...] = ()

@@ -90,6 +90,7 @@ class Urdf:
         mimics: Mimic elements by joint.
         remarks: How the file is read where that is not plain, one sentence a kind.
         notes: What of the file has no effect on purpose, likewise.
+        plain: Whether nothing in it was tidied or mended: Pinocchio's own reading is varpin's.
     """
 
     path: Path
@@ -97,6 +98,7 @@ class Urdf:
     mimics: Mapping[str, Mimic]
     remarks: tuple[str, ...]
     notes: tuple[str, ...]
+    plain: bool
 
     @property
     def loops(self) -> tuple[tuple[str, str], ...]:
@@ -142,15 +144,17 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
                 f"{path}: link {link!r} is the child of joints {parent[link]!r} and {name!r}: "
                 "varpin takes trees, no closed loops"
             )
+    tidied = False
     for element in (part for tag in ("link/inertial", "joint") for found in root.iterfind(tag) for part in found):
         for key in _NUMBERS.get(element.tag, ()):
-            if key in element.attrib:
-                element.set(key, " ".join(element.attrib[key].split()))
+            if (words := element.get(key)) is not None and (tidy := " ".join(words.split())) != words:
+                element.set(key, tidy)
+                tidied = True
     remarks = [*([f"its XML is not well-formed, and was mended: {fault}"] if fault else []), *_remarks(root)]
     mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
     soft = _joints_with(root, "safety_controller")
     notes = (f"soft limits of <safety_controller> have no effect: {listed(soft, 'joints')}",) if soft else ()
-    return Urdf(path, root, mimics, tuple(remarks), notes)
+    return Urdf(path, root, mimics, tuple(remarks), notes, plain=not (tidied or remarks))
 
 
 def build_model(urdf: Urdf) -> pin.Model:
@@ -163,6 +167,10 @@ def build_model(urdf: Urdf) -> pin.Model:
     if isinstance(model, str):
         why = next(_faults(urdf.root), f"Pinocchio cannot read it: {model[:120]}")
         raise RobotError(f"{urdf.path} is not a URDF: {why}")
+    return _require_all_links(urdf, model)
+
+
+def _require_all_links(urdf: Urdf, model: pin.Model) -> pin.Model:
     bodies = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
     links = [link.get("name", "") for link in urdf.root.findall("link")]
     if lost := [repr(link) for link in links if link not in bodies]:
@@ -170,23 +178,24 @@ def build_model(urdf: Urdf) -> pin.Model:
     return model
 
 
-def read_inertials(urdf: Urdf) -> tuple[tuple[Inertial, ...], tuple[str, ...]]:
+def read_inertials(urdf: Urdf, model: pin.Model) -> tuple[tuple[Inertial, ...], tuple[str, ...]]:
     """The inertias of the links that have one, as Pinocchio reads them, and remarks about those it reads in part."""
-    # Pinocchio merges links on fixed joints into one body; a joint that moves keeps them apart.
-    small = _part(urdf.root, "link/inertial", "joint/parent", "joint/child")
     given = {link.get("name", ""): link for link in urdf.root.findall("link") if link.find("inertial") is not None}
-    for joint in small.findall("joint"):
-        child = joint.find("child")
-        joint.set("type", "floating" if child is not None and child.get("link") in given else "fixed")
-    model = _build(small)
-    if isinstance(model, str):
-        return (), ()
+    frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given]
+    if len({frame.parentJoint for frame in frames}) < len(frames):
+        # Pinocchio merges links on fixed joints into one body; a joint that moves keeps them apart.
+        small = _part(urdf.root, "link/inertial", "joint/parent", "joint/child")
+        for joint in small.findall("joint"):
+            child = joint.find("child")
+            joint.set("type", "floating" if child is not None and child.get("link") in given else "fixed")
+        apart = _build(small)
+        if isinstance(apart, str):
+            return (), ()
+        model = apart
     found, remarks = [], []
-    bodies = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
-    for name, link in given.items():
-        if name not in bodies:
-            continue
-        body = model.inertias[bodies[name]]
+    for frame in (frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given):
+        name, link = frame.name, given[frame.name]
+        body = frame.placement.actInv(model.inertias[frame.parentJoint])
         if fault := next(_faults_of_numbers(link.findall("inertial")[0], required=True), ""):
             effect = "massless" if body.mass == 0.0 else "a point mass"
             remarks.append(f"link {name!r} is {effect}, as Pinocchio reads it: {fault}")
@@ -196,31 +205,37 @@ def read_inertials(urdf: Urdf) -> tuple[tuple[Inertial, ...], tuple[str, ...]]:
     return tuple(found), tuple(remark + more for remark in remarks[:1])
 
 
-def differences(urdf: Urdf, text: str | None, model: pin.Model) -> tuple[str, ...]:
-    """Where ``model`` is not what Pinocchio reads from the file as it is; empty if it cannot read that.
+def compared_model(urdf: Urdf, text: str | None) -> tuple[pin.Model, tuple[str, ...]]:
+    """Pinocchio's model of a file, and where it is not what Pinocchio reads from the file as it is, if it reads that.
 
     Args:
         urdf: The file.
         text: The URDF text, if not the file's content.
-        model: From :func:`build_model`.
+
+    Raises:
+        RobotError: As for :func:`build_model`.
     """
     try:
         with captured_stderr():
             own = pin.buildModelFromUrdf(str(urdf.path)) if text is None else pin.buildModelFromXML(text)
-        if own == model:
-            return ()
         theirs = list(own.names)[1:]
     except (ValueError, RuntimeError, IndexError):
-        return ()
+        return build_model(urdf), ()
+    # Pinocchio's parser knows no entities.
+    if urdf.plain and b"<!ENTITY" not in (urdf.path.read_bytes() if text is None else text.encode()):
+        return _require_all_links(urdf, own), ()
+    model = build_model(urdf)
+    if own == model:
+        return model, ()
     if theirs != list(model.names)[1:]:
-        return (f"Pinocchio's own reading of the file has other joints: {listed(theirs, 'joints')}",)
+        return model, (f"Pinocchio's own reading of the file has other joints: {listed(theirs, 'joints')}",)
     odd = [
         repr(name)
         for j, name in enumerate(model.names)
         if model.inertias[j] != own.inertias[j] or model.jointPlacements[j] != own.jointPlacements[j]
     ]
     what = f"in the masses or places of {listed(odd, 'joints')}" if odd else "in limits or frames"
-    return (f"Pinocchio's own reading of the file differs {what}: it reads numbers less leniently",)
+    return model, (f"Pinocchio's own reading of the file differs {what}: it reads numbers less leniently",)
 
 
 def build_shapes(

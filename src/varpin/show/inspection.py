@@ -22,7 +22,7 @@ from varpin.model.additions import Base
 from varpin.model.inertia import fault, one_of_each, principal_moments
 from varpin.model.mimic import joint_index
 from varpin.model.tree import is_unbounded, joint_axis
-from varpin.model.urdf import Inertial, Urdf, listed, read_inertials, read_urdf
+from varpin.model.urdf import Inertial, Urdf, build_model, listed, read_inertials, read_urdf
 from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
 from varpin.support.checks import JointValues, joint_array
 
@@ -99,7 +99,7 @@ def inspect_robot(
     margin = Guard().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
     urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
-    inertials, lacks = ((), ()) if urdf is None else read_inertials(urdf)
+    inertials, lacks = ((), ()) if urdf is None else read_inertials(urdf, build_model(urdf))
     joints, links = _joints(robot), _links(robot, inertials)
     warnings = [
         *(() if urdf is None else (*urdf.remarks, *urdf.notes)),
