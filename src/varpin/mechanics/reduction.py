@@ -57,7 +57,7 @@ class Required:
         return 1.0 - sum(len(part) ** 3 for part in self.parts) / self.described**3
 
     def _rows(self) -> list[tuple[str, str]]:
-        rows = [("joints", f"{len(self.joints)} of {self.described} computed: {listed(self.joints)}")]
+        rows = [("computed", f"{len(self.joints)} of {self.described}: {listed(self.joints)}")]
         for title, joints in (("locked", self.locked), ("nothing touches", self.idle)):
             if joints:
                 rows.append((title, listed(f"{joint} at {at}" for joint, at in joints.items())))

@@ -195,7 +195,7 @@ def word(*options: str) -> Rule:
 
 def entries(rule: Rule, length: int | None = None, *, distinct: bool = False) -> Rule:
     """A list of values, of a given length if any."""
-    what = f"a list of {'' if length is None else f'{length} entries, '}each {rule.what}"
+    what = f"a list{'' if length is None else f' of {length}'}, each {rule.what}"
 
     def read(value: Any, where: Where) -> tuple[Any, ...]:
         if not isinstance(value, list):
