@@ -25,6 +25,8 @@ from varpin.support.checks import is_file
 # One number for all, one for each in order, or a table by name in which those left out are 0.
 ByName = float | tuple[float, ...] | Mapping[str, float]
 _T = TypeVar("_T")
+# Most names that a message lists: all keys and types.
+_NAMED = 20
 
 
 class SceneFileError(VarpinError, ValueError):
@@ -67,13 +69,25 @@ class Where:
 
     def of(self, error: VarpinError, given: Mapping[str, Any]) -> SceneFileError:
         """An error of the API about the keys ``given`` of this table: that of the key which the error is about."""
-        if isinstance(error, UnknownJoint | UnknownFrame):
-            name = error.joint if isinstance(error, UnknownJoint) else error.frame
-            for key, value in given.items():
-                if isinstance(value, Mapping) and name in value:
-                    return self.at(key).at(name).error(str(error))
-                if is_named(value, name):
-                    return self.at(key).error(str(error))
+        name, told = "", str(error)
+        if isinstance(error, UnknownJoint):
+            name, told = (
+                error.joint,
+                f"there is no joint {error.joint!r}; {suggestion(error.joint, error.joints, 'joints')}",
+            )
+        elif isinstance(error, UnknownFrame):
+            name, told = (
+                error.frame,
+                f"there is no frame {error.frame!r}; {suggestion(error.frame, error.frames, 'frames')}",
+            )
+        for key, value in given.items() if name else ():
+            if isinstance(value, Mapping) and name in value:
+                return self.at(key).at(name).error(told)
+            # A name, several of them, or a point in a frame.
+            if any(
+                isinstance(part, str) and part == name for part in (value if isinstance(value, tuple) else (value,))
+            ):
+                return self.at(key).error(told)
         if isinstance(error, InputError) and error.argument is not None:
             return self.at(error.argument).error(str(error)) if error.argument else self.error(str(error))
         # A name of one letter is a word, too.
@@ -105,11 +119,6 @@ class Where:
             raise self.error(str(error)) from None
 
 
-def is_named(value: Any, name: str) -> bool:
-    """Whether a value, such as a point in a frame, has this name."""
-    return value == name if isinstance(value, str) else isinstance(value, tuple) and value[:1] == (name,)
-
-
 def shown(value: object) -> str:
     """A short text for a value from a file."""
     if isinstance(value, bool):
@@ -122,11 +131,12 @@ def shown(value: object) -> str:
 
 
 def suggestion(word: str, names: Iterable[str], what: str) -> str:
-    """A hint with similar names, and the list of all names."""
+    """A hint with similar names, and the list of names."""
     names = tuple(names)
     matches = difflib.get_close_matches(word, names, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
-    return f"{hint}{what}: {', '.join(names) or 'none'}"
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"{hint}{what}: {', '.join(names[:_NAMED]) or 'none'}{more}"
 
 
 def word_of(name: str) -> str:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import array
-import csv
 import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 import scipy
@@ -36,18 +34,6 @@ from varpin.io.scenefile.reading import (
     word,
 )
 from varpin.model import Robot
-
-
-class Horizon(Protocol):
-    """A time grid."""
-
-    @property
-    def dt(self) -> float:
-        """Time step [s]."""
-
-    @property
-    def duration(self) -> float:
-        """Duration [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,14 +180,16 @@ def reference(**others: Any) -> Rule:
     return Rule("a number for all, a list, a table by name, sines, waypoints or a file", read)
 
 
-def timeline(given: Any, where: Where, names: Sequence[str], what: str, robot: Robot, spec: Horizon) -> Timeline:
+def timeline(
+    given: Any, where: Where, names: Sequence[str], what: str, robot: Robot, dt: float, duration: float
+) -> Timeline:
     """The values over time of a reference that was read at ``where``, for the components ``names``.
 
     Raises:
         SceneFileError: It has other components or another length, or does not last for the horizon.
     """
     if isinstance(given, Samples):
-        return _of_file(given.file, where.at("file"), names, spec.duration, what)
+        return _of_file(given.file, where.at("file"), names, duration, what)
     if isinstance(given, Waypoints):
         for index, row in enumerate(given.values):
             where.at("values").at(index).spread(row, names)
@@ -218,8 +206,8 @@ def timeline(given: Any, where: Where, names: Sequence[str], what: str, robot: R
         place = where.at("sines").at(index)
         if sine.of not in names:
             raise place.at("of").error(f"there is no {what} {sine.of!r}; {suggestion(sine.of, names, what + 's')}")
-        if sine.frequency > 0.5 / spec.dt:
-            most = f"<= {0.5 / spec.dt:g} [Hz], the most that dt = {spec.dt:g} s resolves"
+        if sine.frequency > 0.5 / dt:
+            most = f"<= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves"
             raise place.at("frequency").error(f"must be {most}, got {sine.frequency:g}")
     if not given.sines:
         return constant(offset)
@@ -253,34 +241,23 @@ def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
 
 
 def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
-    numbers = array.array("d")
-    head: list[str] = []
+    """The columns of a CSV file: a line of names, then lines of numbers."""
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            for number, row in enumerate(filter(None, csv.reader(stream)), start=1):
-                if not head:
-                    head = [name.strip() for name in row]
-                    twice = [name for name, times in Counter(head).items() if times > 1]
-                    if twice:
-                        raise wrong(f"it has two columns {shown(twice[0])}")
-                    continue
-                if len(row) != len(head):
-                    raise wrong(f"row {number} has {len(row)} entries, but there are {len(head)} columns")
-                for column, word in zip(head, row, strict=True):
-                    try:
-                        value = float(word)
-                    except ValueError:
-                        raise wrong(
-                            f"row {number}, column {shown(column)}: {shown(word.strip())} is not a number"
-                        ) from None
-                    if not math.isfinite(value):
-                        raise wrong(f"row {number}, column {shown(column)} is not finite")
-                    numbers.append(value)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if not len(numbers):
+        head, *lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()] or [""]
+        names = [name.strip() for name in head.split(",")]
+        numbers = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2) if lines else np.zeros((0, 0))
+    except (OSError, ValueError) as error:
+        raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or str(error).partition(';')[0]}") from None
+    if twice := [name for name, times in Counter(names).items() if times > 1]:
+        raise wrong(f"it has two columns {shown(twice[0])}")
+    if not numbers.size:
         raise wrong("it must have a line of column names and lines of numbers")
-    return dict(zip(head, np.array(numbers).reshape(-1, len(head)).T, strict=True))
+    if numbers.shape[1] != len(names):
+        raise wrong(f"its rows have {numbers.shape[1]} entries, but there are {len(names)} columns")
+    if not np.isfinite(numbers).all():
+        row, column = np.argwhere(~np.isfinite(numbers))[0].tolist()
+        raise wrong(f"row {row + 2}, column {shown(names[column])} is not finite")
+    return dict(zip(names, numbers.T, strict=True))
 
 
 def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:

@@ -102,7 +102,7 @@ class SceneFile:
         most, constraints = task.control_limit, []
         for index, given in enumerate(spec.plan_constraint):
             try:
-                constraints.append(given.make(task.scene.robot, given.given))
+                constraints.append(given.make(task.scene.robot))
             except VarpinError as error:
                 raise spec.where.at("plan_constraint").at(index).of(error, given.given) from None
         try:

@@ -259,6 +259,7 @@ def _on_robot(tables: SceneTables, robot: Robot) -> Task:
     names, root = robot.joint_names, tables.where
     springs, initial, actuation = root.at("springs"), root.at("initial"), root.at("actuation")
     rest = springs.at("rest").positions(tables.springs.rest, robot)
+    stiffness = springs.at("stiffness").spread(tables.springs.stiffness, names)
     q0 = initial.at("q").positions(tables.initial.q, robot)
     _refuse_degrees(springs.at("rest"), rest, robot)
     _refuse_degrees(initial.at("q"), q0, robot)
@@ -287,7 +288,7 @@ def _on_robot(tables: SceneTables, robot: Robot) -> Task:
             gravity=tables.gravity,
             damping=given["damping"],
             friction=given["friction"],
-            stiffness=springs.at("stiffness").spread(tables.springs.stiffness, names),
+            stiffness=stiffness,
             rest=rest,
             forces=_forces(tables, robot, effort),
             constraints=tables.constraint or None,
@@ -298,7 +299,9 @@ def _on_robot(tables: SceneTables, robot: Robot) -> Task:
         raise _located(error, tables, robot) from None
     controls = tables.simulate.controls
     if controls is not None and controls != "hold":
-        controls = timeline(controls, root.at("simulate").at("controls"), driven, "driven joint", robot, tables)
+        controls = timeline(
+            controls, root.at("simulate").at("controls"), driven, "driven joint", robot, tables.dt, tables.duration
+        )
     task = Task(
         tables=tables,
         scene=scene,
@@ -404,7 +407,7 @@ def _term(
     if term.target and "hold" not in given and (term.target in given or term.target != "before"):
         components, kind = (joints, what) if term.of_joints else (term.components, "component")
         at = place.at(term.target)
-        target = timeline(given.get(term.target, 0.0), at, components, kind, robot, tables)
+        target = timeline(given.get(term.target, 0.0), at, components, kind, robot, tables.dt, tables.duration)
         if term.space == "q" and target.constant:
             _refuse_degrees(at, target(0.0), robot)
     holding_q = None
