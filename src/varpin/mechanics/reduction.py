@@ -56,7 +56,9 @@ class Required:
         """Saved share of the linear algebra of a plan, whose work grows with the cube of the number of joints."""
         return 1.0 - sum(len(part) ** 3 for part in self.parts) / self.described**3
 
-    def _rows(self) -> list[tuple[str, str]]:
+    @property
+    def rows(self) -> list[tuple[str, str]]:
+        """The report as names and texts."""
         rows = [("computed", f"{len(self.joints)} of {self.described}: {listed(self.joints)}")]
         for title, joints in (("locked", self.locked), ("nothing touches", self.idle)):
             if joints:
@@ -72,10 +74,10 @@ class Required:
         ]
 
     def _repr_html_(self) -> str:
-        return facts("What is computed", self._rows())
+        return facts("What is computed", self.rows)
 
     def __str__(self) -> str:
-        return "\n".join(f"{name}: {words}" for name, words in self._rows())
+        return "\n".join(f"{name}: {words}" for name, words in self.rows)
 
 
 def requirements(
@@ -107,22 +109,17 @@ def _terms(scene: Scene) -> dict[str, str]:
     names, kinds = scene.robot.joint_names, list(dict.fromkeys(map(type, scene.forces)))
     others = [kind.__name__ for kind in kinds if kind not in (JointSpring, JointDamper)]
     noise = scene.noise.diffusion
-    counts = (
-        {}
-        if noise is None
-        else {
-            "additive": noise.constant.any(axis=0),
-            "control": noise.control.any(axis=(0, 2)),
-            "state": noise.quadratic.any(axis=0),
-        }
-    )
-    acting = [f"{kind} ({np.count_nonzero(mask)} processes)" for kind, mask in counts.items() if mask.any()]
+    acting = [f"{scene.processes} processes"] if scene.processes else []
+    if noise is not None:
+        masks = (noise.constant.any(axis=0), noise.control.any(axis=(0, 2)), noise.quadratic.any(axis=0))
+        counts = zip(("additive", "control", "state"), map(np.count_nonzero, masks), strict=True)
+        acting = [f"{kind} ({count} processes)" for kind, count in counts if count]
     absent = [words for words, kind in _ABSENT.items() if kind not in kinds]
     terms = {
         "gravity": f"{', '.join(f'{g:g}' for g in scene.gravity)} m/s^2" if scene.gravity.any() else "none",
-        "damping": where(scene.damping, names),
-        "springs": where(scene.stiffness, names),
-        "noise": ", ".join(acting) or (f"{scene.processes} processes" if scene.processes else "none"),
+        "damping": joints_with(scene.damping, names),
+        "springs": joints_with(scene.stiffness, names),
+        "noise": ", ".join(acting) or "none",
         "driven": ", ".join(np.array(names)[scene.actuation.any(axis=1)].tolist()) or "none",
         "other forces": ", ".join(sorted(others)) or "none",
         "not modelled": f"{', '.join([*absent, 'contact'])}; shapes are read only for a replay",
@@ -132,7 +129,7 @@ def _terms(scene: Scene) -> dict[str, str]:
     return terms
 
 
-def where(values: ArrayLike, names: Sequence[str]) -> str:
+def joints_with(values: ArrayLike, names: Sequence[str]) -> str:
     """The joints with values other than 0, in words."""
     acting = [name for name, value in zip(names, np.asarray(values).tolist(), strict=True) if value]
     if acting and len(acting) == len(names):
@@ -195,13 +192,9 @@ def without(scene: Scene, joints: Mapping[str, float] | Collection[str]) -> Scen
     if not held:
         return scene
     noise = scene.noise.diffusion
-    for odd, what in (
-        (scene.constraints, "constraints"),
-        (scene.custom, "a CustomForce"),
-        (noise is None, "CustomNoise"),
-    ):
-        if odd:
-            raise InputError(f"a scene with {what} keeps all its joints: its functions and rows are of all of them")
+    odd = "constraints" if scene.constraints else "a CustomForce" if scene.custom else ""
+    if odd or noise is None:
+        raise InputError(f"a scene with {odd or 'CustomNoise'} keeps all its joints, of which its functions are")
     keep = np.flatnonzero([name not in held for name in names])
     columns = driving(scene, held)
     actuation = scene.actuation[:, columns]
@@ -214,7 +207,7 @@ def without(scene: Scene, joints: Mapping[str, float] | Collection[str]) -> Scen
         damping=0.0,
         forces=[part for part in (_part(force, scene, keep, held) for force in scene.forces) if part is not None],
         actuation=actuation[keep],
-        noise=None if noise is None else _Rows(_rows(noise, keep, columns)),
+        noise=_Rows(_rows(noise, keep, columns)),
         constraints=(),
     )
 

@@ -247,7 +247,8 @@ def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
         names = [name.strip() for name in head.split(",")]
         numbers = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2) if lines else np.zeros((0, 0))
     except (OSError, ValueError) as error:
-        raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or str(error).partition(';')[0]}") from None
+        told = getattr(error, "strerror", None) or f"{str(error).partition(';')[0]} (row 0 is the first of numbers)"
+        raise wrong(f"cannot be read: {told}") from None
     if twice := [name for name, times in Counter(names).items() if times > 1]:
         raise wrong(f"it has two columns {shown(twice[0])}")
     if not numbers.size:

@@ -18,7 +18,7 @@ from varpin.io.scenefile.terms import CostTable
 from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import CoulombFriction, Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
-from varpin.mechanics.reduction import Required, driving, idle_joints, report, where
+from varpin.mechanics.reduction import Required, driving, idle_joints, joints_with, report
 from varpin.mechanics.scene import Scene, closest_controls
 from varpin.model import Robot, combine, load_robot, looks_like_degrees
 from varpin.model.tree import frame_index
@@ -202,7 +202,7 @@ def _terms(task: Task) -> dict[str, str]:
     ]
     terms = {
         "payload": ", ".join(payloads) or "none",
-        "torque limits": where(np.isfinite(task.torque_limit), task.driven),
+        "torque limits": joints_with(np.isfinite(task.torque_limit), task.driven),
         "cost": ", ".join(costs) or "none",
     }
     if kept:
