@@ -243,8 +243,8 @@ def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
 def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
     """The columns of a CSV file: a line of names, then lines of numbers."""
     try:
-        head, *lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()] or [""]
-        names = [name.strip() for name in head.split(",")]
+        head, *lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()] or [""]
+        names = [name.strip(' "\t') for name in head.split(",")]
         numbers = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2) if lines else np.zeros((0, 0))
     except (OSError, ValueError) as error:
         told = getattr(error, "strerror", None) or f"{str(error).partition(';')[0]} (row 0 is the first of numbers)"

@@ -147,7 +147,7 @@ def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
     """The task without idle joints, unless they stay, and the report on it."""
     scene, tables = task.scene, task.tables
     out: Mapping[str, float] = {}
-    if idle and not tables.plan_constraint:
+    if idle and not (tables.plan_constraint or scene.constraints):
         touched = np.any([_touched(term, task) for term in task.costs], axis=0) if task.costs else []
         busy = [name for name, acts in zip(scene.robot.joint_names, touched, strict=False) if acts]
         controls: Any = task.controls
@@ -367,7 +367,8 @@ def _located(error: VarpinError, tables: SceneTables, robot: Robot) -> SceneFile
             except VarpinError as wrong:
                 place = tables.where.at(key).at(index)
                 return place.of(wrong, {} if isinstance(part, str) else vars(part))
-    key = "noise" if "Noise" in str(error) else "actuation" if "control" in str(error) else "force"
+    words = {"Noise": "noise", "control": "actuation", "servo": "force"}
+    key = next((key for word, key in words.items() if word in str(error)), "")
     return tables.where.at(key).error(str(error))
 
 
