@@ -291,6 +291,21 @@ def test_forces_on_frames_that_cannot_be(change, key, tmp_path):
     assert caught.value.key == key
 
 
+def test_the_velocity_of_a_cubic_input_is_a_control_without_a_limit(tmp_path):
+    text = tracked("0.3").replace(
+        "[horizon]",
+        """[actuation]
+torque_limit = 2.0
+[[constraint]]
+type = "kinematic_input"
+joint = "mcp"
+interpolation = "cubic"
+[horizon]""",
+    )
+    limits = vp.load_scene(write(tmp_path, text)).problem.control_limits
+    np.testing.assert_array_equal(limits[1], [np.inf, 2.0, 2.0, np.inf])
+
+
 def test_servos_that_stand_where_they_are_told_leave_joints_idle(tmp_path):
     """A finger that nothing moves is left out with its servos; told to go elsewhere, it is not."""
     text = """
@@ -456,6 +471,13 @@ MISTAKES = {
         GOOD + '[[force]]\ntype = "glue"',
         "force[0].type",
     ),
+    "misspelt key of a force": (GOOD + '[[force]]\ntype = "stop"\nstifness = 1.0', "force[0].stifness"),
+    "text in a force": (GOOD + '[[force]]\ntype = "stop"\nstiffness = "stiff"', "force[0].stiffness"),
+    "option of an integrator": (changed("alpha = 0.5", "alpha = 0.5\ntolerance = -1.0"), "integrator.tolerance"),
+    "joint of a stop": (
+        GOOD + '[[force]]\ntype = "stop"\nstiffness = 1.0\nlower = { mpc = 0.0 }',
+        "force[0].lower.mpc",
+    ),
     "force without a number": (GOOD + '[[force]]\ntype = "armature"', "force[0].inertia"),
     "negative friction": (GOOD + '[[force]]\ntype = "friction"\nlevel = -1', "force[0].level"),
     "force on no joint": (
@@ -567,6 +589,9 @@ def test_every_mistake_has_its_own_message(tmp_path):
         ("unknown cost", ("'traking'", "'tracking'", "velocity")),
         ("force without a number", ("number", "list", "table")),
         ("no TOML", "line 3"),
+        ("misspelt key of a force", ("'stiffness'", "stiffness, damping, lower, upper, width")),
+        ("text in a force", ("[N m/rad or N/m]", "'stiff'")),
+        ("joint of a stop", ("'mcp'", "mcp, pip")),
     ],
 )
 def test_a_message_says_what_is_allowed(mistake, facts, tmp_path):

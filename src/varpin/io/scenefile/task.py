@@ -99,8 +99,10 @@ class Task:
 
     @property
     def control_limit(self) -> Floats:
-        """Bounds of the controls (m,), infinite where there is none; those of servos bound the effort instead."""
-        return np.where(self.positions, np.inf, self.torque_limit / np.abs(self.gear))
+        """Bounds of the scene's controls, infinite where there is none; those of servos bound the effort instead."""
+        limit = np.full(self.scene.controls, np.inf)
+        limit[: len(self.driven)] = np.where(self.positions, np.inf, self.torque_limit / np.abs(self.gear))
+        return limit
 
     def cost(self) -> Cost:
         """The cost as an object."""
