@@ -69,24 +69,19 @@ class Where:
 
     def of(self, error: VarpinError, given: Mapping[str, Any]) -> SceneFileError:
         """An error of the API about the keys ``given`` of this table: that of the key which the error is about."""
-        name, told = "", str(error)
-        if isinstance(error, UnknownJoint):
-            name, told = (
-                error.joint,
-                f"there is no joint {error.joint!r}; {suggestion(error.joint, error.joints, 'joints')}",
-            )
-        elif isinstance(error, UnknownFrame):
-            name, told = (
-                error.frame,
-                f"there is no frame {error.frame!r}; {suggestion(error.frame, error.frames, 'frames')}",
-            )
+        name, known, what = "", tuple[str, ...](), ""
+        match error:
+            case UnknownJoint():
+                name, known, what = error.joint, error.joints, "joint"
+            case UnknownFrame():
+                name, known, what = error.frame, error.frames, "frame"
         for key, value in given.items() if name else ():
+            told = f"there is no {what} {name!r}; {suggestion(name, known, what + 's')}"
             if isinstance(value, Mapping) and name in value:
                 return self.at(key).at(name).error(told)
             # A name, several of them, or a point in a frame.
-            if any(
-                isinstance(part, str) and part == name for part in (value if isinstance(value, tuple) else (value,))
-            ):
+            parts = value if isinstance(value, tuple) else (value,)
+            if name in [part for part in parts if isinstance(part, str)]:
                 return self.at(key).error(told)
         if isinstance(error, InputError) and error.argument is not None:
             return self.at(error.argument).error(str(error)) if error.argument else self.error(str(error))
@@ -312,18 +307,18 @@ def point(what: str, **others: Rule) -> Rule:
     return either(what, text=TEXT, table=in_frame, **others)
 
 
+def _listed(rule: Rule) -> Rule:
+    return checked(rule, lambda value, _: list(value) if isinstance(value, tuple) else value)
+
+
 def _numbers(unit: str) -> Rule:
     one = number(unit)
-    return either(f"a number or a list of numbers{_in(unit)}", number=one, list=checked(entries(one), _listed))
-
-
-def _listed(value: Any, _: Where) -> Any:
-    return list(value)
+    return _listed(either(f"a number or a list of numbers{_in(unit)}", number=one, list=entries(one)))
 
 
 # Rules by the annotation of a field of the API, from its unit.
 _BY_ANNOTATION: Mapping[str, Callable[[str], Rule]] = {
-    "JointValues": lambda unit: checked(values(unit), lambda value, _: list(value) if type(value) is tuple else value),
+    "JointValues": lambda unit: _listed(values(unit)),
     "Point": lambda _: point("a frame's name, { frame, place } or a place in the world [m]", list=_numbers("m")),
     "FramePoint": lambda _: point("a frame's name, or { frame, place }"),
     "ArrayLike": _numbers,
