@@ -28,14 +28,14 @@ from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.model import joint_unit
 from varpin.signals.commands import changing, in_parts, open_loop, rows
+from varpin.signals.controls import Controls, commands_of
+from varpin.signals.functions import Sampled
 from varpin.signals.inputs import in_parts_of_steps, prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.commands import Controls, commands_of
 from varpin.simulation.energy import energy_defects
-from varpin.simulation.functions import Sampled
 from varpin.simulation.gate import proven_error
+from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
-from varpin.simulation.loop import Law, law_of
 from varpin.simulation.scales import speed_scales, travel_scales
 from varpin.simulation.short_forces import short_forces
 from varpin.simulation.spectrum import fastest_rate

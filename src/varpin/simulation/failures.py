@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from varpin.errors import VarpinError
+from varpin.errors import StepError, VarpinError
 from varpin.integrators.base import Failure
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
@@ -25,71 +24,16 @@ class Interrupted(KeyboardInterrupt):
         super().__init__(f"interrupted after {trajectory.steps} steps; they are in .trajectory")
 
 
-class StepError(VarpinError, ValueError):
-    """A user's function failed in a step.
-
-    Attributes:
-        step: Index of the step.
-        time: Time of the call [s].
-        trajectory: The motion before; None where the function is called before the motion begins.
-    """
-
-    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory | None) -> None:
-        self.step = step
-        self.time = time
-        self.trajectory = trajectory
-        before = "" if trajectory is None else "; what came before is in error.trajectory"
-        super().__init__(f"step {step} (t = {time:.6g} s): {problem}{before}")
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (type(self), str(self), vars(self).copy())
-
-
-def _restored(kind: type[StepError], message: str, values: dict[str, Any]) -> StepError:
-    """An unpickled error."""
-    error = kind.__new__(kind, message)
-    vars(error).update(values)
-    return error
-
-
-class ControlError(StepError):
-    """A control law or the function of an OpenLoop raised, or returned something that is no control.
-
-    Attributes:
-        step: Index of the step it was called for.
-        time: The time it was called with [s].
-        trajectory: The motion before; None from an ensemble, which evaluates its controls before it begins.
-    """
-
-
 class NoiseError(StepError):
-    """A function of a custom noise raised, or returned something that is no field.
-
-    Attributes:
-        step: Index of the step it was called in.
-        time: The start of that step [s].
-        trajectory: The motion before.
-    """
+    """A function of a custom noise raised, or returned something that is no field."""
 
 
 class ForceError(StepError):
-    """A function of a custom force raised, or returned something that is no force.
-
-    Attributes:
-        step: Index of the step it was called in.
-        time: The start of that step [s].
-        trajectory: The motion before.
-    """
+    """A function of a custom force raised, or returned something that is no force."""
 
 
 class ConstraintError(StepError):
-    """A function of a custom constraint raised, or returned something that is no value of it.
-
-    Attributes:
-        step: Index of the step it was called in.
-        time: The start of that step [s].
-        trajectory: The motion before.
-    """
+    """A function of a custom constraint raised, or returned something that is no value of it."""
 
 
 class ToleranceError(VarpinError, RuntimeError):
