@@ -145,10 +145,10 @@ def lacked(row: Row) -> str:
 KINDS = (
     (r"non-physical inertia", "inertia that no body has"),
     (r"no mass|without mass|massless", "links without mass"),
-    (r"leaves out what the description gives", "dry friction left out of the scene"),
+    (r"leaves out the friction", "dry friction left out of the scene"),
     (r"damping is faster than the step", "dampers faster than 1 ms"),
-    (r"leave their limits", "joints beyond limits"),
-    (r"pass their velocity limits", "joints beyond velocity limits"),
+    (r"passe?s? (its|their) position limit", "joints beyond limits"),
+    (r"passe?s? (its|their) velocity limit", "joints beyond velocity limits"),
     (r"mesh|skeleton", "meshes missing"),
     (r"mimic", "mimic joints"),
     (r"equality|tendon|spring", "parts of MJCF left out"),

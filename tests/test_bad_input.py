@@ -609,6 +609,11 @@ class TestSimulation:
         with refused(vp.InputError, "integrator", "varpin.Midpoint()"):
             self.run(scene, integrator=value)
 
+    @pytest.mark.parametrize("name", ["damping", "friction"])
+    def test_true_is_no_number(self, name):
+        with refused(vp.InputError, name, "True"):
+            vp.Scene(vp.planar_chain(2), **{name: True})
+
     @pytest.mark.parametrize("value", [None, "ur5"])
     def test_scene(self, value):
         with refused(vp.InputError, "scene", "varpin.Scene"):

@@ -125,6 +125,8 @@ def test_no_check():
     assert coarse.warnings == ()
     assert "error" not in repr(coarse)
     assert about(moved(FREE, EULER).warnings, "error")
+    searched = vp.simulate(FREE, Q0, V0, duration=0.2, tolerance=1e-4, check=False)
+    assert searched.error.max() == pytest.approx(searched.accuracy.error)
     assert moved(FREE, steps=0).warnings == ()
     assert moved(FREE, start=([0.5 * np.pi, 0.0, 0.0], np.zeros(3))).error.max() < 1e-9
 
@@ -318,7 +320,7 @@ def test_limits():
         worst = int(excess.max(axis=0).argmax())
         assert (told.joint, told.unit) == (robot.joint_names[worst], unit)
         assert told.value == pytest.approx(excess.max())
-        assert told.time == pytest.approx(motion.t[int((excess[:, worst] > 0.0).argmax())])
+        assert told.time == pytest.approx(motion.t[int(excess[:, worst].argmax())])
         count = int((excess.max(axis=0) > 1e-6).sum()) - 1
         assert not unnamed(told, f"'{told.joint}'", f"{limit[worst]:.4g} {unit}", f"by {told.value:.3g}")
         assert told.endswith((f"{count} more joint does", f"{count} more joints do") if count else "")
@@ -499,3 +501,20 @@ def test_efforts_within_a_step_are_told_on_either_side():
         told.append([finding.value for finding in about(motion.warnings, "effort limits")])
     assert told[0]
     assert told[0] == pytest.approx(told[1])
+
+
+def test_a_blow_within_a_step_is_held_against_the_limit_of_efforts():
+    """Its mean over the step is a fifth of it, within the limit."""
+    scene = vp.Scene(vp.load_robot("ur5"))
+    push = vp.OpenLoop(lambda t: [0.0, 400.0 * (0.1 <= t < 0.102), 0.0, 0.0, 0.0, 0.0], breaks=[0.1, 0.102])
+    motion = moved(scene, dt=0.01, steps=20, controls=push, start=np.zeros((2, 6)))
+    (told,) = about(motion.warnings, "effort limits")
+    assert told.value == pytest.approx(400.0 - scene.robot.effort_limit[1])
+    assert told.time == pytest.approx(0.1)
+
+
+def test_breaks_outside_the_motion():
+    def told(*breaks):
+        return about(moved(FREE, controls=vp.OpenLoop(lambda t: np.ones(3), breaks=breaks)).warnings, "breaks outside")
+
+    assert [len(told(*breaks)) for breaks in ((), (100, 102), (100, 0.1), (-1.0,))] == [0, 1, 0, 1]

@@ -19,8 +19,6 @@ import varpin as vp
 import varpin_command
 from varpin.cli import console, exits, main
 from varpin.model import load_robot
-from varpin.study.paper import Reproduction
-from varpin.study.paper.claims import Claim
 
 ROD = '<mass value="1"/><origin xyz="0.5 0 0"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.083" iyz="0" izz="0.083"/>'
 
@@ -135,7 +133,16 @@ def test_split_steps_are_flagged_in_the_table(arm, capsys):
     assert main(["simulate", arm, "--integrator", "midpoint", "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
     out, err = capsys.readouterr()
     assert re.search(r"split steps +│ \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", out)
-    assert re.search(r"^varpin: warning: q is off by up to \S+ rad, .* Use integrator=.* or dt = ", err, re.MULTILINE)
+    assert re.search(r"^varpin: warning: q is off by up to \S+ rad, .* Use integrator=", err, re.MULTILINE)
+
+
+def test_all_warnings_are_printed(tmp_path, capsys):
+    start = ["--dt", "0.05", "--steps", "20", "--v0", "8", "0", "0", "0", "0", "0", "--save", str(tmp_path / "a.npz")]
+    assert main(["simulate", "ur5", "--integrator", "midpoint", *start]) == 0
+    said = " ".join(re.sub(r"[│\s]+", " ", "".join(capsys.readouterr())).replace("warning ", "").split())
+    told = vp.Trajectory.load(tmp_path / "a.npz").warnings
+    assert len(told) > 1
+    assert not unnamed(said, *(str(finding.joint) for finding in told), *(finding.kind[:-1] for finding in told[1:]))
 
 
 def test_forced_motion_has_an_energy_change_and_no_error(arm, capsys):
@@ -537,50 +544,12 @@ def test_version_and_help(capsys):
         main(["--version"])
     assert stop.value.code == 0
     assert capsys.readouterr().out == f"varpin {vp.__version__}\n"
-    commands = "simulate", "inspect", "tradeoff", "advise", "paper"
+    commands = "simulate", "inspect", "tradeoff", "advise"
     for arguments in (["--help"], *([command, "--help"] for command in commands)):
         with pytest.raises(SystemExit) as stop:
             main(arguments)
         assert stop.value.code == 0
         assert "usage: varpin" in capsys.readouterr().out
-
-
-def test_paper_explains_itself(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["paper", "--help"])
-    assert stop.value.code == 0
-    out = capsys.readouterr().out
-    for words in ("usage: varpin paper", "--quick", "--out FOLDER", "--quiet", "an interrupted run continues"):
-        assert words in " ".join(out.split())
-
-
-def test_paper_refuses_a_folder_it_cannot_make(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("varpin.study.paper.reproduction.fill", lambda *_, **__: pytest.fail("the work must not start"))
-    (tmp_path / "file").write_text("")
-    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        assert main(["paper", "--quick", "--out", str(folder)]) == 2
-        assert not unnamed(error_of(capsys), "varpin: error", str(folder / "cells"), "Not a directory")
-
-
-def test_paper_prints_its_claims_and_where_the_report_is(tmp_path, capsys, monkeypatch):
-    result = Reproduction(tmp_path / "report.html", (Claim("paper", "a [b] c", "1 of 2", "holds in part"),))
-    monkeypatch.setattr("varpin.study.paper.reproduce", lambda folder, **_: result)
-    assert main(["paper", "--out", str(tmp_path)]) == 0
-    out, err = capsys.readouterr()
-    assert err == ""
-    assert re.search(r"holds in part +│ a \[b\] c +│ 1 of 2", out)
-    assert out.replace("\n", "").endswith(str(result.page))
-    assert main(["paper", "--quiet", "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.replace("\n", "") == str(result.page)
-
-
-def test_interrupted_paper_is_status_130(tmp_path, capsys, monkeypatch):
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("varpin.study.paper.reproduction.fill", interrupt)
-    assert main(["paper", "--quick", "--out", str(tmp_path)]) == 130
-    assert error_of(capsys) == "varpin: interrupted"
 
 
 def python_m_varpin(*arguments):

@@ -82,14 +82,14 @@ def test_paths_with_controls_of_their_own(integrator, line):
     if line:
         options["stage_times"] = np.array(integrator.stage_times or (0.5,))
     own = open_loop(u.reshape(-1, 2))._replace(own=R, before=before, **options)
-    found = integrator.motions(scene, q, v, own, scene.no_drift, 0.01)
+    found = integrator.motions(scene, q, v, own, 0.01)
     for k in range(P):
         part = slice(k, k + 1)
         alone = open_loop(u[k])._replace(before=before[part], **options)
-        expected = integrator.motions(scene, q[part], v[part], alone, scene.no_drift, 0.01)
+        expected = integrator.motions(scene, q[part], v[part], alone, 0.01)
         assert all(a[k].tobytes() == b[0].tobytes() for a, b in zip(found, expected, strict=True))
     with pytest.raises(ValueError, match="u has"):
-        integrator.motions(scene, q, v, own._replace(u=own.u[1:].copy()), scene.no_drift, 0.01)
+        integrator.motions(scene, q, v, own._replace(u=own.u[1:].copy()), 0.01)
 
 
 @pytest.mark.parametrize(

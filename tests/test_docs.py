@@ -140,7 +140,8 @@ PLACE = re.compile(r"`([\w/]+\.(?:hpp|py))`: `(\w+)`")
 def described(file, name):
     """The docstrings of the functions or classes of this name in a Python file, or the comments above those in C++."""
     if file.endswith(".py"):
-        nodes = ast.walk(ast.parse((ROOT / "src/varpin" / file).read_text(encoding="utf-8")))
+        folder = ROOT / ("benchmarks" if file.startswith("paper/") else "src/varpin")
+        nodes = ast.walk(ast.parse((folder / file).read_text(encoding="utf-8")))
         named = [node for node in nodes if getattr(node, "name", None) == name and isinstance(node, DEFINITIONS)]
         found = [ast.get_docstring(node) or "" for node in named]
     else:

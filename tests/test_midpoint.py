@@ -1,13 +1,11 @@
 """The midpoint integrator against exact solutions, a plain version of itself, and what its structure promises."""
 
-import logging
 from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 import scipy.linalg
-from findings import about
 from refusals import refused, unnamed
 from scipy.optimize import root
 from scipy.special import ellipj, ellipk
@@ -70,18 +68,6 @@ def test_momentum_about_a_vertical_axis_is_conserved_to_rounding():
 
 
 @pytest.mark.slow
-def test_energy_round_off_walks_at_random():
-    """A mass on a spring: the midpoint rule conserves its energy exactly, so what is left is rounding."""
-    model = pin.Model()
-    joint = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "slide")
-    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3.Identity())
-    scene = vp.Scene(vp.load_robot(model), stiffness=3.0, gravity=False)
-    motion = vp.simulate(scene, [1.0], [0.3], dt=1e-2, steps=1_000_000, integrator=vp.Midpoint())
-    error = np.abs(motion.energy / motion.energy[0] - 1.0)
-    assert error.max() < 50 * np.finfo(float).eps
-
-
-@pytest.mark.slow
 def test_energy_of_a_million_small_steps_does_not_drift():
     """The three links at 1e-4 for 100 s: once the method's own oscillation is quiet, only rounding is left."""
     scene = vp.Scene(vp.planar_chain(3))
@@ -109,20 +95,8 @@ def test_long_chains_fall_for_ten_seconds(links):
     assert np.abs(motion.energy - motion.energy[0]).max() < 0.05 * GRAVITY * links**2 / 2
 
 
-@pytest.mark.parametrize("links", [2, 3, 5])
-@pytest.mark.parametrize("dt", [0.05, 0.1, 0.2, 0.5])
-def test_no_silent_energy_jump_at_coarse_steps(links, dt):
-    steps = int(200 / dt)
-    motion = vp.simulate(
-        vp.Scene(vp.planar_chain(links)), np.zeros(links), np.zeros(links), dt=dt, steps=steps, integrator=vp.Midpoint()
-    )
-    assert motion.statistics.split_steps > 0
-    assert motion.statistics.jets.sum() / motion.statistics.substeps.sum() <= 6.0
-    assert np.abs(motion.energy - motion.energy[0]).max() < 0.05 * GRAVITY * links**2 / 2
-
-
 def test_without_the_energy_guard_there_are_silent_jumps():
-    """What the guard is for: without it the same runs jump to other branches of solutions."""
+    """What the guard is for: without it runs at coarse steps jump to other branches of solutions."""
     unguarded = vp.Midpoint(guard=vp.Guard(energy_balance=1e12, energy_budget=1e12))
     scene = vp.Scene(vp.planar_chain(2))
     try:
@@ -142,20 +116,6 @@ def test_few_iterations_from_rest_under_gravity(name):
         )
         assert motion.statistics.newton_iterations.mean() <= 3.0
         assert motion.statistics.residual.max() < 20.0
-
-
-@pytest.mark.parametrize("stiffness", [1e-2, 1.0, 1e2, 1e4])
-@pytest.mark.parametrize("damping", [0.0, 1e-2, 1.0, 1e4])
-def test_stiff_springs_and_dampers(stiffness, damping):
-    """Springs and dampers far faster than the step: finite, bounded, and dissipating what they should."""
-    scene = vp.Scene(vp.load_robot("finger"), gravity=False, stiffness=stiffness, damping=damping)
-    motion = vp.simulate(scene, [0.1, 0.1, 0.1], np.zeros(3), dt=1e-2, steps=500, integrator=vp.Midpoint())
-    assert np.isfinite(motion.q).all()
-    if damping == 0.0:
-        assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 0.1
-    else:
-        assert motion.energy[-1] < motion.energy[0]
-        assert motion.energy.max() <= motion.energy[0] * (1.0 + 1e-9)
 
 
 def test_failure_keeps_what_was_done():
@@ -268,18 +228,6 @@ def test_a_constant_torque_is_guarded_like_a_potential(dt):
         assert np.abs(energy - energy[0]).max() < 0.1 * GRAVITY * 9 / 2
     errors = np.abs(torque.energy - 30.0 * torque.q.sum(axis=1) - torque.energy[0])
     np.testing.assert_allclose(torque.statistics.energy_defect, errors[1:], rtol=0, atol=1e-9)
-
-
-def test_dampers_faster_than_the_step_are_reported(caplog):
-    with caplog.at_level(logging.WARNING, logger="varpin"):
-        motion = vp.simulate(
-            vp.Scene(vp.planar_chain(1), damping=100.0), [0.0], [1.0], dt=0.1, steps=5, integrator=vp.Midpoint()
-        )
-    assert about(caplog.messages, "error")
-    assert (np.diff(np.sign(motion.v[:, 0])) != 0).all()
-    caplog.clear()
-    vp.simulate(vp.Scene(vp.planar_chain(1), damping=1.0), [0.0], [1.0], dt=0.1, steps=5, integrator=vp.Midpoint())
-    assert not about(caplog.messages, "error")
 
 
 @pytest.mark.parametrize(

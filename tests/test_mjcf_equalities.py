@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 from battery.loops import Closure, Dynamics
 
 import varpin as vp
-
-mujoco = pytest.importorskip("mujoco")
 
 MASS = '<inertial pos="0.02 0.05 0.1" mass="1.3" diaginertia="0.02 0.03 0.025" quat="0.9 0.2 0.1 0"/>'
 PLACE = 'pos="0.1 0.02 0.2" quat="0.9 0.1 0.2 0.3"'

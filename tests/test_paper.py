@@ -1,28 +1,28 @@
 """The paper's experiments: the store, the claims and the report on made-up cells, and the whole of it, slowly, by the
 command line."""
 
-import base64
 import csv
 import dataclasses
-import html
-import io
 import logging
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from refusals import refused
 
 import varpin as vp
-from varpin.study.paper import cases, experiments, reproduce
-from varpin.study.paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS
-from varpin.study.paper.claims import Claim, assess, free_motions, series, verdict
-from varpin.study.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Store, Task, fill, run, tasks
-from varpin.study.paper.figures import draw
-from varpin.study.paper.report import write
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+from paper import cases, experiments
+from paper.__main__ import reproduce
+from paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS
+from paper.claims import Claim, assess, free_motions, series, verdict
+from paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Store, Task, fill, run, tasks
+from paper.figures import draw
+from paper.report import write
 
 FIGURES = ["figure1", "figure2", "figure3", "figure4", "figure5", "truth", "noise"]
 
@@ -167,7 +167,7 @@ def test_a_damaged_cell_is_computed_again(tmp_path, caplog, counted, damage):
     path = tmp_path / f"{task.name}.npz"
     path.write_bytes(damage(path.read_bytes()))
     counted.clear()
-    with caplog.at_level(logging.WARNING, logger="varpin.study.paper"):
+    with caplog.at_level(logging.WARNING, logger="paper"):
         found = fill(Store(tmp_path), quick=True)
     assert f"{path} cannot be read" in caplog.text
     assert counted == [task.name]
@@ -394,23 +394,14 @@ def test_series_run_from_fine_to_coarse(cells):
 def test_report_has_every_figure_and_every_cell(tmp_path, cells, motions, figures):
     own = {task.name: cells[task.name] for task in tasks(quick=True)}
     assert list(figures) == FIGURES
-    claim = Claim("nobody", "1 < 2 & <b>x</b>", "<script>alert(1)</script>", "holds in part")
-    page = write(tmp_path, own, [claim, *assess(own, motions)], figures, quick=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        [*(f"{name}.png" for name in FIGURES), "claims.csv", "report.html", "table1.csv"]
-    )
-    text = page.read_text(encoding="utf-8")
-    images = [base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', text)]
-    assert images == [(tmp_path / f"{name}.png").read_bytes() for name in FIGURES]
-    for image in images:
-        picture = np.asarray(Image.open(io.BytesIO(image)).convert("L"))
+    claim = Claim("nobody", "1 < 2 & <b>x</b>", "1, 2", "holds in part")
+    write(tmp_path, own, [claim, *assess(own, motions)], figures)
+    files = [*(f"{name}.png" for name in FIGURES), "claims.csv", "table1.csv"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(files)
+    for name in FIGURES:
+        picture = np.asarray(Image.open(tmp_path / f"{name}.png").convert("L"))
         assert picture.shape[1] > 900
         assert picture.std() > 5.0
-    assert html.escape(claim.sentence) in text
-    assert html.escape(claim.measured) in text
-    assert "<script" not in text
-    assert text.count("<tr") == text.count("</tr>")
-
     with (tmp_path / "table1.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(own)
@@ -436,36 +427,23 @@ def test_legends_cover_no_curve(figures):
                 assert not any(legend.get_window_extent().contains(*point) for point in points), name
 
 
-def test_reproduce_makes_its_folder_and_returns_the_claims(tmp_path, monkeypatch, counted):
-    monkeypatch.setattr("varpin.study.paper.reproduction.draw", lambda *_: {})
-    result = reproduce(str(tmp_path / "a" / "b"), quick=True)
-    assert result.page == tmp_path / "a" / "b" / "report.html"
-    assert result.page.is_file()
-    assert len(counted) == len(list((tmp_path / "a" / "b" / "cells").iterdir()))
-    assert {claim.verdict for claim in result.claims} <= {"holds", "holds in part", "does not hold", "not measured"}
-    again = reproduce(tmp_path / "a" / "b", quick=True)
-    assert [claim.verdict for claim in again.claims] == [claim.verdict for claim in result.claims]
+def test_reproduce_returns_the_claims(tmp_path, monkeypatch, counted):
+    monkeypatch.setattr("paper.__main__.draw", lambda *_: {})
+    folder = tmp_path / "a" / "b"
+    claims = reproduce(folder, quick=True)
+    assert len(counted) == len(list((folder / "cells").iterdir()))
+    assert {claim.verdict for claim in claims} <= {"holds", "holds in part", "does not hold", "not measured"}
+    assert [claim.verdict for claim in reproduce(folder, quick=True)] == [claim.verdict for claim in claims]
     assert len(counted) == len(set(counted))
 
 
-def test_a_folder_that_cannot_be_made_is_refused_before_the_work(tmp_path, counted):
-    (tmp_path / "file").write_text("")
-    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        with refused(vp.FileError, "folder"):
-            reproduce(folder, quick=True)
-    with refused(vp.InputError, "folder"):
-        reproduce(3)
-    assert counted == []
-
-
 @pytest.mark.slow
-def test_quick_reproduction_by_the_command_line(tmp_path):
+def test_quick_reproduction(tmp_path):
     folder = tmp_path / "paper"
-    command = [sys.executable, "-m", "varpin", "paper", "--quick", "--quiet", "--out", str(folder)]
+    command = [sys.executable, str(Path(cases.__file__).parent), str(folder), "--quick"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=900)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == str(folder / "report.html")
-    assert (folder / "report.html").stat().st_size > 100_000
+    assert "holds" in done.stdout
 
     with (folder / "claims.csv").open(newline="") as stream:
         claims = list(csv.DictReader(stream))

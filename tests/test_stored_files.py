@@ -13,18 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from findings import about
 from refusals import refused
 
 import varpin as vp
 from varpin.io.archive import read_npz
 from varpin.study.extremes import Record
-from varpin.study.paper import cases
-from varpin.study.paper.experiments import Store, Task
 from varpin.study.tradeoff import OptimalControlTradeoff, WorkPrecision
 
 DATA = Path(__file__).parent / "data" / "files"
-TASK = Task(cases.MAIN, cases.CASES[0], "variational", 1e-2)
 
 
 @functools.cache
@@ -113,26 +109,6 @@ def test_read_and_written_again_it_is_the_same(name, tmp_path):
     for key in before.keys() & after.keys():
         assert before[key].dtype == after[key].dtype
         np.testing.assert_array_equal(before[key], after[key])
-
-
-def test_cells_of_the_paper(tmp_path, caplog):
-    """A cell of varpin 0.1 is read; one of another version, or a damaged one, is computed again."""
-    store = Store(tmp_path)
-    path = tmp_path / f"{TASK.name}.npz"
-    path.write_bytes((DATA / "cell.npz").read_bytes())
-    cell = store.load(TASK)
-    facts = json.loads(str(members_of("cell.npz")["facts"]))
-    assert (cell.cost, cell.iterations, cell.closed_loop) == (facts["cost"], facts["iterations"], np.inf)
-    np.testing.assert_array_equal(cell.q, members_of("cell.npz")["q"])
-    store.save(TASK, cell)
-    np.testing.assert_equal(vars(store.load(TASK)), vars(cell))
-    assert not caplog.records
-    members = read_npz(path)
-    np.savez(path, **members | {"version": "0.0.1"})
-    assert store.load(TASK) is None
-    np.savez(path, **members | {"q": np.zeros((4, 2))})
-    assert store.load(TASK) is None
-    assert about(caplog.messages, "computed again")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.99])

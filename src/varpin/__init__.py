@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from varpin._version import __version__ as __version__
 from varpin.errors import AssemblyError as AssemblyError
+from varpin.errors import ControlError as ControlError
 from varpin.errors import FileError as FileError
 from varpin.errors import InputError as InputError
 from varpin.errors import LinearizationError as LinearizationError
@@ -81,7 +82,6 @@ from varpin.signals.policy import FirstOrderHold as FirstOrderHold
 from varpin.signals.policy import LinearPolicy as LinearPolicy
 from varpin.signals.policy import OpenLoop as OpenLoop
 from varpin.simulation.failures import ConstraintError as ConstraintError
-from varpin.simulation.failures import ControlError as ControlError
 from varpin.simulation.failures import ForceError as ForceError
 from varpin.simulation.failures import Interrupted as Interrupted
 from varpin.simulation.failures import NoiseError as NoiseError

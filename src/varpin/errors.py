@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any, Self
 
 
 class VarpinError(Exception):
     """Base of all errors that varpin raises."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), str(self), vars(self).copy())
+
+
+def _restored(kind: type[VarpinError], message: str, values: dict[str, Any]) -> VarpinError:
+    """An unpickled error."""
+    error = kind.__new__(kind, message)
+    vars(error).update(values)
+    return error
 
 
 class RobotError(VarpinError, ValueError):
@@ -67,9 +78,8 @@ class UnsupportedJoint(RobotError):
         self.kind = kind
         value = "position" if numbers == 1 else f"[{numbers} numbers]"
         super().__init__(
-            f"joint {joint!r} is a {kind}, which has no single coordinate in R; varpin takes revolute, prismatic, "
-            f"continuous, fixed and mimic joints: fix it to the base with lock={{{joint!r}: {value}}}, "
-            "or describe it as a chain of one-axis joints"
+            f"joint {joint!r} is a {kind}, which has no single coordinate in R: hold it with "
+            f"lock={{{joint!r}: {value}}}, or describe it as a chain of revolute and prismatic joints"
         )
 
 
@@ -202,3 +212,30 @@ class LinearizationError(VarpinError, RuntimeError):
         self.time = time
         self.reason = reason
         super().__init__(f"step {step} (t = {time:.6g} s) cannot be linearized: {reason}; a smaller dt may help")
+
+
+class StepError(VarpinError, ValueError):
+    """A user's function failed in a step.
+
+    Attributes:
+        step: Index of the step that it was called for.
+        time: The time it was called with, or the start of that step [s].
+        problem: What failed, in words.
+        trajectory: The motion before; None where the function is called before the motion begins, as in an ensemble.
+    """
+
+    def __init__(self, step: int, time: float, problem: str, trajectory: Any = None) -> None:
+        self.step = step
+        self.time = time
+        self.trajectory = trajectory
+        before = "" if trajectory is None else "; what came before is in error.trajectory"
+        super().__init__(f"step {step} (t = {time:.6g} s): {problem}{before}")
+        self.problem = problem
+
+    def after(self, trajectory: Any) -> Self:
+        """The same error with the motion before it."""
+        return type(self)(self.step, self.time, self.problem, trajectory)
+
+
+class ControlError(StepError):
+    """A control law or the function of an OpenLoop raised, or returned something that is no control."""

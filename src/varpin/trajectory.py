@@ -390,10 +390,10 @@ class Trajectory(Frozen):
             ("energy [J]", f"{self.energy[0]:.6g} at first, {self.energy[-1]:.6g} in the end"),
             ("energy's largest change [J]", f"{np.abs(self.energy - self.energy[0]).max():.3g}"),
         ]
-        if self.error_text:
-            rows.append(("estimated error of q [rad or m]", self.error_text.removeprefix("error ")))
         if statistics.energy_defect.any():
             rows.append(("of it, not the work of a force [J]", f"{np.abs(statistics.energy_defect).max():.3g}"))
+        if self.error_text:
+            rows.append(("estimated error of q [rad or m]", self.error_text.removeprefix("error ")))
         if statistics.newton_iterations.any():
             rows.append(("Newton iterations", f"{statistics.newton_iterations.mean():.2f} a step"))
         if statistics.split_steps:

@@ -197,7 +197,7 @@ def add_gravity(group: argparse._ActionsContainer) -> None:
         nargs=3,
         metavar=("X", "Y", "Z"),
         default=True,
-        help="in world axes [m/s^2]; default: 0 0 -9.81",
+        help="in world axes [m/s^2]; default: the robot's, 0 0 -9.81",
     )
     gravity.add_argument("--no-gravity", dest="gravity", action="store_false", help="none")
 

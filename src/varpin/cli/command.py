@@ -17,7 +17,7 @@ from varpin.cli.interrupts import Interrupts
 from varpin.cli.replay import add_replay
 from varpin.cli.simulate import add_simulate
 from varpin.cli.solve import add_solve
-from varpin.cli.studies import add_advise, add_extremes, add_paper, add_tradeoff
+from varpin.cli.studies import add_advise, add_extremes, add_tradeoff
 from varpin.errors import VarpinError
 
 _EXAMPLES = """\
@@ -54,7 +54,6 @@ def _parser() -> tuple[Parser, Mapping[str, Parser]]:
     add_inspect(commands.add_parser("inspect", help="report on a robot description", allow_abbrev=False))
     add_tradeoff(commands.add_parser("tradeoff", help="measure speed against accuracy", allow_abbrev=False))
     add_advise(commands.add_parser("advise", help="find the cheapest integrator and step", allow_abbrev=False))
-    add_paper(commands.add_parser("paper", help="reproduce the paper's experiments", allow_abbrev=False))
     add_extremes(commands.add_parser("extremes", help="run every integrator where it is hard", allow_abbrev=False))
     for command in commands.choices.values():
         command.set_defaults(parser=command)

@@ -121,7 +121,7 @@ def _run(
             complaint = f"interrupted after {trajectory.steps}{of} steps, which are kept"
         except StepFailure as failure:
             trajectory, status = failure.trajectory, STEP_FAILED
-            complaint = f"{failure.problem}. What came before is kept; {failure.advice}"
+            complaint = f"{failure.problem}. {failure.advice}. The motion so far is kept"
         wall_time = time.perf_counter() - begin
         writers = {output.path: partial(output.write, robot, trajectory) for output in outputs}
         written, trouble = write_all(errors, writers, request.interrupts)
@@ -211,6 +211,9 @@ def _summary(trajectory: Trajectory, asked: int | None, wall_time: float, driven
     names = "q at the end [rad or m]", "v at the end [rad/s or m/s]"
     for name, values in zip(names, (trajectory.q[-1], trajectory.v[-1]), strict=True):
         add_row(table, name, "  ".join(f"{value:.6g}" for value in values))
+    # The log has the first.
+    for finding in trajectory.warnings[1:]:
+        add_row(table, "warning", finding, style="bold yellow")
     for path in files:
         add_row(table, "written", f"{path} ({file_size(path.stat().st_size)})")
     return table

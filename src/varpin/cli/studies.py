@@ -1,4 +1,4 @@
-"""``varpin tradeoff``, ``advise``, ``paper`` and ``extremes``: measurements of integrators."""
+"""``varpin tradeoff``, ``advise`` and ``extremes``: measurements of integrators."""
 
 from __future__ import annotations
 
@@ -126,36 +126,6 @@ def _advise(request: argparse.Namespace, _errors: Console) -> int:
         for path in write_advice(folder, advice, title):
             say(console, str(path), prefix="written")
     return 0 if advice.reached else STEP_FAILED
-
-
-def add_paper(parser: argparse.ArgumentParser) -> None:
-    """Arguments of ``varpin paper``."""
-    parser.description = (
-        "Run the experiments of the paper on stochastic variational integrators and write tables (CSV), figures (PNG) "
-        "and a report (HTML) that compares each of its claims with the measured result. Results in the folder are not "
-        "computed again, so that an interrupted run continues where it stopped."
-    )
-    parser.set_defaults(run=_paper, log_level=logging.ERROR)
-    parser.add_argument("--quick", action="store_true", help="fewer time steps and one setting: about a minute")
-    parser.add_argument(
-        "--out", type=Path, default=Path("paper"), metavar="FOLDER", help="output folder; default: %(default)s"
-    )
-    parser.add_argument("--quiet", action="store_true", help="print nothing but the report's path")
-
-
-def _paper(request: argparse.Namespace, errors: Console) -> int:
-    from varpin.study.paper import reproduce  # noqa: PLC0415  (its figures need matplotlib, which takes long to import)
-
-    with progress_bar(errors, 1, quiet=request.quiet, unit="cells") as report:
-        result = reproduce(request.out, quick=request.quick, progress=lambda done, cells, _: report(done, cells))
-    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-    if not request.quiet:
-        table = table_of("Claims", ("verdict", "sentence", "measured"))
-        for claim in result.claims:
-            add_row(table, claim.verdict, claim.sentence, claim.measured)
-        console.print(table)
-    say(console, str(result.page), prefix="")
-    return 0
 
 
 def add_extremes(parser: argparse.ArgumentParser) -> None:

@@ -656,7 +656,8 @@ def _unplanned(reason: str, failure: VarpinError | None, motion: Trajectory) -> 
     """The failure of a run that has no plan left; it holds the plant's motion so far."""
     residual = failure.residual if isinstance(failure, StepFailure) else np.nan
     told = f"no plan can be made from here, and the last plan is at its end; {reason}"
-    return StepFailure(motion.steps, motion.t[-1], Failure(told, residual), motion)
+    cause = "Use a longer horizon, or more iterations a tick"
+    return StepFailure(motion.steps, motion.t[-1], Failure(told, residual), motion, cause)
 
 
 def _method(plant: Plant, plan: Trajectory, dt: float, *, noisy: bool) -> Integrator:

@@ -57,7 +57,7 @@ class Parts(Frozen):
         """
         own, dt = self._commands(u), self.dt / self.count
         try:
-            found = self.integrator.motions(self.scene, q.copy(), v.copy(), own, self.scene.no_drift, dt)
+            found = self.integrator.motions(self.scene, q.copy(), v.copy(), own, dt)
         except CustomForceError:
             return None
         if found is None:

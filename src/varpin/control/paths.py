@@ -12,8 +12,8 @@ from varpin.control.costs import CostSum
 from varpin.control.problem import OptimalControlProblem
 from varpin.ensemble.paths import Shared, Task, chunks, without_geometry
 from varpin.mechanics.wiener import Children
+from varpin.signals.controls import commands_of
 from varpin.signals.policy import LinearPolicy
-from varpin.simulation.commands import commands_of
 from varpin.support.frozen import Frozen
 
 

@@ -20,9 +20,9 @@ from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import children
+from varpin.signals.controls import commands_of
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.choice import stronger, usual_integrator
-from varpin.simulation.commands import commands_of
 from varpin.simulation.start import in_other_units, on_constraints
 from varpin.simulation.time_steps import time_steps
 from varpin.support.checks import (
@@ -88,9 +88,9 @@ def simulate_ensemble(
             ``statistics.quantile_errors`` bounds their errors by the width of a bin. Levels 0 and 1 stay exact.
         workers: Number of threads; the number of cores if left out.
         executor: Any ``concurrent.futures.Executor`` instead of threads: a ``ProcessPoolExecutor``, Dask's
-            ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. The work of a lost worker
-            is repeated. At most four chunks of paths for each worker are submitted and not yet merged; together they
-            return at most 2 GiB, unless two chunks alone return more.
+            ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. At most
+            256 chunks of paths are submitted and not yet merged; together they return at most 2 GiB, unless two chunks
+            alone return more.
         progress: Called with (paths done, P) after each chunk.
 
     Raises:
@@ -98,7 +98,7 @@ def simulate_ensemble(
         ForceError: A function of a :class:`varpin.CustomForce` failed. The error names the path and holds its motion up
             to the failure.
         AssemblyError: No configuration near q0 satisfies the scene's constraints.
-        VarpinError: Every path failed, or workers are lost repeatedly.
+        VarpinError: Every path failed, or the executor has lost its workers.
         EnsembleInterrupted: Ctrl-C; holds the finished paths, and those that threads had begun. It is a
             KeyboardInterrupt.
     """

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from varpin.arrays import Floats, Integers
 from varpin.core import Watch
-from varpin.core.arrays import Commands, RolloutArrays
+from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.errors import InputError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import Fields, over_steps
@@ -235,28 +235,17 @@ class Integrator(ABC):
         """
 
     def motions(
-        self,
-        scene: Scene,
-        q0: Floats,
-        v0: Floats,
-        commands: Commands,
-        drift: Floats,
-        dt: float,
-        impulses: Floats | None = None,
+        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, dt: float
     ) -> tuple[Floats, Floats] | None:
         """Configurations and velocities (P, N, n) after each step of P motions from (q0, v0) (P, n), without noise.
 
-        ``commands`` and ``drift`` are as for :meth:`rollout_compiled`; ``impulses`` (P, N, 2, n) are added to the
-        momenta before and after each step, or spread over it by an integrator that holds the noise. Returns None if a
-        motion fails, or if the integrator takes no impulses.
+        ``commands`` are as for :meth:`rollout_compiled`. Returns None if a motion fails.
         """
-        if impulses is not None:
-            return None
         try:
             state, _ = self.start(scene, q0, v0)
         except SingularMassMatrix:
             return None
-        parts = self.rollout_compiled(scene, state, commands, scene.silence, drift, dt)
+        parts = self.rollout_compiled(scene, state, commands, scene.silence, scene.no_drift, dt)
         if any(part.failure is not None for part in parts):
             return None
         return np.array([part.q for part in parts]), np.array([part.v for part in parts])
@@ -307,6 +296,73 @@ class Integrator(ABC):
         raise InputError(
             f"{self} has no second-order linearization; variational integrators have, such as varpin.Gauss(...)"
         )
+
+
+@dataclass(frozen=True)
+class Run:
+    """State of a rollout in the core.
+
+    Attributes:
+        paths: The paths, with their work arrays.
+        start: Initial configurations (P, n) [rad or m].
+    """
+
+    paths: Any
+    start: Floats
+
+
+class Compiled(Integrator):
+    """An integrator whose paths are in the core; ``reasons`` are the texts of their outcomes."""
+
+    reasons: ClassVar[Mapping[int, str]]
+
+    @abstractmethod
+    def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
+        """The state of a rollout of P paths at (q0, v0), each (P, n)."""
+
+    def rollout_compiled(
+        self,
+        scene: Scene,
+        state: Run,
+        commands: Commands,
+        increments: Floats,
+        drift: Floats,
+        dt: float,
+        impulses: Floats | None = None,
+    ) -> list[Segment]:
+        """See :meth:`Integrator.rollout_compiled`."""
+        nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
+        state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
+        return segments_of(nodes, self.reasons, state.paths)
+
+    def watched(
+        self,
+        scene: Scene,
+        state: Run,
+        commands: Commands,
+        dt: float,
+        nodes: RolloutArrays,
+        watch: Watch,
+        impulses: Floats | None = None,
+    ) -> tuple[Failure | None, Bytes]:
+        """See :meth:`Integrator.watched`."""
+        if scene.noise.diffusion is None or scene.constraints:
+            return super().watched(scene, state, commands, dt, nodes, watch, impulses)
+        state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
+        done = int(nodes.done[0])
+        return failure_of(nodes, 0, done, self.reasons), parts_of(nodes, 0, done, state.paths)
+
+    def motions(
+        self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, dt: float
+    ) -> tuple[Floats, Floats] | None:
+        """See :meth:`Integrator.motions`."""
+        try:
+            state = self.begun(scene, q0, v0)
+        except SingularMassMatrix:
+            return None
+        nodes = new_nodes(len(q0), steps_of(commands), scene.robot.dof, scene.controls)
+        state.paths.roll(dt, commands, scene.silence, scene.no_drift, nodes)
+        return None if nodes.ended.any() else (nodes.q, nodes.v)
 
 
 @functools.lru_cache(maxsize=256)
@@ -439,16 +495,14 @@ def forces(scene: Scene, trajectory: Trajectory, drift: Floats | float = 0.0) ->
     return np.ascontiguousarray(total + drift if isinstance(drift, np.ndarray) else total)
 
 
-def segments_of(
-    nodes: RolloutArrays, reasons: Mapping[int, str], halvings: Callable[[int], Bytes] | None = None
-) -> list[Segment]:
+def segments_of(nodes: RolloutArrays, reasons: Mapping[int, str], paths: Any = None) -> list[Segment]:
     """A segment for each path, with views of the arrays that the core wrote.
 
-    ``halvings`` returns the halvings of a path's steps; it is called only for paths with divided steps.
+    ``paths`` are those of the core, asked for the halvings of divided steps.
     """
     segments = []
     for i, done in enumerate(nodes.done.tolist()):
-        parts = np.zeros(0, dtype=np.uint8) if halvings is None else parts_of(nodes, i, done, halvings)
+        parts = parts_of(nodes, i, done, paths)
         statistics, failure = statistics_of(nodes, i, done, parts), failure_of(nodes, i, done, reasons)
         segments.append(
             Segment(
@@ -479,10 +533,10 @@ def statistics_of(nodes: RolloutArrays, path: int, done: int, halvings: Bytes) -
     )
 
 
-def parts_of(nodes: RolloutArrays, path: int, done: int, halvings: Callable[[int], Bytes]) -> Bytes:
-    """The halvings of a path's steps; ``halvings`` is called only if a step was divided."""
+def parts_of(nodes: RolloutArrays, path: int, done: int, paths: Any) -> Bytes:
+    """The halvings of a path's steps; none where no step was divided."""
     split = done > 0 and nodes.tally[path, :done, 3].max() > 1
-    return halvings(path) if split else np.zeros(0, dtype=np.uint8)
+    return paths.halvings(path) if split else np.zeros(0, dtype=np.uint8)
 
 
 def failure_of(nodes: RolloutArrays, path: int, done: int, reasons: Mapping[int, str]) -> Failure | None:

@@ -9,25 +9,23 @@ import numpy as np
 
 from varpin import core
 from varpin.arrays import Floats
-from varpin.core import ExplicitMethod, Outcome, Watch
-from varpin.core.arrays import Commands, RolloutArrays, new_nodes
+from varpin.core import ExplicitMethod, Outcome
+from varpin.core.arrays import Commands, new_nodes
 from varpin.errors import LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
-    Failure,
-    Integrator,
+    Compiled,
+    Run,
     Segment,
     diffusion_and_drift,
     drifts,
-    failure_of,
     first_nodes,
     forces,
     noise_of_step,
-    segments_of,
 )
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, refuse_constraints
-from varpin.signals.commands import contiguous, control_of, ends_of, first_of, steps_of
-from varpin.trajectory import Bytes, Trajectory
+from varpin.signals.commands import control_of, ends_of, first_of
+from varpin.trajectory import Trajectory
 
 REASONS: dict[int, str] = {
     Outcome.not_finite: "the state is no longer finite",
@@ -36,45 +34,34 @@ REASONS: dict[int, str] = {
 
 
 @dataclass(frozen=True)
-class ExplicitRun:
-    """State of a rollout.
-
-    Attributes:
-        paths: The paths and work arrays in the core.
-        start: Initial configurations (P, n) [rad or m].
-    """
-
-    paths: core.ExplicitRollout
-    start: Floats
-
-
-@dataclass(frozen=True)
-class _Explicit(Integrator):
+class _Explicit(Compiled):
     """The base class of explicit methods."""
 
     method: ClassVar[ExplicitMethod]
     variational = False
+    reasons = REASONS
 
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ExplicitRun, list[Segment]]:
+    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
         """See :meth:`Integrator.start`."""
         refuse_constraints(scene, self)
         if scene.custom is not None:
             scene.custom.check(q0, v0)
         paths, n = q0.shape
-        run = ExplicitRun(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
-        nodes = new_nodes(paths, 1, n, scene.controls)
+        run, nodes = self.begun(scene, q0, v0), new_nodes(paths, 1, n, scene.controls)
         if not run.paths.first_nodes(nodes):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         q, p, v, energy = (part[:, 0] for part in (nodes.q, nodes.p, nodes.v, nodes.energy))
         return run, first_nodes(q, p, v, energy, scene.controls)
 
-    def fork(self, state: ExplicitRun) -> ExplicitRun:
-        """See :meth:`Integrator.fork`."""
-        return ExplicitRun(state.paths.copy(), state.start)
+    def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
+        """See :meth:`Compiled.begun`."""
+        return Run(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
 
-    def step_in_python(
-        self, scene: Scene, state: ExplicitRun, command: Commands, increment: Floats, dt: float
-    ) -> Segment:
+    def fork(self, state: Run) -> Run:
+        """See :meth:`Integrator.fork`."""
+        return Run(state.paths.copy(), state.start)
+
+    def step_in_python(self, scene: Scene, state: Run, command: Commands, increment: Floats, dt: float) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python.
 
         The noise impulse is a constant force over the step for explicit Euler, where this is equivalent, and a jump of
@@ -94,54 +81,6 @@ class _Explicit(Integrator):
         (segment,) = self.rollout_compiled(scene, state, now, scene.silence, drift[None, None], dt)
         segment.u[:] = decided
         return segment
-
-    def rollout_compiled(
-        self,
-        scene: Scene,
-        state: ExplicitRun,
-        commands: Commands,
-        increments: Floats,
-        drift: Floats,
-        dt: float,
-        impulses: Floats | None = None,
-    ) -> list[Segment]:
-        """See :meth:`Integrator.rollout_compiled`."""
-        nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
-        state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
-        return segments_of(nodes, REASONS)
-
-    def watched(
-        self,
-        scene: Scene,
-        state: ExplicitRun,
-        commands: Commands,
-        dt: float,
-        nodes: RolloutArrays,
-        watch: Watch,
-        impulses: Floats | None = None,
-    ) -> tuple[Failure | None, Bytes]:
-        """See :meth:`Integrator.watched`."""
-        if scene.noise.diffusion is None:
-            return super().watched(scene, state, commands, dt, nodes, watch, impulses)
-        state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
-        return failure_of(nodes, 0, int(nodes.done[0]), REASONS), np.zeros(0, dtype=np.uint8)
-
-    def motions(
-        self,
-        scene: Scene,
-        q0: Floats,
-        v0: Floats,
-        commands: Commands,
-        drift: Floats,
-        dt: float,
-        impulses: Floats | None = None,
-    ) -> tuple[Floats, Floats] | None:
-        """See :meth:`Integrator.motions`."""
-        paths, n = q0.shape
-        nodes = new_nodes(paths, steps_of(commands), n, scene.controls)
-        rollout = core.ExplicitRollout.start(scene.core, self.method, q0, v0)
-        rollout.roll(dt, commands, scene.silence, drift, nodes, impulses=impulses)
-        return None if nodes.ended.any() else (nodes.q, nodes.v)
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""

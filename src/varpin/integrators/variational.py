@@ -16,36 +16,33 @@ from varpin.core import (
     Outcome,
     Tableau,
     VariationalRollout,
-    Watch,
     constrained_derivatives,
     variational_bends,
     variational_curvatures,
     variational_derivatives,
     variational_ends,
 )
-from varpin.core.arrays import Commands, RolloutArrays, new_nodes
+from varpin.core.arrays import Commands
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
-    Failure,
+    Compiled,
     Integrator,
+    Run,
     Segment,
     diffusion_and_drift,
     drifts,
-    failure_of,
     first_nodes,
     forces,
     noise_of_step,
-    parts_of,
-    segments_of,
     without_inputs,
     written,
 )
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
-from varpin.signals.commands import contiguous, control_of, cubics, ends_of, first_of, steps_of
+from varpin.signals.commands import control_of, cubics, ends_of, first_of
 from varpin.signals.inputs import in_parts_of_steps, prescribing, with_ends
 from varpin.support.checks import count, fraction, is_one_of, positive
-from varpin.trajectory import MOST_HALVINGS, Bytes, Trajectory
+from varpin.trajectory import MOST_HALVINGS, Trajectory
 
 # Tolerance of an energy balance that is not checked.
 _UNCHECKED = 1e300
@@ -64,21 +61,6 @@ REASONS: dict[int, str] = {
     Outcome.toggle: "constraints are about to depend on each other, as at a toggle point, or cease to",
     Outcome.assembly: "the constraints turn so far that the step may end in another assembly",
 }
-
-
-@dataclass(frozen=True)
-class VariationalRun:
-    """State of a rollout.
-
-    Attributes:
-        paths: The paths in the core.
-        start: Initial configurations (P, n) [rad or m].
-        driven: Whether the scene has kinematic inputs.
-    """
-
-    paths: VariationalRollout | ConstrainedRollout
-    start: Floats
-    driven: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,7 +101,14 @@ class Guard:
         return text if text.endswith(")") else f"{text}()"
 
 
-class Variational(Integrator):
+@dataclass(frozen=True)
+class _Run(Run):
+    """A :class:`Run`, with whether the scene has kinematic inputs."""
+
+    driven: bool = False
+
+
+class Variational(Compiled):
     """A variational integrator on (q, p) with guarded steps and noise impulses."""
 
     guard: Guard | None
@@ -127,6 +116,7 @@ class Variational(Integrator):
     kick: Literal["left", "split", "held"]
 
     variational = True
+    reasons = REASONS
 
     def same_map(self, other: Integrator) -> bool:
         """See :meth:`Integrator.same_map`; guards and tolerances do not change the map of an undivided step."""
@@ -208,48 +198,40 @@ class Variational(Integrator):
             return _core_guards(None)
         return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
 
-    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[VariationalRun, list[Segment]]:
+    def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
         if scene.custom is not None:
             scene.custom.check(q0, v0)
-        run = self._begun(scene, q0, v0)
-        return run, first_nodes(*run.paths.nodes(), scene.controls)
+        run = self.begun(scene, q0, v0)
+        q, p, v, energy = run.paths.nodes()
+        return run, first_nodes(q, p, v, energy, scene.controls)
 
-    def _begun(self, scene: Scene, q0: Floats, v0: Floats) -> VariationalRun:
+    def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
+        """See :meth:`Compiled.begun`.
+
+        Raises:
+            SingularMassMatrix: M(q0) is not positive definite.
+        """
         rollout: VariationalRollout | ConstrainedRollout
-        guards = self._guards_of(driven=bool(scene.inputs))
+        method = scene.core, self._tableau()
+        options = float(self.tolerance), self._guards_of(driven=bool(scene.inputs))
         if scene.constraints:
-            rollout = ConstrainedRollout(
-                scene.core,
-                self._tableau(),
-                self._places(scene),
-                float(self.tolerance),
-                guards,
-                len(q0),
-                self.holds_noise,
-            )
+            rollout = ConstrainedRollout(*method, self._places(scene), *options, len(q0), self.holds_noise)
         else:
-            rollout = VariationalRollout(
-                scene.core,
-                self._tableau(),
-                float(self.tolerance),
-                guards,
-                self.left,
-                len(q0),
-                held=self.holds_noise,
-            )
+            rollout = VariationalRollout(*method, *options, self.left, len(q0), held=self.holds_noise)
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
-        return VariationalRun(rollout, q0.copy(), bool(scene.inputs))
+        return _Run(rollout, q0.copy(), bool(scene.inputs))
 
-    def fork(self, state: VariationalRun) -> VariationalRun:
+    def fork(self, state: Run) -> Run:
         """See :meth:`Integrator.fork`."""
-        return VariationalRun(state.paths.fork(self._guards_of(driven=state.driven)), state.start, state.driven)
+        driven = isinstance(state, _Run) and state.driven
+        return _Run(state.paths.fork(self._guards_of(driven=driven)), state.start, driven)
 
     def rollout_compiled(
         self,
         scene: Scene,
-        state: VariationalRun,
+        state: Run,
         commands: Commands,
         increments: Floats,
         drift: Floats,
@@ -257,52 +239,12 @@ class Variational(Integrator):
         impulses: Floats | None = None,
     ) -> list[Segment]:
         """See :meth:`Integrator.rollout_compiled`."""
-        nodes = _rolled(scene, state, commands, increments, drift, dt, impulses)
-        found = segments_of(nodes, REASONS, state.paths.halvings)
+        found = super().rollout_compiled(scene, state, commands, increments, drift, dt, impulses)
         if isinstance(state.paths, ConstrainedRollout):
             return [_constrained(scene, state.paths, i, segment) for i, segment in enumerate(found)]
         return found
 
-    def watched(
-        self,
-        scene: Scene,
-        state: VariationalRun,
-        commands: Commands,
-        dt: float,
-        nodes: RolloutArrays,
-        watch: Watch,
-        impulses: Floats | None = None,
-    ) -> tuple[Failure | None, Bytes]:
-        """See :meth:`Integrator.watched`."""
-        if scene.noise.diffusion is None or isinstance(state.paths, ConstrainedRollout):
-            return super().watched(scene, state, commands, dt, nodes, watch, impulses)
-        state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
-        done = int(nodes.done[0])
-        return failure_of(nodes, 0, done, REASONS), parts_of(nodes, 0, done, state.paths.halvings)
-
-    def motions(
-        self,
-        scene: Scene,
-        q0: Floats,
-        v0: Floats,
-        commands: Commands,
-        drift: Floats,
-        dt: float,
-        impulses: Floats | None = None,
-    ) -> tuple[Floats, Floats] | None:
-        """See :meth:`Integrator.motions`; under constraints impulses are available if they are held."""
-        if impulses is not None and scene.constraints and not self.holds_noise:
-            return None
-        try:
-            run = self._begun(scene, q0, v0)
-        except SingularMassMatrix:
-            return None
-        nodes = _rolled(scene, run, commands, scene.silence, drift, dt, impulses)
-        return None if nodes.ended.any() else (nodes.q, nodes.v)
-
-    def step_in_python(
-        self, scene: Scene, state: VariationalRun, command: Commands, increment: Floats, dt: float
-    ) -> Segment:
+    def step_in_python(self, scene: Scene, state: Run, command: Commands, increment: Floats, dt: float) -> Segment:
         """One step of one path with diffusion fields that are evaluated in Python."""
         q, p, v, _ = state.paths.nodes()
         decided = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
@@ -561,18 +503,3 @@ def _core_guards(given: Guard | None, balance: float = 1.0, budget: float = 1.0)
 def _require_solved(trajectory: Trajectory, outcome: int, done: int) -> None:
     if outcome in REASONS:
         raise LinearizationError(done, done * trajectory.dt, REASONS[outcome])
-
-
-def _rolled(
-    scene: Scene,
-    state: VariationalRun,
-    commands: Commands,
-    increments: Floats,
-    drift: Floats,
-    dt: float,
-    impulses: Floats | None = None,
-) -> RolloutArrays:
-    """Advance ``state`` by the steps of ``commands``; the nodes after them."""
-    nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
-    state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
-    return nodes

@@ -10,7 +10,7 @@ import pinocchio as pin
 from varpin.errors import InputError
 from varpin.mechanics.constraints import Constraint, FrameOnFrame, JointTie, PointOnLine, PointOnPoint
 from varpin.model import Robot
-from varpin.model.equalities import Closure, Gear, on_named_frame
+from varpin.model.equalities import Closure, End, Gear
 from varpin.model.tree import place_of_frame
 
 # Largest miss of constraints that locked joints keep [m or rad].
@@ -30,8 +30,8 @@ def description_constraints(robot: Robot) -> tuple[Constraint, ...]:
 
 
 def _closure(closure: Closure, robot: Robot) -> Constraint | None:
-    (a, here), (b, there) = (on_named_frame(robot.free_model, end) for end in (closure.a, closure.b))
-    (body, *at), (other, *on) = (place_of_frame(robot.free_model, frame, robot.name) for frame in (a, b))
+    (a, here), (b, there) = closure.a, closure.b
+    (body, *at), (other, *on) = (place_of_frame(robot.free_model, name, robot.name) for name in (a, b))
     if body == other:
         miss = (pin.SE3(*at) * here).actInv(pin.SE3(*on) * there)
         turned = np.abs(pin.log3(miss.rotation)).max() if closure.turns else 0.0
@@ -40,12 +40,12 @@ def _closure(closure: Closure, robot: Robot) -> Constraint | None:
     if closure.turns:
         return FrameOnFrame(a, b, (there * here.inverse()).homogeneous)
     if closure.plane is not None:
-        return PointOnLine(_point(a, here), _point(b, there), there.rotation @ np.array(closure.plane.normal))
-    return PointOnPoint(_point(a, here), _point(b, there))
+        return PointOnLine(_point(closure.a), _point(closure.b), there.rotation @ np.array(closure.plane.normal))
+    return PointOnPoint(_point(closure.a), _point(closure.b))
 
 
-def _point(frame: str, place: pin.SE3) -> str | tuple[str, Sequence[float]]:
-    return (frame, place.translation.tolist()) if place.translation.any() else frame
+def _point(end: End) -> str | tuple[str, Sequence[float]]:
+    return (end.body, end.place.translation.tolist()) if end.place.translation.any() else end.body
 
 
 def _tie(gear: Gear, robot: Robot) -> Constraint | None:

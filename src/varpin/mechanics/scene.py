@@ -185,7 +185,8 @@ class Scene(Frozen):
 
         Main args:
             robot: From :func:`varpin.load_robot`.
-            gravity: ``True`` for (0, 0, -9.81), ``False`` for none, or any vector (3,) [m/s^2].
+            gravity: ``True`` for that of the robot's description, (0, 0, -9.81) unless a ``pin.Model`` or an MJCF file
+                has another; ``False`` for none; or any vector (3,) [m/s^2].
             forces: Forces on joints (friction, stops, rotors, springs, dampers, servos, such as
                 :class:`varpin.CoulombFriction`) and on frames (wrenches, springs, dampers, such as
                 :class:`varpin.FrameSpring`).
@@ -221,7 +222,7 @@ class Scene(Frozen):
             raise RobotError(f"the robot's tree is damaged: it has {robot.tree.armature.size} coordinates, not {n}")
         values: dict[str, Any] = {
             "robot": robot,
-            "gravity": _gravity(gravity),
+            "gravity": _gravity(gravity, robot),
         }
         values |= _forces(robot, forces, damping, friction, stiffness, rest)
         values["actuation"] = _served(robot, _actuation(robot, actuation), values["elements"])
@@ -817,10 +818,10 @@ def require_scene(scene: object) -> Scene:
     return scene
 
 
-def _gravity(gravity: ArrayLike | bool) -> Floats:
+def _gravity(gravity: ArrayLike | bool, robot: Robot) -> Floats:
     """Gravity (3,) [m/s^2] from the argument of a scene."""
     if isinstance(gravity, bool | np.bool_):
-        return np.array(EARTH if gravity else (0.0, 0.0, 0.0))
+        return finite_array("gravity of the robot", robot.free_model.gravity.linear, (3,)) if gravity else np.zeros(3)
     given = as_floats("gravity", gravity)
     if given.ndim == 0 and np.isfinite(given):
         meant = f"({', '.join(f'{g:g}' for g in (0.0, 0.0, -abs(float(given))))})" if given else "False"

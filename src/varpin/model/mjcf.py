@@ -1,48 +1,45 @@
-"""Reading MJCF files: the file is rewritten in a form that Pinocchio's parser reads as MuJoCo does.
+"""MJCF files, read by MuJoCo's own compiler: bodies, joints, equalities and geoms of its model become Pinocchio's."""
 
-Pinocchio drops the placement of a body that is fixed to the world, reads only one body of the world, no ``<include>``
-and not every default, and makes one joint of several in a body. The rewritten text therefore has includes expanded,
-defaults at each element, rotations as quaternions, and one joint a body.
-"""
+from __future__ import annotations
 
+import enum
 import logging
-import tempfile
-import xml.etree.ElementTree as ET
+import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from varpin.errors import RobotError
-from varpin.model.equalities import Closure, End, Equality, Gear
+from varpin.arrays import Floats
+from varpin.errors import MissingDependency, RobotError
+from varpin.model.equalities import Closure, End, Equality, Gear, rounded_plane
+from varpin.model.meshes import MeshPart, coal_shape
 from varpin.model.urdf import captured_stderr, decoded, parsed
 
+coal = pin.coal
 logger = logging.getLogger(__name__)
 
-T = TypeVar("T")
-
-# Elements that generate bodies; they are refused.
-_MACROS = {"attach", "composite", "flexcomp", "replicate"}
-# A frame is read as a body without joint or mass.
-_BODIES = {"body", "frame"}
-_IN_FRAMES = {"body", "camera", "frame", "light", "site"}
-# Allowed numbers of values of the attributes that the model depends on.
-_SIZES = {
-    "armature": (1,), "axis": (3,), "density": (1,), "diaginertia": (3,), "frictionloss": (1,), "fromto": (6,),
-    "fullinertia": (6,), "mass": (1,), "pos": (3,), "quat": (4,), "range": (2,), "ref": (1,), "size": (1, 2, 3),
-    "springdamper": (2,), "xyaxes": (6,), "zaxis": (3,),
-}  # fmt: skip
-_ROTATIONS = ("quat", "euler", "axisangle", "xyaxes", "zaxis")
-# Half the thickness of the plate that shows a plane [m].
+# Arrays of MuJoCo's model that are zero unless the file has what the model leaves out. Older versions lack some.
+_LEFT_OUT = {
+    "body_gravcomp": "gravity compensation",
+    "jnt_stiffness": "joint springs",
+    "jnt_stiffnesspoly": "nonlinear joint springs",
+    "dof_dampingpoly": "nonlinear joint dampers",
+    "actuator_dampingpoly": "nonlinear dampers of actuators",
+    "nflex": "deformable bodies",
+}
+# MuJoCo's viewer shows geoms of the groups up to this one. Those of later groups usually stand for others in contacts.
+_SHOWN = 2
+# MuJoCo's colour of geoms without one, in whose place it shows the material's.
+_GREY = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
+# Half the thickness of the plate that shows a plane [m]: coal's planes are infinite.
 _PLATE = 5e-4
-# Elements with forces that the model leaves out.
-_LEFT_OUT = {"tendon": "tendons", "deformable": "deformable bodies"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,103 +47,19 @@ class Mjcf:
     """An MJCF file, read by :func:`read_mjcf`.
 
     Attributes:
-        path: Path of the file.
-        dynamics: The MJCF text from which Pinocchio builds the model.
-        looks: The MJCF text from which Pinocchio builds the shapes; its mesh paths are absolute.
+        model: Its bodies, joints, sites and keyframes, and its gravity.
         remarks: What the model leaves out, in words.
-        equalities: Equality constraints as in the file, see :func:`varpin.model.equalities.at_reference`.
+        equalities: Its active equality constraints.
     """
 
-    path: Path
-    dynamics: str = field(repr=False)
-    looks: str = field(repr=False)
-    remarks: tuple[str, ...] = ()
-    equalities: tuple[Equality, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class _Reader:
-    """Settings and defaults of a file, and counts of what is left out."""
-
-    path: Path
-    compiler: Mapping[str, str]
-    classes: Mapping[str, Mapping[str, Mapping[str, str]]]
-    left_out: Counter[str]
-
-    @property
-    def angle_unit(self) -> float:
-        """The file's unit of angles [rad]."""
-        return 1.0 if self.compiler.get("angle") == "radian" else np.pi / 180.0
-
-    def fault(self, what: str) -> RobotError:
-        return RobotError(f"{self.path}: {what}")
-
-    def numbers(self, element: ET.Element, key: str, sizes: tuple[int, ...]) -> NDArray[np.float64]:
-        try:
-            values = np.array([float(word) for word in element.get(key, "").split()])
-        except ValueError:
-            values = np.array([np.nan])
-        if len(values) not in sizes or not np.isfinite(values).all():
-            name = element.get("name", "")
-            size = " or ".join(map(str, sizes))
-            raise self.fault(
-                f"<{element.tag}> {name!r}: its {key} must be {size} finite number(s), got {element.get(key)!r}"
-            )
-        return values
-
-    def resolved(self, element: ET.Element, childclass: str) -> ET.Element:
-        """A copy of an element without its children, with its defaults."""
-        name = element.get("class", childclass)
-        if name not in self.classes:
-            raise self.fault(f"<{element.tag}> {element.get('name', '')!r}: there is no default class {name!r}")
-        attributes = self.turned(element)
-        given = self.classes[name].get(element.tag, {})
-        if any(key in attributes for key in _ROTATIONS):
-            given = {key: value for key, value in given.items() if key not in _ROTATIONS}
-        return ET.Element(element.tag, {**given, **attributes})
-
-    def look(self, geom: ET.Element, childclass: str) -> list[ET.Element]:
-        """A geom as :meth:`resolved`; a bounded plane becomes a thin plate, as coal's planes are infinite."""
-        plain = self.resolved(geom, childclass)
-        if plain.get("type") != "plane":
-            return [plain]
-        x, y, *_ = (*self.numbers(plain, "size", (1, 2, 3)), 0.0) if "size" in plain.attrib else (0.0, 0.0)
-        if not (x > 0.0 and y > 0.0):
-            logger.info("%s: plane %r is infinite; it is not drawn", self.path, plain.get("name", ""))
-            return []
-        plain.attrib |= {"type": "box", "size": f"{float(x)!r} {float(y)!r} {_PLATE!r}"}
-        return [plain]
-
-    def turned(self, element: ET.Element) -> dict[str, str]:
-        """The attributes of an element, with its rotation in a form that Pinocchio reads as MuJoCo does."""
-        attributes = {key: value for key, value in element.items() if key not in ("class", "childclass")}
-        for key in attributes:
-            if element.tag in ("body", "frame", "geom", "inertial", "joint") and key in _SIZES:
-                self.numbers(element, key, _SIZES[key])
-        unit = self.angle_unit
-        if "axisangle" in attributes:
-            *axis, angle = self.numbers(element, "axisangle", (4,))
-            length = np.linalg.norm(axis)
-            if length == 0.0:
-                raise self.fault(f"<{element.tag}> {element.get('name', '')!r}: the axis of its axisangle is 0")
-            del attributes["axisangle"]
-            attributes["quat"] = _quaternion(pin.AngleAxis(unit * angle, np.array(axis) / length).matrix())
-        elif "euler" in attributes:
-            sequence = self.compiler.get("eulerseq", "xyz")
-            if len(sequence) != 3 or set(sequence.lower()) - set("xyz"):
-                raise self.fault(f"eulerseq must be three of x, y and z, got {sequence!r}")
-            rotation = np.eye(3)
-            for letter, angle in zip(sequence, self.numbers(element, "euler", (3,)), strict=True):
-                turn = pin.AngleAxis(unit * angle, np.eye(3)["xyz".index(letter.lower())]).matrix()
-                rotation = rotation @ turn if letter.islower() else turn @ rotation
-            del attributes["euler"]
-            attributes["quat"] = _quaternion(rotation)
-        return attributes
+    model: pin.Model
+    remarks: tuple[str, ...]
+    equalities: tuple[Equality, ...]
 
 
 def is_mjcf(path: Path) -> bool:
     """Whether a file is an MJCF by its root element; only ``.xml`` and ``.mjcf`` files are opened."""
-    return path.suffix in (".xml", ".mjcf") and root_tag(path) == "mujoco"
+    return path.suffix.lower() in (".xml", ".mjcf") and root_tag(path) in ("mujoco", "mujocoinclude")
 
 
 def root_tag(path: Path) -> str:
@@ -165,323 +78,308 @@ def read_mjcf(path: Path) -> Mjcf:
     """Read an MJCF file.
 
     Raises:
-        FileError: The file, or an included one, cannot be read.
-        RobotError: It is not an MJCF, or has elements that Pinocchio cannot read.
+        MissingDependency: MuJoCo is not installed.
+        RobotError: MuJoCo cannot read it.
     """
-    root = _included(path, path.parent, ())
-    compiler = {key: value for part in root.findall("compiler") for key, value in part.items()}
-    reader = _Reader(path, compiler, {}, Counter())
-    reader = _Reader(path, compiler, _classes(root, reader), reader.left_out)
-    if "settotalmass" in compiler:
-        raise reader.fault("its masses are scaled by settotalmass, which Pinocchio does not read")
-    if compiler.get("coordinate", "local") == "global":
-        raise reader.fault(
-            "its places are in world axes (coordinate='global'), which MuJoCo has not read since 2.3.4, nor does "
-            "Pinocchio: MuJoCo 2.3.3 writes it with places in each body's own axes"
+    walk = _Walk(path)
+    walk.add_parameters()
+    equalities = walk.equalities()
+    found = [f"{what} ({count})" for what, count in walk.left_out.items() if count]
+    remarks = [f"the file has {', '.join(found)}, which the model leaves out"] if found else []
+    remarks += [
+        f"{each.name} closes a planar loop, whose axes are parallel to {each.plane.tilt:.1g} rad in the file: it holds "
+        "in the plane of the loop alone"
+        for each in equalities
+        if isinstance(each, Closure) and each.plane is not None
+    ]
+    return Mjcf(walk.model, tuple(remarks), equalities)
+
+
+def mjcf_shapes(path: Path) -> tuple[pin.Model, pin.GeometryModel]:
+    """The geoms of an MJCF file that MuJoCo's viewer shows, and those without contacts, on the joints of its model.
+
+    Raises:
+        MissingDependency: MuJoCo is not installed.
+        RobotError: MuJoCo cannot read the file.
+    """
+    walk = _Walk(path)
+    return walk.model, walk.shapes()
+
+
+class _Walk:
+    """Pinocchio's model of an MJCF file, part by part."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import mujoco  # noqa: PLC0415
+        except ImportError:
+            raise MissingDependency(f"the MJCF file {path}", ["mujoco"], 'pip install "varpin[mjcf]"') from None
+        try:
+            with captured_stderr() as complaints, warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                # Its parser takes no other suffix.
+                name = str(path.with_suffix(".xml"))
+                spec = mujoco.MjSpec.from_file(name, include={name: path.read_bytes()})
+                # Both keep the motion: bodies without joints have their names, geoms without contacts are drawn.
+                spec.compiler.fusestatic = spec.compiler.discardvisual = False
+                m = spec.compile()
+                for line in (*complaints(), *(warning.message for warning in caught)):
+                    logger.info("MuJoCo says of %s: %s", path, line)
+        except (ValueError, mujoco.FatalError) as error:
+            fault = "; ".join(str(error).replace("Error: ", "").strip().split("\n"))
+            raise RobotError(f"MuJoCo cannot read {path}: {fault}") from None
+        self.path, self.mujoco, self.m, self.model = path, mujoco, m, pin.Model()
+        self.left_out: Counter[str] = Counter()
+        self.bodies = _named((m.body(k).name for k in range(m.nbody)), "body{}".format)
+        self.joints = _named(
+            (m.joint(k).name for k in range(m.njnt)),
+            lambda k: f"{self.bodies[m.jnt_bodyid[k]]}_joint{k - m.body_jntadr[m.jnt_bodyid[k]] or ''}",
         )
-    reader.left_out["least masses and inertias"] += int(bool({"boundmass", "boundinertia"} & set(compiler)))
-    reader.left_out["balancing of inertias"] += int(compiler.get("balanceinertia") == "true")
-    for part in root.iter():
-        if part.tag in _MACROS:
-            raise reader.fault(f"it has <{part.tag}>, which Pinocchio does not read: write its bodies out")
-        other = [child.tag for child in part if part.tag == "frame" and child.tag not in _IN_FRAMES]
-        if other:
-            raise reader.fault(f"it has a <{other[0]}> in a <frame>: varpin reads those around bodies and sites")
-    for option in root.findall("option"):
-        fluid = [reader.numbers(option, key, (1,)) for key in ("density", "viscosity") if key in option.attrib]
-        reader.left_out["forces of a fluid"] += int(np.any(fluid))
-    for tag, what in _LEFT_OUT.items():
-        reader.left_out[what] += sum(len(part) for part in root.findall(tag))
-    equalities = _equalities(root, reader)
-    texts = []
-    try:
-        for dynamics in (True, False):
-            plain = ET.Element("mujoco", {"model": root.get("model", path.stem)})
-            ET.SubElement(plain, "compiler", {"angle": "radian", "autolimits": compiler.get("autolimits", "true")})
-            if not dynamics:
-                plain.append(_assets(root, reader))
-            world = ET.SubElement(plain, "worldbody")
-            # Pinocchio takes the first body of <worldbody> for the world and ignores the others.
-            stand = ET.SubElement(world, "body", {"name": "world"})
-            for part in root.iterfind("worldbody/*"):
-                if part.tag in _BODIES:
-                    stand.append(_body(part, "main", reader, moving=False, dynamics=dynamics))
-                elif part.tag == "site":
-                    # Pinocchio drops sites of the world itself.
-                    around = ET.SubElement(stand, "body", {"name": f"world:{part.get('name', '')}"})
-                    around.append(reader.resolved(part, "main"))
-                elif part.tag == "geom" and not dynamics:
-                    stand.extend(reader.look(part, "main"))
-            keys = ET.SubElement(plain, "keyframe")
-            keys.extend(part for part in root.iterfind("keyframe/key") if part.get("qpos") and part.get("name"))
-            texts.append(ET.tostring(plain, encoding="unicode"))
-    except RecursionError:
-        raise reader.fault("its bodies are nested too deep") from None
-    found = [f"{what} ({count})" for what, count in reader.left_out.items() if count]
-    remarks = (f"{path} has {', '.join(found)}, which the model leaves out",) if found else ()
-    return Mjcf(path, texts[0], texts[1], remarks, equalities)
+        # Of each body its joint, its placement there and its frame; of each joint its index.
+        self.carriers, self.places, self.frames = [0] * m.nbody, [pin.SE3.Identity()] * m.nbody, [0] * m.nbody
+        self.indices = [0] * m.njnt
+        self._add_bodies()
 
+    def _add_bodies(self) -> None:
+        """Bodies with their masses, joints and sites; a body with several joints hangs on a chain of them."""
+        m, model = self.m, self.model
+        self.frames[0] = model.addFrame(pin.Frame("world", 0, 0, pin.SE3.Identity(), pin.FrameType.BODY))
+        for body in range(1, m.nbody):
+            up = m.body_parentid[body]
+            carrier, frame = self.carriers[up], self.frames[up]
+            place = self.places[up] * _placement(m.body_pos[body], m.body_quat[body])
+            first = m.body_jntadr[body]
+            for joint in range(first, first + m.body_jntnum[body]):
+                kind, before, after = self._joint(joint, place)
+                carrier = self.indices[joint] = model.addJoint(carrier, kind, before, self.joints[joint])
+                frame, place = model.addJointFrame(carrier, frame), after
+            inertia = pin.Inertia(float(m.body_mass[body]), np.zeros(3), np.diag(m.body_inertia[body]))
+            model.appendBodyToJoint(carrier, inertia, place * _placement(m.body_ipos[body], m.body_iquat[body]))
+            self.carriers[body], self.places[body] = carrier, place
+            self.frames[body] = model.addBodyFrame(self.bodies[body], carrier, place, frame)
+        for site in range(m.nsite):
+            if name := m.site(site).name:
+                on, place = self._on_body(m.site_bodyid[site], m.site_pos[site], m.site_quat[site])
+                model.addFrame(pin.Frame(name, *on, place, pin.FrameType.OP_FRAME))
 
-def build_mjcf_model(path: Path, text: str) -> pin.Model:
-    """Pinocchio's model of a file.
+    def _on_body(self, body: int, position: Floats, quaternion: Floats) -> tuple[tuple[int, int], pin.SE3]:
+        """Joint and frame of a body, and a placement in the body as one in the joint."""
+        return (self.carriers[body], self.frames[body]), self.places[body] * _placement(position, quaternion)
 
-    Args:
-        path: Path of the file.
-        text: ``dynamics`` or ``looks`` of :class:`Mjcf`: their joints are the same, their masses are not.
+    def _joint(self, joint: int, place: pin.SE3) -> tuple[pin.JointModel, pin.SE3, pin.SE3]:
+        """A joint of a body at a place; its placement, and that of the body in it."""
+        m, axis, anchor = self.m, self.m.jnt_axis[joint].copy(), _placement(self.m.jnt_pos[joint])
+        # MuJoCo counts from the reference position.
+        back = -float(m.qpos0[m.jnt_qposadr[joint]])
+        match _word(self.mujoco.mjtJoint, m.jnt_type[joint]):
+            case "FREE":
+                # Its position is that of the body in the world.
+                return pin.JointModelFreeFlyer(), pin.SE3.Identity(), pin.SE3.Identity()
+            case "BALL":
+                return pin.JointModelSpherical(), place * anchor, anchor.inverse()
+            case "SLIDE":
+                kind, zero = pin.JointModelPrismaticUnaligned(axis), _placement(back * axis)
+            case _:
+                kind, zero = pin.JointModelRevoluteUnaligned(axis), pin.SE3(pin.exp3(back * axis), np.zeros(3))
+        return kind, place * anchor * zero, anchor.inverse()
 
-    Raises:
-        RobotError: Pinocchio cannot read it.
-    """
-    return _read(path, text, pin.buildModelFromMJCF)
+    def add_parameters(self) -> None:
+        """Gravity, postures, and of each joint its limits, damping, friction and armature."""
+        m, model = self.m, self.model
+        weightless = m.opt.disableflags & self.mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        model.gravity.linear = np.zeros(3) if weightless else m.opt.gravity.copy()
+        model.upperVelocityLimit[:], model.lowerVelocityLimit[:] = np.inf, -np.inf
+        model.damping[:], model.armature[:] = m.dof_damping, m.dof_armature
+        model.upperDryFrictionLimit[:], model.lowerDryFrictionLimit[:] = m.dof_frictionloss, -m.dof_frictionloss
+        order: list[int] = []
+        for joint, index in enumerate(self.indices):
+            kind, q = model.joints[index], int(m.jnt_qposadr[joint])
+            if kind.nv > 1:
+                # MuJoCo's quaternions are (w, x, y, z), Pinocchio's (x, y, z, w).
+                real = q + kind.nq - 4
+                order += [*range(q, real), real + 1, real + 2, real + 3, real]
+                continue
+            order.append(q)
+            if m.jnt_limited[joint]:
+                model.lowerPositionLimit[kind.idx_q], model.upperPositionLimit[kind.idx_q] = m.jnt_range[joint]
+            self._add_drives(joint, kind.idx_v)
+        model.referenceConfigurations["qpos0"] = m.qpos0[order]
+        for key in range(m.nkey):
+            if name := m.key(key).name:
+                model.referenceConfigurations[name] = m.key_qpos[key][order]
+        for name, what in _LEFT_OUT.items():
+            self.left_out[what] += int(np.atleast_2d(np.transpose(getattr(m, name, 0))).any(axis=0).sum())
+        self.left_out["forces of plugins"] += int((m.body_plugin >= 0).sum())
+        self.left_out["forces of a fluid"] += int(m.opt.density != 0.0 or m.opt.viscosity != 0.0)
 
+    def _add_drives(self, joint: int, v: int) -> None:
+        """The largest force of all actuators of a joint together, and the inertia and damping of their rotors."""
+        m, model = self.m, self.model
+        limits, found = np.zeros(2), False
+        for drive, (of_joint, *_) in enumerate(m.actuator_trnid):
+            on = _word(self.mujoco.mjtTrn, m.actuator_trntype[drive])
+            # Before version 4 actuators have one control and one force each, no inertia and no damping.
+            gear = m.actuator_gear[getattr(m, "actuator_outadr", range(m.nu))[drive], 0]
+            if of_joint != joint or on not in ("JOINT", "JOINTINPARENT") or not gear:
+                continue
+            found = True
+            limits += np.sort(gear * self._force_range(drive))
+            for parameter in ("armature", "damping"):
+                own = getattr(m, f"actuator_{parameter}", np.zeros(m.nu))[drive]
+                getattr(model, parameter)[v] += gear**2 * own
+        if not found:
+            limits = np.array([-np.inf, np.inf])
+        if m.jnt_actfrclimited[joint]:
+            limits = np.clip(limits, *m.jnt_actfrcrange[joint])
+        self.left_out["smaller force limits in one direction"] += int(limits[0] != -limits[1])
+        model.upperEffortLimit[v] = np.abs(limits).max()
+        model.lowerEffortLimit[v] = -model.upperEffortLimit[v]
 
-def build_mjcf_shapes(path: Path, looks: str, model: pin.Model) -> pin.GeometryModel:
-    """The visual geometry of a file, as Pinocchio reads it.
+    def _force_range(self, drive: int) -> Floats:
+        """Least and greatest force (2,) of an actuator, before its gear; infinite where nothing bounds it."""
+        m, mujoco = self.m, self.mujoco
+        if m.actuator_forcelimited[drive]:
+            return np.array(m.actuator_forcerange[drive])
+        is_motor = (
+            m.actuator_gaintype[drive] == mujoco.mjtGain.mjGAIN_FIXED
+            and m.actuator_biastype[drive] == mujoco.mjtBias.mjBIAS_NONE
+            and m.actuator_dyntype[drive] == mujoco.mjtDyn.mjDYN_NONE
+        )
+        control = getattr(m, "actuator_ctrladr", range(m.nu))[drive]
+        if is_motor and m.actuator_ctrllimited[control]:
+            return np.sort(m.actuator_gainprm[drive, 0] * m.actuator_ctrlrange[control])
+        return np.array([-np.inf, np.inf])
 
-    Args:
-        path: Path of the file.
-        looks: As in :class:`Mjcf`.
-        model: From :func:`build_mjcf_model`.
+    def shapes(self) -> pin.GeometryModel:
+        """The geoms that MuJoCo's viewer shows, and those without contacts."""
+        m, found = self.m, pin.GeometryModel()
+        for geom in range(m.ngeom):
+            if m.geom_group[geom] > _SHOWN and (m.geom_contype[geom] or m.geom_conaffinity[geom]):
+                continue
+            body = m.geom_bodyid[geom]
+            name = m.geom(geom).name or f"{self.bodies[body]}_geom{geom - m.body_geomadr[body]}"
+            form = self._form(geom)
+            if form is None:
+                logger.info("%s: %r is an infinite plane or a height field; it is not drawn", self.path, name)
+                continue
+            on, place = self._on_body(body, m.geom_pos[geom], m.geom_quat[geom])
+            shape = pin.GeometryObject(name, *on, place, form)
+            shape.meshColor = self._color(geom)
+            found.addGeometryObject(shape)
+        return found
 
-    Raises:
-        RobotError: A mesh is missing or cannot be read; the message names it.
-    """
-    root = parsed(looks)
-    files = {part.get("name", ""): part.get("file", "") for part in root.iterfind("asset/mesh")}
-    absent = {name: file for name, file in files.items() if file and not Path(file).is_file()}
-    lacking = {
-        body.get("name", ""): ", ".join(absent[mesh] for geom in geoms if (mesh := geom.get("mesh", "")) in absent)
-        for body in root.iter("body")
-        if (geoms := body.findall("geom"))
-    }
-    if links := "; ".join(f"link {name!r}: {what}" for name, what in lacking.items() if what):
-        raise RobotError(f"meshes of {path} are missing: {links}")
-    return _read(path, looks, lambda file: pin.buildGeomFromMJCF(model, file, pin.GeometryType.VISUAL))
+    def _form(self, geom: int) -> Any:
+        """The form of a geom for coal; None for an infinite plane or a height field."""
+        m, (x, y, z) = self.m, self.m.geom_size[geom].tolist()
+        match _word(self.mujoco.mjtGeom, m.geom_type[geom]):
+            case "SPHERE":
+                return coal.Sphere(x)
+            case "CAPSULE":
+                return coal.Capsule(x, 2.0 * y)
+            case "CYLINDER":
+                return coal.Cylinder(x, 2.0 * y)
+            case "ELLIPSOID":
+                return coal.Ellipsoid(x, y, z)
+            case "BOX":
+                return coal.Box(2.0 * x, 2.0 * y, 2.0 * z)
+            case "PLANE" if x > 0.0 and y > 0.0:
+                return coal.Box(2.0 * x, 2.0 * y, 2.0 * _PLATE)
+            case "MESH" | "SDF":
+                mesh = m.mesh(m.geom_dataid[geom])
+                corner, face = int(mesh.vertadr[0]), int(mesh.faceadr[0])
+                vertices = m.mesh_vert[corner : corner + int(mesh.vertnum[0])].astype(float)
+                faces = m.mesh_face[face : face + int(mesh.facenum[0])].astype(np.int64)
+                return coal_shape([MeshPart(vertices, faces)])
+        return None
 
+    def _color(self, geom: int) -> Floats:
+        """The colour of a geom (4,) as MuJoCo chooses it; for a texture its mean."""
+        m, material, own = self.m, self.m.geom_matid[geom], self.m.geom_rgba[geom]
+        if material < 0 or (own != _GREY).any():
+            return own.astype(float)
+        color = m.mat_rgba[material].astype(float)
+        texture = m.mat_texid[material, self.mujoco.mjtTextureRole.mjTEXROLE_RGB]
+        if texture >= 0 and m.tex_nchannel[texture] == 3:
+            first, size = m.tex_adr[texture], 3 * m.tex_height[texture] * m.tex_width[texture]
+            color[:3] *= m.tex_data[first : first + size].reshape(-1, 3).mean(axis=0) / 255.0
+        return color
 
-def _read(path: Path, text: str, read: Callable[[str], T]) -> T:
-    """What Pinocchio's parser ``read``, which takes the path of a file, returns for a text."""
-    with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder, "plain.xml")
-        plain.write_text(text, encoding="utf-8")
-        with captured_stderr() as complaints:
-            try:
-                result = read(str(plain))
-            except (ValueError, RuntimeError, IndexError) as error:
-                detail = "; ".join(complaints()) or " ".join(str(error).rpartition("message:")[2].split())
-                raise RobotError(f"Pinocchio cannot read the MJCF file {path}: {detail}") from None
-            for line in complaints():
-                logger.warning("%s: %s", path, line)
-    return result
+    def equalities(self) -> tuple[Equality, ...]:
+        """The active equality constraints of bodies, sites and joints; the others, and tendons, count as left out."""
+        m, tied = self.m, set()
+        found: list[Equality] = []
+        for k in range(m.neq):
+            kind, first, second = _word(self.mujoco.mjtEq, m.eq_type[k]), int(m.eq_obj1id[k]), int(m.eq_obj2id[k])
+            data, parts = m.eq_data[k], self._tendon(first) if kind == "TENDON" and second < 0 else []
+            if not m.eq_active0[k]:
+                self.left_out["inactive equality constraints"] += 1
+            elif kind in ("CONNECT", "WELD"):
+                found.append(self._closure(k, kind == "WELD"))
+            elif kind == "JOINT":
+                coefficients = data[:5] if second >= 0 else data[:1]
+                name = m.eq(k).name or self.joints[first]
+                found.append(self._gear(f"<joint> {name!r}", first, second, coefficients))
+            elif len(parts) == 2:
+                (joint, weight), (leader, other) = parts
+                name = m.eq(k).name or m.tendon(first).name
+                found.append(self._gear(f"<tendon> {name!r}", joint, leader, np.array([data[0], -other]) / weight))
+                tied.add(first)
+            else:
+                self.left_out[f"equality constraints of kind {kind.lower()}"] += 1
+        self.left_out["tendons"] += m.ntendon - len(tied)
+        return tuple(found)
 
+    def _tendon(self, tendon: int) -> list[tuple[int, float]]:
+        """The joints of a fixed tendon and their coefficients; none of another tendon."""
+        m, first = self.m, self.m.tendon_adr[tendon]
+        own = range(first, first + m.tendon_num[tendon])
+        fixed = all(_word(self.mujoco.mjtWrap, m.wrap_type[k]) == "JOINT" and m.wrap_prm[k] for k in own)
+        return [(int(m.wrap_objid[k]), float(m.wrap_prm[k])) for k in own] if fixed else []
 
-def _included(path: Path, folder: Path, above: tuple[Path, ...]) -> ET.Element:
-    """The root element of a file, with its includes expanded."""
-    if path in above:
-        raise RobotError(f"{path} includes itself")
-    try:
-        root = parsed(decoded(path)[0])
-    except expat.ExpatError as error:
-        raise RobotError(f"{path} is not an MJCF: it is not well-formed XML: {error}") from None
-    if root.tag not in ("mujoco", "mujocoinclude"):
-        raise RobotError(f"{path} is not an MJCF: its root element is <{root.tag}>, not <mujoco>")
-    for parent in root.iter():
-        parts = list(parent)
-        for index in reversed([k for k, part in enumerate(parts) if part.tag == "include"]):
-            file = folder / parts[index].get("file", "")
-            parent[index : index + 1] = list(_included(file, folder, (*above, path)))
-    return root
+    def _gear(self, name: str, joint: int, leader: int, coefficients: Floats) -> Gear:
+        """The tie of a joint to a leader, -1 for none, by a polynomial from the reference positions of both."""
+        rest = self.m.qpos0[self.m.jnt_qposadr]
+        follows = np.polynomial.Polynomial(coefficients).trim()
+        if leader >= 0:
+            follows = follows(np.polynomial.Polynomial([-rest[leader], 1.0]))
+        whole = tuple((follows + rest[joint]).coef.tolist())
+        return Gear(name, self.joints[joint], self.joints[leader] if leader >= 0 else None, whole)
 
-
-def _classes(root: ET.Element, reader: _Reader) -> dict[str, dict[str, dict[str, str]]]:
-    """The attributes of each default class by tag, including those of its enclosing classes."""
-    classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
-
-    def read(element: ET.Element, name: str, around: Mapping[str, Mapping[str, str]]) -> None:
-        defaults = {tag: dict(values) for tag, values in around.items()}
-        for part in element:
-            if part.tag != "default":
-                defaults.setdefault(part.tag, {}).update(reader.turned(part))
-        classes[name] = defaults
-        for part in element.findall("default"):
-            read(part, part.get("class", ""), defaults)
-
-    for top in root.findall("default"):
-        read(top, "main", classes["main"])
-        classes[top.get("class", "main")] = classes["main"]
-    return classes
-
-
-def _equalities(root: ET.Element, reader: _Reader) -> tuple[Equality, ...]:
-    """The active equality constraints of bodies, sites, joints and pairs of joints; the others count as left out."""
-    found: list[Equality] = []
-    for part in root.iterfind("equality/*"):
-        # Defaults are those of <equality>, whatever the kind.
-        plain = reader.resolved(ET.Element("equality", part.attrib), "main")
-        if plain.get("active") == "false":
-            reader.left_out["inactive equality constraints"] += 1
-        elif part.tag in ("connect", "weld"):
-            found.append(_closure(part, reader))
-        elif part.tag == "tendon" and (gear := _gear_of_tendon(part, root, reader)) is not None:
-            found.append(gear)
-        elif part.tag == "joint":
-            c = reader.numbers(part, "polycoef", (1, 2, 3, 4, 5)) if "polycoef" in part.attrib else np.array([0.0, 1.0])
-            # Left-out coefficients have their defaults, as in MuJoCo.
-            c = np.concatenate([c, np.array([0.0, 1.0, 0.0, 0.0, 0.0])[len(c) :]])
-            leader = part.get("joint2")
-            kept = c if leader else c[:1]
-            name, joint = _named(part, part.get("joint1", "")), part.get("joint1", "")
-            found.append(Gear(name, joint, leader, tuple(np.trim_zeros(kept, "b").tolist()) or (0.0,)))
+    def _closure(self, k: int, weld: bool) -> Closure:
+        """A ``<connect>`` or a ``<weld>``, with its places on the two bodies."""
+        m, data = self.m, self.m.eq_data[k]
+        ids, turns = [int(m.eq_obj1id[k]), int(m.eq_obj2id[k])], weld and bool(data[10])
+        if m.eq_objtype[k] == self.mujoco.mjtObj.mjOBJ_SITE:
+            name, bodies = m.site(ids[0]).name, [int(m.site_bodyid[site]) for site in ids]
+            places = [_placement(m.site_pos[site], m.site_quat[site]) for site in ids]
         else:
-            reader.left_out[f"equality constraints of kind {part.tag}"] += 1
-    return tuple(found)
+            name, bodies = self.bodies[ids[0]], ids
+            here, there = ((data[3:6], data[6:10]), (data[:3],)) if weld else ((data[:3],), (data[3:6],))
+            places = [_placement(*here), _placement(*there)]
+        a, b = (End(self.bodies[body], place) for body, place in zip(bodies, places, strict=True))
+        carried = [(self.carriers[body], self.places[body] * place) for body, place in zip(bodies, places, strict=True)]
+        plane = None if turns else rounded_plane(self.model, *carried)
+        return Closure(f"<{'weld' if weld else 'connect'}> {m.eq(k).name or name!r}", a, b, turns, plane)
 
 
-def _gear_of_tendon(part: ET.Element, root: ET.Element, reader: _Reader) -> Gear | None:
-    """The tie of two joints by a ``<fixed>`` tendon of constant length; None for other tendons."""
-    name = part.get("tendon1", "")
-    tendon = next((each for each in root.iterfind("tendon/fixed") if each.get("name") == name), None)
-    if part.get("tendon2") or tendon is None:
-        return None
-    parts = [(each.get("joint", ""), float(reader.numbers(each, "coef", (1,))[0])) for each in tendon]
-    if len(parts) != 2 or not all(weight for _, weight in parts):
-        return None
-    offset = reader.numbers(part, "polycoef", (1, 2, 3, 4, 5))[0] if "polycoef" in part.attrib else 0.0
-    (joint, weight), (leader, other) = parts
-    return Gear(_named(part, name), joint, leader, (float(offset) / weight, -other / weight))
+def _named(names: Iterable[str], new: Callable[[int], str]) -> list[str]:
+    """The names of all things of a kind; things without one are named by their number."""
+    found = list(names)
+    for k, name in enumerate(found):
+        if not name:
+            fresh = new(k)
+            while fresh in found:
+                fresh += "_"
+            found[k] = fresh
+    return found
 
 
-def _closure(part: ET.Element, reader: _Reader) -> Closure:
-    """A ``<connect>`` or a ``<weld>``."""
-    weld = part.tag == "weld"
-    turns = weld and ("torquescale" not in part.attrib or bool(reader.numbers(part, "torquescale", (1,)).any()))
-    if {"site1", "site2"} & set(part.attrib):
-        a, b = (End(part.get(key, ""), "site", pin.SE3.Identity()) for key in ("site1", "site2"))
-        return Closure(_named(part, a.frame), a, b, turns)
-    first, second = part.get("body1", ""), part.get("body2") or "world"
-    name = _named(part, first)
-    anchor = pin.SE3.Identity()
-    if "anchor" in part.attrib or not weld:
-        anchor.translation = reader.numbers(part, "anchor", (3,))
-    if not weld:
-        return Closure(name, End(first, "body", anchor), End(second, "body", None), turns)
-    given = reader.numbers(part, "relpose", (7,)) if "relpose" in part.attrib else np.zeros(7)
-    place = None
-    if given[3:].any():
-        w, x, y, z = given[3:] / np.linalg.norm(given[3:])
-        place = pin.SE3(pin.Quaternion(w, x, y, z).matrix(), given[:3])
-    return Closure(name, End(first, "body", place), End(second, "body", anchor), turns)
+def _word(kinds: type[enum.Enum], value: int) -> str:
+    """The last word of a constant of MuJoCo's: ``"HINGE"`` of ``mjJNT_HINGE``."""
+    return str(kinds(value).name).rpartition("_")[2]
 
 
-def _named(part: ET.Element, of: str) -> str:
-    """An equality constraint in words: its name, or the body, site or joint that comes first."""
-    return f"<{part.tag}> {part.get('name', of)!r}"
-
-
-def _assets(root: ET.Element, reader: _Reader) -> ET.Element:
-    assets = ET.Element("asset")
-    folders = {
-        tag: reader.path.parent / reader.compiler.get(key, reader.compiler.get("assetdir", ""))
-        for tag, key in (("mesh", "meshdir"), ("texture", "texturedir"))
-    }
-    for part in root.iterfind("asset/*"):
-        if part.tag in ("mesh", "texture", "material"):
-            plain = reader.resolved(part, "main")
-            if plain.get("file"):
-                plain.set("name", plain.get("name", Path(plain.get("file", "")).stem))
-                plain.set("file", str(folders[part.tag] / plain.get("file", "")))
-            assets.append(plain)
-    return assets
-
-
-def _body(body: ET.Element, childclass: str, reader: _Reader, *, moving: bool, dynamics: bool) -> ET.Element:
-    """A body in rewritten form. Several joints become a chain of bodies, the last of which is the body itself."""
-    childclass = body.get("childclass", childclass)
-    whole = reader.turned(body)
-    if dynamics and "gravcomp" in whole and reader.numbers(body, "gravcomp", (1,)).any():
-        reader.left_out["gravity compensation"] += 1
-    name = whole.pop("name", "")
-    top = last = ET.Element("body", whole)
-    joints = [_joint(part, childclass, reader, dynamics) for part in body if part.tag in ("joint", "freejoint")]
-    for k, joint in enumerate(joints):
-        last.append(joint)
-        if k < len(joints) - 1:
-            last.set("name", f"{name}:{joint.get('name', k)}")
-            last = ET.SubElement(last, "body")
-    if name:
-        last.set("name", name)
-    moving = moving or bool(joints)
-    # Lists: `extend` turns an error in a generator into a TypeError.
-    last.extend([reader.resolved(part, childclass) for part in body.findall("site")])
-    if not dynamics:
-        last.extend([look for part in body.findall("geom") for look in reader.look(part, childclass)])
-    elif moving:
-        last.extend(_masses(body, name, childclass, reader))
-    parts = [part for part in body if part.tag in _BODIES]
-    last.extend([_body(part, childclass, reader, moving=moving, dynamics=dynamics) for part in parts])
-    return top
-
-
-def _joint(joint: ET.Element, childclass: str, reader: _Reader, dynamics: bool) -> ET.Element:
-    plain = reader.resolved(joint, childclass)
-    if plain.get("limited") == "false":
-        plain.attrib.pop("range", None)
-    # Pinocchio takes the range of a slide joint for degrees, too, and subtracts `ref` from every range.
-    unit = 1.0 if plain.get("type") == "slide" else reader.angle_unit
-    ref = np.zeros(1)
-    if "ref" in plain.attrib:
-        ref = unit * reader.numbers(plain, "ref", (1,))
-        plain.set("ref", repr(float(ref[0])))
-    if "range" in plain.attrib:
-        numbers = unit * reader.numbers(plain, "range", (2,)) + ref
-        plain.set("range", " ".join(repr(float(number)) for number in numbers))
-    # Linear coefficients; from MuJoCo 4 on also those of higher powers.
-    stiffness, damping = (
-        reader.numbers(plain, key, (1, 2, 3)) if key in plain.attrib else np.zeros(1)
-        for key in ("stiffness", "damping")
-    )
-    plain.set("damping", repr(float(damping[0])))
-    if dynamics:
-        given = "springdamper" in plain.attrib and (reader.numbers(plain, "springdamper", (2,)) > 0.0).all()
-        reader.left_out["springs and dampers by their time constant"] += int(given)
-        reader.left_out["joint springs"] += int(stiffness.any())
-        reader.left_out["nonlinear joint dampers"] += int(damping[1:].any())
-    return plain
-
-
-def _masses(body: ET.Element, name: str, childclass: str, reader: _Reader) -> list[ET.Element]:
-    """The inertia of a moving body, or the shapes from which it is computed."""
-    inertial, from_shapes = body.find("inertial"), reader.compiler.get("inertiafromgeom", "auto")
-    lowest, highest = reader.numbers(
-        ET.Element("compiler", {"inertiagrouprange": "0 5", **reader.compiler}), "inertiagrouprange", (2,)
-    )
-    geoms = [reader.resolved(geom, childclass) for geom in body.findall("geom")]
-    for plain in geoms:
-        plain.attrib = {"density": "1000", "group": "0", **plain.attrib}
-    geoms = [plain for plain in geoms if lowest <= reader.numbers(plain, "group", (1,)) <= highest]
-    if inertial is not None and not (from_shapes == "true" and geoms):
-        if "mass" not in inertial.attrib or not {"diaginertia", "fullinertia"} & set(inertial.attrib):
-            raise reader.fault(f"body {name!r}: its <inertial> has no mass, or neither diaginertia nor fullinertia")
-        return [ET.Element("inertial", reader.turned(inertial))]
-    shapes = []
-    for plain in geoms if from_shapes != "false" else ():
-        if reader.numbers(plain, "mass" if "mass" in plain.attrib else "density", (1,)) == 0.0:
-            continue
-        if plain.get("mesh") or plain.get("type") in ("mesh", "sdf", "hfield"):
-            raise reader.fault(
-                f"body {name!r} has no <inertial>, and Pinocchio computes the mass of a mesh differently from MuJoCo: "
-                "give it an <inertial>, from body_mass, body_ipos, body_iquat and body_inertia of MuJoCo"
-            )
-        if plain.get("shellinertia") == "true":
-            raise reader.fault(f"body {name!r}: its mass is on the surface of a shape, which Pinocchio does not read")
-        # Pinocchio gives no mass to a shape that collides with nothing.
-        for key in ("contype", "conaffinity"):
-            plain.attrib.pop(key, None)
-        shapes.append(plain)
-    return shapes
-
-
-def _quaternion(rotation: NDArray[np.float64]) -> str:
-    """(w, x, y, z) of a rotation matrix, as text."""
-    q = pin.Quaternion(rotation)
-    return " ".join(map(repr, (float(q.w), float(q.x), float(q.y), float(q.z))))
+def _placement(position: ArrayLike, quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0)) -> pin.SE3:
+    """A placement from a position (3,) and MuJoCo's quaternion (w, x, y, z)."""
+    w, x, y, z = np.asarray(quaternion, dtype=float)
+    return pin.SE3(pin.Quaternion(w, x, y, z).matrix(), np.asarray(position, dtype=float))

@@ -22,7 +22,7 @@ from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
 from varpin.model.meshes import Reader, read_mesh, with_own_meshes
 from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model
-from varpin.model.mjcf import build_mjcf_model, build_mjcf_shapes
+from varpin.model.mjcf import mjcf_shapes
 from varpin.model.payload import Payload, carry
 from varpin.model.sources import Description, describe, hang_shapes
 from varpin.model.srdf import Posture, of_joints
@@ -73,7 +73,7 @@ class Robot(Frozen):
         tree: Flat arrays for the core.
         locked: Locked joints and their positions [rad or m].
         urdf: The URDF or xacro file the robot was read from, or None.
-        expanded: The URDF text of a xacro file, or the text from which the shapes of an MJCF file are built.
+        expanded: The URDF text of a xacro file.
         mjcf: The MJCF file the robot was read from, or None.
         package_dirs: Folders in which meshes are looked up.
         visuals: Geometry that came with a RobotWrapper, locked like the model, or None.
@@ -390,8 +390,8 @@ def load_robot(
         UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
         UnknownJoint: ``lock`` or ``armature`` names a joint that the robot does not have.
         UnknownFrame: A payload names a frame that the robot does not have.
-        MissingDependency: A xacro file needs the package xacro (extra ``xacro``); a name needs robot_descriptions
-            (extra ``descriptions``).
+        MissingDependency: A xacro file needs the package xacro (extra ``xacro``), an MJCF file mujoco (extra
+            ``mjcf``), a name robot_descriptions (extra ``descriptions``).
         InputError: A xacro file has no argument of that name, or a base or an armature is invalid.
         SingularMassMatrix: A joint moves no inertia, or a negative one.
     """
@@ -630,9 +630,8 @@ def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.Geome
     try:
         if robot.visuals is not None:
             return with_own_meshes(robot.visuals, read), {}
-        if robot.mjcf is not None and robot.expanded is not None:
-            full = build_mjcf_model(robot.mjcf, robot.expanded)
-            return _on_joints(robot, full, build_mjcf_shapes(robot.mjcf, robot.expanded, full)), {}
+        if robot.mjcf is not None:
+            return _on_joints(robot, *mjcf_shapes(robot.mjcf)), {}
         if robot.urdf is None:
             return pin.GeometryModel(), {}
         urdf = read_urdf(robot.urdf, robot.expanded)

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.model import example_robot_data, robot_descriptions
-from varpin.model.equalities import Closure, Equality, at_reference
+from varpin.model.equalities import Closure, Equality
 from varpin.model.mimic import (
     JOINT_PARAMETERS,
     Tie,
@@ -22,7 +22,7 @@ from varpin.model.mimic import (
     ties_of,
     untied_model,
 )
-from varpin.model.mjcf import build_mjcf_model, is_mjcf, read_mjcf, root_tag
+from varpin.model.mjcf import is_mjcf, read_mjcf, root_tag
 from varpin.model.srdf import Posture, beside, read_postures, reference_postures
 from varpin.model.urdf import Inertial, Mimic, build_model, read_urdf
 from varpin.model.xacro import enclosing_packages, expand, is_xacro, plain_name
@@ -39,7 +39,7 @@ class Description:
         model: The model without mimic joints.
         ties: Mimic joints.
         urdf: The URDF or xacro file, if there is one.
-        expanded: The URDF text of a xacro file, or the text from which the shapes of an MJCF file are built.
+        expanded: The URDF text of a xacro file.
         mjcf: The MJCF file, if there is one.
         package_dirs: Folders in which ``package://`` paths are looked up.
         visuals: Geometry of a RobotWrapper.
@@ -291,21 +291,12 @@ def _of_file(
 
 def _of_mjcf(path: Path, name: str) -> Description:
     mjcf = read_mjcf(path)
-    description = _of_model(build_mjcf_model(path, mjcf.dynamics), name, None)
-    equalities = at_reference(mjcf.equalities, description.model, path)
-    planar = (
-        f"{each.name} closes a planar loop, whose axes are parallel to {each.plane.tilt:.1g} rad in the file: it holds "
-        "in the plane of the loop alone"
-        for each in equalities
-        if isinstance(each, Closure) and each.plane is not None
-    )
     return replace(
-        description,
+        _of_model(mjcf.model, name, None),
         mjcf=path,
-        expanded=mjcf.looks,
-        remarks=(*mjcf.remarks, *planar),
-        loops=tuple((each.a.frame, each.b.frame) for each in equalities if isinstance(each, Closure)),
-        equalities=equalities,
+        remarks=mjcf.remarks,
+        loops=tuple((each.a.body, each.b.body) for each in mjcf.equalities if isinstance(each, Closure)),
+        equalities=mjcf.equalities,
     )
 
 

@@ -42,14 +42,19 @@ class Moments:
     Attributes:
         series: Coefficients (N, K, m) of its Legendre series over each step.
         rest: Root mean square (N, s) of what is beyond the first s = 1 .. K terms, for the worst control.
-        largest: The largest absolute value seen.
+        extremes: The least and the largest value of each control seen in each step (2, N, m).
         unsettled: Steps whose quadrature has not settled (U,).
     """
 
     series: Floats
     rest: Floats
-    largest: float
+    extremes: Floats
     unsettled: Integers
+
+    @property
+    def largest(self) -> float:
+        """The largest absolute value seen."""
+        return float(np.abs(self.extremes).max(initial=0.0))
 
     def at(self, times: Sequence[float]) -> Floats:
         """The polynomials with the function's moments, at ``times`` (s,) of each step: (N, s, m)."""
@@ -60,7 +65,7 @@ class Moments:
         """Steps first .. last of them."""
         taken = slice(first, last)
         here = self.unsettled[(self.unsettled >= first) & (self.unsettled < last)]
-        return Moments(self.series[taken], self.rest[taken], self.largest, here)
+        return Moments(self.series[taken], self.rest[taken], self.extremes[:, taken], here)
 
     @property
     def mean(self) -> Floats:
@@ -79,7 +84,8 @@ def moments_of(values: Values, first: int, count: int, dt: float, breaks: Sequen
         breaks: Times at which the function jumps or has kinks [s].
     """
     step, begin, width = _panels(first, count, dt, np.array(breaks, dtype=np.float64))
-    total, square, largest, spent = np.zeros((0, 0, 0)), np.zeros((0, 0)), 0.0, 0
+    total, square, spent = np.zeros((0, 0, 0)), np.zeros((0, 0)), 0
+    extremes = np.zeros((2, 0, 0))
     unsettled = np.zeros(0, dtype=np.int64)
     points = _POINTS if dt > _SHORT else _FEW
     x, weights, to_series, to_ends = _rule(points)
@@ -87,17 +93,20 @@ def moments_of(values: Values, first: int, count: int, dt: float, breaks: Sequen
         inside = begin[:, None] + width[:, None] * x
         found = values(((first + step)[:, None] + inside).ravel() * dt, np.repeat(first + step, len(x)))
         found = found.reshape(len(step), len(x), -1)
-        largest, spent = max(largest, float(np.abs(found).max(initial=0.0))), spent + len(step) * len(x)
+        spent += len(step) * len(x)
         if not total.size:
             total = np.zeros((count, MOMENTS, found.shape[2]))
             square = np.zeros((count, found.shape[2]))
+            extremes = np.repeat([[[np.inf]], [[-np.inf]]], count, axis=1) + square
+        np.minimum.at(extremes[0], step, found.min(axis=1))
+        np.maximum.at(extremes[1], step, found.max(axis=1))
         # The gaps between the outermost points and the ends have values of their own.
         inside, ends, found = inside[:, 1:-1], found[:, [0, -1]], found[:, 1:-1]
         tail = np.abs(np.einsum("kp,jpm->jkm", to_series[-(points // 3) :], found)).max(axis=(1, 2), initial=0.0)
         beside = np.abs(np.einsum("ep,jpm->jem", to_ends, found) - ends).max(axis=(1, 2), initial=0.0)
         tail = np.maximum(tail, x[1] * beside)
         last = halving == _HALVINGS or spent > _MOST * count + _MOST * 50
-        open_ = tail * width > _SETTLED * largest
+        open_ = tail * width > _SETTLED * np.abs(extremes).max(initial=0.0)
         done = np.ones_like(open_) if last else ~open_
         # Moments about the whole step, from the values at the points of its panels.
         basis = legvander(2.0 * inside[done] - 1.0, MOMENTS - 1) * (width[done, None, None] * weights[:, None])
@@ -113,7 +122,7 @@ def moments_of(values: Values, first: int, count: int, dt: float, breaks: Sequen
     degrees = 2.0 * np.arange(MOMENTS) + 1.0
     power = np.cumsum(degrees[:, None] * total**2, axis=1)
     rest = np.sqrt(np.maximum(square[:, None] - power, 0.0)).max(axis=2, initial=0.0)
-    return Moments(degrees[:, None] * total, rest, largest, unsettled)
+    return Moments(degrees[:, None] * total, rest, extremes, unsettled)
 
 
 def joined(parts: Sequence[Moments]) -> Moments:
@@ -123,7 +132,7 @@ def joined(parts: Sequence[Moments]) -> Moments:
     series, rest, unsettled = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("series", "rest", "unsettled")
     )
-    return Moments(series, rest, max(part.largest for part in parts), unsettled)
+    return Moments(series, rest, np.concatenate([part.extremes for part in parts], axis=1), unsettled)
 
 
 def _panels(first: int, count: int, dt: float, breaks: Floats) -> tuple[Integers, Floats, Floats]:

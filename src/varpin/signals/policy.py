@@ -160,27 +160,12 @@ class LinearPolicy(Frozen):
         servos: Sequence[str] | None = None,
         linear: bool = False,
     ) -> None:
-        """Make a policy.
+        """Make a policy of the attributes.
 
-        Args:
-            u: Feed-forward controls (N, m).
-            gains: Feedback gains (N, m, 2n).
-            reference: x_k (N, 2n), or (N + 1, 2n), whose last row is not used.
-            hold: Number of simulation steps over which each control is held; it sets the rate of a digital controller.
-            on: The state x, ``"momentum"`` or ``"velocity"``. Integrators on the other state refuse the policy.
-            limits: (lower, upper) of the control with its feedback, each one number, (m,) or by joint name.
-            previous_gains: Gains on the control of the previous interval (N, m, m).
-            previous: Reference of those gains (N, m); if left out, u of the previous interval, and ``before`` for the
-                first.
-            before: Control before the first interval, (m,) or by joint name.
-            period: Length of an interval [s]. ``hold`` then follows from the dt of a simulation, which must divide the
-                period.
-            joints: The joint of each control, as in :attr:`varpin.Scene.control_joints`. ``limits`` and ``before`` may
-                then be given by joint name, and a scene with other controls refuses the policy.
-            servos: The joints whose controls are positions, as in :attr:`varpin.Scene.servo_joints`. A scene with other
-                servos refuses the policy.
-            linear: Make controls linear in time over each interval, with u and the feedback at its end. It needs
-                ``before``, the control at the first node.
+        ``reference`` may have a last row that is not used, (N + 1, 2n). ``previous`` is u of the previous interval if
+        left out, and ``before`` for the first. ``limits`` (lower, upper) and ``before`` take one number, (m,) or, with
+        ``joints``, numbers by joint name. Scenes with other ``joints`` or ``servos``, and integrators on another state
+        than ``on``, refuse the policy. A ``linear`` policy needs ``before``.
 
         Raises:
             InputError: Shapes that do not fit each other, values that are not finite, or names without ``joints``.

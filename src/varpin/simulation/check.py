@@ -28,13 +28,14 @@ from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.model import joint_unit
 from varpin.signals.commands import changing, in_parts, open_loop, rows
+from varpin.signals.controls import Controls, commands_of
+from varpin.signals.functions import Sampled
 from varpin.signals.inputs import in_parts_of_steps, prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.commands import Controls, commands_of
 from varpin.simulation.energy import energy_defects
 from varpin.simulation.gate import proven_error
+from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
-from varpin.simulation.loop import Law, law_of
 from varpin.simulation.scales import speed_scales, travel_scales
 from varpin.simulation.short_forces import short_forces
 from varpin.simulation.spectrum import fastest_rate
@@ -46,6 +47,9 @@ from varpin.trajectory import Trajectory
 TOLD, TOLD_VELOCITY = 0.01, 0.25
 # The share that a better step should leave.
 _AIM = 0.2
+# Most parts of a step that are named; the order of motions with kinks in forces; the excess of an error of half the
+# travel.
+_MOST_PARTS, _KINKED, _LOST = 10, 2, 0.5 / TOLD
 # Stages of the repetition beyond those of a motion of the same order.
 _MORE = 2
 # Steps of one joint between two checks for Ctrl-C: a tenth of a second.
@@ -79,19 +83,20 @@ def check(
         hold: The period of a control law in steps, 0 for none. Where a repetition under the recorded controls is far
             off, and the record tells the law, another one has its feedback.
     """
+    extremes = controls.extremes if isinstance(controls, Sampled) else None
+    limits = beyond_limits(scene, trajectory, extremes)
     if not trajectory.steps:
-        nothing = trajectory.with_error(np.zeros_like(trajectory.q))
-        return nothing.changed(warnings=tuple(beyond_limits(scene, trajectory)))
-    if not integrator.variational:
+        known = np.zeros_like(trajectory.q)
+    elif not integrator.variational:
         defects = energy_defects(scene, integrator, trajectory)
         defects.setflags(write=False)
         trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
     if known is not None:
-        return trajectory.with_error(known).changed(warnings=tuple(beyond_limits(scene, trajectory)))
+        return trajectory.with_error(known).changed(warnings=tuple(limits))
     held_mean = isinstance(controls, FirstOrderHold) and not integrator.stage_times
     if noise_unknown(scene, integrator, trajectory):
         text = "the error is not known: a repetition cannot have this noise. Use kick='held'"
-        return trajectory.changed(warnings=(Finding("error", text), *beyond_limits(scene, trajectory)))
+        return trajectory.changed(warnings=(Finding("error", text), *limits))
     # A function of time would be called again for parts of a step, at whatever time the error is asked for.
     calls = isinstance(controls, OpenLoop) and closer(scene, integrator, trajectory, sampled=True)[1] > 1
     proven = proven_error(scene, integrator, trajectory) if resolved and not (held_mean or calls) else None
@@ -113,7 +118,7 @@ def check(
             text = f"the error is not known: a function of the scene fails in the repetition, {error.__cause__!r:.80}"
             found = (Finding("error", text),)
         motion = trajectory.with_error(off)
-    return motion.changed(warnings=(*found, *beyond_limits(scene, trajectory)))
+    return motion.changed(warnings=(*found, *limits))
 
 
 def distance(again: tuple[Floats, Floats, float], trajectory: Trajectory) -> tuple[Floats, Floats]:
@@ -325,7 +330,8 @@ def error_findings(
         unit = joint_unit(scene.robot, joint)
         value = float(off[worst, joint])
         part = f", {100.0 * share:.2g} % of the largest travel" if share < 1.0 else ""
-        where = f"(joint {names[joint]!r}, right until t = {t[first - 1]:.3g} s)"
+        since = f"right until t = {t[first - 1]:.3g} s" if first > 1 else "from the start"
+        where = f"(joint {names[joint]!r}, {since})"
         text = f"q is off by up to {value:.2g} {unit}{part} {where}. "
         return (
             Finding("error", text + cure(share / TOLD), names[joint], time=float(t[first - 1]), value=value, unit=unit),
@@ -356,17 +362,23 @@ def _cure(scene: Scene, integrator: Integrator, trajectory: Trajectory, excess: 
     A policy on (q, v), which is ``fed`` back, takes no other method. A law with a period of ``hold`` steps keeps it.
     """
     if not (integrator.l_stable or scene.constraints) and damped_faster(scene, trajectory):
-        return "Dampers are faster than the step: use integrator=varpin.Radau(4)"
+        return "Damping or friction is faster than the step: use integrator=varpin.Radau(4)"
     if isinstance(integrator, Reference):
         return "Use a smaller rtol"
-    times = (max(excess, 1.0) / _AIM) ** (1.0 / integrator.order)
-    parts = 10 if not times < 10.0 else max(2, math.ceil(times))
-    stages = (integrator.order + 1) // 2 + _MORE
-    family = "Radau" if integrator.l_stable else "Gauss"
-    named = stages <= MOST_STAGES and not fed
-    other = f"integrator=varpin.{family}({stages}) or " if named else ""
+    # Kinks of forces cost any method its order.
+    order = integrator.order if scene.smooth else min(integrator.order, _KINKED)
+    times = (max(excess, 1.0) / _AIM) ** (1.0 / order)
+    parts = _MOST_PARTS if not times < _MOST_PARTS else max(2, math.ceil(times))
     period = f" with period={hold * parts}" if hold else ""
-    return f"Use {other}dt = {trajectory.dt / parts:.2g} s{period}"
+    smaller = f"dt = {trajectory.dt / parts:.2g} s{period}"
+    stages = (integrator.order + 1) // 2 + _MORE
+    if fed or stages > MOST_STAGES or not (scene.smooth or not scene.elements):
+        return f"Use {smaller}"
+    other = f"integrator=varpin.{'Radau' if integrator.l_stable else 'Gauss'}({stages})"
+    # As large as the motion, errors tell no more how much it takes; and of a low order, smaller steps take too many.
+    if times < _MOST_PARTS:
+        return f"Use {other} or {smaller}"
+    return f"Use {other} and a smaller dt" if excess > _LOST else f"Use {other}"
 
 
 def damped_faster(scene: Scene, trajectory: Trajectory, turns: float = 2.0) -> bool:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from varpin.arrays import Floats
-from varpin.errors import VarpinError
+from varpin.errors import StepError, VarpinError
 from varpin.integrators.base import Failure
 from varpin.mechanics.scene import Scene
 from varpin.trajectory import Trajectory
@@ -26,71 +24,16 @@ class Interrupted(KeyboardInterrupt):
         super().__init__(f"interrupted after {trajectory.steps} steps; they are in .trajectory")
 
 
-class StepError(VarpinError, ValueError):
-    """A user's function failed in a step.
-
-    Attributes:
-        step: Index of the step.
-        time: Time of the call [s].
-        trajectory: The motion before; None where the function is called before the motion begins.
-    """
-
-    def __init__(self, step: int, time: float, problem: str, trajectory: Trajectory | None) -> None:
-        self.step = step
-        self.time = time
-        self.trajectory = trajectory
-        before = "" if trajectory is None else "; what came before is in error.trajectory"
-        super().__init__(f"step {step} (t = {time:.6g} s): {problem}{before}")
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (type(self), str(self), vars(self).copy())
-
-
-def _restored(kind: type[StepError], message: str, values: dict[str, Any]) -> StepError:
-    """An unpickled error."""
-    error = kind.__new__(kind, message)
-    vars(error).update(values)
-    return error
-
-
-class ControlError(StepError):
-    """A control law or the function of an OpenLoop raised, or returned something that is no control.
-
-    Attributes:
-        step: Index of the step it was called for.
-        time: The time it was called with [s].
-        trajectory: The motion before; None from an ensemble, which evaluates its controls before it begins.
-    """
-
-
 class NoiseError(StepError):
-    """A function of a custom noise raised, or returned something that is no field.
-
-    Attributes:
-        step: Index of the step it was called in.
-        time: The start of that step [s].
-        trajectory: The motion before.
-    """
+    """A function of a custom noise raised, or returned something that is no field."""
 
 
 class ForceError(StepError):
-    """A function of a custom force raised, or returned something that is no force.
-
-    Attributes:
-        step: Index of the step it was called in.
-        time: The start of that step [s].
-        trajectory: The motion before.
-    """
+    """A function of a custom force raised, or returned something that is no force."""
 
 
 class ConstraintError(StepError):
-    """A function of a custom constraint raised, or returned something that is no value of it.
-
-    Attributes:
-        step: Index of the step it was called in.
-        time: The start of that step [s].
-        trajectory: The motion before.
-    """
+    """A function of a custom constraint raised, or returned something that is no value of it."""
 
 
 class ToleranceError(VarpinError, RuntimeError):
@@ -120,7 +63,7 @@ class StepFailure(VarpinError, RuntimeError):
         time: Its start [s].
         residual: The last residual, in units of the rounding error of its terms.
         reason: What stopped the last attempt.
-        problem: The step, the reason and the state, in words.
+        problem: The step and the reason, in words.
         advice: The cause if one is known, or what to try.
         q: Configuration at the start of the step (n,) [rad or m].
         v: Velocity there (n,).
@@ -135,12 +78,9 @@ class StepFailure(VarpinError, RuntimeError):
         self.reason = failure.reason
         self.q, self.v, self.p = trajectory.q[-1], trajectory.v[-1], trajectory.p[-1]
         self.trajectory = trajectory
-        self.advice = cause or "a smaller dt may go further"
-        self.problem = (
-            f"step {step} (t = {time:.6g} s) cannot be trusted: {failure.reason}; last residual {failure.residual:.3g} "
-            f"rounding units, at q = {_row(self.q)}, v = {_row(self.v)}"
-        )
-        super().__init__(f"{self.problem}. What came before is in error.trajectory; {self.advice}")
+        self.advice = cause or "Use a smaller dt"
+        self.problem = f"step {step} (t = {time:.6g} s) failed: {failure.reason}"
+        super().__init__(f"{self.problem}. {self.advice}. The motion so far is in error.trajectory")
 
 
 def named(scene: Scene, failure: Failure) -> Failure:
@@ -149,8 +89,3 @@ def named(scene: Scene, failure: Failure) -> Failure:
         return failure
     what = f"CustomForce {scene.custom.names} may be the reason, where it jumps or its derivatives are wrong"
     return replace(failure, reason=f"{failure.reason} ({what})")
-
-
-def _row(values: Floats) -> str:
-    """A vector on one line."""
-    return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"

@@ -21,8 +21,11 @@ _UNITS = (("rad", "m"), ("rad/s", "m/s"), ("N m", "N"))
 _ROUNDING = 1e-6
 
 
-def beyond_limits(scene: Scene, trajectory: Trajectory) -> list[Finding]:
-    """Loops that the scene leaves open, and for each kind of limit the joint that passes it by most."""
+def beyond_limits(scene: Scene, trajectory: Trajectory, extremes: Floats | None = None) -> list[Finding]:
+    """Loops that the scene leaves open, and for each kind of limit the joint that passes it by most.
+
+    ``extremes`` (2, N, m) are the least and largest controls in each step, where the record has means alone.
+    """
     found = []
     if loops := scene.open_loops:
         a, b = loops[0]
@@ -33,12 +36,12 @@ def beyond_limits(scene: Scene, trajectory: Trajectory) -> list[Finding]:
         return found
     q, v, u = trajectory.q, trajectory.v, trajectory.u
     inside = inside_bounds(scene.core, q, v, u, trajectory.u_stages, scene.bound_rows)
-    kept = (inside[0], inside[1], inside[2] and scene.direct_efforts)
+    kept = (inside[0], inside[1], inside[2] and scene.direct_efforts and extremes is None)
     bounds = scene.bounds.position, scene.bounds.velocity, scene.bounds.effort
     for kind, (least, most) in enumerate(bounds):
         if kept[kind] or not scene.bounded[kind]:
             continue
-        values = (q, v, _efforts(scene, trajectory) if kind == 2 else v)[kind]
+        values = (q, v, _efforts(scene, trajectory, extremes) if kind == 2 else v)[kind]
         with np.errstate(invalid="ignore"):
             excess = np.maximum(least - values, values - most)
             excess = np.where(excess > _ROUNDING * (most if kind else 1.0), excess, -np.inf)
@@ -54,11 +57,7 @@ def _passed(
     """The finding about one kind of limits: the joint with the largest ``excess`` (K, n), and when."""
     worst = excess.max(axis=0)
     joint = int(worst.argmax())
-    name, peak, first = (
-        scene.robot.joint_names[joint],
-        int(excess[:, joint].argmax()),
-        int((excess[:, joint] > 0).argmax()),
-    )
+    name, peak = scene.robot.joint_names[joint], int(excess[:, joint].argmax())
     unit = _UNITS[kind][int(scene.robot.slides[joint])]
     limit = limits[int(values[peak, joint] > 0.5 * (limits[0][joint] + limits[1][joint]))][joint]
     what = ("position", "velocity", "effort")[kind]
@@ -69,17 +68,17 @@ def _passed(
         f"joint {name!r} passes its {what} limit {limit:.4g} {unit} by {worst[joint]:.3g} {when}{soft}"
         f"{and_more(int((worst > 0).sum()) - 1, 'joint')}"
     )
-    return Finding(KINDS[kind], text, name, time=float(trajectory.t[first]), value=float(worst[joint]), unit=unit)
+    return Finding(KINDS[kind], text, name, time=float(trajectory.t[peak]), value=float(worst[joint]), unit=unit)
 
 
-def _efforts(scene: Scene, trajectory: Trajectory) -> Floats:
-    """Forces of the motors (N, n) [N m or N]."""
+def _efforts(scene: Scene, trajectory: Trajectory, extremes: Floats | None) -> Floats:
+    """Forces of the motors (N, n) [N m or N], the largest of each step."""
     q, v = trajectory.q[:-1], trajectory.v[:-1]
+    within = np.moveaxis(trajectory.u_stages, 1, 0) if extremes is None else extremes
     forces = drive_forces(scene.elements, q, v, trajectory.u @ scene.actuation.T)
-    # Where controls change within a step, the largest of its stages counts.
-    for stage in range(trajectory.u_stages.shape[1]):
-        at_stage = drive_forces(scene.elements, q, v, trajectory.u_stages[:, stage] @ scene.actuation.T)
-        forces = np.where(np.abs(at_stage) > np.abs(forces), at_stage, forces)
+    for u in within:
+        other = drive_forces(scene.elements, q, v, u @ scene.actuation.T)
+        forces = np.where(np.abs(other) > np.abs(forces), other, forces)
     # Controls of kinematic inputs are positions: their forces are those of the constraints.
     for row, c in scene.inputs.items():
         forces[:, c] = trajectory.constraint_forces[:, int(np.argmax(scene.constraint_order == row))]

@@ -9,15 +9,17 @@ import numpy as np
 from varpin._version import __version__
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
-from varpin.errors import VarpinError
+from varpin.errors import ControlError, StepError, VarpinError
 from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import Failure, join
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import lines, open_loop, rows, steps_of
-from varpin.signals.inputs import as_moved
-from varpin.simulation.failures import ConstraintError, ForceError, StepError
+from varpin.signals.controls import Controls
+from varpin.signals.functions import ControlLaw, Sampled, decision
+from varpin.signals.inputs import as_moved, in_parts_of_steps
+from varpin.simulation.failures import ConstraintError, ForceError
 from varpin.trajectory import Trajectory
 
 # Number of segments from which on they are joined into one.
@@ -189,6 +191,47 @@ def next_command(commands: Commands, record: MotionRecord) -> Commands:
     return rows(commands, decision, decision + 1, before)._replace(hold=1)
 
 
+def next_block(
+    controls: Controls | ControlLaw, commands: Commands, record: MotionRecord, most: int, left: int
+) -> Commands:
+    """Commands of the next steps.
+
+    Args:
+        controls: Of the motion.
+        commands: All commands, unless the controls are a function.
+        record: The steps so far.
+        most: About how many steps; whole intervals of held controls unless it is 1.
+        left: Steps to the end of the motion.
+
+    Raises:
+        ControlError: The function of the controls failed.
+    """
+    if callable(controls):
+        decides = record.steps % commands.hold == 0
+        k, last = record.steps, record.last
+        u = decision(controls, record.scene, k, k * record.dt, last.q[-1], last.v[-1]) if decides else last.u[-1:]
+        if record.scene.inputs:
+            # All steps of the period: a kinematic input is on its way over them.
+            state = record.last.q[-1:], record.last.v[-1:]
+            u = in_parts_of_steps(record.scene, u, *state, commands.hold * record.dt, commands.hold)
+            return open_loop(u[:left])
+        return open_loop(u)._replace(hold=min(1 if most == 1 else commands.hold, left))
+    if isinstance(controls, Sampled):
+        times, first = record.integrator.stage_times, record.steps
+        try:
+            return controls.commands(first, min(most, left), times)
+        except ControlError as error:
+            # The steps before the one for which it fails.
+            if error.step == first:
+                raise
+            return controls.commands(first, error.step - first, times)
+    if most == 1 and not len(commands.stage_times):
+        return next_command(commands, record)
+    first = record.steps // commands.hold
+    before = record.last.u[None, -1] if record.steps else None
+    return rows(commands, first, first + max(1, most // commands.hold), before)
+
+
 class Motions:
     """Motions from one state under given commands; they share their work arrays."""
 
@@ -210,13 +253,13 @@ class Motions:
             increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
 
         Raises:
-            ForceError: A function of a CustomForce failed.
+            ForceError: A function of a CustomForce failed; so for a ConstraintError.
         """
         drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
         state = self.integrator.fork(self._state)
         try:
             (segment,) = self.integrator.rollout(self.scene, state, commands, drawn, self.dt)
-        except CustomForceError as error:
+        except (CustomForceError, CustomConstraintError) as error:
             given = self.scene, self.integrator, self._start, commands, self.dt, increments
             raise located(*given, error) from error
         done = len(segment.u)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
-from varpin.errors import InputError
+from varpin.errors import ControlError, InputError
 from varpin.finding import Finding, announce, ranked
 from varpin.integrators import Integrator, Segment
 from varpin.integrators.base import Failure
@@ -18,15 +18,15 @@ from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.signals.commands import open_loop, steps_of
+from varpin.signals.controls import Controls, commands_of
+from varpin.signals.functions import ControlLaw, Sampled, begins_elsewhere, function_findings, require_law, resolved
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import check as checked
 from varpin.simulation.choice import usual_integrator
-from varpin.simulation.commands import Controls, commands_of, next_block
 from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, named
-from varpin.simulation.functions import ControlLaw, Sampled, begins_elsewhere, require_law, resolved, unsettled
 from varpin.simulation.loop import outgrown, unstable_loop
 from varpin.simulation.progress import Progress, Reporter
-from varpin.simulation.record import MotionRecord, function_error
+from varpin.simulation.record import MotionRecord, function_error, next_block
 from varpin.simulation.start import controls_in_degrees, in_other_units, on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, time_steps
 from varpin.simulation.tolerance import steps_for_tolerance
@@ -180,19 +180,22 @@ def simulate(
     record = MotionRecord(scene, integrator, dt, dw, start, commands if linear else None, held=held)
     interrupted = not _roll(record, state, steps, controls, commands, Reporter(progress, steps, dt), hold, check=check)
     motion = record.trajectory()
+    known = None if interrupted else error
     try:
         found: list[Finding] = [*unmet, *noise_forgotten(scene, rng, increments)]
         if check:
             function = controls if isinstance(controls, Sampled) else None
-            whole = function is None or resolved(function, integrator)
+            whole = function is None or resolved(function, integrator.stage_times)
             given = None if callable(controls) or interrupted else controls
-            known = None if interrupted else error
             motion = checked(scene, integrator, motion, given, resolved=whole, known=known, hold=period if law else 0)
             loop = () if hold is None else unstable_loop(scene, motion, hold)
             wrong = [finding for finding in motion.warnings if finding.kind == "error"]
-            found = [*loop, *wrong, *(unsettled(function) if function else ()), *found, *motion.warnings]
+            of_function = function_findings(function, motion.duration) if function else ()
+            found = [*loop, *wrong, *of_function, *found, *motion.warnings]
             if isinstance(controls, OpenLoop | FirstOrderHold):
                 found += begins_elsewhere(controls, scene, q0, v0)
+        elif known is not None:
+            motion = motion.with_error(known)
         found += early
         if not any(finding.kind == "start in degrees" for finding in early):
             # Without controls servos hold the start.
@@ -233,7 +236,10 @@ def _roll(
         reporter.begin(record.last)
         while record.steps < steps:
             done = record.steps
-            block = next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
+            try:
+                block = next_block(controls, commands, record, 1 if stepwise else chunk, steps - done)
+            except ControlError as error:
+                raise error.after(record.trajectory()) from error.__cause__
             segment = _rolled_out(record, state, block)
             record.add(segment, block.within)
             if segment.failure is not None:

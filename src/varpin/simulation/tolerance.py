@@ -10,21 +10,21 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
-from varpin.errors import InputError, VarpinError
+from varpin.errors import InputError, StepError, VarpinError
 from varpin.finding import Finding
 from varpin.integrators import Integrator, Reference, integrator_of
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import open_loop
+from varpin.signals.controls import Controls, commands_of, held_rows
+from varpin.signals.functions import ControlLaw, Sampled, require_law
 from varpin.signals.inputs import held_in_parts
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.check import closer, distance, repeated
-from varpin.simulation.commands import Controls, commands_of, held_rows
 from varpin.simulation.failures import ToleranceError
-from varpin.simulation.functions import ControlLaw, Sampled, require_law
 from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, candidates, first_steps
-from varpin.simulation.record import Motions, located
+from varpin.simulation.record import Motions
 from varpin.simulation.short_forces import short_forces
 from varpin.support.checks import positive
 from varpin.trajectory import Accuracy
@@ -33,8 +33,6 @@ from varpin.trajectory import Accuracy
 _MOST_WORK = 50_000_000
 # Trials of the integrator and step of an earlier motion.
 _AGAIN = 3
-# Factor on the number of steps in which the failing step of a user's function is looked for.
-_REFINED = 16
 # Trials in which a user's function fails after which the search ends, if none has passed.
 _RAISES = 24
 
@@ -70,7 +68,8 @@ class _Search:
         self.steps = self.evaluations = 0
         self.errors: dict[tuple[str, int], Floats] = {}
         self._sampled: dict[int, Sampled] = {}
-        self._raised, self._passed = 0, False
+        self._raised: list[VarpinError] = []
+        self._passed = False
 
     def given(self, steps: int) -> Controls:
         """The controls of a motion in so many steps."""
@@ -120,13 +119,12 @@ class _Search:
             # Each step of a repetition takes about twice the evaluations.
             parts = closer(self.scene, integrator, motion)[1]
             self.steps, self.evaluations = self.steps + parts * steps, self.evaluations + 2 * parts * int(work)
-        except (CustomForceError, CustomConstraintError, VarpinError) as error:
-            if not isinstance(error, CustomForceError | CustomConstraintError) and not hasattr(error, "trajectory"):
-                raise
+        except (StepError, CustomForceError, CustomConstraintError) as error:
             # Coarse steps may go where the function is not defined.
-            self._raised, self.evaluations = self._raised + 1, self.evaluations + steps
-            if self._raised >= _RAISES and not self._passed:
-                raise self._located(integrator, steps, error) from error
+            self._raised.append(error)
+            self.evaluations += steps
+            if len(self._raised) >= _RAISES and not self._passed:
+                raise max(self._raised, key=lambda each: getattr(each, "step", -1)) from error
             return Trial(steps, math.inf, float(steps))
         self._passed = True
         off = distance(again, motion)[0]
@@ -135,19 +133,6 @@ class _Search:
         largest = max(float(off.max()), floor)
         whole = motion.statistics.split_steps == 0
         return Trial(steps, largest if math.isfinite(largest) else math.inf, float(work), whole=whole)
-
-    def _located(self, integrator: Integrator, steps: int, error: Exception) -> VarpinError:
-        """The error of a user's function with its failing step, found in smaller steps or, failing that, in its own."""
-        cause = error if isinstance(error, CustomForceError | CustomConstraintError) else error.__cause__
-        if not isinstance(cause, CustomForceError | CustomConstraintError):
-            assert isinstance(error, VarpinError)
-            return error
-        for fine in (_REFINED * steps, steps):
-            start, dt = (self.q0, self.v0), self.duration / fine
-            found = located(self.scene, integrator, start, self.commands(integrator, fine), dt, None, cause)
-            if found is not cause:
-                return found
-        return cause
 
 
 def steps_for_tolerance(
@@ -200,9 +185,9 @@ def steps_for_tolerance(
         ladder = Ladder(search.attempt, members, coarse, search.rows, lambda: search.evaluations > search.most)
         try:
             found = ladder.for_tolerance(max(wish, floor))[0][0]
-        except VarpinError as failure:
-            if hasattr(failure, "trajectory"):
-                raise
+        except (StepError, CustomForceError, CustomConstraintError):
+            raise
+        except VarpinError:
             raise ToleranceError(wish, duration, coarse, math.inf) from None
     if not found.error < SENSIBLE:
         raise ToleranceError(wish, duration, found.steps, found.error)

@@ -1,1 +1,1 @@
-"""Studies: speed against accuracy, advice, extremes, the paper."""
+"""Studies: speed against accuracy, advice, extremes."""

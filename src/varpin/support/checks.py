@@ -231,7 +231,9 @@ def as_floats(name: str, value: object) -> Floats:
     """
     try:
         array = np.asarray(value)
-        numbers = array.dtype.kind in "biuf" or all(isinstance(entry, Real) for entry in array.flat)
+        # True is no number: of damping=True nobody means 1.
+        kind = array.dtype.kind
+        numbers = kind in "iuf" or (kind != "b" and all(isinstance(entry, Real) for entry in array.flat))
         if numbers:
             return np.array(array, dtype=np.float64, order="C")
     except (TypeError, ValueError, OverflowError) as error:

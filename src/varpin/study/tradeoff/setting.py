@@ -20,8 +20,8 @@ from varpin.integrators import Integrator
 from varpin.integrators.base import Segment
 from varpin.mechanics.scene import OF_CONSTRAINTS, Scene, require_scene
 from varpin.signals.commands import open_loop
+from varpin.signals.controls import held_rows
 from varpin.signals.inputs import held_in_parts
-from varpin.simulation.commands import held_rows
 from varpin.simulation.ladder import candidates
 from varpin.simulation.start import on_constraints
 from varpin.support.checks import JointValues, joint_array, positive

@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from paper import cases
+from paper.cases import CASES, COARSE, COARSEST, MAIN
+from paper.claims import REFERENCE, Cells, Motions, cell, main_steps, series, series_of_noise
+from paper.experiments import OPTIMUM, PLAIN, STOCHASTIC
 from varpin.show.plots import COLORS
-from varpin.study.paper import cases
-from varpin.study.paper.cases import CASES, COARSE, COARSEST, MAIN
-from varpin.study.paper.claims import REFERENCE, Cells, Motions, cell, main_steps, series, series_of_noise
-from varpin.study.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC
 
 # Tracking errors are linear below this [rad] and logarithmic beyond: a start away from the optimum outweighs the rest a
 # hundredfold.

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from paper import cases
+from paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS, Setting
+from paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell
 from varpin.integrators import RungeKutta4
 from varpin.mechanics.scene import Scene
 from varpin.simulation.failures import StepFailure
 from varpin.simulation.simulate import simulate
-from varpin.study.paper import cases
-from varpin.study.paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS, Setting
-from varpin.study.paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell
 from varpin.trajectory import Trajectory
 
 Cells = Mapping[str, Cell]

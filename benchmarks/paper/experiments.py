@@ -15,6 +15,8 @@ from typing import Annotated
 
 import numpy as np
 
+from paper import cases
+from paper.cases import CASES, MAIN, METHODS, VARIATIONS, Case, Setting
 from varpin._version import __version__
 from varpin.arrays import Floats
 from varpin.control import Solution, solve
@@ -22,8 +24,6 @@ from varpin.errors import FileError, VarpinError
 from varpin.integrators import RungeKutta4
 from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
 from varpin.linearization import linearize
-from varpin.study.paper import cases
-from varpin.study.paper.cases import CASES, MAIN, METHODS, VARIATIONS, Case, Setting
 
 Progress = Callable[[int, int, str], None]
 

@@ -3,26 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 
 from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
-from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import Times, changing, open_line, open_loop, rows
-from varpin.signals.inputs import in_parts_of_steps, prescribing
+from varpin.signals.commands import Times, changing, open_line, open_loop
+from varpin.signals.functions import Sampled
+from varpin.signals.inputs import prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.functions import ControlLaw, Sampled, decision, of_time, sampled
-from varpin.simulation.record import MotionRecord, next_command
 from varpin.support.checks import JointValues, as_floats, control_array, require_finite
 
 # All controls but a control law: known before the motion, or fed back by the core.
 Controls = JointValues | LinearPolicy | OpenLoop | FirstOrderHold | None
 
 
-def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps: int, dt: float) -> Commands:
+class Method(Protocol):
+    """What controls need to know of an integrator."""
+
+    variational: bool
+
+    @property
+    def stage_times(self) -> Times:
+        """Times of a unit step at which controls that change within it are evaluated; empty if their mean is held."""
+
+
+def commands_of(scene: Scene, integrator: Method, controls: Controls, steps: int, dt: float) -> Commands:
     """Commands of the core for controls of ``steps`` steps of ``dt`` [s].
 
     The controls are None, (steps, m), (m,), by joint name, a function of time, linear between nodes or a policy.
@@ -49,7 +58,7 @@ def commands_of(scene: Scene, integrator: Integrator, controls: Controls, steps:
         )
     if isinstance(controls, OpenLoop):
         of = controls if isinstance(controls, Sampled) and controls.dt == dt else Sampled(controls, scene, dt)
-        return of_time(of, of.moments(0, steps, None), integrator)
+        return of.commands(0, steps, integrator.stage_times)
     if isinstance(controls, FirstOrderHold):
         if controls.u.shape != (steps + 1, scene.controls):
             raise InputError(
@@ -117,33 +126,3 @@ def _on_lines(u: Floats, times: Times) -> Commands:
         return open_loop(0.5 * (before + after)[:, 0])
     share = np.array(times)[:, None]
     return changing((1.0 - share) * before + share * after, times)
-
-
-def next_block(
-    controls: Controls | ControlLaw, commands: Commands, record: MotionRecord, most: int, left: int
-) -> Commands:
-    """Commands of the next steps.
-
-    Args:
-        controls: Of the motion.
-        commands: All commands, unless the controls are a function.
-        record: The steps so far.
-        most: About how many steps; whole intervals of held controls unless it is 1.
-        left: Steps to the end of the motion.
-    """
-    if callable(controls):
-        decides = record.steps % commands.hold == 0
-        u = decision(controls, record) if decides else record.last.u[-1:]
-        if record.scene.inputs:
-            # All steps of the period: a kinematic input is on its way over them.
-            state = record.last.q[-1:], record.last.v[-1:]
-            u = in_parts_of_steps(record.scene, u, *state, commands.hold * record.dt, commands.hold)
-            return open_loop(u[:left])
-        return open_loop(u)._replace(hold=min(1 if most == 1 else commands.hold, left))
-    if isinstance(controls, Sampled):
-        return sampled(controls, record, min(most, left))
-    if most == 1 and not len(commands.stage_times):
-        return next_command(commands, record)
-    first = record.steps // commands.hold
-    before = record.last.u[None, -1] if record.steps else None
-    return rows(commands, first, first + max(1, most // commands.hold), before)
