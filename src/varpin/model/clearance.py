@@ -18,7 +18,7 @@ from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
 from varpin.model.hull import Hull, hull_around, mesh_points
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
-from varpin.model.robot import Robot, geometry
+from varpin.model.robot import Robot, readable_geometry
 from varpin.model.tree import place_of_frame, z_to
 from varpin.model.urdf import decoded, parsed
 from varpin.support.checks import finite_array, over_time, positive, rotation_matrix
@@ -452,10 +452,13 @@ def _vertices(robot: Robot) -> dict[str, Floats]:
     """Points (N, 3) [m], in each link's axes, whose hull contains the shapes of the link."""
     found: dict[str, list[Floats]] = {}
     model = robot.free_model
-    for shape in geometry(robot).geometryObjects:
+    shapes, faulty = readable_geometry(robot)
+    for _, what in faulty.values():
+        raise RobotError(what)
+    for shape in shapes.geometryObjects:
         frame = model.frames[shape.parentFrame]
         place = frame.placement.inverse() * shape.placement
-        corners = _corners(shape.geometry) * np.asarray(shape.meshScale)
+        corners = _corners(shape.geometry)
         found.setdefault(frame.name, []).append(corners @ place.rotation.T + place.translation)
     return {name: np.vstack(parts) for name, parts in found.items()}
 

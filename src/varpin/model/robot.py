@@ -20,6 +20,7 @@ from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotor
 from varpin.model.angles import ADVICE, looks_like_degrees
 from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
+from varpin.model.meshes import Reader, read_mesh, with_own_meshes
 from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.payload import Payload, carry
@@ -35,7 +36,7 @@ from varpin.model.tree import (
     to_pinocchio,
     tree_mass_matrix,
 )
-from varpin.model.urdf import build_model, build_shapes, missing_meshes, missing_meshes_message, read_urdf
+from varpin.model.urdf import build_model, build_shapes, read_urdf
 from varpin.support.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed, table
@@ -622,67 +623,49 @@ def geometry(robot: Robot) -> pin.GeometryModel:
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
     """
-    if robot.parts:
-        return _of_parts(robot, [geometry(part.robot) for part in robot.parts])
-    if robot.visuals is not None:
-        return robot.visuals
-    if robot.mjcf is not None:
-        return _on_joints(robot, *mjcf_shapes(robot.mjcf))
-    if robot.urdf is None:
-        return pin.GeometryModel()
-    urdf = read_urdf(robot.urdf, robot.expanded)
-    full = build_model(urdf)
-    return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, pin.coal.MeshLoader()))
+    shapes, faulty = readable_geometry(robot)
+    for _, what in faulty.values():
+        raise RobotError(what)
+    for shape in shapes.geometryObjects:
+        if getattr(shape.geometry, "build_state", None) == pin.coal.BVHBuildState.BVH_BUILD_STATE_BEGUN:
+            shape.geometry.endModel()
+    return shapes
 
 
-def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
+def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
     """The readable part of :func:`geometry`, link by link.
+
+    Args:
+        robot: The robot.
+        read: Reads a mesh file.
 
     Returns:
         The shapes of the links that can be read, and for each other link by name, its joint in ``free_model`` and its
         fault in words; missing meshes share one message.
     """
     if robot.parts:
-        found = [readable_geometry(part.robot) for part in robot.parts]
+        found = [readable_geometry(part.robot, read) for part in robot.parts]
         faults_of_links = {
             part.prefix + name: (joint + part.shift if joint else 0, what)
             for part, (_, faulty) in zip(robot.parts, found, strict=True)
             for name, (joint, what) in faulty.items()
         }
         return _of_parts(robot, [shapes for shapes, _ in found]), faults_of_links
-    if robot.mjcf is not None:
-        try:
-            return geometry(robot), {}
-        except RobotError as error:
-            faulty = str(error)
-        return pin.GeometryModel(), {frame.name: (frame.parentJoint, faulty) for frame in _links(robot.free_model)}
-    if robot.visuals is not None or robot.urdf is None:
-        return geometry(robot), {}
-    urdf = read_urdf(robot.urdf, robot.expanded)
-    full = build_model(urdf)
-    loader = pin.coal.CachedMeshLoader()
+    frames = [frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY]
     try:
-        return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader)), {}
+        if robot.visuals is not None:
+            return with_own_meshes(robot.visuals, read), {}
+        if robot.mjcf is not None:
+            return _on_joints(robot, *mjcf_shapes(robot.mjcf)), {}
+        if robot.urdf is None:
+            return pin.GeometryModel(), {}
+        urdf = read_urdf(robot.urdf, robot.expanded)
+        full = build_model(urdf)
+        shapes, faulty = build_shapes(urdf, full, robot.package_dirs, read)
     except RobotError as error:
-        problem = str(error)
-    found, missing = pin.GeometryModel(), {}
-    absent = missing_meshes(urdf, robot.package_dirs)
-    absent_message = missing_meshes_message(urdf, absent, robot.package_dirs)
-    for link in urdf.elements("link"):
-        name = link.get("name", "")
-        if link.find("visual") is None:
-            continue
-        try:
-            part = _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader, name))
-        except RobotError as error:
-            frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
-            missing[name] = frame.parentJoint, absent_message if name in absent else str(error)
-        else:
-            for shape in part.geometryObjects:
-                found.addGeometryObject(shape)
-    if urdf.root is None:
-        missing = {frame.name: (frame.parentJoint, problem) for frame in _links(robot.free_model)}
-    return found, missing
+        return pin.GeometryModel(), {frame.name: (frame.parentJoint, str(error)) for frame in frames}
+    joints = {frame.name: frame.parentJoint for frame in frames}
+    return _on_joints(robot, full, shapes), {link: (joints[link], what) for link, what in faulty.items()}
 
 
 def _of_parts(robot: Robot, shapes: Sequence[pin.GeometryModel]) -> pin.GeometryModel:
@@ -700,10 +683,6 @@ def _of_parts(robot: Robot, shapes: Sequence[pin.GeometryModel]) -> pin.Geometry
                 shape.placement = part.place * given.placement
             together.addGeometryObject(shape)
     return together
-
-
-def _links(model: pin.Model) -> list[pin.Frame]:
-    return [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
 
 
 def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin.GeometryModel:

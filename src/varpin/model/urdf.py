@@ -7,7 +7,6 @@ some useful mimic elements.
 
 import codecs
 import contextlib
-import copy
 import logging
 import math
 import os
@@ -29,6 +28,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from varpin.errors import FileError, RobotError
+from varpin.model.meshes import Reader, put_mesh, read_mesh, with_own_meshes
 
 logger = logging.getLogger(__name__)
 
@@ -176,46 +176,58 @@ def build_model(urdf: Urdf, *, mimic: bool = False) -> pin.Model:
 
 
 def build_shapes(
-    urdf: Urdf, model: pin.Model, package_dirs: Sequence[str], loader: pin.coal.MeshLoader, link: str | None = None
-) -> pin.GeometryModel:
-    """The visual geometry in a file, as Pinocchio reads it.
+    urdf: Urdf, model: pin.Model, package_dirs: Sequence[str], read: Reader = read_mesh
+) -> tuple[pin.GeometryModel, dict[str, str]]:
+    """The visual geometry in a file, as Pinocchio reads it, except for meshes.
 
     Args:
         urdf: The file.
         model: From :func:`build_model`.
         package_dirs: Folders in which ``package://`` paths are looked up.
-        loader: Loader of the meshes.
-        link: Read only this link, which needs well-formed XML; all links if left out.
+        read: Reads a mesh file.
+
+    Returns:
+        The shapes of the links whose meshes can all be read, and the fault of each other link in words.
 
     Raises:
-        RobotError: A mesh is missing or cannot be read; the message names it.
+        RobotError: A shape is no shape; the message names the file.
     """
-    text, textures = urdf.text, dict[str, str]()
+    text, looks = urdf.text, dict[str, _Look]()
     if urdf.root is not None:
-        absent = missing_meshes(urdf, package_dirs)
-        if absent := {name: files for name, files in absent.items() if link in (None, name)}:
-            raise RobotError(missing_meshes_message(urdf, absent, package_dirs))
-        looks, textures = _looks(urdf, urdf.root, package_dirs, link)
-        text = _written(urdf, looks)
-
-    def read() -> pin.GeometryModel:
-        return pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, list(package_dirs), loader)
+        root, looks = _looks(urdf.root)
+        text = _written(urdf, root)
 
     with captured_stderr() as complaints:
         try:
-            shapes = _on_a_stack(urdf, read)
+            shapes = _on_a_stack(
+                urdf, lambda: pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, [*package_dirs])
+            )
         except (ValueError, RuntimeError, IndexError) as error:
-            whose = "" if link is None else f" of link {link!r}"
-            raise RobotError(f"the meshes{whose} in {urdf.path} cannot be read: {error}") from None
+            raise RobotError(f"the shapes in {urdf.path} cannot be read: {error}") from None
         for line in complaints():
             logger.warning("%s: %s", urdf.path, line)
+    absent = missing_meshes(urdf, package_dirs)
+    faults = dict.fromkeys(absent, missing_meshes_message(urdf, absent, package_dirs))
     for shape in shapes.geometryObjects:
-        if shape.name in textures:
-            texture = _located(textures[shape.name], urdf.path, package_dirs)
+        look = looks.get(shape.name, _Look(""))
+        if look.texture:
+            texture = _located(look.texture, urdf.path, package_dirs)
             if texture is None:
-                logger.warning("%s: texture %r is not there", urdf.path, textures[shape.name])
+                logger.warning("%s: texture %r is not there", urdf.path, look.texture)
             shape.meshTexturePath = "" if texture is None else str(texture)
-    return shapes
+        if look.mesh and look.link not in faults:
+            scale = [number for word in look.scale.split() if (number := _finite(word))]
+            try:
+                if len(scale) != len(look.scale.split()) or len(scale) != 3:
+                    raise FileError(f"mesh {look.mesh} has the scale {look.scale!r}: give three numbers other than 0")
+                put_mesh(shape, str(_located(look.mesh, urdf.path, package_dirs)), scale, read)
+            except FileError as error:
+                faults[look.link] = f"link {look.link!r}: {error}"
+    found = pin.GeometryModel()
+    for shape in with_own_meshes(shapes, read).geometryObjects:
+        if shape.name not in looks or looks[shape.name].link not in faults:
+            found.addGeometryObject(shape)
+    return found, faults
 
 
 def missing_meshes(urdf: Urdf, package_dirs: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -436,54 +448,52 @@ def _dynamics(root: ET.Element, massive: Collection[str]) -> ET.Element:
     return small
 
 
-def _looks(
-    urdf: Urdf, root: ET.Element, package_dirs: Sequence[str], only: str | None
-) -> tuple[ET.Element, dict[str, str]]:
-    """The part of a URDF for Pinocchio's shapes: joints, and links with their visuals; and the textures of shapes.
+@dataclass(frozen=True)
+class _Look:
+    """What Pinocchio does not read of a ``<visual>``: names of its mesh and texture, as in the file, or empty."""
 
-    Mesh paths are made absolute, as Pinocchio resolves relative ones against the working folder.
+    link: str
+    texture: str = ""
+    mesh: str = ""
+    scale: str = "1 1 1"
+
+
+def _looks(root: ET.Element) -> tuple[ET.Element, dict[str, _Look]]:
+    """The part of a URDF for Pinocchio's shapes: joints, and links with their visuals; and the rest by shape.
+
+    Spheres stand for the meshes, as coal's loader misreads some.
 
     Pinocchio ignores textures and shows a material without a colour in black. Such a material is left out, as is black
     beside a texture, which converters write for want of a colour: the mesh then keeps the colours of its file.
-
-    Args:
-        urdf: The file.
-        root: Its root element.
-        package_dirs: Folders in which ``package://`` paths are looked up.
-        only: Name of the only link with visuals; all links if None.
     """
     small = ET.Element("robot", {"name": root.get("name", "")})
     shared = {material.get("name"): material for material in root.findall("material")}
     small.extend(material for material in shared.values() if _has_color(material))
-    textures = {}
+    looks = {}
     for link in root.findall("link"):
         part = ET.SubElement(small, "link", _named(link))
-        for k, visual in enumerate(link.findall("visual") if only in (None, link.get("name")) else ()):
-            declared = visual.find("material")
+        for k, visual in enumerate(link.findall("visual")):
+            declared, mesh = visual.find("material"), visual.find("geometry/mesh")
             material = declared if declared is None or len(declared) else shared.get(declared.get("name"), declared)
             texture = None if material is None else material.find("texture")
-            if texture is not None and texture.get("filename"):
-                # The name that Pinocchio gives to the shape.
-                textures[f"{link.get('name')}_{k}"] = texture.get("filename", "")
             plain = ET.SubElement(part, "visual", visual.attrib)
-            plain.extend(
-                _with_absolute_paths(child, urdf, package_dirs)
-                for child in visual
-                if child is not declared or (material is not None and _has_color(material))
+            for child in visual:
+                if child is declared and not (material is not None and _has_color(material)):
+                    continue
+                if child.tag == "geometry" and mesh is not None:
+                    ET.SubElement(ET.SubElement(plain, "geometry"), "sphere", radius="1")
+                else:
+                    plain.append(child)
+            # The name that Pinocchio gives to the shape.
+            name = link.get("name", "")
+            looks[f"{name}_{k}"] = _Look(
+                name,
+                "" if texture is None else texture.get("filename", ""),
+                "" if mesh is None else mesh.get("filename", ""),
+                "1 1 1" if mesh is None else mesh.get("scale", "1 1 1"),
             )
     small.extend(root.findall("joint"))
-    return small, textures
-
-
-def _with_absolute_paths(part: ET.Element, urdf: Urdf, package_dirs: Sequence[str]) -> ET.Element:
-    """A part of a visual with absolute mesh paths."""
-    if part.find("mesh") is None:
-        return part
-    resolved = copy.deepcopy(part)
-    for mesh in resolved.iterfind("mesh"):
-        file = mesh.get("filename", "")
-        mesh.set("filename", str(_located(file, urdf.path, package_dirs) or file))
-    return resolved
+    return small, looks
 
 
 def _has_color(material: ET.Element) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,7 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Guard, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.model import Robot, build_robot, check_inertia
+from varpin.model import Robot, build_robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.additions import Base
 from varpin.model.inertia import fault, principal_moments
 from varpin.model.mimic import joint_index
@@ -33,6 +34,9 @@ CONDITION = 1e6
 # for an arm with all joints in one place.
 LENGTH_RATIO = 2.0
 LENGTH = 10.0
+# Plausible sizes of the largest mesh of a moving link, as multiples of the arm's reach: inches taken for metres are 39
+# times too large. Those of the robots of example-robot-data are 0.25 to 1.2.
+MESH_RATIOS = (0.01, 10.0)
 # Density of osmium, the densest element [kg/m^3].
 DENSITY = 22_600.0
 
@@ -93,6 +97,7 @@ def inspect_robot(
         *_mass_warnings(robot),
         *_inertia_warnings(robot, links),
         *_ratio_warnings(robot),
+        *_mesh_warnings(robot),
         *_matrix_warnings(robot, scaled),
         *_limit_warnings(joints, robot, None if q is None else configuration),
         *_mimic_warnings(robot, urdf, joints, tied=mimic == "tied"),
@@ -303,6 +308,24 @@ def _ratio_warnings(robot: Robot) -> Iterator[str]:
                     f"the {what} of neighbouring links {pair} differ by a factor of {heavy / light:.1g}: "
                     f"{values[parent]:.3g} and {values[body]:.3g} {unit}"
                 )
+
+
+def _mesh_warnings(robot: Robot) -> Iterator[str]:
+    sizes = {
+        shape: float(np.ptp(shape.geometry.vertices(), axis=0).max())
+        for shape in readable_geometry(robot)[0].geometryObjects
+        if shape.parentJoint and isinstance(shape.geometry, pin.coal.BVHModelBase)
+    }
+    reach = longest_reach(robot)
+    if not sizes or not 0.0 < reach < np.inf:
+        return
+    shape, size = max(sizes.items(), key=lambda own: own[1])
+    if not MESH_RATIOS[0] * reach <= size <= MESH_RATIOS[1] * reach:
+        name, link = Path(shape.meshPath).name or shape.name, robot.free_model.frames[shape.parentFrame].name
+        yield (
+            f"mesh {name!r} of link {link!r} is {size:.3g} m long, where the arm reaches {reach:.3g} m: if it is not "
+            "in metres, its scale= must make it so"
+        )
 
 
 def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
