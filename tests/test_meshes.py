@@ -275,36 +275,25 @@ def test_a_box_is_a_box_in_every_file(tmp_path, caplog, name):
     assert bool(naming(caplog.messages, "no_material.dae", "colours")) == (name == "no_material.dae")
 
 
-def test_parts_have_the_looks_of_their_materials(tmp_path):
-    effect = (
-        '<effect id="{0}e"><profile_COMMON><technique sid="t"><{1}><diffuse><color>{2} 1</color></diffuse>{3}</{1}>'
-        '</technique></profile_COMMON></effect><material id="{0}"><instance_effect url="#{0}e"/></material>'
-    )
-    transparent = '<transparent opaque="{}"><color>0.2 0.2 0.2 1</color></transparent><transparency><float>0.25</float>'
-    parts = [
-        effect.format("r", "lambert", "1 0 0", ""),
-        effect.format("b", "phong", "0 0 1", transparent.format("A_ONE") + "</transparency>"),
-    ]
-    pairs = [part.partition("<material") for part in parts]
-    library = (
-        f"<library_effects>{''.join(head for head, _, _ in pairs)}</library_effects>"
-        f"<library_materials>{''.join(mark + tail for _, mark, tail in pairs)}</library_materials>"
-    )
-    bound = "".join(
-        f'<instance_material symbol="{symbol}" target="#{name}"/>' for symbol, name in (("red", "r"), ("blue", "b"))
-    )
-    node = (
-        f'<instance_geometry url="#g"><bind_material><technique_common>{bound}</technique_common></bind_material>'
-        "</instance_geometry>"
-    )
+@pytest.mark.parametrize(("opaque", "opacity"), [("A_ONE", 0.25), ("RGB_ZERO", 0.95)])
+def test_parts_have_the_looks_of_their_materials(tmp_path, opaque, opacity):
+    clear = f'<transparent opaque="{opaque}"><color>0.2 0.2 0.2 1</color></transparent>'
+    clear += "<transparency><float>0.25</float></transparency>"
+    effects, materials, bound = "", "", ""
+    for name, kind, color, more in (("red", "lambert", "1 0 0", ""), ("blue", "phong", "0 0 1", clear)):
+        look = f"<{kind}><diffuse><color>{color} 1</color></diffuse>{more}</{kind}>"
+        effects += f'<effect id="{name}e"><profile_COMMON><technique>{look}</technique></profile_COMMON></effect>'
+        materials += f'<material id="{name}m"><instance_effect url="#{name}e"/></material>'
+        bound += f'<instance_material symbol="{name}" target="#{name}m"/>'
+    library = f"<library_effects>{effects}</library_effects><library_materials>{materials}</library_materials>"
+    node = NO_MATERIAL.replace('<instance_material symbol="red" target="#gone"/>', bound)
     path = tmp_path / "a.dae"
-    for opaque, opacity in (("A_ONE", 0.25), ("RGB_ZERO", 0.95)):
-        path.write_text(collada(primitives=HALVES, node=node, extra=library).replace("A_ONE", opaque))
-        red, blue = read_mesh(str(path))
-        np.testing.assert_allclose(red.color, [1.0, 0.0, 0.0, 1.0])
-        np.testing.assert_allclose(blue.color, [0.0, 0.0, 1.0, opacity])
-        assert red.shine["specular"] == (0.0, 0.0, 0.0)
-        assert "specular" not in blue.shine
+    path.write_text(collada(primitives=HALVES, node=node, extra=library))
+    red, blue = read_mesh(str(path))
+    np.testing.assert_allclose(red.color, [1.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(blue.color, [0.0, 0.0, 1.0, opacity])
+    assert red.shine["specular"] == (0.0, 0.0, 0.0)
+    assert "specular" not in blue.shine
 
 
 @pytest.mark.parametrize(

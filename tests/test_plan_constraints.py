@@ -977,7 +977,7 @@ def test_scene_files(tmp_path):
     path.write_text(SCENE, encoding="utf-8")
     loaded = vp.load_scene(path)
     assert loaded.required.terms["the plan keeps"] == (
-        "joint limits, velocity limits, control rate, reach frame, half space, box, outside sphere, clearance"
+        "velocity limits, control rate, reach frame, clearance, box, half space, outside sphere, joint limits"
     )
     assert loaded.required.terms["not modelled"].endswith("shapes are read only for replays and clearance")
     made = loaded.problem.constraints

@@ -328,26 +328,6 @@ def test_a_model_without_geometry_gets_a_skeleton(browser, tmp_path, caplog):
         assert any(np.allclose(pose[:3, 3], [joint + 0.5, 0.0, 0.0], atol=1e-6) for pose in poses.values())
 
 
-def test_a_missing_mesh_falls_back_with_a_warning_that_names_it(tmp_path, caplog):
-    urdf = tmp_path / "arm.urdf"
-    urdf.write_text(
-        """<robot name="arm">
-        <link name="base"/>
-        <link name="rod">
-          <inertial><mass value="1"/><origin xyz="0.5 0 0"/>
-            <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
-          <visual><geometry><mesh filename="no_such_mesh.stl"/></geometry></visual>
-        </link>
-        <joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/></joint>
-        </robot>"""
-    )
-    robot = vp.load_robot(urdf)
-    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
-        path = replay(robot, [[0.0], [1.0]], dt=0.1, html=tmp_path / "arm.html")
-    assert naming(caplog.messages, "no_such_mesh.stl", "skeleton")
-    assert any("skeleton" in command.get("path", "") for command in commands(path))
-
-
 def test_a_missing_mesh_costs_its_link_alone(tmp_path, caplog):
     """Of a box, an unreadable rod and a ball, the rod alone is drawn as a skeleton."""
 

@@ -62,7 +62,7 @@ def write(folder, text):
 
 def test_joints_that_stay(tmp_path):
     text = '[robot]\nsource = "ur5"\nkeep = ["elbow_joint", "wrist_1_joint"]\nlock = { shoulder_lift_joint = -1.0 }\n'
-    robot = vp.load_scene(write(tmp_path, text + "[horizon]\ndt = 1e-3\nsteps = 5\n"), required_only=False).robot
+    robot = vp.load_scene(write(tmp_path, text + "[horizon]\ndt = 1e-3\nsteps = 5\n")).robot
     assert robot.joint_names == ("elbow_joint", "wrist_1_joint")
     assert robot.locked["shoulder_lift_joint"] == -1.0
     wrong = write(tmp_path, text.replace("elbow_joint", "elbow") + "[horizon]\ndt = 1e-3\nsteps = 5\n")

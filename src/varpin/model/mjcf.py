@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.errors import MissingDependency, RobotError
 from varpin.model.equalities import Closure, End, Equality, Gear, rounded_plane
+from varpin.model.meshes import MeshPart, coal_shape
 from varpin.model.urdf import captured_stderr, read_xml
 
 coal = pin.coal
@@ -287,12 +288,7 @@ class _Walk:
                 corner, face = int(mesh.vertadr[0]), int(mesh.faceadr[0])
                 vertices = m.mesh_vert[corner : corner + int(mesh.vertnum[0])].astype(float)
                 faces = m.mesh_face[face : face + int(mesh.facenum[0])].astype(np.int64)
-                form = coal.BVHModelOBBRSS()
-                form.beginModel(len(faces), len(vertices))
-                form.addVertices(vertices)
-                form.addTriangles(faces)
-                form.endModel()
-                return form
+                return coal_shape([MeshPart(vertices, faces)])
         return None
 
     def _color(self, geom: int) -> Floats:

@@ -458,6 +458,31 @@ def build_robot(
     return _built(source, package_dirs, lock, keep, mimic, payload, xacro_args, srdf, base, armature, None)[0]
 
 
+def hold_joints(robot: Robot, positions: Mapping[str, ArrayLike]) -> Robot:
+    """A robot that is no combined one, with further joints locked at ``positions`` by name [rad or m].
+
+    Raises:
+        UnknownJoint: The robot has no such joint.
+        RobotError: No joint is left.
+    """
+    whole = Description(robot.name, robot.free_model, robot.ties, visuals=robot.visuals)
+    model, ties, visuals, locked = _lock(whole, positions)
+    followers = {tie.follower for tie in ties}
+    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
+    if not coordinates:
+        raise RobotError(f"robot {robot.name!r} has no joint left that moves")
+    return robot.changed(
+        model=tied_model(model, ties),
+        joint_names=tuple(model.names[joint] for joint in coordinates),
+        free_model=model,
+        ties=ties,
+        tree=flatten(model, ties, coordinates),
+        locked=MappingProxyType({**robot.locked, **locked}),
+        visuals=visuals,
+        loops=_open(robot.loops, model),
+    )
+
+
 def _built(
     source: object,
     package_dirs: Sequence[str | os.PathLike[str]] | None,
