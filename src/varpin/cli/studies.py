@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import logging
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.text import Text
@@ -15,16 +18,29 @@ from varpin.cli.console import progress_bar, say
 from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import folder_at
 from varpin.model import load_robot
-from varpin.study.tradeoff import advise, work_precision
+from varpin.study.advice import advise
+from varpin.study.precision import work_precision
+from varpin.study.record import Study, StudyInterrupted
 from varpin.support.tables import WIDTH, add_row, table_of
+
+if TYPE_CHECKING:
+    from varpin.study.extremes import Record
+
+# Terminal styles of the kinds of result.
+_STYLES = {
+    "accurate": "green",
+    "degraded": "yellow",
+    "refused": "cyan",
+    "stopped": "magenta",
+    "silent wrong": "bold white on red",
+}
 
 
 def add_tradeoff(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``varpin tradeoff``."""
     parser.description = (
         "Run a robot's motion with every integrator and many time steps. Print and write errors against an accurate "
-        "reference, and wall times. Runs recorded in the folder are not repeated, so that an interrupted "
-        "measurement continues where it stopped."
+        "reference, and wall times. Ctrl-C keeps the runs that are done."
     )
     parser.set_defaults(run=_tradeoff, log_level=logging.WARNING)
     add_robot(parser)
@@ -41,18 +57,16 @@ def add_tradeoff(parser: argparse.ArgumentParser) -> None:
         "--out",
         type=Path,
         metavar="FOLDER",
-        help="write a table (CSV), a figure (PNG), a page (HTML), the record (NPZ)",
+        help="write a table (CSV), a figure (PNG), a page (HTML)",
     )
     outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
 
 
 def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
-    from varpin.show.tradeoff_report import COLUMNS, cells, write_report  # noqa: PLC0415 - matplotlib is slow to import
-
     folder = None if request.out is None else folder_at(request.out)
     scene, q0, v0, torque = motion_of(request)
-    with request.interrupts.keeping(), progress_bar(errors, 1, quiet=request.quiet, unit="runs") as progress:
-        record = work_precision(
+    with _kept(request, errors) as study:
+        study.done = work_precision(
             scene,
             q0,
             v0,
@@ -60,20 +74,14 @@ def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
             duration=request.duration,
             dts=request.dt,
             repeats=request.repeats,
-            progress=progress,
-            save=None if folder is None else folder / "tradeoff.npz",
+            progress=study.progress,
         )
+    record = study.done
     title = f"{record.robot}: speed against accuracy over {record.duration:g} s"
-    files = [] if folder is None else [folder / "tradeoff.npz", *write_report(folder, record, title)]
-    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    console = _console()
     if not request.quiet:
-        table, front = table_of(title, COLUMNS), record.pareto()
-        for run in record.runs:
-            add_row(table, *cells(record, run, run in front), style="bold" if run in front else "")
-        console.print(table)
-        say(console, f"errors are against {record.reference}, accurate to {record.reference_error:.1e}", prefix="")
-        for path in files:
-            say(console, str(path), prefix="written")
+        _print_table(console, record, title)
+    _write(console, folder, "tradeoff", record, title, quiet=request.quiet)
     return INTERRUPTED if record.missing else 0
 
 
@@ -93,13 +101,12 @@ def add_advise(parser: argparse.ArgumentParser) -> None:
     )
     add_motion(parser)
     outputs = parser.add_argument_group("outputs")
-    outputs.add_argument("--out", type=Path, metavar="FOLDER", help="write advice.png and advice.html there")
+    outputs.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="write a table (CSV), a figure (PNG), a page (HTML)"
+    )
 
 
 def _advise(request: argparse.Namespace, _errors: Console) -> int:
-    from varpin.show.tradeoff_report import write_advice  # noqa: PLC0415 - as above
-    from varpin.study.tradeoff.advice import COLUMNS  # noqa: PLC0415
-
     folder = None if request.out is None else folder_at(request.out)
     scene, q0, v0, torque = motion_of(request)
     advice = advise(
@@ -111,20 +118,15 @@ def _advise(request: argparse.Namespace, _errors: Console) -> int:
         tolerance=request.tolerance,
         budget=request.budget,
     )
-    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-    for line in advice.reason.splitlines():
+    console = _console()
+    for line in advice.notes:
         say(console, line, prefix="")
     say(console, simulate_words(request, advice.integrator, advice.dt, advice.steps), prefix="run it")
-    table = table_of("The best of each method", COLUMNS)
-    for choice in (advice.best, *advice.alternatives):
-        add_row(table, *choice.cells())
-    console.print(table)
+    _print_table(console, advice, "The best of each method", notes=())
     say(console, f"(found in {advice.calibration:.2g} s)", prefix="")
-    if folder is not None:
-        goal = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"
-        title = f"{scene.robot.name}: an integrator for {request.duration:g} s and {goal}"
-        for path in write_advice(folder, advice, title):
-            say(console, str(path), prefix="written")
+    goal = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"
+    title = f"{scene.robot.name}: an integrator for {request.duration:g} s and {goal}"
+    _write(console, folder, "advice", advice, title)
     return 0 if advice.reached else STEP_FAILED
 
 
@@ -138,41 +140,93 @@ def add_extremes(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_extremes, log_level=logging.CRITICAL)
     add_robot(parser)
     parser.add_argument("--deep", action="store_true", help="give each motion 15 minutes of work instead of 20 s")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="write the record (JSON) and a heat map (HTML)")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="write a table (CSV) and a heat map (HTML)")
     parser.add_argument("--quiet", action="store_true", help="print nothing but what is silent wrong")
 
 
 def _extremes(request: argparse.Namespace, errors: Console) -> int:
-    from varpin.show import extremes_report as report  # noqa: PLC0415 - most commands do not need it
-    from varpin.study.extremes import Kind, check_robot  # noqa: PLC0415
+    from varpin.study.extremes import Kind, check_robot  # noqa: PLC0415 - most commands do not need it
 
     robot = load_robot(request.robot, **robot_options(request))
     folder = None if request.out is None else folder_at(request.out)
-    with request.interrupts.keeping(), progress_bar(errors, 1, quiet=request.quiet, unit="cells") as progress:
-        record = check_robot(
-            robot,
-            patience=900.0 if request.deep else 20.0,
-            progress=lambda done, cells, _: progress(done, cells),
-        )
-    if folder is not None:
-        record.save(folder / "extremes.json")
-    files = [] if folder is None else [folder / "extremes.json", report.write_page(folder / "extremes.html", record)]
-    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+    with _kept(request, errors) as study:
+        study.done = check_robot(robot, patience=900.0 if request.deep else 20.0, progress=study.progress)
+    record, console = study.done, _console()
     if not request.quiet:
-        columns, rows = report.grid(record)
-        table = table_of(f"{record.robot} at the extremes", ("motion", *columns))
-        for name, cells in rows.items():
-            entries = (cells.get(column) for column in columns)
-            table.add_row(
-                Text(name), *(Text(report.entry(c), style=report.STYLES[c.kind]) if c else Text("") for c in entries)
-            )
-        console.print(table)
-        for kind, count in record.counts().items():
-            say(console, f"{count} {kind.value}", prefix=report.LETTERS[kind])
-        for path in files:
-            say(console, str(path), prefix="written")
+        _print_kinds(console, record)
+    _write(console, folder, "extremes", record, f"{record.robot} at the extremes", quiet=request.quiet)
     for cell in record.wrong():
         say(console, f"{cell.trial}, {cell.integrator}: {'; '.join(cell.found)}", prefix=Kind.WRONG.value, style="red")
     if record.missing:
         return INTERRUPTED
     return FAULTY if record.wrong() else 0
+
+
+class _Kept:
+    """A study that a command measures.
+
+    Attributes:
+        done: Its result, also after Ctrl-C.
+        progress: Its callback.
+    """
+
+    done: Any
+    progress: Callable[[int, int], None]
+
+
+@contextlib.contextmanager
+def _kept(request: argparse.Namespace, errors: Console) -> Iterator[_Kept]:
+    """A block that sets ``done``, with a progress bar; Ctrl-C sets it to what there is."""
+    study = _Kept()
+    with request.interrupts.keeping(), progress_bar(errors, 1, quiet=request.quiet, unit="runs") as study.progress:
+        try:
+            yield study
+        except StudyInterrupted as stop:
+            study.done = stop.record
+            say(errors, f"interrupted: {len(study.done.runs)} runs are kept, {study.done.missing} are missing")
+
+
+def _console() -> Console:
+    return Console() if sys.stdout.isatty() else Console(width=WIDTH)
+
+
+def _print_table(console: Console, study: Study[Any], title: str, notes: Sequence[str] | None = None) -> None:
+    """The runs, those that nothing beats in bold, and what is to be known of them."""
+    table, front = table_of(title, study.columns()), study.pareto()
+    for run in study.runs:
+        add_row(table, *study.cells(run), style="bold" if run in front else "")
+    console.print(table)
+    for note in study.notes if notes is None else notes:
+        say(console, note, prefix="")
+
+
+def _print_kinds(console: Console, record: Record) -> None:
+    """A letter for each motion and integrator, and how many of each letter an integrator has."""
+    from varpin.show.study_report import MEANING, grid  # noqa: PLC0415 - as above
+
+    columns, rows = grid(record)
+    table = table_of(f"{record.robot} at the extremes", ("motion", *(str(k + 1) for k in range(len(columns)))))
+    for name, cells in rows.items():
+        letters = (Text(str(cell)[0], style=_STYLES[cell.kind.value]) if cell else Text("") for cell in cells)
+        table.add_row(Text(name), *letters)
+    console.print(table)
+    kinds = table_of("", ("", "integrator", *(kind.value for kind in MEANING)))
+    for k, name in enumerate(columns):
+        counts = (sum(cell.kind is kind for cell in record.runs if cell.integrator == name) for kind in MEANING)
+        add_row(kinds, str(k + 1), name, *map(str, counts))
+    console.print(kinds)
+    for kind, meaning in MEANING.items():
+        say(console, f"{record.counts()[kind]} {kind.value}: {meaning}", prefix=kind.value[0].upper())
+
+
+def _write(
+    console: Console, folder: Path | None, name: str, study: Study[Any], title: str, *, quiet: bool = False
+) -> None:
+    """Write the files of a study, if there is a folder, and say so."""
+    if folder is None:
+        return
+    from varpin.show.study_report import write_report  # noqa: PLC0415 - matplotlib is slow to import
+
+    for path in write_report(folder, name, study, title):
+        if not quiet:
+            say(console, str(path), prefix="written")

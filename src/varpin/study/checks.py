@@ -19,11 +19,26 @@ from varpin.linearization import linearize
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.simulation.simulate import simulate
-from varpin.study.extremes.exact import SHORTEST, Exact
-from varpin.study.extremes.record import CONSERVED_MOMENTUM, LEVELS
-from varpin.study.extremes.units import velocity_change
+from varpin.study.exact import SHORTEST, Exact, velocity_change
 from varpin.trajectory import Trajectory
 
+# The measures of a motion, and the value from which on each of them is wrong. Accuracy in units of the motion itself:
+# of q shares of the largest travel and of each joint's, of v of each joint's largest, with a larger level, for a small
+# shift in time changes a peak of the velocity by much; of the energy a share of what is turned over. Structure in units
+# of rounding, with a margin for ill-conditioned mass matrices.
+LEVELS = {
+    "error": 0.05,
+    "joint": 0.1,
+    "velocity": 0.25,
+    "period": 1.0,
+    "energy": 0.1,
+    "momentum": 0.1,
+    "reversal": 1e-4,
+    "symplecticity": 1e-7,
+    "record": 1e-6,
+}
+# The level of the momentum where the method conserves it by construction.
+CONSERVED_MOMENTUM = 1e-6
 # Steps from rest of which half a step is much.
 _STARTING = 4
 # Rounding of a sum of a hundred terms at most, in units of its largest one.
@@ -186,7 +201,7 @@ def finite(trajectory: Trajectory) -> bool:
 
 
 def measures(scene: Scene, integrator: Integrator, trajectory: Trajectory, exact: Exact | None) -> dict[str, float]:
-    """Every check of a motion by its name in :class:`Cell`."""
+    """Every check of a motion by its name in :data:`LEVELS`."""
     if (
         exact is not None
         and exact.cut
