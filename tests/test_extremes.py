@@ -471,6 +471,15 @@ def test_check_robot_agrees_with_the_battery(load, hasty):
         assert mine.kind is Kind.STOPPED or not math.isnan(mine.error)
 
 
+def test_rest_and_torques_that_change_their_sign_are_not_wrong(load, monkeypatch):
+    """Momenta below the smallest normal number have no digits; explicit steps move by the velocity before the force."""
+    monkeypatch.setattr(robot_checks, "motions_of", few({"dampers, h d / I = 10", "+-10 times its weight"}))
+    damped, _, _, flipped = vp.check_robot(load("finger"), integrators=[vp.Radau(4), vp.ExplicitEuler()]).runs
+    assert damped.kind is flipped.kind is Kind.ACCURATE
+    assert damped.record < 1e-9
+    assert flipped.energy < 1e-3
+
+
 def test_check_robot_keeps_what_was_done(load):
     def interrupt(done, cells):
         if done == 2:

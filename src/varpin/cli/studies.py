@@ -193,8 +193,9 @@ def _console() -> Console:
 def _print_table(console: Console, study: Study[Any], title: str, notes: Sequence[str] | None = None) -> None:
     """The runs, those that nothing beats in bold, and what is to be known of them."""
     table, front = table_of(title, study.columns()), study.pareto()
+    table.columns[0].no_wrap = True
     for run in study.runs:
-        add_row(table, *study.cells(run), style="bold" if run in front else "")
+        add_row(table, *study.row(run), style="bold" if run in front else "")
     console.print(table)
     for note in study.notes if notes is None else notes:
         say(console, note, prefix="")
@@ -207,7 +208,7 @@ def _print_kinds(console: Console, record: Record) -> None:
     columns, rows = grid(record)
     table = table_of(f"{record.robot} at the extremes", ("motion", *(str(k + 1) for k in range(len(columns)))))
     for name, cells in rows.items():
-        letters = (Text(str(cell)[0], style=_STYLES[cell.kind.value]) if cell else Text("") for cell in cells)
+        letters = (Text(cell.kind.letter, style=_STYLES[cell.kind.value]) if cell else Text("") for cell in cells)
         table.add_row(Text(name), *letters)
     console.print(table)
     kinds = table_of("", ("", "integrator", *(kind.value for kind in MEANING)))
@@ -216,7 +217,7 @@ def _print_kinds(console: Console, record: Record) -> None:
         add_row(kinds, str(k + 1), name, *map(str, counts))
     console.print(kinds)
     for kind, meaning in MEANING.items():
-        say(console, f"{record.counts()[kind]} {kind.value}: {meaning}", prefix=kind.value[0].upper())
+        say(console, f"{record.counts()[kind]} {kind.value}: {meaning}", prefix=kind.letter)
 
 
 def _write(

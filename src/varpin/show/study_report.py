@@ -34,6 +34,7 @@ MEANING = {
 _PALER = (1e-6, 1e-2)
 _STYLE = """
 tr.front { background: #dff2e1; }
+body:has(.map) { max-width: 88rem; }
 .map { font-size: 0.78rem; }
 .map td { border: 1px solid #fff; padding: 0.15rem 0.4rem; white-space: nowrap; }
 .accurate0 { background: #6fc3a4; } .accurate1 { background: #9ad5bf; } .accurate2 { background: #c4e7da; }
@@ -81,7 +82,7 @@ def _image(study: Study[Any]) -> bytes:
 def _table(study: Study[Any]) -> str:
     front = study.pareto()
     head = "".join(f"<th>{html.escape(name)}</th>" for name in study.columns())
-    rows = "".join(_row(study.cells(run), marked=run in front) for run in study.runs)
+    rows = "".join(_row(study.row(run), marked=run in front) for run in study.runs)
     failures = [
         f"{run.integrator}, dt = {run.dt:g} s: {run.failure}" for run in study.runs if getattr(run, "failure", "")
     ]
@@ -100,7 +101,7 @@ def _map(record: Record) -> str:
     """Motions by integrators, in colours."""
     counts = record.counts()
     legend = "".join(
-        f'<tr><td class="{_class(kind, math.nan)}">{kind.value[0].upper()}</td><td>{counts[kind]}</td>'
+        f'<tr><td class="{_class(kind, math.nan)}">{kind.letter}</td><td>{counts[kind]}</td>'
         f'<td class="text">{kind.value}: {text}</td></tr>'
         for kind, text in MEANING.items()
     )

@@ -92,7 +92,7 @@ class Advice(Study[Choice]):
 
     def note(self, run: Choice) -> str:
         """Whether a choice was measured."""
-        return "" if run.measured else "by order"
+        return "" if run.measured else "extrapolated"
 
     def pareto(self) -> tuple[Choice, ...]:
         """The choice, if it meets the wish."""

@@ -67,7 +67,9 @@ def energy_error(scene: Scene, trajectory: Trajectory) -> float:
         return math.nan
     kinetic = 0.5 * np.einsum("ki,ki->k", trajectory.p, trajectory.v)
     force = trajectory.u @ scene.actuation.T
-    work = np.append(0.0, np.cumsum(np.einsum("ki,ki->k", force, np.diff(trajectory.q, axis=0))))
+    # By mean velocities: an explicit step moves q by the velocity before its force has acted.
+    way = 0.5 * trajectory.dt * (trajectory.v[1:] + trajectory.v[:-1])
+    work = np.append(0.0, np.cumsum(np.einsum("ki,ki->k", force, way)))
     off = trajectory.energy - trajectory.energy[0] - work
     off = np.maximum(off, 0.0) if scene.dissipates else np.abs(off)
     some = trajectory.q[_spread(trajectory.steps, _FEW_NODES)]
@@ -172,8 +174,8 @@ def record_error(scene: Scene, trajectory: Trajectory) -> float:
         speed = np.abs(v).sum()
         sums = np.append(np.full(len(v), speed), speed**2)
         rounding = _ROUNDING * np.diag(mass).max() * sums + _of_last_bits(scene, q, v)
-        # What overflows on the way there is not comparable.
-        known = (units > 0.0) & np.isfinite(units) & np.isfinite(rounding)
+        # What overflows on the way there, or is at rest to the last bit, is not comparable.
+        known = (units > np.finfo(np.float64).tiny) & np.isfinite(units) & np.isfinite(rounding)
         off = np.maximum(off - rounding, 0.0)
         shares = off[known] / units[known]
         worst = max(worst, float(np.nan_to_num(shares, nan=np.inf).max(initial=0.0)))

@@ -54,6 +54,11 @@ class Kind(Enum):
     STOPPED = "stopped"
     WRONG = "silent wrong"
 
+    @property
+    def letter(self) -> str:
+        """Its letter in tables."""
+        return "W" if self is Kind.WRONG else self.value[0].upper()
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -109,11 +114,13 @@ class Cell:
     def __str__(self) -> str:
         """The kind's letter with the error, or E with that of the energy where no exact motion is known; the steps."""
         known = self.error if not math.isnan(self.error) else self.energy
-        error = "" if math.isnan(known) else f" {'E ' if math.isnan(self.error) else ''}{known:.0e}"
+        error = (
+            "" if math.isnan(known) else f" {'E ' if math.isnan(self.error) else ''}{f'{known:.0e}' if known else 0}"
+        )
         if self.kind in (Kind.REFUSED, Kind.STOPPED):
             error = ""
         steps = "" if self.done == self.steps or self.kind is Kind.REFUSED else f" {self.done}/{self.steps}"
-        return self.kind.value[0].upper() + error + steps
+        return self.kind.letter + error + steps
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -128,7 +135,9 @@ class Record(Study[Cell]):
         "trial": "motion",
         "kind": "result",
         "error": "error / travel",
-        "energy": "E error / turnover",
+        "joint": "error / joint's travel",
+        "velocity": "error / joint's speed",
+        "energy": "energy error / turnover",
     }
     shown: ClassVar = ("trial", "integrator", "kind", "error", "energy")
 

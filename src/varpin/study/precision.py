@@ -109,8 +109,8 @@ class WorkPrecision(Study[WorkPrecisionRun]):
         """What a reader of the table has to know."""
         return (
             f"{self.duration:g} s of motion; wall times on one thread",
-            f"errors in q: the largest over joints and {self.samples} times, against {self.reference}, which is "
-            f"accurate to {self.reference_error:.1e}; smaller ones show as <",
+            f"errors in q: the largest over joints and {self.samples} instant{'s' * (self.samples > 1)}, against "
+            f"{self.reference}, which is accurate to {self.reference_error:.1e}; smaller ones show as <",
             "Pareto: no other run has both a smaller time and a smaller error",
         )
 
@@ -119,10 +119,10 @@ class WorkPrecision(Study[WorkPrecisionRun]):
         marks = ["failed"] if run.failure else ["Pareto"] if run in self.pareto() else []
         return "; ".join([*marks, *([f"{run.split_steps} split"] if run.split_steps else [])])
 
-    def cells(self, run: WorkPrecisionRun) -> tuple[str, ...]:
+    def row(self, run: WorkPrecisionRun) -> tuple[str, ...]:
         """A run as entries of the columns that screens show."""
-        texts = dict(zip((*self.shown, "note"), super().cells(run), strict=True))
-        if self.at_floor(run):
+        texts = dict(zip((*self.shown, "note"), super().row(run), strict=True))
+        if self.at_floor(run) and self.reference_error > 0.0:
             texts["error"] = f"<{self.reference_error:.3g}"
         return tuple(texts.values())
 

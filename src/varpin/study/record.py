@@ -78,14 +78,14 @@ class Study(Generic[Row]):
         """The headings of the columns that screens show."""
         return (*map(self._heading, self.shown), "note")
 
-    def cells(self, run: Row) -> tuple[str, ...]:
+    def row(self, run: Row) -> tuple[str, ...]:
         """A run as entries of these columns."""
         return (*(_text(getattr(run, name)) for name in self.shown), self.note(run))
 
     def _repr_html_(self) -> str:
         front = self.pareto()
         strong = [k for k, run in enumerate(self.runs) if run in front]
-        table = markup.table(self.columns(), map(self.cells, self.runs), strong)
+        table = markup.table(self.columns(), map(self.row, self.runs), strong)
         return markup.facts(repr(self), [("", note) for note in self.notes], table)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
