@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import logging
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from rich.console import Console
-from rich.text import Text
 
 from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options, simulate_words
 from varpin.cli.console import progress_bar, say
@@ -20,20 +18,13 @@ from varpin.cli.outputs import folder_at
 from varpin.model import load_robot
 from varpin.study.advice import advise
 from varpin.study.precision import work_precision
-from varpin.study.record import Study, StudyInterrupted
+from varpin.study.record import Progress, Study, StudyInterrupted
 from varpin.support.tables import WIDTH, add_row, table_of
 
 if TYPE_CHECKING:
     from varpin.study.extremes import Record
 
-# Terminal styles of the kinds of result.
-_STYLES = {
-    "accurate": "green",
-    "degraded": "yellow",
-    "refused": "cyan",
-    "stopped": "magenta",
-    "silent wrong": "bold white on red",
-}
+Made = TypeVar("Made", bound=Study[Any])
 
 
 def add_tradeoff(parser: argparse.ArgumentParser) -> None:
@@ -44,43 +35,25 @@ def add_tradeoff(parser: argparse.ArgumentParser) -> None:
     )
     parser.set_defaults(run=_tradeoff, log_level=logging.WARNING)
     add_robot(parser)
-    parser.add_argument(
-        "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
-    )
+    _add_duration(parser)
     parser.add_argument("--dt", type=float, nargs="+", metavar="S", help="time steps [s]; default: 0.04 and its halves")
     parser.add_argument(
         "--repeats", type=int, default=3, metavar="N", help="repetitions of each run; default: %(default)d"
     )
     add_motion(parser)
-    outputs = parser.add_argument_group("outputs")
-    outputs.add_argument(
-        "--out",
-        type=Path,
-        metavar="FOLDER",
-        help="write a table (CSV), a figure (PNG), a page (HTML)",
-    )
-    outputs.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+    _add_outputs(parser)
 
 
 def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
-    folder = None if request.out is None else folder_at(request.out)
+    folder = _folder(request)
     scene, q0, v0, torque = motion_of(request)
-    with _kept(request, errors) as study:
-        study.done = work_precision(
-            scene,
-            q0,
-            v0,
-            controls=torque,
-            duration=request.duration,
-            dts=request.dt,
-            repeats=request.repeats,
-            progress=study.progress,
-        )
-    record = study.done
-    title = f"{record.robot}: speed against accuracy over {record.duration:g} s"
-    console = _console()
+    options = {"controls": torque, "duration": request.duration, "dts": request.dt, "repeats": request.repeats}
+    record = _kept(request, errors, lambda progress: work_precision(scene, q0, v0, progress=progress, **options))
+    title, console = f"{record.robot}: speed against accuracy over {record.duration:g} s", _console()
     if not request.quiet:
         _print_table(console, record, title)
+        for note in record.notes:
+            say(console, note, prefix="")
     _write(console, folder, "tradeoff", record, title, quiet=request.quiet)
     return INTERRUPTED if record.missing else 0
 
@@ -96,37 +69,24 @@ def add_advise(parser: argparse.ArgumentParser) -> None:
     goal = parser.add_mutually_exclusive_group(required=True)
     goal.add_argument("--tolerance", type=float, metavar="E", help="largest allowed error in q [rad or m]")
     goal.add_argument("--budget", type=float, metavar="S", help="largest allowed wall time [s]")
-    parser.add_argument(
-        "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
-    )
+    _add_duration(parser)
     add_motion(parser)
-    outputs = parser.add_argument_group("outputs")
-    outputs.add_argument(
-        "--out", type=Path, metavar="FOLDER", help="write a table (CSV), a figure (PNG), a page (HTML)"
-    )
+    _add_outputs(parser, quiet=None)
 
 
 def _advise(request: argparse.Namespace, _errors: Console) -> int:
-    folder = None if request.out is None else folder_at(request.out)
+    folder = _folder(request)
     scene, q0, v0, torque = motion_of(request)
-    advice = advise(
-        scene,
-        q0,
-        v0,
-        controls=torque,
-        duration=request.duration,
-        tolerance=request.tolerance,
-        budget=request.budget,
-    )
+    options = {"controls": torque, "tolerance": request.tolerance, "budget": request.budget}
+    advice = advise(scene, q0, v0, duration=request.duration, **options)
     console = _console()
-    for line in advice.notes:
-        say(console, line, prefix="")
+    for note in advice.notes:
+        say(console, note, prefix="")
     say(console, simulate_words(request, advice.integrator, advice.dt, advice.steps), prefix="run it")
-    _print_table(console, advice, "The best of each method", notes=())
+    _print_table(console, advice, "The best of each method")
     say(console, f"(found in {advice.calibration:.2g} s)", prefix="")
     goal = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"
-    title = f"{scene.robot.name}: an integrator for {request.duration:g} s and {goal}"
-    _write(console, folder, "advice", advice, title)
+    _write(console, folder, "advice", advice, f"{advice.robot}: an integrator for {request.duration:g} s and {goal}")
     return 0 if advice.reached else STEP_FAILED
 
 
@@ -135,23 +95,21 @@ def add_extremes(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Run difficult motions of a robot with every integrator, and judge each by independent checks: accurate; "
         "degraded with a warning; refused; stopped; or silent wrong, which is a bug of varpin. Exit status 1 if "
-        "anything is silent wrong."
+        "anything is silent wrong. It takes some minutes; Ctrl-C keeps the runs that are done."
     )
     parser.set_defaults(run=_extremes, log_level=logging.CRITICAL)
     add_robot(parser)
     parser.add_argument("--deep", action="store_true", help="give each motion 15 minutes of work instead of 20 s")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="write a table (CSV) and a heat map (HTML)")
-    parser.add_argument("--quiet", action="store_true", help="print nothing but what is silent wrong")
+    _add_outputs(parser, quiet="print nothing but what is silent wrong")
 
 
 def _extremes(request: argparse.Namespace, errors: Console) -> int:
     from varpin.study.extremes import Kind, check_robot  # noqa: PLC0415 - most commands do not need it
 
     robot = load_robot(request.robot, **robot_options(request))
-    folder = None if request.out is None else folder_at(request.out)
-    with _kept(request, errors) as study:
-        study.done = check_robot(robot, patience=900.0 if request.deep else 20.0, progress=study.progress)
-    record, console = study.done, _console()
+    folder, patience = _folder(request), 900.0 if request.deep else 20.0
+    record = _kept(request, errors, lambda progress: check_robot(robot, patience=patience, progress=progress))
+    console = _console()
     if not request.quiet:
         _print_kinds(console, record)
     _write(console, folder, "extremes", record, f"{record.robot} at the extremes", quiet=request.quiet)
@@ -162,60 +120,60 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
     return FAULTY if record.wrong() else 0
 
 
-class _Kept:
-    """A study that a command measures.
-
-    Attributes:
-        done: Its result, also after Ctrl-C.
-        progress: Its callback.
-    """
-
-    done: Any
-    progress: Callable[[int, int], None]
+def _add_duration(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--duration", type=float, default=1.0, metavar="S", help="of the motion [s]; default: %(default)g"
+    )
 
 
-@contextlib.contextmanager
-def _kept(request: argparse.Namespace, errors: Console) -> Iterator[_Kept]:
-    """A block that sets ``done``, with a progress bar; Ctrl-C sets it to what there is."""
-    study = _Kept()
-    with request.interrupts.keeping(), progress_bar(errors, 1, quiet=request.quiet, unit="runs") as study.progress:
+def _add_outputs(parser: argparse.ArgumentParser, quiet: str | None = "print warnings and errors only") -> None:
+    outputs = parser.add_argument_group("outputs")
+    outputs.add_argument("--out", type=Path, metavar="FOLDER", help="write a table (CSV), a figure and a page (HTML)")
+    if quiet is not None:
+        outputs.add_argument("--quiet", action="store_true", help=quiet)
+
+
+def _folder(request: argparse.Namespace) -> Path | None:
+    return None if request.out is None else folder_at(request.out)
+
+
+def _kept(request: argparse.Namespace, errors: Console, study: Callable[[Progress], Made]) -> Made:
+    """A study with a progress bar; after Ctrl-C what there is of it."""
+    with request.interrupts.keeping(), progress_bar(errors, 1, quiet=request.quiet, unit="runs") as progress:
         try:
-            yield study
+            return study(progress)
         except StudyInterrupted as stop:
-            study.done = stop.record
-            say(errors, f"interrupted: {len(study.done.runs)} runs are kept, {study.done.missing} are missing")
+            say(errors, f"interrupted: {len(stop.record.runs)} runs are kept, {stop.record.missing} are missing")
+            return cast("Made", stop.record)
 
 
 def _console() -> Console:
     return Console() if sys.stdout.isatty() else Console(width=WIDTH)
 
 
-def _print_table(console: Console, study: Study[Any], title: str, notes: Sequence[str] | None = None) -> None:
-    """The runs, those that nothing beats in bold, and what is to be known of them."""
+def _print_table(console: Console, study: Study[Any], title: str) -> None:
+    """The runs, those that nothing beats in bold."""
     table, front = table_of(title, study.columns()), study.pareto()
     table.columns[0].no_wrap = True
     for run in study.runs:
         add_row(table, *study.row(run), style="bold" if run in front else "")
     console.print(table)
-    for note in study.notes if notes is None else notes:
-        say(console, note, prefix="")
 
 
 def _print_kinds(console: Console, record: Record) -> None:
     """A letter for each motion and integrator, and how many of each letter an integrator has."""
-    from varpin.show.study_report import MEANING, grid  # noqa: PLC0415 - as above
+    from varpin.show.study_report import MEANING, grid  # noqa: PLC0415 - matplotlib is slow to import
 
-    columns, rows = grid(record)
-    table = table_of(f"{record.robot} at the extremes", ("motion", *(str(k + 1) for k in range(len(columns)))))
+    names, rows = grid(record)
+    letters = table_of(f"{record.robot} at the extremes", ("motion", *(str(k + 1) for k in range(len(names)))))
     for name, cells in rows.items():
-        letters = (Text(cell.kind.letter, style=_STYLES[cell.kind.value]) if cell else Text("") for cell in cells)
-        table.add_row(Text(name), *letters)
-    console.print(table)
-    kinds = table_of("", ("", "integrator", *(kind.value for kind in MEANING)))
-    for k, name in enumerate(columns):
-        counts = (sum(cell.kind is kind for cell in record.runs if cell.integrator == name) for kind in MEANING)
-        add_row(kinds, str(k + 1), name, *map(str, counts))
-    console.print(kinds)
+        add_row(letters, name, *(cell.kind.letter if cell else "" for cell in cells))
+    counts = table_of("", ("", "integrator", *(kind.value for kind in MEANING)))
+    for k, name in enumerate(names):
+        own = [cell.kind for cell in record.runs if cell.integrator == name]
+        add_row(counts, str(k + 1), name, *(str(own.count(kind)) for kind in MEANING))
+    console.print(letters)
+    console.print(counts)
     for kind, meaning in MEANING.items():
         say(console, f"{record.counts()[kind]} {kind.value}: {meaning}", prefix=kind.letter)
 
@@ -223,7 +181,7 @@ def _print_kinds(console: Console, record: Record) -> None:
 def _write(
     console: Console, folder: Path | None, name: str, study: Study[Any], title: str, *, quiet: bool = False
 ) -> None:
-    """Write the files of a study, if there is a folder, and say so."""
+    """Write the files of a study if there is a folder."""
     if folder is None:
         return
     from varpin.show.study_report import write_report  # noqa: PLC0415 - matplotlib is slow to import
