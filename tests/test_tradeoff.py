@@ -209,6 +209,8 @@ def test_members_that_fail_do_not_stop_the_others():
     assert sound.survived
     assert record.pareto() == (sound,)
     assert "2 failed" in repr(record)
+    assert record.failures[1].endswith(", dt = 0.001 s: ZeroDivisionError: on purpose")
+    assert record.failures[0].startswith("ExplicitEuler, dt = 0.001 s: step ")
 
 
 def test_interrupted_studies_hold_the_runs_that_are_done(problem):

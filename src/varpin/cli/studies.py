@@ -52,7 +52,7 @@ def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
     title, console = f"{record.robot}: speed against accuracy over {record.duration:g} s", _console()
     if not request.quiet:
         _print_table(console, record, title)
-        for note in record.notes:
+        for note in (*record.notes, *record.failures):
             say(console, note, prefix="")
     _write(console, folder, "tradeoff", record, title, quiet=request.quiet)
     return INTERRUPTED if record.missing else 0

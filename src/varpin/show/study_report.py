@@ -55,7 +55,7 @@ def write_report(folder: Path, name: str, study: Study[Any], title: str) -> list
     files = {table: b"", figure: _image(study), document: b""}
     study.to_csv(table)
     missing = (f"an interruption left out {study.missing} runs",) if study.missing else ()
-    notes = [*study.notes, *missing, f"measured with varpin {__version__}"]
+    notes = [*study.notes, *study.failures, *missing, f"measured with varpin {__version__}"]
     body = f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in notes)}</ul>"
     if files[figure]:
         body += picture(files[figure], title)
@@ -83,10 +83,7 @@ def _table(study: Study[Any]) -> str:
     front = study.pareto()
     head = "".join(f"<th>{html.escape(name)}</th>" for name in study.columns())
     rows = "".join(_row(study.row(run), marked=run in front) for run in study.runs)
-    failures = [
-        f"{run.integrator}, dt = {run.dt:g} s: {run.failure}" for run in study.runs if getattr(run, "failure", "")
-    ]
-    return f"<table><tr>{head}</tr>{rows}</table>" + "".join(f"<p>{html.escape(text)}</p>" for text in failures)
+    return f"<table><tr>{head}</tr>{rows}</table>"
 
 
 def _row(entries: tuple[str, ...], *, marked: bool) -> str:

@@ -118,8 +118,8 @@ class Setting(Frozen):
             (segment,) = integrator.rollout(scene, state, commands, np.zeros((0, 0, 0)), dt)
             parts.append(segment)
             if segment.failure is not None:
-                done += len(segment.q)  # noqa: PLW2901 - the loop ends here
-                failure = f"step {done} of {steps} (t = {done * dt:.4g} s): {segment.failure.reason}"
+                step = done + len(segment.q)
+                failure = f"step {step} of {steps} (t = {step * dt:.4g} s): {segment.failure.reason}"
                 break
         seconds = time.perf_counter() - begin
         return (trajectory_of(scene, integrator, dt, first, parts, None, None), failure), seconds

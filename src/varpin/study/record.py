@@ -58,8 +58,13 @@ class Study(Generic[Row]):
     @property
     def summary(self) -> str:
         """The result in a few words."""
-        lost = sum(bool(getattr(run, "failure", "")) for run in self.runs)
-        return f"{len(self.runs)} runs" + (f", {lost} failed" if lost else "")
+        return f"{len(self.runs)} runs" + (f", {len(self.failures)} failed" if self.failures else "")
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Why runs failed, each in a sentence."""
+        runs: tuple[Any, ...] = self.runs
+        return tuple(f"{r.integrator}, dt = {r.dt:g} s: {r.failure}" for r in runs if getattr(r, "failure", ""))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -86,7 +91,7 @@ class Study(Generic[Row]):
         front = self.pareto()
         strong = [k for k, run in enumerate(self.runs) if run in front]
         table = markup.table(self.columns(), map(self.row, self.runs), strong)
-        return markup.facts(repr(self), [("", note) for note in self.notes], table)
+        return markup.facts(repr(self), [("", note) for note in (*self.notes, *self.failures)], table)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write all columns of the runs as CSV, with units in the heading; returns the path.
