@@ -103,7 +103,9 @@ def _map(record: Record) -> str:
         for kind, text in MEANING.items()
     )
     columns, rows = grid(record)
-    head = "".join(f"<th>{html.escape(name).replace('(', '<br>(')}</th>" for name in columns)
+    head = "".join(
+        f"<th>{html.escape(name).replace('(', '<br>(').replace('Euler', '<br>Euler')}</th>" for name in columns
+    )
     lines = "".join(
         f'<tr><td class="text">{html.escape(name)}</td>{"".join(map(_box, cells))}</tr>' for name, cells in rows.items()
     )
