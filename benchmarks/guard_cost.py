@@ -3,15 +3,12 @@
     python benchmarks/guard_cost.py
 
 Without guards it takes every root that Newton's method finds and keeps no ledger. Both run in turns in one process,
-from the same states, on motions that no guard objects to, so that they do the same steps. Writes the table of
-``docs/mathematics.md`` between its markers.
+from the same states, on motions that no guard objects to, so that they do the same steps.
 """
 
 import time
 
 import numpy as np
-from guards import DOCUMENT
-from pages import fill
 
 import varpin as vp
 
@@ -60,7 +57,6 @@ def main() -> None:
         *(row(name) for name in ROBOTS),
     ]
     print("\n".join(table))
-    fill(DOCUMENT, {"cost": "\n".join(table)})
 
 
 if __name__ == "__main__":

@@ -1,19 +1,14 @@
-"""Energy errors of an undamped planar chain at coarse steps, and what the guards of the midpoint step cost.
+"""Prints energy errors of an undamped planar chain at coarse steps, and what the guards of the midpoint step cost.
 
-Writes the table of ``docs/mathematics.md`` between its markers.
-
-    python benchmarks/guards.py
+python benchmarks/guards.py
 """
 
 import logging
-from pathlib import Path
 
 import numpy as np
-from pages import fill
 
 import varpin as vp
 
-DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "mathematics.md"
 DURATION = 1000.0
 
 
@@ -39,7 +34,6 @@ def main() -> None:
         *(row(links, dt) for links in (3,) for dt in (0.01, 0.05, 0.1, 0.2, 0.5)),
     ]
     print("\n".join(table))
-    fill(DOCUMENT, {"guards": "\n".join(table)})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The table and the figure of docs/crocoddyl.md from what plans_race.py measured.
+"""The summary and the figure of docs/crocoddyl.md from what plans_race.py measured.
 
 python benchmarks/plans_race_page.py race.json
 """
@@ -25,48 +25,12 @@ SHAPES = {"held": ("#56b4e9", "x"), "linear": ("#009e73", "+")}
 Results = dict[str, dict[str, Any]]
 
 
-def cells(best: dict[str, Any] | None) -> str:
-    if best is None:
-        return "none | | |"
-    scheme = best["scheme"].replace("stages=", "").replace("(alpha=0.5)", "")
-    line = " linear" if best["controls"] == "linear" else ""
-    each = 1e3 * best["seconds"] / max(best["iterations"], 1)
-    return f"{scheme}{line}, {best['N']} | {best['iterations']} | {digits(each)} | {digits(1e3 * best['seconds'])}"
-
-
-def digits(x: float) -> str:
-    return f"{x:.0f}" if x >= 100.0 else f"{x:.3g}"
-
-
-def by_itself(plain: dict[str, Any]) -> str:
-    good = plain["met"] and plain["loss"] <= WITHIN
-    return digits(1e3 * plain["seconds"]) + ("" if good else " (*)")
-
-
 def ratio(task: dict[str, Any], way: str) -> float:
     """varpin's time over crocoddyl's; zero where only varpin has a plan, infinite where only crocoddyl has one."""
     own, other = (task["best"][side].get(way) for side in ("varpin", "crocoddyl"))
     if own is None:
         return np.nan if other is None else np.inf
     return 0.0 if other is None else own["seconds"] / other["seconds"]
-
-
-def told(x: float) -> str:
-    return "none has" if np.isnan(x) else "lost" if np.isinf(x) else "only varpin" if x == 0.0 else f"{x:.2f}"
-
-
-def table(results: Results) -> str:
-    lines = [
-        "| task | crocoddyl: step, nodes | iterations | ms each | ms | varpin: step, nodes | iterations | ms each | ms "
-        "| ratio | by controls alone | `true_cost`: held | linear |",
-        "|---|---|---:|---:|---:|---|---:|---:|---:|---:|---:|---:|---:|",
-    ]
-    for name, task in results.items():
-        sides = [cells(task["best"][side].get("feedback")) for side in ("crocoddyl", "varpin")]
-        both = [told(ratio(task, way)) for way in WAYS]
-        plain = [by_itself(task["plain"][shape]) for shape in SHAPES]
-        lines.append(f"| {' | '.join([name, *sides, *both, *plain])} |")
-    return "\n".join(lines)
 
 
 def summary(results: Results) -> str:
@@ -128,7 +92,7 @@ def main() -> None:
         if failed:
             print(f"{file} has no results of {', '.join(failed)}")
     FigureCanvasAgg(draw(results)).print_png(DOCS / "images" / "plans_race.png")
-    fill(DOCS / "crocoddyl.md", {"race": f"{summary(results)}\n\n{table(results)}"})
+    fill(DOCS / "crocoddyl.md", {"race": summary(results)})
     print(summary(results))
 
 

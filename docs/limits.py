@@ -1,15 +1,13 @@
-"""The tables of docs/limits.md, from a record of the battery of scenes.
+"""The table of other simulators of docs/limits.md, from a record of the battery of scenes.
 
     python benchmarks/extremes.py FOLDER --scenes
-    python docs/limits.py FOLDER/scenes.pickle    # the table of other simulators
-    python docs/limits.py --chains    # the table of undamped chains: two minutes
+    python docs/limits.py FOLDER/scenes.pickle
 
 Other simulators take part where they are installed (``pip install "varpin[peers]"``; trep has no release for Python 3).
 """
 
 from __future__ import annotations
 
-import logging
 import pickle
 import sys
 from collections.abc import Callable, Iterator
@@ -18,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-import varpin as vp
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.study.checks import LEVELS
 from varpin.study.exact import Exact
@@ -38,8 +35,6 @@ MOTIONS: dict[str, Callable[[peers.Case, float], peers.Motion | None]] = {
     "Drake RK3, 1e-4": partial(peers.drake_motion, scheme="runge_kutta3"),
     "trep midpoint": peers.trep_motion,
 }
-GAUSS = tuple(vp.Gauss(stages) for stages in (2, 3, 4))
-CHAIN_STEPS = 100_000
 # What others are asked to do as well: chains that all describe alike.
 SHARED = (
     "3 links, dt = 0.01 s",
@@ -54,12 +49,9 @@ SHARED = (
 
 
 def main() -> None:
-    """Rewrite the tables."""
+    """Rewrite the table."""
     if len(sys.argv) != 2:
-        raise SystemExit("usage: limits.py RECORD or limits.py --chains")
-    if sys.argv[1] == "--chains":
-        fill(DOCUMENT, {"chains": "\n".join(chains())})
-        return
+        raise SystemExit("usage: limits.py RECORD")
     record: Record = pickle.loads(Path(sys.argv[1]).read_bytes())
     missing = [name for name in ("mujoco", "pydrake", "trep") if peers.available(name) is None]
     if missing:
@@ -130,23 +122,6 @@ def in_words(trial: Trial, motion: Callable[[peers.Case, float], peers.Motion | 
         total = 2.0 * kinetic - np.array([jet.L for jet in jets])
         energy = np.nan_to_num(np.abs(total - total[0]).max() / max(kinetic.max(), np.finfo(float).tiny), nan=np.inf)
     return outcome(float(error), float(energy), found.said)
-
-
-def chains() -> Iterator[str]:
-    """A row for each step of an undamped chain: the energy error over 1e5 steps, and how many of them were split."""
-    logging.getLogger("varpin").setLevel(logging.CRITICAL)
-    yield f"| links | h [s] | {' | '.join(map(str, GAUSS))} |"
-    yield "|---" * (2 + len(GAUSS)) + "|"
-    for links in (3,):
-        scene, rest = vp.Scene(vp.planar_chain(links)), np.zeros(links)
-        for dt in (0.01, 0.05, 0.1, 0.5):
-            texts = []
-            for integrator in GAUSS:
-                motion = vp.simulate(scene, rest, rest, dt=dt, steps=CHAIN_STEPS, integrator=integrator, check=False)
-                error = np.abs(motion.energy - motion.energy[0]).max() / (9.81 * links**2 / 2)
-                texts.append(f"{error:.0e} ({motion.statistics.split_steps / CHAIN_STEPS:.0%})")
-            sys.stderr.write(f"{links} links, {dt:g} s: {', '.join(texts)}\n")
-            yield f"| {links} | {dt:g} | {' | '.join(texts)} |"
 
 
 @cache

@@ -25,8 +25,8 @@ def main() -> None:
         shutil.copy(folder / f"{name}.png", DOCUMENT.parent / "images" / f"paper_{name}.png")
     with (folder / "claims.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    table = ["| verdict | source | sentence | measured |", "|---|---|---|---|"]
-    table += [f"| {r['verdict']} | {r['source']} | {r['sentence']} | {r['measured']} |" for r in rows]
+    table = ["| verdict | source | sentence |", "|---|---|---|"]
+    table += [f"| {r['verdict']} | {r['source']} | {r['sentence']} |" for r in rows if r["source"].startswith("paper")]
     fill(DOCUMENT, {"claims": "\n".join(table)})
 
 

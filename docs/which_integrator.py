@@ -8,7 +8,6 @@ included. Times are the best of several rounds in which the methods take turns, 
     python docs/which_integrator.py                   # rewrites the page and its figures
     python docs/which_integrator.py --quick FOLDER    # shorter, into a folder: the page, its figures, and which.csv
     python docs/which_integrator.py --only real       # one section
-    python docs/which_integrator.py --redraw          # the figure of plans, from the numbers on the page
 """
 
 from __future__ import annotations
@@ -49,8 +48,6 @@ Run = Callable[[], np.ndarray]
 BLOCKS = 20
 # Errors [rad] from which on a motion is another one.
 LOST = 1.0
-# What a table says of a motion that is not finite, or another one.
-GONE = "lost"
 
 STYLES = {
     "Midpoint": ("#0072b2", "o", "-"),
@@ -113,7 +110,6 @@ class Scale:
         long: The long horizon [s].
         paths: Brownian paths.
         finest: The reference of a path takes 2**finest steps a second.
-        stationary: Duration of the runs in equilibrium [s].
         control_steps: Time steps of plans [s].
         thin: One in so many settings of the short races is taken.
     """
@@ -123,13 +119,12 @@ class Scale:
     long: float
     paths: int
     finest: int
-    stationary: float
     control_steps: tuple[float, ...]
     thin: int
 
 
-FULL = Scale(7, 0.3, 1000.0, 2000, 12, 400.0, (1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 1e-2, 1.5e-2, 2e-2), 1)
-QUICK = Scale(3, 0.3, 100.0, 60, 10, 50.0, (4e-3, 1e-2, 2e-2), 2)
+FULL = Scale(7, 0.3, 1000.0, 2000, 12, (1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 1e-2, 1.5e-2, 2e-2), 1)
+QUICK = Scale(3, 0.3, 100.0, 60, 10, (4e-3, 1e-2, 2e-2), 2)
 
 
 def race(entries: Sequence[Entry], exact: np.ndarray, scale: Scale) -> list[Point]:
@@ -173,7 +168,7 @@ def varpin_run(case: peers.Case, integrator: vp.Integrator, steps: int) -> Run:
 
 # Short horizon ------------------------------------------------------------------------------------------------------
 
-LEVELS = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
+LEVELS = (1e-3, 1e-6, 1e-10)
 STEPS: dict[vp.Integrator, tuple[float, ...]] = {
     vp.ExplicitEuler(): (1e-2, 3e-3, 1e-3, 3e-4, 1e-4),
     vp.SemiImplicitEuler(): (1e-2, 3e-3, 1e-3, 3e-4, 1e-4),
@@ -327,10 +322,9 @@ class Energy:
     split: float = 0.0
 
     @property
-    def figures(self) -> tuple[float, float, float]:
-        """Median, root mean square and largest of its absolute value."""
-        size = np.abs(self.error)
-        return float(np.median(size)), float(np.sqrt(np.mean(self.error**2))), float(size.max())
+    def rms(self) -> float:
+        """Its root mean square."""
+        return float(np.sqrt(np.mean(self.error**2)))
 
     @property
     def trend(self) -> tuple[float, float]:
@@ -398,24 +392,13 @@ def long(scale: Scale) -> tuple[str, Figure]:
     """Energy over the long run."""
     runs = long_runs(scale)
     lines = [
-        f"| {scale.long:g} s of a chain of 3 | time [s] | median | rms | largest | trend over the run | split steps |",
-        "|---|---|---|---|---|---|---|",
+        f"| {scale.long:g} s of a chain of 3 | time [s] | rms | trend over the run | split steps |",
+        "|---|---|---|---|---|",
     ]
     for run in runs:
         slope, uncertainty = run.trend
-        numbers = " | ".join(f"{x:.1e}" for x in run.figures)
         trend = f"{slope:+.1e} ± {uncertainty:.0e}"
-        lines.append(f"| {run.method} | {run.seconds:.2f} | {numbers} | {trend} | {100 * run.split:.2g} % |")
-    by = {run.method: run for run in runs}
-    two, mid = by["Gauss(2), 0.02 s"], by["Midpoint, 0.01 s"]
-    ratios = [a / b for a, b in zip(two.figures, mid.figures, strict=True)]
-    slope, uncertainty = two.trend
-    lines += [
-        "",
-        f"Gauss(2) at 0.02 s over Midpoint at 0.01 s: median {ratios[0]:.3f}, rms {ratios[1]:.3f}, largest "
-        f"{ratios[2]:.3f}, time {two.seconds / mid.seconds:.2f}. Its trend is {abs(slope / uncertainty):.1f} standard "
-        "errors from none.",
-    ]
+        lines.append(f"| {run.method} | {run.seconds:.2f} | {run.rms:.1e} | {trend} | {100 * run.split:.2g} % |")
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     axes = figure.subplots()
     for run in runs:
@@ -438,53 +421,45 @@ def long(scale: Scale) -> tuple[str, Figure]:
 # Optimal control ----------------------------------------------------------------------------------------------------
 
 
-PLAN_COLUMNS = ("start", "integrator", "dt [s]", "solve [ms]", "iterations", "planned cost", "true, open loop",
-                "true, feedback")  # fmt: skip
 PLAN_STARTS = ("on the reference", "off it")
-# The two true costs, in the order of the table's last columns.
+# The two true costs.
 PLAN_MARKS: dict[str, dict[str, Any]] = {
     "open loop": {"marker": "o", "markersize": 4, "linestyle": "none"},
     "with feedback": {"marker": "s", "markersize": 9, "linestyle": "none", "markerfacecolor": "none"},
 }
 
 
-def control(scale: Scale) -> tuple[str, Figure]:
+def control(scale: Scale) -> tuple[None, Figure]:
     """True cost of the finger's plans against solve time."""
-    lines = [f"| {' | '.join(PLAN_COLUMNS)} |", "|" + "---|" * len(PLAN_COLUMNS)]
     # Off the reference most solve times are those of searches that do not converge: once is enough.
     settings = ((cases.MAIN, 3, 0.0), (cases.VARIATIONS[0], 1, 2e-3))
+    members: tuple[tuple[str, Sequence[vp.Integrator]], ...] = (
+        ("variational", (vp.ExplicitEuler(), vp.Midpoint())),
+        # Running costs at the Gauss points: of fourth order, for who is.
+        (cases.FOURTH_ORDER, (vp.RungeKutta4(), vp.Gauss(2))),
+    )
+    runs: dict[str, list[vp.OptimalControlRun]] = {}
     for start, (setting, repeats, least_step) in zip(PLAN_STARTS, settings, strict=True):
-        members: tuple[tuple[str, Sequence[vp.Integrator]], ...] = (
-            ("variational", (vp.ExplicitEuler(), vp.Midpoint())),
-            # Running costs at the Gauss points: of fourth order, for who is.
-            (cases.FOURTH_ORDER, (vp.RungeKutta4(), vp.Gauss(2))),
-        )
-        runs: list[vp.OptimalControlRun] = []
+        runs[start] = []
         for method, integrators in members:
             problem = cases.problem(setting, None, method, scale.control_steps[0])
             dts = [dt for dt in scale.control_steps if _divides(dt, cases.DURATION) and dt >= least_step]
-            runs += vp.optimal_control_tradeoff(problem, integrators, dts, repeats=repeats).runs
-        for run in runs:
-            costs = (run.planned_cost, run.open_loop_cost, run.closed_loop_cost)
-            cells = " | ".join(f"{cost:.5g}" if np.isfinite(cost) else GONE for cost in costs)
-            name = name_of_text(run.integrator)
-            lines.append(f"| {start} | {name} | {run.dt:g} | {1e3 * run.seconds:.1f} | {run.iterations} | {cells} |")
-    return "\n".join(lines), plans_figure(lines)
+            runs[start] += vp.optimal_control_tradeoff(problem, integrators, dts, repeats=repeats).runs
+    return None, plans_figure(runs)
 
 
-def plans_figure(lines: Iterable[str]) -> Figure:
-    """A panel for each method and start, from the lines of the table; a measured page can be drawn again."""
-    rows = [[word.strip() for word in line.strip("| \n").split("|")] for line in lines]
-    rows = [row for row in rows if len(row) == len(PLAN_COLUMNS) and row[0] in PLAN_STARTS]
-    names = list(dict.fromkeys(row[1] for row in rows))
+def plans_figure(runs: dict[str, list[vp.OptimalControlRun]]) -> Figure:
+    """A panel for each method and start."""
+    names = list(dict.fromkeys(name_of_text(run.integrator) for own in runs.values() for run in own))
     figure = Figure(figsize=(11, 6), layout="constrained")
-    panels = figure.subplots(len(PLAN_STARTS), len(names), sharex="row", sharey="row", squeeze=False)
-    for start, line_of_panels in zip(PLAN_STARTS, panels, strict=True):
+    panels = figure.subplots(len(runs), len(names), sharex="row", sharey="row", squeeze=False)
+    for (start, own), line_of_panels in zip(runs.items(), panels, strict=True):
         for name, axes in zip(names, line_of_panels, strict=True):
             # No lines: a finer step is not always a slower solve.
-            for column, (label, style) in enumerate(PLAN_MARKS.items(), 6):
-                points = [(float(row[3]), float(row[column])) for row in rows
-                          if row[:2] == [start, name] and row[column] != GONE]  # fmt: skip
+            shown = [run for run in own if name_of_text(run.integrator) == name]
+            for label, style in PLAN_MARKS.items():
+                costs = [run.open_loop_cost if label == "open loop" else run.closed_loop_cost for run in shown]
+                points = [(1e3 * run.seconds, y) for run, y in zip(shown, costs, strict=True) if np.isfinite(y)]
                 axes.loglog(
                     [x for x, _ in points], [y for _, y in points], color=STYLES[name][0], label=label, **style
                 )  # fmt: skip
@@ -521,8 +496,8 @@ NOISY: dict[str, vp.Integrator] = {
 }
 
 
-def noise(scale: Scale) -> tuple[str, Figure]:
-    """Strong and weak errors on the same Brownian paths, and the stationary law of an oscillator."""
+def noise(scale: Scale) -> tuple[None, Figure]:
+    """Strong and weak errors on the same Brownian paths."""
     scene = vp.Scene(vp.planar_chain(2), damping=0.3, noise=vp.AdditiveNoise(0.5))
     rest = np.zeros(2)
     fine = 2**scale.finest
@@ -546,7 +521,6 @@ def noise(scale: Scale) -> tuple[str, Figure]:
             array[path] = end(NOISY[name], coarsen(dw, fine // 2**k))
     figure = Figure(figsize=(10, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2)
-    lines = ["| method | dt [s] | strong error [rad] | weak error of q1^2 [rad^2] |", "|---|---|---|---|"]
     for name in NOISY:
         colour, marker, stroke = STYLES[name]
         dts, strong, weak, bars = [], [], [], []
@@ -557,8 +531,6 @@ def noise(scale: Scale) -> tuple[str, Figure]:
             strong.append(np.sqrt((off**2).mean()))
             weak.append(abs(gap.mean()))
             bars.append(gap.std(ddof=1) / np.sqrt(scale.paths))
-            if k % 2 == 0:
-                lines.append(f"| {name} | 1/{2**k} | {strong[-1]:.1e} | {weak[-1]:.1e} ± {2 * bars[-1]:.0e} |")
         left.loglog(dts, strong, color=colour, marker=marker, linestyle=stroke, label=name)
         right.errorbar(dts, weak, yerr=2.0 * np.array(bars), color=colour, marker=marker, linestyle=stroke, capsize=2)
     right.set(yscale="log", xlabel="dt [s]", ylabel="weak error of q1² after 1 s [rad²]", title="weak")
@@ -567,42 +539,7 @@ def noise(scale: Scale) -> tuple[str, Figure]:
         axes.set_xscale("log", base=2)
         plots.apply_style(axes)
     figure.legend(loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return "\n".join([*lines, "", *stationary(scale)]), figure
-
-
-def stationary(scale: Scale) -> list[str]:
-    """Mean of q^2 and v^2 of a damped oscillator in thermal equilibrium, over what they are."""
-    # A rod of inertia 1/3 on a spring: omega = 3 / s; the noise is that of temperature 1 / 2.
-    damping, stiffness, inertia = 0.2, 3.0, 1.0 / 3.0
-    strength = 0.2**0.5
-    heat = strength**2 / (2.0 * damping)
-    lines = [
-        "| stationary oscillator | dt omega | mean q^2 over its law's | mean v^2 over its law's |",
-        "|---|---|---|---|",
-    ]
-    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=damping, stiffness=stiffness,
-                     noise=vp.AdditiveNoise(strength))  # fmt: skip
-    start = np.random.default_rng(3).normal(size=(2, 500, 1))
-    q0, v0 = start[0] * np.sqrt(heat / stiffness), start[1] * np.sqrt(heat / inertia)
-    for name in ("Euler-Maruyama", "Midpoint", "Midpoint, split kick", "Midpoint, held"):
-        for product in (0.03, 0.3, 1.0, 1.8):
-            dt = product / 3.0
-            steps = round(scale.stationary / dt)
-            cells = []
-            try:
-                ensemble = vp.simulate_ensemble(
-                    scene, q0, v0, dt=dt, steps=steps, paths=500, rng=5, integrator=NOISY[name], store=False
-                )
-                own = ensemble.statistics
-                late = slice(len(own.mean) // 4, None)
-                squares = own.covariance[late].diagonal(axis1=1, axis2=2) + own.mean[late] ** 2
-                # The state is (q, p) for variational integrators, and (q, v) for the others.
-                second = heat * inertia if NOISY[name].variational else heat / inertia
-                cells = [f"{x:.3f}" if x < 1e3 else GONE for x in squares.mean(axis=0) / (heat / stiffness, second)]
-            except vp.VarpinError:
-                cells = [GONE, GONE]
-            lines.append(f"| {name} | {product:g} | {' | '.join(cells)} |")
-    return lines
+    return None, figure
 
 
 # Stiffness ----------------------------------------------------------------------------------------------------------
@@ -625,14 +562,13 @@ def stiff_case(kind: str, product: float) -> peers.Case:
     return peers.Case(f"stiff {kind}, {product:g}", scene, rest, rest, rest)
 
 
-def stiff(scale: Scale) -> tuple[str, Figure]:
+def stiff(scale: Scale) -> tuple[None, Figure]:
     """Errors of the first two joints at one step, over the stiffness of the third."""
     own: tuple[vp.Integrator, ...] = (
         vp.ExplicitEuler(), vp.SemiImplicitEuler(), vp.RungeKutta4(), vp.Midpoint(), vp.Gauss(2), vp.Gauss(3),
     )  # fmt: skip
     figure = Figure(figsize=(10, 4.6), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
-    tables = []
     handles: dict[str, object] = {}
     for kind, axes in zip(("spring", "damper"), panels, strict=True):
         curves: dict[str, list[Point]] = {}
@@ -655,30 +591,22 @@ def stiff(scale: Scale) -> tuple[str, Figure]:
             for point in race(slow, exact[:2], scale):
                 curves.setdefault(f"{point.method}, {point.setting}", []).append(point)
         heading = "dt omega" if kind == "spring" else "dt times rate"
-        lines = [
-            f"| stiff {kind}: {heading} = | {' | '.join(f'{p:g}' for p in PRODUCTS)} |",
-            "|---" * (len(PRODUCTS) + 1) + "|",
-        ]
         for label, points in curves.items():
-            cells = [f"{p.error:.0e} ({p.microseconds:.0f})" if p.error < LOST else GONE for p in points]
-            lines.append(f"| {label} | {' | '.join(cells)} |")
             colour, marker, stroke = STYLES[points[0].method]
             good = [(x, p.error) for x, p in zip(PRODUCTS, points, strict=True) if p.error < LOST]
             if good:
                 (handles[label],) = axes.loglog(
                     *zip(*good, strict=True), color=colour, marker=marker, linestyle=stroke, markersize=5
                 )
-        tables.append("\n".join(lines))
         axes.set(xlabel=heading, title=f"stiff {kind} at the last of three joints")
         plots.apply_style(axes)
     panels[0].set_ylabel("error of the first two joints after 1 s [rad]")
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return "\n\n".join(tables), figure
+    return None, figure
 
 
 # Real arms ----------------------------------------------------------------------------------------------------------
 
-REAL_LEVELS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8, 1e-10)
 REAL: tuple[vp.Integrator, ...] = (
     vp.RungeKutta4(), vp.Midpoint(), *(vp.Gauss(s) for s in (2, 3, 4)), *(vp.Radau(s) for s in (2, 3)),
 )  # fmt: skip
@@ -784,7 +712,7 @@ def real(scale: Scale) -> tuple[str, Figure, list[tuple[str, Point]]]:
         exact = peers.scipy_run(arm.case, 1e-13)()
         points = race(real_entries(arm, scale), exact, scale)
         rows += [(arm.case.name, point) for point in points]
-        lines += best_of(points, arm.case.name, REAL_LEVELS, names)
+        lines += best_of(points, arm.case.name, LEVELS, names)
         draw_race(axes, points, handles)
         axes.set(title=arm.case.name, xlabel="time for one second [us]", ylim=(1e-12, LOST))
     panels[0].set_ylabel("error in q after 1 s [rad]")
@@ -814,7 +742,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("folder", nargs="?", type=Path, default=DOCS, help="where page and images go; docs if left out")
     parser.add_argument("--quick", action="store_true", help="shorter runs, fewer settings")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="these sections alone: short, long, control, ...")
-    parser.add_argument("--redraw", action="store_true", help="draw the plans from the page's table, measure nothing")
     options = parser.parse_args(None if arguments is None else list(arguments))
     scale = QUICK if options.quick else FULL
     images = options.folder / "images"
@@ -822,9 +749,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
     page = options.folder / PAGE
     if page.resolve() != (DOCS / PAGE).resolve():
         shutil.copy(DOCS / PAGE, page)
-    if options.redraw:
-        _print(plans_figure(page.read_text(encoding="utf-8").splitlines()), images / "which_control.png")
-        return
     logging.getLogger("varpin").setLevel(logging.ERROR)
     for case in short_cases():
         peers.require_same(case)
@@ -839,7 +763,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
     for name, section in sections.items():
         if options.only is not None and name not in options.only:
             continue
-        parts[name], figures[name], *raced = section(scale)
+        text, figures[name], *raced = section(scale)
+        parts |= {} if text is None else {name: text}
         rows += raced[0] if raced else []
         _tell(name, begin)
     for name, figure in figures.items():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pinocchio as pin
@@ -36,10 +38,25 @@ class TestFiles:
             vp.load_robot(name)
         assert (info.value.name, info.value.matches[0]) == (name, match)
 
-    @pytest.mark.parametrize("name", ["", "qwertyuiop", "a\0b.urdf"])
-    def test_a_name_like_no_other_lists_all(self, name):
-        with refused(vp.RobotNotFound, "finger", "ur5", "z1"):
+    @pytest.mark.parametrize("name", ["", "qwertyuiop"])
+    def test_a_name_like_no_other_tells_where_names_are(self, name):
+        with refused(vp.RobotNotFound, "robot_names"):
             vp.load_robot(name)
+
+    def test_a_path_that_is_not_there_tells_of_its_folder_alone(self, tmp_path):
+        arm(tmp_path)
+        with refused(vp.RobotNotFound, "made_up.urdf", str(tmp_path)) as info:
+            vp.load_robot(tmp_path / "mad_up.urdf")
+        assert "ur5" not in str(info.value)
+        for path in (tmp_path / "no" / "arm.urdf", "a\0b.urdf"):
+            with refused(vp.RobotNotFound, "urdf"):
+                vp.load_robot(path)
+
+    @pytest.mark.parametrize("start", ["", "\n", "<?xml version='1.0'?>\n"])
+    def test_text_for_a_path(self, tmp_path, start):
+        with refused(vp.InputError, "text of a file", "path") as info:
+            vp.load_robot(start + arm(tmp_path).read_text())
+        assert len(str(info.value)) < 240
 
     def test_robots_on_a_free_flyer(self):
         with refused(vp.RobotError, "'talos'", "URDF"):
@@ -163,8 +180,8 @@ class TestJoints:
         ("changes", "facts"),
         [
             ({"axis": "0 0 0"}, ("'j1'", "axis")),
-            ({"axis": "nan 0 0"}, ("axis", "[j1]")),
-            ({"axis": "up"}, ("axis", "[j1]")),
+            ({"axis": "nan 0 0"}, ("axis", "'j1'")),
+            ({"axis": "up"}, ("axis", "'j1'")),
             ({"kind": "hinge"}, ("[j1]", "[hinge]")),
             ({"kind": ""}, "[j1]"),
         ],
@@ -178,10 +195,9 @@ class TestJoints:
     @pytest.mark.parametrize(
         ("old", "new", "facts"),
         [
-            ('<limit effort="9" velocity="8" lower="-1" upper="1"/>', "", "limits"),
-            ('rpy="0.1 0.2 0.3"/><parent', 'rpy="0 nan 0"/><parent', ("origin", "[j1]")),
-            ('<child link="l1"/>', '<child link="l9"/>', ("child", "[l9]", "[j1]")),
-            ('<parent link="base"/>', '<parent link="l9"/>', ("parent", "[l9]", "[j1]")),
+            ('rpy="0.1 0.2 0.3"/><parent', 'rpy="0 nan 0"/><parent', ("origin", "'j1'")),
+            ('<child link="l1"/>', '<child link="l9"/>', ("child", "'l9'", "'j1'")),
+            ('<parent link="base"/>', '<parent link="l9"/>', ("parent", "'l9'", "'j1'")),
             ('<parent link="base"/>', '<parent link="l1"/>', ("'l1'", "loop")),
             ("</robot>", '<link name="l2"/></robot>', ("[base]", "[l2]")),
             ("</robot>", '<link name="l1"/></robot>', "'l1'"),
@@ -222,7 +238,7 @@ class TestJoints:
             joint("j2", "b", "c"),
             joint("j3", "c", "b"),
         )
-        with refused(vp.RobotError, "'c', 'b'", "loop"):
+        with refused(vp.RobotError, "'b', 'c'", "loop"):
             vp.load_robot(path)
 
     def test_nothing_moves(self, tmp_path):
@@ -709,3 +725,15 @@ def test_what_is_no_flag_function_list_or_record(robot, call, facts):
 @pytest.mark.parametrize("value", [True, np.True_])
 def test_what_is_a_flag(scene, value):
     assert vp.simulate(scene, *REST, **FREE, check=value).steps == 2
+
+
+@pytest.mark.parametrize("content", ["", "from nose import tools\n"])
+def test_another_package_of_pinocchio_s_name(tmp_path, content):
+    (tmp_path / "nose").mkdir()
+    (tmp_path / "nose" / "tools.py").touch()
+    (tmp_path / "pinocchio.py").write_text(content)
+    paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    run = [sys.executable, "-S", "-c", "import varpin"]
+    found = subprocess.run(run, env={"PYTHONPATH": paths}, capture_output=True, text=True, check=False)
+    assert found.returncode == 1
+    assert "pip uninstall -y pinocchio" in found.stderr.splitlines()[-1]

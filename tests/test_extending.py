@@ -19,7 +19,7 @@ from varpin.core.arrays import Carried, ConstraintRows, Coupling, Diffusion, Ele
 from varpin.integrators import registry
 from varpin.integrators.collocation import Collocation
 from varpin.integrators.tableau import midpoint
-from varpin.io.scenefile.spec import CONSTRAINTS
+from varpin.io.scenefile.tables import CONSTRAINTS
 from varpin.mechanics import constraints, forces
 from varpin.mechanics.forces import point_of
 from varpin.mechanics.noise import CompiledFields

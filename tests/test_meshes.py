@@ -1,15 +1,20 @@
-"""Meshes are found beside the file and in packages; those that are not there are named, link by link."""
+"""Meshes are found beside the file and in packages, and mean in every use what their files say."""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
+import numpy as np
+import pinocchio as pin
 import pytest
+from chromium import commands
 from mechanisms import INERTIAL, joint, link, write_urdf
-from refusals import refused, unnamed
+from refusals import naming, refused, unnamed
 
 import varpin as vp
 from varpin.model import geometry, readable_geometry
+from varpin.model.meshes import read_mesh
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
@@ -91,3 +96,242 @@ def test_a_mesh_that_is_none_beside_one_that_is_not_there(package):
     _, missing = readable_geometry(robot)
     assert "bad.stl" in missing["l1"][1]
     assert "link 'l2': lost.stl" in missing["l2"][1]
+
+
+# A box of 0.1 x 0.2 x 0.3 m with a corner at the origin.
+SIDES = np.array([0.1, 0.2, 0.3])
+CORNERS = np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.2) for z in (0.0, 0.3)])
+QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+TRIANGLES = np.concatenate([QUADS[:, :3], QUADS[:, [0, 2, 3]]])
+
+
+def words(numbers):
+    return " ".join(f"{number:.9g}" for number in np.ravel(numbers))
+
+
+INSTANCE = '<instance_geometry url="#g"/>'
+
+
+def collada(corners=CORNERS, unit='<unit meter="1"/>', up="Z_UP", node=INSTANCE, primitives=None, extra=""):
+    """A Collada file of corners, by default in the box's triangles."""
+    vertex = '<input semantic="VERTEX" source="#v" offset="0"/>'
+    faces = f'<triangles count="12">{vertex}<p>{words(TRIANGLES)}</p></triangles>'
+    faces = faces if primitives is None else primitives.replace("VERTEX", vertex)
+    axes = "".join(f'<param name="{axis}" type="float"/>' for axis in "XYZ")
+    asset = f"<asset>{unit}<up_axis>{up}</up_axis></asset>" if unit else ""
+    return (
+        f'<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">{asset}{extra}'
+        f'<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="{corners.size}">'
+        f'{words(corners)}</float_array><technique_common><accessor source="#a" count="{len(corners)}" stride="3">'
+        f'{axes}</accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>'
+        f"</vertices>{faces}</mesh></geometry></library_geometries><library_visual_scenes>"
+        f'<visual_scene id="s"><node id="n">{node}</node></visual_scene></library_visual_scenes>'
+        '<scene><instance_visual_scene url="#s"/></scene></COLLADA>'
+    )
+
+
+def wavefront(corners=CORNERS, faces=QUADS):
+    lines = [f"v {words(corner)}" for corner in corners] + [f"f {words(face + 1)}" for face in faces]
+    return "\n".join(lines) + "\n"
+
+
+def relative_wavefront():
+    """Each face behind corners of its own, which it counts backwards."""
+    blocks = [[*(f"v {words(CORNERS[k])}" for k in face), "f -4 -3 -2 -1 # a-side"] for face in QUADS]
+    return "\n".join(line for block in blocks for line in block)
+
+
+def ascii_stl(triangles=TRIANGLES, name="box"):
+    facets = (
+        "".join(
+            "facet normal 0 0 0 outer loop "
+            + " ".join(f"vertex {words(CORNERS[k])}" for k in face)
+            + " endloop endfacet\n"
+            for face in triangles
+        )
+        .replace(" outer", "\nouter")
+        .replace(" vertex", "\nvertex")
+        .replace(" endloop ", "\nendloop\n")
+    )
+    return f"solid {name}\n{facets}endsolid {name}\n"
+
+
+def binary_stl(corners=CORNERS):
+    facets = b"".join(struct.pack("<12fH", 0, 0, 0, *np.ravel(corners[face]), 0) for face in TRIANGLES)
+    return b"solid of a CAD program".ljust(80) + struct.pack("<I", len(TRIANGLES)) + facets
+
+
+HALF = "<triangles count='6' material='{}'>VERTEX<p>{}</p></triangles>"
+HALVES = HALF.format("red", words(TRIANGLES[:6])) + HALF.format("blue", words(TRIANGLES[6:]))
+LINES = f"<lines count='1'>VERTEX<p>0 1</p></lines>{HALVES}"
+POLYLIST = f"<polylist count='6'>VERTEX<vcount>{words([4] * 6)}</vcount><p>{words(QUADS)}</p></polylist>"
+POLYGONS = f"<polygons count='6'>VERTEX{''.join(f'<p>{words(quad)}</p>' for quad in QUADS)}</polygons>"
+FANS = f"<trifans count='6'>VERTEX{''.join(f'<p>{words(quad)}</p>' for quad in QUADS)}</trifans>"
+NESTED = (
+    f'<translate>0.1 0 0.3</translate><node id="m"><rotate>0 1 0 180</rotate><scale>0.5 2 1</scale>{INSTANCE}</node>'
+)
+MIRRORED = f"<matrix>-1 0 0 0.1 0 1 0 0 0 0 1 0 0 0 0 1</matrix>{INSTANCE}"
+TWICE = f'<scale>1 1 0.5</scale>{INSTANCE}<node id="m"><translate>0 0 0.3</translate>{INSTANCE}</node>'
+NO_MATERIAL = (
+    '<instance_geometry url="#g"><bind_material><technique_common><instance_material symbol="red" target="#gone"/>'
+    "</technique_common></bind_material></instance_geometry>"
+)
+MATERIALS = "mtllib a.mtl\nmtllib b.mtl\n"
+
+# Files of the same box, and the scale in the URDF.
+FILES = {
+    "metres.dae": (collada(), "1 1 1"),
+    "centimetres.dae": (collada(CORNERS / 0.01, '<unit meter="0.01" name="cm"/>'), "1 1 1"),
+    "inches.dae": (collada(CORNERS / 0.0254, '<unit name="inch" meter="2.54e-2"/>', "Y_UP"), "1 1 1"),
+    "feet.dae": (collada(CORNERS / 0.3048, '<unit meter="0.3048"/>', "X_UP"), "1 1 1"),
+    "no_unit.dae": (collada(unit=""), "1 1 1"),
+    "unit_and_scale.dae": (collada(CORNERS / 0.01, '<unit meter="0.001"/>'), "10 10 10"),
+    "nested.dae": (collada(CORNERS * [2.0, 0.5, 1.0], node=NESTED), "1 1 1"),
+    "mirrored_node.dae": (collada(node=MIRRORED), "1 1 1"),
+    "twice.dae": (collada(node=TWICE), "1 1 1"),
+    "two_materials.dae": (collada(primitives=HALVES), "1 1 1"),
+    "lines.dae": (collada(primitives=LINES), "1 1 1"),
+    "polylist.dae": (collada(primitives=POLYLIST), "1 1 1"),
+    "polygons.DAE": (collada(primitives=POLYGONS), "1 1 1"),
+    "fans.dae": (collada(primitives=FANS), "1 1 1"),
+    "no_material.dae": (collada(primitives=HALVES, node=NO_MATERIAL), "1 1 1"),
+    "quads.obj": (wavefront(), "1 1 1"),
+    "triangles.obj": (wavefront(faces=TRIANGLES), "1 1 1"),
+    "mixed.obj": (wavefront(faces=[*QUADS[:3], *TRIANGLES[3:6], *TRIANGLES[9:]]), "1 1 1"),
+    "relative.obj": (relative_wavefront(), "1 1 1"),
+    "comments.obj": (wavefront().replace("\nf 1", " # right-hand\nf 1").replace("8 6\n", "8 6 # a-side\n"), "1 1 1"),
+    "unused.obj": (wavefront(np.vstack([CORNERS, [[9.0, 9.0, 9.0]]])), "1 1 1"),
+    "materials.obj": (
+        MATERIALS + wavefront(faces=QUADS[:2]) + "usemtl red\n" + wavefront(faces=QUADS[2:4] + 8)
+        + "usemtl blue\n" + wavefront(faces=QUADS[4:] + 16),
+        "1 1 1",
+    ),
+    "objects.obj": ("o one\n" + wavefront(faces=QUADS[:3]) + "o two\n" + wavefront(faces=QUADS[3:] + 8), "1 1 1"),
+    "mirrored.obj": (wavefront(CORNERS * [1.0, -1.0, 1.0], QUADS[:, ::-1]), "1 -1 1"),
+    "through_a_point.obj": (wavefront(-CORNERS, QUADS[:, ::-1]), "-1 -1 -1"),
+    "millimetres.obj": (wavefront(1000.0 * CORNERS), "0.001 0.001 1e-3"),
+    "box.off": (
+        f"OFF\n8 12 0\n{chr(10).join(map(words, CORNERS))}\n{chr(10).join(f'3 {words(face)}' for face in TRIANGLES)}\n",
+        "1 1 1",
+    ),
+    "ascii.stl": (ascii_stl(), "1 1 1"),
+    "two_solids.stl": (ascii_stl(TRIANGLES[:5]) + ascii_stl(TRIANGLES[5:], "rest"), "1 1 1"),
+    "binary.STL": (binary_stl(), "1 1 1"),
+    "millimetres.stl": (binary_stl(1000.0 * CORNERS), "0.001 0.001 0.001"),
+}  # fmt: skip
+
+
+def drawn(page):
+    """The triangles (F, 3, 3) of all shapes of the robot on a page."""
+    found = []
+    for command in commands(page):
+        if command["type"] == "set_object" and "/shapes/" in command["path"]:
+            (form,) = command["object"]["geometries"]
+            points = np.frombuffer(form["data"]["attributes"]["position"]["array"].data, dtype=np.float32)
+            found.append(points.reshape(-1, 3)[np.frombuffer(form["data"]["index"]["array"].data, dtype=np.uint32)])
+    return np.concatenate(found).reshape(-1, 3, 3)
+
+
+def volume(triangles):
+    return np.linalg.det(triangles).sum() / 6.0
+
+
+def arm(folder, name, scale):
+    shape = f'<visual><geometry><mesh filename="{name}" scale="{scale}"/></geometry></visual>'
+    return write_urdf(folder, link("l1"), link("l2", "", shape), joint("j1", "base", "l1"), joint("j2", "l1", "l2"))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_box_is_a_box_in_every_file(tmp_path, caplog, name):
+    content, scale = FILES[name]
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    (tmp_path / "b.mtl").write_text("newmtl blue\nKd 0 0 1\nd 0.5\n")
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    path = arm(tmp_path, name, scale)
+    robot = vp.load_robot(path, inertia="meshes")
+    body = robot.free_model.inertias[2]
+    assert body.mass == pytest.approx(6.0, rel=1e-6)
+    np.testing.assert_allclose(body.lever, 0.5 * SIDES, atol=1e-7)
+    moments = 6.0 / 12.0 * ((SIDES**2).sum() - SIDES**2)
+    np.testing.assert_allclose(body.inertia, np.diag(moments), atol=1e-7)
+    clear = vp.KeepClear(robot, [vp.Obstacle.sphere([9.0, 0.0, 0.0], 0.1)], 0.01)
+    begin, end, radius = clear.capsules["l2"]
+    assert radius == pytest.approx(np.hypot(0.05, 0.1), rel=1e-6)
+    np.testing.assert_allclose(np.mean([begin, end], axis=0), 0.5 * SIDES, atol=1e-7)
+    if scale == "1 1 1":
+        np.testing.assert_allclose(vp.Obstacle.mesh(tmp_path / name).hull.sides, SIDES, rtol=1e-6)
+    # A model that Pinocchio has read the meshes of, as coal does.
+    model = pin.buildModelFromUrdf(str(path))
+    model.appendBodyToJoint(2, pin.Inertia.Random(), pin.SE3.Identity())
+    shapes = pin.buildGeomFromUrdf(model, str(path), pin.GeometryType.VISUAL, package_dirs=[str(tmp_path)])
+    wrapped = vp.load_robot(pin.RobotWrapper(model, visual_model=shapes))
+    for shown in (robot, wrapped):
+        for options in ({}, {"torques": np.zeros((1, 2))}, {"ghost": np.zeros((2, 2))}):
+            triangles = drawn(vp.replay(shown, np.zeros((2, 2)), dt=1.0, html=tmp_path / "a.html", **options))
+            np.testing.assert_allclose(triangles.min(axis=(0, 1)), np.zeros(3), atol=1e-7)
+            np.testing.assert_allclose(triangles.max(axis=(0, 1)), SIDES, rtol=1e-6)
+            figures = 2 if "ghost" in options else 1
+            assert volume(triangles) == pytest.approx(0.006 * figures, rel=1e-5)
+    assert bool(naming(caplog.messages, "no_material.dae", "colours")) == (name == "no_material.dae")
+
+
+@pytest.mark.parametrize(("opaque", "opacity"), [("A_ONE", 0.25), ("RGB_ZERO", 0.95)])
+def test_parts_have_the_looks_of_their_materials(tmp_path, opaque, opacity):
+    clear = f'<transparent opaque="{opaque}"><color>0.2 0.2 0.2 1</color></transparent>'
+    clear += "<transparency><float>0.25</float></transparency>"
+    effects, materials, bound = "", "", ""
+    for name, kind, color, more in (("red", "lambert", "1 0 0", ""), ("blue", "phong", "0 0 1", clear)):
+        look = f"<{kind}><diffuse><color>{color} 1</color></diffuse>{more}</{kind}>"
+        effects += f'<effect id="{name}e"><profile_COMMON><technique>{look}</technique></profile_COMMON></effect>'
+        materials += f'<material id="{name}m"><instance_effect url="#{name}e"/></material>'
+        bound += f'<instance_material symbol="{name}" target="#{name}m"/>'
+    library = f"<library_effects>{effects}</library_effects><library_materials>{materials}</library_materials>"
+    node = NO_MATERIAL.replace('<instance_material symbol="red" target="#gone"/>', bound)
+    path = tmp_path / "a.dae"
+    path.write_text(collada(primitives=HALVES, node=node, extra=library))
+    red, blue = read_mesh(str(path))
+    np.testing.assert_allclose(red.color, [1.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(blue.color, [0.0, 0.0, 1.0, opacity])
+    assert red.shine["specular"] == (0.0, 0.0, 0.0)
+    assert "specular" not in blue.shine
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "facts"),
+    [
+        ("a.stl", b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", ("Git LFS", "pull")),
+        ("a.stl", b"no mesh", "no triangles"),
+        ("a.step", b"ISO-10303-21;", ".stl"),
+        ("a.dae", b"<COLLADA", "cannot be read"),
+        ("a.dae", collada(unit='<unit meter="0"/>').encode(), "<unit>"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\n", "no triangles"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "finite"),
+        ("a.obj", b"v 0 0 0\nf 1 2 3\n", "cannot be read"),
+    ],
+)
+def test_what_is_no_mesh_is_named_with_its_cause(tmp_path, name, content, facts):
+    (tmp_path / name).write_bytes(content)
+    facts = (name, *([facts] if isinstance(facts, str) else facts))
+    with refused(vp.FileError, facts):
+        vp.Obstacle.mesh(tmp_path / name)
+    with refused(vp.RobotError, ("'l2'", *facts)):
+        geometry(vp.load_robot(arm(tmp_path, name, "1 1 1"), lock={"j2": 0.0}))
+
+
+@pytest.mark.parametrize("scale", ["1 1", "1 0 1", "one 1 1", "inf 1 1"])
+def test_scales_are_three_numbers(tmp_path, scale):
+    (tmp_path / "a.obj").write_text(wavefront())
+    with refused(vp.RobotError, "'l2'", "a.obj", repr(scale)):
+        vp.load_robot(arm(tmp_path, "a.obj", scale), inertia="meshes")
+
+
+@pytest.mark.parametrize(
+    ("scale", "told"), [("1 1 1", False), ("1000 1000 1000", True), ("39.4 39.4 39.4", True), ("1e-3 1e-3 1e-3", True)]
+)
+def test_a_mesh_in_other_units_is_told(tmp_path, scale, told):
+    (tmp_path / "a.stl").write_bytes(binary_stl())
+    shape = f'<visual><geometry><mesh filename="a.stl" scale="{scale}"/></geometry></visual>'
+    path = write_urdf(tmp_path, link("l1", extra=shape), link("l2"), joint("j1", "base", "l1"), joint("j2", "l1", "l2"))
+    warnings = vp.inspect_robot(path).warnings
+    assert bool(naming(warnings, "mesh 'a.stl'", "'l1'", "scale=")) == told
+    assert all(len(warning) <= 240 for warning in warnings)

@@ -77,8 +77,8 @@ CASES = {
     ),
     vp.SingularMassMatrix: (
         lambda _: massless(),
-        "the mass matrix is singular at q = [0. 0.]: motion of 'j2' carries no inertia; give the links it moves mass "
-        "and inertia, add armature to the joint, or lock it",
+        "the mass matrix is singular: motion of 'j2' carries no inertia; give the links it moves mass and inertia, "
+        "give the joint an armature, or lock it",
     ),
     vp.InputError: (lambda _: vp.Scene(CHAIN, gravity=[0, 0]), "gravity must have shape (3,), got (2,)"),
     vp.UnknownFrame: (

@@ -72,6 +72,14 @@ def reference(problem, plan):
     return minimize(lambda x: problem.cost_of(motion(x)), start, method="SLSQP", constraints=rules, options=options)
 
 
+@pytest.mark.parametrize("length", [0.1, 1.0, 7.0])
+def test_a_half_space_is_what_its_formula_says(length):
+    normal, offset, q = length * np.array([0.6, 0.0, 0.8]), -0.3 * length, np.array([[0.2, 0.4], [-1.0, 0.3]])
+    plane = vp.KeepInHalfSpace(ROBOT, "tip", normal, offset)
+    p = ROBOT.frame_positions(q)
+    np.testing.assert_allclose(plane.distances(p)[:, 0], (offset - p @ normal) / length, atol=1e-15)
+
+
 def test_the_last_step_onto_constraints_costs_next_to_nothing():
     """The wrist of an arm that falls over without feedback: brought to its bound, it comes back to its way."""
     robot = vp.load_robot("kinova")
@@ -969,7 +977,7 @@ def test_scene_files(tmp_path):
     path.write_text(SCENE, encoding="utf-8")
     loaded = vp.load_scene(path)
     assert loaded.required.terms["the plan keeps"] == (
-        "joint limits, velocity limits, control rate, reach frame, half space, box, outside sphere, clearance"
+        "velocity limits, control rate, reach frame, clearance, box, half space, outside sphere, joint limits"
     )
     assert loaded.required.terms["not modelled"].endswith("shapes are read only for replays and clearance")
     made = loaded.problem.constraints

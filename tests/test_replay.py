@@ -70,9 +70,8 @@ def test_page_poses_every_shape_as_pinocchio_does(browser, tmp_path, name):
         poses = shape_poses(browser)
         pin.updateGeometryPlacements(model, data, shapes, placements, robot.free_positions(expected))
         assert sorted(poses) == list(range(shapes.ngeoms))
-        for k, shape in enumerate(shapes.geometryObjects):
-            scale = np.diag([*shape.meshScale, 1.0]) if shape.meshPath.endswith(".dae") else np.eye(4)
-            np.testing.assert_allclose(poses[k], placements.oMg[k].homogeneous @ scale, atol=2e-5)
+        for k in range(shapes.ngeoms):
+            np.testing.assert_allclose(poses[k], placements.oMg[k].homogeneous, atol=2e-5)
 
 
 def test_meshes_keep_their_colours(browser, tmp_path):
@@ -329,26 +328,6 @@ def test_a_model_without_geometry_gets_a_skeleton(browser, tmp_path, caplog):
         assert any(np.allclose(pose[:3, 3], [joint + 0.5, 0.0, 0.0], atol=1e-6) for pose in poses.values())
 
 
-def test_a_missing_mesh_falls_back_with_a_warning_that_names_it(tmp_path, caplog):
-    urdf = tmp_path / "arm.urdf"
-    urdf.write_text(
-        """<robot name="arm">
-        <link name="base"/>
-        <link name="rod">
-          <inertial><mass value="1"/><origin xyz="0.5 0 0"/>
-            <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
-          <visual><geometry><mesh filename="no_such_mesh.stl"/></geometry></visual>
-        </link>
-        <joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/></joint>
-        </robot>"""
-    )
-    robot = vp.load_robot(urdf)
-    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
-        path = replay(robot, [[0.0], [1.0]], dt=0.1, html=tmp_path / "arm.html")
-    assert naming(caplog.messages, "no_such_mesh.stl", "skeleton")
-    assert any("skeleton" in command.get("path", "") for command in commands(path))
-
-
 def test_a_missing_mesh_costs_its_link_alone(tmp_path, caplog):
     """Of a box, an unreadable rod and a ball, the rod alone is drawn as a skeleton."""
 
@@ -390,20 +369,9 @@ def test_a_missing_mesh_costs_its_link_alone(tmp_path, caplog):
         assert {p.split("/moving/shapes/")[0].rpartition("/")[2] for p in bones} == {joint}
 
 
-def test_a_mesh_pinocchio_cannot_send_is_drawn_in_one_colour(tmp_path, caplog, monkeypatch):
-    def broken(loader, shape):
-        raise UserWarning("Texture 'skin.png' not found.")
-
-    monkeypatch.setattr(shape_module.MeshcatVisualizer, "loadMeshFromFile", broken)
-    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
-        path = replay(vp.load_robot("ur5"), np.zeros((1, 6)), dt=1.0, html=tmp_path / "ur5.html")
-    assert naming(caplog.messages, "'skin.png'", "colour")
-    drawn = [command for command in commands(path) if command["type"] == "set_object" and "shapes" in command["path"]]
-    assert {command["object"]["geometries"][0]["type"] for command in drawn} == {"BufferGeometry"}
-
-
 def test_a_mesh_the_page_cannot_take_is_left_out(browser, tmp_path, monkeypatch):
-    monkeypatch.setattr(shape_module, "_collada_parts", lambda path: ["<COLLADA/>"])
+    broken = {"type": "BufferGeometry", "data": {"attributes": {"position": None}}}
+    monkeypatch.setattr(shape_module._Triangles, "lower", lambda form, _: {"uuid": form.uuid, **broken})
     visit(browser, replay(vp.load_robot("ur5"), np.zeros((11, 6)), dt=0.1, html=tmp_path / "ur5.html"))
     assert any(entry["level"] == "SEVERE" for entry in browser.get_log("browser"))
     assert browser.execute_script("return viewer.animator.playing && viewer.animator.duration") == 1.0

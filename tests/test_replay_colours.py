@@ -14,7 +14,6 @@ from refusals import naming
 
 import varpin as vp
 from varpin.model import geometry
-from varpin.show.replay import wavefront
 from varpin.show.replay.picture import Picture, labels
 
 CORNERS = [f"v {x} {y} {z}" for x in (0, 1) for y in (0, 1) for z in (0, 1)]
@@ -94,30 +93,6 @@ def test_shapes_have_the_colours_of_their_files(browser, folder):
     assert found["4 4"][:2] == ["#ffffff", 16]
     assert found["5 5"] == ["#ffffff", 0, 1, True]
     assert found["6 6"][0] in ("#e5e5e5", "#e6e6e6")
-
-
-def test_wavefront_parts(folder):
-    red, blue, squares = wavefront.parts(folder / "cube.obj")
-    assert red.text.splitlines() == [
-        *(CORNERS[k] for k in (0, 1, 3, 2, 4, 6, 7, 5)),
-        *("vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"),
-        *("f 1/1 2/2 3/3 4/4", "f 5/1 6/2 7/3 8/4"),
-    ]
-    # Negative numbers count back from the last vertex.
-    assert blue.text.splitlines()[-2:] == ["f 1 2 3 4", "f 5 6 7 8"]
-    assert [blue.text.splitlines()[k] for k in (4, 5, 6, 7)] == [CORNERS[k] for k in (2, 3, 7, 6)]
-    assert (red.color, red.opacity, red.texture, red.mapped) == ((0.9, 0.1, 0.1), 1.0, "", True)
-    assert (blue.color, blue.opacity, blue.mapped) == ((0.1, 0.1, 0.9), 0.5, False)
-    assert squares.texture == str(folder / "squares.png")
-
-
-def test_wavefront_without_its_library(folder):
-    (folder / "cube.mtl").unlink()
-    assert [part.color for part in wavefront.parts(folder / "cube.obj")] == [None] * 3
-    normals = folder / "normals.obj"
-    normals.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1 3//1\n")
-    (part,) = wavefront.parts(normals)
-    assert part.text.splitlines()[-2:] == ["vn 0 0 1", "f 1//1 2//1 3//1"]
 
 
 def test_textures_that_are_not_there_are_named(folder, caplog):

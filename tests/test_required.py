@@ -200,3 +200,135 @@ def test_payload_that_cannot_be(given, facts):
 def test_payload_on_a_frame_that_the_robot_does_not_have():
     with refused(vp.UnknownFrame, "'tool'", "'tool0'"):
         vp.load_robot("ur5", payload=vp.Payload("tool", 1.0))
+
+
+def every_force(robot):
+    """Forces on all joints in every form of their values, and between two fingers."""
+    n = robot.dof
+    return [
+        vp.JointSpring({"joint_1.0": 1.0, "joint_6.0": 0.0}, 0.3),
+        vp.PositionServo(np.full(n, 2.0), 0.05, {"joint_0.0": 0.4, "joint_5.0": 0.3}),
+        vp.CoulombFriction(dict.fromkeys(robot.joint_names, 0.001), 0.1),
+        vp.JointStop(1.0, lower=np.full(n, -3.0), upper={"joint_1.0": 0.2, "joint_13.0": 2.0}),
+        vp.Armature(np.linspace(1e-5, 2e-5, n)),
+        vp.FrameDamper("link_3.0", ("link_7.0", [0.0, 0.0, 0.01]), 0.2),
+        vp.FrameDamper("link_11.0", [0.0, 0.1, 0.1], 0.2),
+    ]
+
+
+def test_scenes_in_python_are_the_same_without_idle_joints():
+    robot = vp.load_robot("allegro_right_hand")
+    noise = [
+        vp.AdditiveNoise(1e-3 * np.eye(16)[:, [2]]),
+        vp.ControlNoise(1e-2 * np.eye(16)[:, [1], None] * np.eye(16)[0]),
+    ]
+    q0 = {"joint_9.0": 0.2, "joint_12.0": 0.3}
+    scene = vp.Scene(
+        robot, gravity=False, damping=1e-3, forces=every_force(robot)[:1] + every_force(robot)[2:], noise=noise
+    )
+    required = scene.required(q0)
+    part = scene.without(required.idle)
+    # The index finger has a spring, the middle finger a damper to it.
+    assert part.robot.joint_names == tuple(f"joint_{k}.0" for k in range(8))
+    assert required.joints == part.robot.joint_names
+    assert required.parts == (required.joints,)
+    assert required.idle.keys() == {f"joint_{k}.0" for k in range(8, 16)}
+    assert required.idle["joint_12.0"] == 0.3
+    assert dict(part.robot.locked) == dict(required.idle)
+    assert part.processes == scene.processes == 2
+    assert len(part.couplings) == 1
+    own = [robot.joint_names.index(name) for name in part.robot.joint_names]
+    start = np.zeros(16)
+    start[[robot.joint_names.index(name) for name in q0]] = list(q0.values())
+    options = {"dt": 1e-3, "steps": 40, "rng": 0, "check": False}
+    whole = vp.simulate(scene, start, np.zeros(16), controls=0.01 * np.eye(16)[0], **options)
+    alone = vp.simulate(part, start[own], np.zeros(8), controls=0.01 * np.eye(8)[0], **options)
+    np.testing.assert_allclose(alone.q, whole.q[:, own], rtol=1e-11, atol=1e-13)
+    assert np.ptp(alone.q, axis=0).max() > 0.01
+
+
+def test_servos_hold_idle_joints_and_move_the_others():
+    robot = vp.load_robot("allegro_right_hand")
+    scene = vp.Scene(robot, gravity=False, forces=every_force(robot))
+    q0 = np.zeros(16)
+    command = q0 + 0.1 * (np.array(robot.joint_names) == "joint_13.0")
+    assert scene.required(q0).joints == tuple(f"joint_{k}.0" for k in range(8))
+    required = scene.required(q0, controls=command)
+    assert len(required.joints) == 12
+    part = scene.without(required.idle)
+    assert part.servo_joints == required.joints
+    own = [robot.joint_names.index(name) for name in part.robot.joint_names]
+    whole = vp.simulate(scene, q0, q0, dt=1e-3, steps=40, controls=command, check=False)
+    alone = vp.simulate(part, q0[own], q0[own], dt=1e-3, steps=40, controls=command[own], check=False)
+    np.testing.assert_allclose(alone.q, whole.q[:, own], rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("given", "joints"),
+    [
+        ({}, 16),  # nothing moves at all
+        ({"v0": {"joint_1.0": 0.1}}, 4),
+        ({"controls": np.eye(16)[5]}, 4),
+        ({"controls": [np.zeros(16), np.eye(16)[1]], "task": ["joint_13.0"]}, 8),
+        ({"task": ["joint_1.0", "joint_2.0"]}, 4),
+    ],
+)
+def test_what_touches_a_joint_in_python(given, joints):
+    scene = vp.Scene(vp.load_robot("allegro_right_hand"), gravity=False)
+    assert len(scene.required(0.0, **given).joints) == joints
+
+
+def test_held_joints_are_those_of_a_robot_that_is_loaded_with_them():
+    """Of the damping of mimic joints and of springs, servos and motors, too."""
+    lock = {"panda_joint1": 0.3, "panda_joint5": -0.2}
+    whole, robot = vp.load_robot("panda"), vp.load_robot("panda", lock=lock)
+    part = vp.Scene(
+        whole, damping="robot", stiffness={"panda_joint1": 3.0, "panda_joint2": 2.0}, actuation=np.eye(8)[:, 1:]
+    )
+    part = part.without(lock)
+    scene = vp.Scene(robot, damping="robot", stiffness={"panda_joint2": 2.0}, actuation=np.eye(6))
+    assert part.robot.joint_names == robot.joint_names
+    np.testing.assert_array_equal(part.robot.damping, robot.damping)
+    np.testing.assert_array_equal(part.actuation, scene.actuation)
+    q, v = np.linspace(0.1, 0.2, 6), np.linspace(0.3, -0.3, 6)
+    motions = [vp.simulate(s, q, v, dt=1e-3, steps=20, check=False).q for s in (part, scene)]
+    np.testing.assert_allclose(*motions, rtol=1e-12, atol=1e-13)
+
+
+def test_joints_of_combined_robots_are_held():
+    pair = vp.combine(vp.load_robot("finger"), vp.load_robot("finger"), prefixes=["a_", "b_"])
+    part = vp.Scene(pair, damping={"a_pip": 0.1, "b_dip": 0.2}).without({"a_dip": 0.4, "b_mcp": 0.1})
+    assert part.robot.joint_names == ("a_mcp", "a_pip", "b_pip", "b_dip")
+    np.testing.assert_array_equal(part.damping, [0.0, 0.1, 0.0, 0.2])
+    own = [vp.load_robot("finger", lock=lock) for lock in ({"dip": 0.4}, {"mcp": 0.1})]
+    expected = np.concatenate([vp.Scene(robot).holding_torque([0.2, 0.3]) for robot in own])
+    np.testing.assert_allclose(part.holding_torque([0.2, 0.3, 0.2, 0.3]), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("scene", "joints", "kind", "facts"),
+    [
+        ({"constraints": vp.JointTie("dip", "pip")}, ["mcp"], vp.InputError, "constraints"),
+        ({"forces": vp.CustomForce(lambda q, v: 0.0 * q)}, ["mcp"], vp.InputError, "CustomForce"),
+        ({"noise": vp.CustomNoise(lambda q, v, u: np.ones((3, 1)), 1)}, ["mcp"], vp.InputError, "CustomNoise"),
+        ({}, "mcp", vp.InputError, "'mcp'"),
+        ({}, {"mcp": "a"}, vp.InputError, "'mcp'"),
+        ({}, {"mcq": 0.0}, vp.UnknownJoint, ("'mcq'", "mcp")),
+        ({}, ["mcp", "pip", "dip"], vp.RobotError, "joint"),
+    ],
+)
+def test_scenes_that_keep_their_joints(scene, joints, kind, facts):
+    made = vp.Scene(vp.load_robot("finger"), **scene)
+    with refused(kind, facts):
+        made.without(joints)
+
+
+def test_nothing_is_left_out_of_scenes_with_constraints_or_functions():
+    robot = vp.load_robot("allegro_right_hand")
+    for more in (
+        {"constraints": vp.JointTie("joint_1.0", "joint_2.0")},
+        {"forces": vp.CustomForce(lambda q, v: 0.0 * q)},
+    ):
+        assert not vp.Scene(robot, gravity=False, **more).required(0.0, {"joint_1.0": 0.1}).idle
+    with refused(vp.InputError, ("controls", "(16,)", "(1, 3)")):
+        vp.Scene(robot).required(0.0, controls=np.zeros(3))

@@ -178,13 +178,26 @@ class TestSources:
         assert_same_jet(vp.lagrangian_jet(scene, q, v, backend="pinocchio"), before, rtol=0)
         assert geometry(robot).ngeoms == 0
 
-    def test_gravity_of_a_model_is_not_the_scene_s(self):
+    @pytest.mark.parametrize("gravity", [(0.0, 0.0, -1.62), (0.0, 0.0, 0.0), (3.0, -9.0, 0.5)])
+    def test_gravity_of_a_model_is_the_scene_s_unless_given(self, load, caplog, gravity):
         model = random_tree(0, branching=False)
-        model.gravity = pin.Motion(np.array([0.0, 0.0, -100.0]), np.zeros(3))
-        robot = vp.load_robot(model)
+        model.gravity = pin.Motion(np.array(gravity), np.zeros(3))
+        q = np.ones(7)
+        for robot in (
+            vp.load_robot(model),
+            vp.load_robot(model, base=np.eye(4)),
+            vp.load_robot(pin.RobotWrapper(model)),
+        ):
+            held = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.configuration(q))
+            assert vp.Scene(robot).gravity.tolist() == list(gravity)
+            np.testing.assert_allclose(vp.Scene(robot).holding_torque(q), held, rtol=0, atol=1e-12)
         for backend in ("compiled", "pinocchio"):
-            jet = vp.lagrangian_jet(vp.Scene(robot, gravity=False), np.ones(7), np.zeros(7), backend=backend)
+            jet = vp.lagrangian_jet(vp.Scene(robot, gravity=False), q, np.zeros(7), backend=backend)
             assert np.abs(jet.Lq).max() == 0.0
+        vp.combine(robot, load("xarm7"))
+        assert naming(caplog.messages, "gravity", f"'{robot.name}'")
+        for kept in (vp.load_robot(model, lock={model.names[1]: 0.1}), vp.combine(robot, robot)):
+            assert vp.Scene(kept).gravity.tolist() == list(gravity)
 
     def test_joints_added_out_of_order_are_reordered(self, caplog):
         # Pinocchio computes another mass matrix, without a word, unless every subtree is contiguous.
@@ -261,6 +274,37 @@ class TestGeometry:
         shapes.addGeometryObject(pin.GeometryObject("ball", 9, pin.SE3.Identity(), pin.hppfcl.Sphere(0.1)))
         with refused(vp.RobotError, "'ball'", "9"):
             vp.load_robot(pin.RobotWrapper(random_tree(0), pin.GeometryModel(), shapes))
+
+
+class TestKeeping:
+    def test_locks_all_other_joints_where_they_may_be(self, load):
+        whole = load("panda")
+        robot = vp.load_robot("panda", keep=["panda_joint2", "panda_joint7"], lock={"panda_joint5": 0.3})
+        assert robot.joint_names == ("panda_joint2", "panda_joint7")
+        lower, upper = whole.position_limits
+        nearest = dict(zip(whole.joint_names, np.clip(0.0, lower, upper), strict=True)) | {"panda_joint5": 0.3}
+        for name, at in robot.locked.items():
+            assert at == pytest.approx(nearest.get(name, 0.0))
+        same = vp.load_robot("panda", lock={k: v for k, v in nearest.items() if k not in robot.joint_names})
+        assert_same_jet(jet_at(robot, [0.1, 0.2], [1.0, 2.0]), jet_at(same, [0.1, 0.2], [1.0, 2.0]), rtol=0)
+
+    def test_keeps_followers_with_their_leader(self):
+        robot = vp.load_robot("panda", keep=["panda_finger_joint1"])
+        assert robot.joint_names == ("panda_finger_joint1",)
+        assert len(robot.ties) == 1
+        with refused(vp.InputError, "panda_finger_joint2", "panda_finger_joint1"):
+            vp.load_robot("panda", keep=["panda_finger_joint2"])
+
+    def test_refuses_names_and_forms(self):
+        for keep in ("elbow_joint", {"elbow_joint": 0.0}, [3]):
+            with refused(vp.InputError, "keep"):
+                vp.load_robot("ur5", keep=keep)
+        with refused(vp.UnknownJoint, "keep", "'elbow'", "'elbow_joint'"):
+            vp.load_robot("ur5", keep=["elbow"])
+        with refused(vp.InputError, "'elbow_joint'", "keep", "lock"):
+            vp.load_robot("ur5", keep=["elbow_joint"], lock={"elbow_joint": 0.1})
+        with refused(vp.RobotError, "no joint that moves"):
+            vp.load_robot("ur5", keep=[])
 
 
 class TestLocking:
@@ -467,10 +511,39 @@ class TestMimic:
         place = {"j_c": (0.2, 1.0), "j_d": (0.4, 2.0), "j_b": (0.6, 3.0), "j_a": (-0.1, -1.0)}
         self.check(robot, [0.2, 0.4, 0.6], [1.0, 2.0, 3.0], place)
         assert robot.velocity_limit.tolist() == [8.0] * 3
-        assert robot.effort_limit.tolist() == [9.0] * 3
+        assert robot.effort_limit.tolist() == [9.0, 4.5, 9.0]  # j_a bears 9 N m, twice what j_d exerts on it
         locked = vp.load_robot(path, lock={"j_b": 0.6})
         assert_same_jet(jet_at(locked, [0.2, 0.4], [1.0, 2.0]), jet_at(robot, [0.2, 0.4, 0.6], [1.0, 2.0, 0.0]), [0, 1])
         assert locked.velocity_limit.tolist() == [8.0] * 2
+
+    @pytest.mark.parametrize(
+        ("ratio", "offset", "limits", "speed", "effort"),
+        [(1, 0, (-0.5, 0.4), 2.0, 3.0), (-2, 0, (-0.2, 0.25), 1.0, 6.0), (0.5, 0.1, (-1.0, 0.6), 4.0, 1.5)],
+    )
+    def test_limits_of_followers_are_limits_of_their_leader(self, tmp_path, ratio, offset, limits, speed, effort):
+        tight = joint("j2", "a", "b", inside=mimic("j1", ratio, offset))
+        tight = tight.replace(
+            'effort="9" velocity="8" lower="-1" upper="1"', 'effort="3" velocity="2" lower="-0.5" upper="0.4"'
+        )
+        path = write_urdf(tmp_path, link("a"), link("b"), joint("j1", "base", "a"), tight)
+        robot = vp.load_robot(path)
+        assert (*robot.position_limits[0], *robot.position_limits[1]) == pytest.approx(limits)
+        assert (*robot.velocity_limit, *robot.effort_limit) == pytest.approx((speed, effort))
+        q = np.linspace(*limits, 5)[:, None]
+        follower = robot.free_positions(q)[:, robot.free_model.getJointId("j2") - 1]
+        assert (follower >= -0.5 - 1e-12).all()
+        assert (follower <= 0.4 + 1e-12).all()
+        free = vp.load_robot(path, mimic="free")
+        assert free.position_limits[0].tolist() == [-1.0, -0.5]
+        assert vp.combine(robot, robot).position_limits[0] == pytest.approx([limits[0]] * 2)
+
+    def test_followers_without_room_are_told(self, tmp_path, caplog):
+        path = write_urdf(
+            tmp_path, link("a"), link("b"), joint("j1", "base", "a"), joint("j2", "a", "b", inside=mimic("j1", 1, 5))
+        )
+        assert vp.load_robot(path).position_limits[0].tolist() == [-1.0]
+        assert naming(caplog.messages, "'j2'", "no room")
+        assert naming(vp.inspect_robot(path).warnings, "'j2'", "no room")
 
     def test_chain_of_mimics_ends_at_the_free_joint(self, tmp_path):
         path = write_urdf(

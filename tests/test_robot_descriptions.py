@@ -108,7 +108,7 @@ def test_without_the_package(monkeypatch):
     with refused(vp.RobotNotFound, "ur5"):
         vp.load_robot("ur55")
     # Names of the package without their ending are unknown, and the message has the pip command.
-    with refused(vp.RobotNotFound, "'iiwa14'", "panda", "iiwa14_description", "varpin[descriptions]"):
+    with refused(vp.RobotNotFound, "'iiwa14'", "iiwa14_description", "varpin[descriptions]"):
         vp.load_robot("iiwa14")
     with refused(vp.RobotNotFound, "arm.urdf") as info:
         vp.load_robot("arm.urdf")

@@ -60,6 +60,16 @@ def write(folder, text):
     return path
 
 
+def test_joints_that_stay(tmp_path):
+    text = '[robot]\nsource = "ur5"\nkeep = ["elbow_joint", "wrist_1_joint"]\nlock = { shoulder_lift_joint = -1.0 }\n'
+    robot = vp.load_scene(write(tmp_path, text + "[horizon]\ndt = 1e-3\nsteps = 5\n")).robot
+    assert robot.joint_names == ("elbow_joint", "wrist_1_joint")
+    assert robot.locked["shoulder_lift_joint"] == -1.0
+    wrong = write(tmp_path, text.replace("elbow_joint", "elbow") + "[horizon]\ndt = 1e-3\nsteps = 5\n")
+    with pytest.raises(vp.SceneFileError, match=r"keep.*elbow_joint"):
+        vp.load_scene(wrong)
+
+
 def test_robots_of_a_file_are_those_that_combine_makes(tmp_path):
     file = vp.load_scene(write(tmp_path, TWO), required_only=False)
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])

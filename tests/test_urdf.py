@@ -14,7 +14,7 @@ from refusals import naming, refused, unnamed
 
 import varpin as vp
 from varpin.model import example_robot_data, geometry, readable_geometry
-from varpin.model.urdf import build_model, read_urdf
+from varpin.model.urdf import build_model, read_inertials, read_urdf
 
 ROBOTS = example_robot_data.locate(example_robot_data.FIXED_BASE["ur5"]).parents[2]
 PUBLISHED = sorted(str(path.relative_to(ROBOTS)) for path in ROBOTS.rglob("*.urdf"))
@@ -64,7 +64,7 @@ def test_published_robots_are_as_pinocchio_reads_them(name):
     frames = {frame.name: frame for frame in expected.frames if frame.type == pin.FrameType.BODY}
     # Links that hang on one another for good, taken together, are the bodies.
     bodies = np.zeros((expected.njoints, 6, 6))
-    for part in urdf.inertials:
+    for part in read_inertials(urdf, expected)[0]:
         lever, place = part.mass * pin.skew(part.center), frames[part.link].placement
         body = np.block([[part.mass * np.eye(3), -lever], [lever, part.inertia - lever @ pin.skew(part.center)]])
         bodies[frames[part.link].parentJoint] += place.toDualActionMatrix() @ body @ place.toActionMatrixInverse()
@@ -84,6 +84,16 @@ ODD = {
     ),
     "a default namespace": (lambda text: text.replace("<robot ", '<robot xmlns="http://drake.mit.edu" '), ""),
     "an expanded xacro": (lambda text: text.replace("<robot ", '<robot xmlns:xacro="http://ros.org/wiki/xacro" '), ""),
+    "a xacro macro that nothing uses": (
+        lambda text: text.replace("</robot>", "<xacro:macro name='a'/></robot>"),
+        "<xacro:macro>",
+    ),
+    "a xacro macro that nothing expanded": (
+        lambda text: text.replace("<robot ", '<robot xmlns:x="http://ros.org/wiki/xacro" ').replace(
+            "</link>", "<x:insert/></link>"
+        ),
+        "<x:insert>",
+    ),
     "comments with dashes": (lambda text: text.replace("<joint", "<!-- one -- two --- -->\n<!---->\n<joint"), ""),
     "a comment around a joint": (lambda text: text.replace("</robot>", "<!--<joint name='k'/>--></robot>"), ""),
     "unknown elements": (lambda text: text.replace("</link>", "<sensor><camera/></sensor><mass/></link>"), ""),
@@ -104,10 +114,10 @@ ODD = {
     "no declaration": (lambda text: text.partition("\n")[2], ""),
     "entities": (
         lambda text: '<!DOCTYPE robot [<!ENTITY m "1.3">]>\n' + text.partition("\n")[2].replace('"1.3"', '"&m;"'),
-        "",
+        ("Pinocchio", "'j1'", "masses"),
     ),
-    "an encoding that it is not in": (lambda text: text.replace("?>", ' encoding="utf-16"?>', 1), ""),
-    "an unknown encoding": (lambda text: text.replace("?>", ' encoding="klingon"?>', 1), "'klingon'"),
+    "an encoding that it is not in": (lambda text: text.replace("?>", ' encoding="utf-16"?>', 1), "XML"),
+    "an unknown encoding": (lambda text: text.replace("?>", ' encoding="klingon"?>', 1), "klingon"),
     "no inertia": (lambda text: text.replace(INERTIAL, HEAVY, 1), ("'l1'", "<inertial>", "<inertia>")),
     "no ixy": (lambda text: text.replace('ixy="0.001" ', "", 1), ("'l1'", "<inertial>", "ixy")),
     "no mass": (
@@ -193,13 +203,6 @@ class TestOdd:
             (lambda text: " \r\n", "empty"),
             (lambda text: "hello", "XML"),
             (lambda text: text[:-10], "XML"),
-            (lambda text: text.replace("</robot>", "<xacro:macro name='a'/></robot>"), "xacro"),
-            (
-                lambda text: text.replace("<robot ", '<robot xmlns:x="http://ros.org/wiki/xacro" ').replace(
-                    "</link>", "<x:insert/></link>"
-                ),
-                ("xacro", "<x:insert>"),
-            ),
             (lambda text: text.replace('"1.3"', '"${m}"', 1), ("xacro", "<mass value='${m}'>")),
             (lambda text: text.replace('"l1"', '"$(arg l)"'), ("xacro", "<link name='$(arg l)'>")),
             (lambda text: text.replace("robot", "sdf"), "<sdf>"),
@@ -217,6 +220,205 @@ class TestOdd:
         written(tmp_path, two)
         with refused(vp.RobotError, "made_up.urdf", "odd.urdf"):
             vp.load_robot(tmp_path)
+
+
+H = np.sqrt(0.5)
+SPEC = (
+    '<inertial><origin xyz="0.1 0.2 0" {}/><mass value="2"/>'
+    '<inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+class TestVersions:
+    """quat_xyzw belongs to URDF 1.1 and later; before, it is left out."""
+
+    def written(self, folder, version, turn, extra=""):
+        inertial, moved = SPEC.format(turn), joint("j1", "base", "l1").replace('rpy="0.1 0.2 0.3"', turn)
+        path = write_urdf(
+            folder, link("l1", inertial, extra), moved, link("t", inertial), joint("j2", "l1", "t", "fixed")
+        )
+        path.write_text(path.read_text().replace("<robot ", f'<robot version="{version}" '))
+        return path
+
+    @pytest.mark.parametrize("version", ["1.0", "1.1", "1.2"])
+    def test_turns_are_as_pinocchio_reads_them(self, tmp_path, version):
+        path = self.written(tmp_path, version, f'quat_xyzw="{H} 0 0 {H}"')
+        robot = vp.load_robot(path)
+        assert_same(robot.free_model, pin.buildModelFromUrdf(str(path)))
+        turned = robot.free_model.jointPlacements[1].rotation
+        expected = np.eye(3) if version == "1.0" else pin.rpy.rpyToMatrix(np.pi / 2, 0, 0)
+        np.testing.assert_allclose(turned, expected, atol=1e-12)
+        for inertial in read_inertials(read_urdf(path), build_model(read_urdf(path)))[0]:
+            np.testing.assert_allclose(inertial.inertia, expected @ np.diag([0.1, 0.2, 0.25]) @ expected.T, atol=1e-12)
+
+    def test_turns_of_shapes(self, tmp_path):
+        capsule = '<geometry><capsule radius="0.05" length="0.5"/></geometry>'
+        shape = f'<visual><origin quat_xyzw="0 {H} 0 {H}"/>{capsule}</visual>'
+        path = self.written(tmp_path, "1.2", 'rpy="0 0 0"', shape)
+        (drawn,) = geometry(vp.load_robot(path)).geometryObjects
+        assert isinstance(drawn.geometry, pin.coal.Capsule)
+        np.testing.assert_allclose(drawn.placement.rotation[:, 2], [1.0, 0.0, 0.0], atol=1e-12)
+
+    @pytest.mark.parametrize("version", ["9.9", "1.3", "1", "0.9", "2.0", "", "x"])
+    def test_that_do_not_exist(self, tmp_path, version):
+        path = self.written(tmp_path, version, "")
+        with pytest.raises(ValueError, match="URDF"):
+            pin.buildModelFromUrdf(str(path))
+        with refused(vp.RobotError, "version", f"'{version}'", "1.2"):
+            vp.load_robot(path)
+
+    def test_limits_without_effort(self, tmp_path, caplog):
+        path = self.written(tmp_path, "1.2", "")
+        path.write_text(path.read_text().replace('effort="9" velocity="8" ', ""))
+        robot = vp.load_robot(path)
+        assert (robot.position_limits[1].tolist(), robot.velocity_limit.tolist()) == ([1.0], [np.inf])
+        assert not caplog.records
+
+
+NONE = "count as none"
+
+
+class TestLimits:
+    @pytest.mark.parametrize(
+        ("limit", "read", "facts"),
+        [
+            ('lower="-1" upper="1" velocity="3" effort="-1"', (-1, 1, 3, np.inf), (NONE, "effort -1", "'j1'")),
+            ('lower="-1" upper="1" velocity="-1" effort="3"', (-1, 1, np.inf, 3), (NONE, "velocity -1", "'j1'")),
+            (
+                'lower="-inf" upper="inf" velocity="inf" effort="+Infinity"',
+                (-np.inf, np.inf, np.inf, np.inf),
+                (NONE, "'j1'"),
+            ),
+            ('lower="-1" upper="1"', (-1, 1, np.inf, np.inf), (NONE, "no effort", "no velocity")),
+            ("", (-np.inf, np.inf, np.inf, np.inf), (NONE, "no effort")),
+            ('lower="-1e16" upper="1e16" velocity="3" effort="3"', (-np.inf, np.inf, 3, 3), (NONE, "1e16")),
+            ('lower="-170" upper="172.5" velocity="3" effort="3"', (-170, 172.5, 3, 3), ("degrees", "-170 to 172.5")),
+            ('lower="-6.28" upper="6.28" velocity="3" effort="3"', (-6.28, 6.28, 3, 3), ""),
+            ('lower="1" upper="-1" velocity="3" effort="3"', (1, -1, 3, 3), ("no room", "1 to -1 of 'j1'")),
+            ('lower=" -1" upper="1 " velocity="3" effort="3"', (-1, 1, 3, 3), ""),
+        ],
+    )
+    def test_as_exporters_write_them(self, tmp_path, caplog, limit, read, facts):
+        text = arm(tmp_path).read_text().replace('effort="9" velocity="8" lower="-1" upper="1"', limit)
+        robot = vp.load_robot(written(tmp_path, text))
+        found = (*robot.position_limits[0], *robot.position_limits[1], *robot.velocity_limit, *robot.effort_limit)
+        assert found == read
+        assert robot.unbounded.tolist() == [np.isinf(read[0])]
+        assert len(caplog.messages) == bool(facts)
+        assert not facts or naming(caplog.messages, facts)
+        assert not facts or naming(vp.inspect_robot(robot).warnings, facts)
+
+    def test_on_a_continuous_joint_are_told(self, tmp_path, caplog):
+        assert vp.load_robot(arm(tmp_path, kind="continuous")).unbounded.all()
+        assert naming(caplog.messages, "continuous", "'j1'")
+
+    def test_one_line_for_many_joints(self, tmp_path, caplog):
+        parts = [link(f"l{k}") + joint(f"j{k}", f"l{k - 1}" if k else "base", f"l{k}") for k in range(12)]
+        path = write_urdf(tmp_path, *parts)
+        vp.load_robot(written(tmp_path, path.read_text().replace('effort="9"', 'effort="-1"')))
+        (line,) = caplog.messages
+        assert len(line) < 240
+
+
+class TestToldAsLeftOut:
+    def test_soft_limits_and_misnamed_dynamics(self, tmp_path, caplog):
+        soft = '<safety_controller soft_lower_limit="-0.1" k_velocity="10"/>'
+        path = arm(tmp_path, inside=soft + '<joint_properties damping="0.2" friction="0.2"/>')
+        robot = vp.load_robot(path)
+        assert robot.position_limits[0].tolist() == [-1.0]
+        assert naming(caplog.messages, "joint_properties", "dynamics", "'j1'")
+        assert naming(vp.inspect_robot(path).warnings, "safety_controller", "'j1'")
+
+    @pytest.mark.parametrize("how", ["beside", "given"])
+    def test_rotors_of_an_srdf_are_as_pinocchio_reads_them(self, tmp_path, how):
+        path = write_urdf(tmp_path, link("a"), link("b"), joint("j1", "base", "a"), joint("j2", "a", "b"))
+        rotors = '<joint name="j2" mass="1e-4" gear_ratio="-50"/><joint name="no" mass="1" gear_ratio="1"/>'
+        srdf = tmp_path / ("made_up.srdf" if how == "beside" else "other.srdf")
+        srdf.write_text(f'<robot name="{how}"><rotor_params>{rotors}</rotor_params></robot>')
+        robot = vp.load_robot(path, srdf=None if how == "beside" else srdf)
+        model = pin.buildModelFromUrdf(str(path))
+        pin.loadRotorParameters(model, str(srdf), False)
+        np.testing.assert_allclose(robot.model.armature, model.armature, rtol=1e-14)
+        assert model.armature[1] == pytest.approx(0.25)
+        assert vp.load_robot(path, armature=0.5).model.armature.tolist() == [0.5, 0.5]
+
+
+class TestFaultyNumbers:
+    def test_a_decimal_comma_is_named_as_the_cause(self, tmp_path):
+        path = arm(tmp_path, INERTIAL.replace('"1.3"', '"0,3"'))
+        with refused(vp.SingularMassMatrix, "'j1'", "'l1'", "'0,3'", "point") as info:
+            vp.load_robot(path)
+        assert len(str(info.value)) <= 240
+        moved = joint("j1", "base", "l1").replace('xyz="0.1 0.02', 'xyz="0,1 0.02')
+        with refused(vp.RobotError, "'j1'", "'0,1 0.02 0.2'", "point"):
+            vp.load_robot(write_urdf(tmp_path, link("l1"), moved))
+
+    def test_a_mass_of_a_billion_kilograms_is_told_as_what_it_is(self, tmp_path, caplog):
+        heavy = INERTIAL.replace('"1.3"', '"6e9"').replace('ixx="0.02"', 'ixx="1e30"')
+        parts = [link("a"), link("b", heavy), joint("j1", "base", "a"), joint("j2", "a", "b")]
+        path = write_urdf(tmp_path, *parts)
+        with refused(vp.SingularMassMatrix, "'b'", "6e+09 kg", "millimetres"):
+            vp.load_robot(path)
+        assert naming(vp.inspect_robot(path).warnings, "'b'", "6e+09 kg")
+
+    def test_in_a_shape_are_told(self, tmp_path, caplog):
+        shape = '<visual><geometry><box size="0,1 0.1 0.1"/></geometry></visual>'
+        path = write_urdf(tmp_path, link("l1", extra=shape), joint("j1", "base", "l1"))
+        assert geometry(vp.load_robot(path)).ngeoms == 0
+        assert naming(caplog.messages, "read in part", "made_up.urdf")
+
+    def test_a_xacro_file_that_was_not_expanded(self, tmp_path):
+        text = arm(tmp_path).read_text().partition("<link")[0] + '<link name="world"/><xacro:arm/></robot>'
+        with refused(vp.RobotError, "no joint that moves", "<xacro:arm>"):
+            vp.load_robot(written(tmp_path, text))
+
+    def test_a_git_lfs_pointer(self, tmp_path):
+        text = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 123\n"
+        with refused(vp.RobotError, "odd.urdf", "Git LFS", "git lfs pull"):
+            vp.load_robot(written(tmp_path, text))
+
+
+class TestPackages:
+    BOX = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+
+    def robot(self, folder, mesh):
+        """A robot in urdf/ of package my_arm, whose folder is named otherwise."""
+        for name in ("urdf", "meshes"):
+            (folder / "ws" / "Some-Repo" / name).mkdir(parents=True, exist_ok=True)
+        package = folder / "ws" / "Some-Repo"
+        (package / "package.xml").write_text("<package><name>my_arm</name></package>")
+        (package / "meshes" / "box.obj").write_text(self.BOX)
+        shape = f'<visual><geometry><mesh filename="{mesh}"/></geometry></visual>'
+        return write_urdf(package / "urdf", link("l1", extra=shape), joint("j1", "base", "l1"))
+
+    @pytest.mark.parametrize(
+        "mesh",
+        [
+            "package://my_arm/meshes/box.obj",
+            "$(find my_arm)/meshes/box.obj",
+            "model://my_arm/meshes/box.obj",
+            "../meshes/box.obj",
+        ],
+    )
+    def test_have_the_name_in_their_package_xml(self, tmp_path, mesh):
+        path = self.robot(tmp_path, mesh)
+        assert geometry(vp.load_robot(path)).ngeoms == 1
+        moved = tmp_path / "elsewhere.urdf"
+        moved.write_text(path.read_text())
+        for folder in (tmp_path / "ws", tmp_path / "ws" / "Some-Repo"):
+            if "://" in mesh or "$" in mesh:
+                assert geometry(vp.load_robot(moved, package_dirs=[folder])).ngeoms == 1
+
+    @pytest.mark.parametrize("mesh", ["package://my_arm/Meshes/box.obj", "../meshes/BOX.obj"])
+    def test_a_file_in_other_case_is_named(self, tmp_path, mesh):
+        robot = vp.load_robot(self.robot(tmp_path, mesh))
+        with refused(vp.RobotError, mesh, "box.obj is there", "'l1'"):
+            geometry(robot)
+
+    def test_a_file_that_is_not_there_is_named_with_where_it_was_looked_for(self, tmp_path):
+        robot = vp.load_robot(self.robot(tmp_path, "package://your_arm/box.obj"))
+        with refused(vp.RobotError, "package://your_arm/box.obj", "package_dirs"):
+            geometry(robot)
 
 
 class TestInertia:

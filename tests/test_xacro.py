@@ -97,11 +97,12 @@ def test_packages_are_those_around_the_file_each_time(workspace, tmp_path):
 
 
 def test_package_dirs(workspace, tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "parts").rename(tmp_path / "elsewhere" / "parts")
+    elsewhere = tmp_path / "not" / "near" / "it"
+    elsewhere.mkdir(parents=True)
+    (tmp_path / "parts").rename(elsewhere / "parts")
     with refused(vp.RobotError, "'parts'"):
         vp.load_robot(workspace)
-    assert vp.load_robot(workspace, package_dirs=[tmp_path / "elsewhere"]).dof == 1
+    assert vp.load_robot(workspace, package_dirs=[elsewhere]).dof == 1
 
 
 @pytest.mark.parametrize(
@@ -152,3 +153,11 @@ def test_arguments_of_what_is_no_xacro_file(tmp_path):
 def test_no_such_file(tmp_path):
     with refused(vp.RobotNotFound, "arm.urdf.xacro"):
         vp.load_robot("arm.urdf.xacro")
+
+
+@pytest.mark.parametrize("how", ['"$(arg tool)"', "\"${xacro.arg('tool')}\""])
+def test_an_argument_without_a_default_is_named(tmp_path, how):
+    path = tmp_path / "arm.urdf.xacro"
+    path.write_text(f'<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name={how}/>')
+    with refused(vp.RobotError, "arm.urdf.xacro", "'tool'", "xacro_args={'tool'"):
+        vp.load_robot(path)

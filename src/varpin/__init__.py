@@ -12,6 +12,7 @@ Load an arm, integrate it variationally, replay it:
 
 from typing import TYPE_CHECKING
 
+from varpin._pinocchio import pinocchio as _pinocchio  # noqa: F401
 from varpin._version import __version__ as __version__
 from varpin.errors import AssemblyError as AssemblyError
 from varpin.errors import ControlError as ControlError
@@ -70,6 +71,7 @@ from varpin.mechanics.noise import CustomNoise as CustomNoise
 from varpin.mechanics.noise import Noise as Noise
 from varpin.mechanics.noise import NoiseFieldError as NoiseFieldError
 from varpin.mechanics.noise import StateNoise as StateNoise
+from varpin.mechanics.reduction import Required as Required
 from varpin.mechanics.scene import Scene as Scene
 from varpin.model import Payload as Payload
 from varpin.model import Robot as Robot
@@ -146,7 +148,6 @@ if TYPE_CHECKING:
     from varpin.ensemble import EnsembleStatistics as EnsembleStatistics
     from varpin.ensemble import PathFailure as PathFailure
     from varpin.ensemble import simulate_ensemble as simulate_ensemble
-    from varpin.io.scenefile import Required as Required
     from varpin.io.scenefile import SceneFile as SceneFile
     from varpin.io.scenefile import SceneFileError as SceneFileError
     from varpin.io.scenefile import load_scene as load_scene
@@ -220,7 +221,7 @@ _LATE: dict[str, tuple[str, ...]] = {
     "varpin.study.extremes": ("check_robot",),
     "varpin.study.linearization_check": ("LinearizationCheck", "check_linearization"),
     "varpin.control.mpc": ("Mpc", "MpcRun", "Plant"),
-    "varpin.io.scenefile": ("Required", "SceneFile", "SceneFileError", "load_scene"),
+    "varpin.io.scenefile": ("SceneFile", "SceneFileError", "load_scene"),
     "varpin.control": (
         "ConstraintReport",
         "Kept",

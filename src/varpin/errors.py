@@ -6,6 +6,9 @@ import difflib
 from collections.abc import Iterable
 from typing import Any, Self
 
+# Names that fit a message of two lines.
+_MOST_NAMES = 8
+
 
 class VarpinError(Exception):
     """Base of all errors that varpin raises."""
@@ -31,6 +34,11 @@ def _meant(name: str, known: tuple[str, ...]) -> tuple[list[str], str]:
     return matches, f"did you mean {' or '.join(map(repr, matches))}? " if matches else ""
 
 
+def _some(names: tuple[str, ...]) -> str:
+    """The first of many names, and how many more there are; all names have their attribute."""
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {len(names) - _MOST_NAMES} more" if names[_MOST_NAMES:] else "")
+
+
 class RobotNotFound(RobotError):
     """No robot of that name, or no file at that path.
 
@@ -43,10 +51,12 @@ class RobotNotFound(RobotError):
         self.name = name
         known = sorted(known)
         self.matches = difflib.get_close_matches(name.lower(), known, n=5, cutoff=0.5)
-        hint = f"close matches: {', '.join(self.matches)}" if self.matches else f"known names: {', '.join(known)}"
+        hints = [f"close matches: {', '.join(self.matches)}"] if self.matches else []
+        if not (note or self.matches):
+            hints = ["varpin.robot_names() lists the names, such as " + ", ".join(known[:5])]
         if more and name.lower() not in known:
-            hint += f"; {more}"
-        super().__init__(f"no robot or URDF file {name!r}{note}; {hint}")
+            hints.append(more)
+        super().__init__("; ".join([f"no robot or URDF file {name[:100]!r}{note}", *hints]))
 
 
 class UnknownJoint(RobotError):
@@ -62,7 +72,7 @@ class UnknownJoint(RobotError):
         self.joint = joint
         self.joints = tuple(joints)
         self.matches, hint = _meant(joint, self.joints)
-        super().__init__(f"{where}: {lack} {joint!r}; {hint}joints: {', '.join(self.joints)}")
+        super().__init__(f"{where}: {lack} {joint!r}; {hint}joints: {_some(self.joints)}")
 
 
 class UnsupportedJoint(RobotError):
@@ -91,20 +101,20 @@ class SingularMassMatrix(RobotError):
         negative: Whether the inertia is negative.
     """
 
-    def __init__(self, joints: Iterable[str], q: object, *, negative: bool = False) -> None:
+    def __init__(
+        self, joints: Iterable[str], q: object = None, *, negative: bool = False, cause: str = "", hint: str = ""
+    ) -> None:
         self.joints = tuple(joints)
         self.negative = negative
-        moving = f"motion of {', '.join(map(repr, self.joints))} carries"
-        if negative:
-            super().__init__(
-                f"the mass matrix is not positive definite at q = {q}: {moving} negative inertia; correct the masses "
-                "and inertias of the links it moves, add armature to the joint, or lock it"
-            )
-        else:
-            super().__init__(
-                f"the mass matrix is singular at q = {q}: {moving} no inertia; give the links it moves mass and "
-                "inertia, add armature to the joint, or lock it"
-            )
+        more = f" and {len(self.joints) - 3} more" if len(self.joints) > 3 else ""
+        names = ", ".join(map(repr, self.joints[:3])) + more
+        kind, lack = ("not positive definite", "negative") if negative else ("singular", "no")
+        why = cause or (
+            f"motion of {names} carries {lack} inertia; "
+            + (hint or "give the links it moves mass and inertia, give the joint an armature, or lock it")
+        )
+        at = "" if q is None else f" at q = {q}"
+        super().__init__(f"the mass matrix is {kind}{at}: {why}")
 
 
 class InputError(VarpinError, ValueError):
@@ -154,7 +164,7 @@ class UnknownFrame(InputError):
         self.matches, hint = _meant(frame, self.frames)
         owner = f"robot {robots[0]!r} has" if len(robots) == 1 else f"robots {', '.join(map(repr, robots))} have"
         where = f"{option}: " if option else ""
-        super().__init__(f"{where}{owner} no frame {frame!r}; {hint}frames: {', '.join(self.frames)}")
+        super().__init__(f"{where}{owner} no frame {frame!r}; {hint}frames: {_some(self.frames)}")
 
 
 class UnknownPosture(InputError):

@@ -45,20 +45,10 @@ def _inspect_scene(request: argparse.Namespace) -> int:
     file = scene_file(request, request.robot, "inspect", *ROBOT_OPTIONS, "gravity", "q", "v")
     spec, required = file.spec, file.required
     table = facts(f"{spec.title} ({spec.path.name})")
-    add_row(table, "robot", f"{file.robot.name}, {len(required.joints)} of {required.described} joints computed")
-    add_row(table, "computed", ", ".join(required.joints))
-    for title, joints in (("locked", required.locked), ("left out: nothing touches", required.idle)):
-        if joints:
-            add_row(table, title, ", ".join(f"{joint} at {at}" for joint, at in joints.items()), style="dim")
-    if len(required.parts) > 1:
-        add_row(table, "planned apart", "; ".join(", ".join(part) for part in required.parts))
-    if required.coupled:
-        add_row(table, "planned together", required.coupled)
-    for name, words in required.terms.items():
+    add_row(table, "robot", file.robot.name)
+    for name, words in required.rows:
         add_row(table, name, words, style="dim" if words == "none" or name == "not modelled" else "")
     add_row(table, "horizon", f"{spec.steps} steps of {spec.dt:g} s, {file.integrator}")
-    if required.saved:
-        add_row(table, "saved", f"{100 * required.saved:.0f}% of the linear algebra of a plan, by counting")
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
     console.print(table)
     return 0

@@ -15,7 +15,7 @@ from varpin.cli.exits import INTERRUPTED, MISTAKE
 from varpin.cli.interrupts import Interrupts
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.io.archive import atomic_file
-from varpin.io.scenefile.spec import FIGURES
+from varpin.io.scenefile.tables import FIGURES
 from varpin.model import Robot
 from varpin.show.replay import check_film, replay
 from varpin.support.checks import positive, writable

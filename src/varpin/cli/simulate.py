@@ -78,7 +78,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
 def _simulate(request: argparse.Namespace, errors: Console) -> int:
     if names_scene(request.robot):
         file = scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
-        driven = bool(not file.scene.conservative or file.controls() is not None or file.spec.seed is not None)
+        driven = bool(not file.scene.conservative or file.controls() is not None or file.spec.simulate.seed is not None)
         outputs = outputs_of(request, file.marks)
         return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
     outputs = outputs_of(request)

@@ -7,7 +7,7 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.errors import AssemblyError, SingularMassMatrix
 from varpin.mechanics.scene import Scene, require_scene
-from varpin.model.tree import place_on_body
+from varpin.model.kinematics import place_on_body
 from varpin.support.checks import JointValues, joint_array
 
 # Rank tolerance of the constraint Jacobian in the kinetic-energy metric, relative to the largest singular value.

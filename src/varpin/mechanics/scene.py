@@ -6,11 +6,11 @@ Equation (1.1) of the paper.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,6 +52,9 @@ from varpin.support.checks import JointValues, as_floats, finite_array, is_one_o
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
 from varpin.support.weak import Weak
+
+if TYPE_CHECKING:
+    from varpin.mechanics.reduction import Required
 
 logger = logging.getLogger(__name__)
 
@@ -293,6 +296,50 @@ class Scene(Frozen):
             else:
                 found.update(*(path_coordinates(self.robot.tree, body).tolist() for body in (each.a, each.b)))
         return sorted(found)
+
+    def without(self, joints: Mapping[str, float] | Collection[str]) -> Scene:
+        """The scene with some joints held still: they are no coordinates, and what acts on them alone is gone.
+
+        A force on frames stays as long as one of its frames moves. A control of held joints alone is gone, too.
+
+        Args:
+            joints: Their positions by name [rad or m], such as :attr:`Required.idle`; or their names, for 0.
+
+        Raises:
+            InputError: The scene has constraints, a CustomForce or CustomNoise, which are of all joints.
+            UnknownJoint: There is no such joint.
+            RobotError: No joint is left.
+        """
+        from varpin.mechanics.reduction import without  # noqa: PLC0415 - it is made of scenes
+
+        return without(self, joints)
+
+    def required(
+        self,
+        q0: JointValues,
+        v0: JointValues = 0.0,
+        *,
+        controls: ArrayLike | None = None,
+        task: Iterable[str] = (),
+    ) -> Required:
+        """The joints that have to be computed, and those that stay at rest: ``scene.without(required.idle)``.
+
+        A group of joints that shares no inertia with others is idle if it starts at rest, and no gravity, spring, noise
+        or control acts on it, nor a task. The motion of the other joints is the same without it.
+
+        Args:
+            q0: Initial configuration, (n,) or by joint name [rad or m].
+            v0: Initial velocity, one number, (n,) or by joint name [rad/s or m/s].
+            controls: Controls of the motion, (m,) or rows of them; left out, none act, and servos hold q0.
+            task: Joints that a task moves by controls that are not known yet, such as those in the cost of a plan.
+
+        Raises:
+            InputError: A wrong shape, or a value that is not finite.
+            UnknownJoint: There is no joint of that name.
+        """
+        from varpin.mechanics.reduction import requirements  # noqa: PLC0415 - it is made of scenes
+
+        return requirements(self, q0, v0, controls, task)
 
     @property
     def dissipates(self) -> bool:

@@ -1,16 +1,7 @@
 """Robots: finding and parsing their files, locking joints, and the flat tree that the core runs on."""
 
-from varpin.model.angles import ADVICE as ADVICE
-from varpin.model.angles import looks_like_degrees as looks_like_degrees
 from varpin.model.chain import planar_chain as planar_chain
 from varpin.model.combination import combine as combine
-from varpin.model.degrees import degrees_hint as degrees_hint
-from varpin.model.degrees import degrees_per_second_hint as degrees_per_second_hint
-from varpin.model.millimetres import AFAR as AFAR
-from varpin.model.millimetres import ASIDE as ASIDE
-from varpin.model.millimetres import IN_MILLIMETRES as IN_MILLIMETRES
-from varpin.model.millimetres import longest_reach as longest_reach
-from varpin.model.millimetres import millimetres_hint as millimetres_hint
 from varpin.model.payload import Payload as Payload
 from varpin.model.robot import Robot as Robot
 from varpin.model.robot import build_robot as build_robot
@@ -23,4 +14,13 @@ from varpin.model.sources import bundled_robots as bundled_robots
 from varpin.model.sources import models_dir as models_dir
 from varpin.model.sources import robot_names as robot_names
 from varpin.model.tree import require_sound as require_sound
+from varpin.model.units import ADVICE as ADVICE
+from varpin.model.units import AFAR as AFAR
+from varpin.model.units import ASIDE as ASIDE
+from varpin.model.units import IN_MILLIMETRES as IN_MILLIMETRES
+from varpin.model.units import degrees_hint as degrees_hint
+from varpin.model.units import degrees_per_second_hint as degrees_per_second_hint
 from varpin.model.units import joint_unit as joint_unit
+from varpin.model.units import longest_reach as longest_reach
+from varpin.model.units import looks_like_degrees as looks_like_degrees
+from varpin.model.units import millimetres_hint as millimetres_hint

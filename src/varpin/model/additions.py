@@ -139,7 +139,10 @@ def with_mesh_inertias(description: Description, density: float) -> Description:
     urdf = read_urdf(description.urdf, description.expanded)
     full = build_model(urdf)
     known = {inertial.link for inertial in description.inertials}
-    shapes = build_shapes(urdf, full, description.package_dirs, pin.coal.MeshLoader())
+    shapes, faults = build_shapes(urdf, full, description.package_dirs)
+    for link, fault in faults.items():
+        if link not in known:
+            raise RobotError(fault)
     model, index = description.model.copy(), joint_index(description.model)
     masses: dict[str, float] = {}
     for shape in shapes.geometryObjects:

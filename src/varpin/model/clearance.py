@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
@@ -18,9 +17,9 @@ from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
 from varpin.model.hull import Hull, hull_around, mesh_points
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
-from varpin.model.robot import Robot, geometry
+from varpin.model.robot import Robot, readable_geometry
 from varpin.model.tree import place_of_frame, z_to
-from varpin.model.urdf import decoded, parsed
+from varpin.model.urdf import read_xml
 from varpin.support.checks import finite_array, over_time, positive, rotation_matrix
 from varpin.support.frozen import Frozen
 
@@ -427,10 +426,7 @@ def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
     """Pairs of links that an SRDF file excludes from collision checks."""
     if srdf is None:
         return set()
-    try:
-        root = parsed(decoded(srdf)[0])
-    except expat.ExpatError as error:
-        raise RobotError(f"{srdf} is not an SRDF: it is not well-formed XML: {error}") from None
+    root, _ = read_xml(srdf)
     pairs = {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
     links = {link for pair in pairs for link in pair}
     unknown = sorted(links - {frame.name for frame in robot.free_model.frames})
@@ -452,10 +448,13 @@ def _vertices(robot: Robot) -> dict[str, Floats]:
     """Points (N, 3) [m], in each link's axes, whose hull contains the shapes of the link."""
     found: dict[str, list[Floats]] = {}
     model = robot.free_model
-    for shape in geometry(robot).geometryObjects:
+    shapes, faulty = readable_geometry(robot)
+    for _, what in faulty.values():
+        raise RobotError(what)
+    for shape in shapes.geometryObjects:
         frame = model.frames[shape.parentFrame]
         place = frame.placement.inverse() * shape.placement
-        corners = _corners(shape.geometry) * np.asarray(shape.meshScale)
+        corners = _corners(shape.geometry)
         found.setdefault(frame.name, []).append(corners @ place.rotation.T + place.translation)
     return {name: np.vstack(parts) for name, parts in found.items()}
 

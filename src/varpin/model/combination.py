@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
@@ -18,6 +19,8 @@ from varpin.model.mimic import Tie, rebuild, tied_model
 from varpin.model.robot import Part, Robot
 from varpin.model.sources import Description
 from varpin.model.tree import flatten
+
+logger = logging.getLogger(__name__)
 
 
 def combine(
@@ -60,6 +63,8 @@ def combine(
         raise InputError(f"with the prefixes {given} there are two joints or frames named {twice[0]!r}")
     model, ties, parts = pin.Model(), [], []
     model.gravity = robots[0].model.gravity
+    if any((robot.model.gravity.linear != model.gravity.linear).any() for robot in robots):
+        logger.warning("robots of different gravity are combined: that of %r is the default of scenes", robots[0].name)
     for robot, place, prefix in zip(robots, placements, given, strict=True):
         part = robot.free_model if place is None else _placed(robot, place)
         shift = model.njoints - 1

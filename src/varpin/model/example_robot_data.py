@@ -104,7 +104,7 @@ def locate(relative: str) -> Path:
         RobotError: example-robot-data is not installed, or its version does not contain the file.
     """
     try:
-        files = _files()
+        files = _files(relative)
     except metadata.PackageNotFoundError:
         raise RobotError(
             f"{relative} is in {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}"
@@ -125,14 +125,16 @@ def installed() -> tuple[str, ...]:
     return tuple(name for name, relative in FIXED_BASE.items() if relative in held)
 
 
-def _files() -> list[str]:
-    """Files of the distribution as the installer recorded them; ``metadata.files`` takes longer.
+def _files(part: str = "") -> list[str]:
+    """Files of the distribution with ``part`` in their path, as the installer recorded them.
+
+    ``metadata.files`` takes longer.
 
     Raises:
         PackageNotFoundError: It is not installed.
     """
     record = metadata.distribution(DISTRIBUTION).read_text("RECORD") or ""
-    return [row[0] for row in csv.reader(record.splitlines()) if row]
+    return [row[0] for row in csv.reader(line for line in record.splitlines() if part in line) if row]
 
 
 def package_dir(urdf: Path) -> Path:

@@ -13,8 +13,9 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
-from varpin.errors import FileError, InputError
-from varpin.support.checks import as_floats, is_file, path_like, positive, require_finite
+from varpin.errors import InputError
+from varpin.model.meshes import joined, read_mesh
+from varpin.support.checks import as_floats, path_like, positive, require_finite
 from varpin.support.frozen import Frozen
 
 coal = pin.coal
@@ -91,11 +92,4 @@ def mesh_points(path: str | os.PathLike[str], scale: float) -> Floats:
     """
     file = path_like("mesh path", path)
     factor = positive("mesh scale", scale, "1")
-    if not is_file(file):
-        raise FileError(f"no mesh file {str(file)!r}")
-    try:
-        mesh = coal.MeshLoader().load(str(file), np.full(3, factor))
-    except (ValueError, RuntimeError) as error:
-        reason = str(error).partition("message: ")[2].replace("\n", " ").partition(" Hint")[0].strip()
-        raise FileError(f"cannot read the mesh {file}: {reason or error}") from None
-    return np.array(mesh.vertices(), dtype=np.float64).reshape(-1, 3)
+    return joined(read_mesh(str(file))).vertices * factor

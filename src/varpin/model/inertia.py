@@ -1,5 +1,7 @@
 """Checks of masses and inertias."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -13,6 +15,8 @@ from varpin.model.urdf import Inertial
 TRIANGLE_TOLERANCE = 1e-3
 # Below this squared radius of gyration [m^2], a link is a point mass and its moments are rounding errors.
 POINT = 1e-12
+# No link of an arm, or of a crane, weighs more [kg]; a link of 100 g whose mesh is in mm does, 1e9 times too much.
+HEAVY = 1e6
 
 
 def principal_moments(inertia: Floats) -> Floats:
@@ -20,28 +24,49 @@ def principal_moments(inertia: Floats) -> Floats:
     return np.asarray(np.linalg.eigvalsh(inertia), dtype=np.float64)
 
 
-def fault(link: str, mass: float, moments: Floats) -> str:
-    """The fault of a link's mass [kg] or principal moments (3,), ascending [kg m^2]; empty if there is none."""
+def fault(link: str, mass: float, moments: Floats) -> tuple[str, str]:
+    """The kind of fault of a link's mass [kg] or principal moments (3,), ascending [kg m^2], and a sentence about it.
+
+    Both are empty if there is none.
+    """
     if mass < 0.0:
-        return f"link {link!r} has mass {mass:g} < 0 [kg]"
+        return "negative mass", f"link {link!r} has mass {mass:g} < 0 [kg]"
+    if mass > HEAVY:
+        return "heavy", f"link {link!r} has a mass of {mass:.3g} kg: are its sizes in millimetres?"
     if np.abs(moments).max() <= POINT * mass:
-        return ""
+        return "", ""
     low, middle, high = moments
     shown = ", ".join(f"{moment:.3g}" for moment in moments)
     if low < -TRIANGLE_TOLERANCE * abs(high):
-        return (
+        return "non-physical inertia", (
             f"link {link!r} has a non-physical inertia: it is not positive definite (principal moments {shown} kg m^2)"
         )
     if high > (1.0 + TRIANGLE_TOLERANCE) * (low + middle):
-        return (
+        return "non-physical inertia", (
             f"link {link!r} has a non-physical inertia: its principal moments {shown} kg m^2 violate the "
             f"triangle inequality, {high:.3g} > {low:.3g} + {middle:.3g}"
         )
-    return ""
+    return "", ""
+
+
+def one_of_each(found: Iterable[tuple[str, str, str]]) -> Iterator[str]:
+    """The first sentence of each kind, and which others it is true of.
+
+    Args:
+        found: Kinds, names and sentences; those without a sentence are left out.
+    """
+    kinds: dict[str, list[tuple[str, str]]] = {}
+    for kind, name, sentence in found:
+        if sentence:
+            kinds.setdefault(kind, []).append((name, sentence))
+    for (_, sentence), *others in kinds.values():
+        names = ", ".join(repr(name) for name, _ in others[:2]) + (f", {len(others) - 2} more" if others[2:] else "")
+        also = f"also {names}" if len(sentence) + len(names) < 230 else f"{len(others)} more"
+        yield sentence + (f" ({also})" if others else "")
 
 
 def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
-    """Faults of the inertias of a model's moving links, in words.
+    """Faults of the inertias of a model's moving links, one sentence a kind.
 
     Args:
         model: The model without mimic joints.
@@ -52,6 +77,9 @@ def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
         names = {joint: name for name, joint in reversed(links.items())}
         bodies = [(names.get(j, model.names[j]), model.inertias[j]) for j in range(1, model.njoints)]
         found = [(name, body.mass, np.array(body.inertia)) for name, body in bodies]
-    for name, mass, inertia in found:
-        if np.isfinite(inertia).all() and (found_fault := fault(name, mass, principal_moments(inertia))):
-            yield found_fault
+    return one_of_each(
+        (kind, name, sentence)
+        for name, mass, inertia in found
+        if np.isfinite(inertia).all()
+        for kind, sentence in [fault(name, mass, principal_moments(inertia))]
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,9 +12,11 @@ from varpin.arrays import Floats, Integers
 from varpin.core import Links as Core
 from varpin.core.arrays import Tree
 from varpin.errors import InputError
-from varpin.model.robot import Robot
 from varpin.model.tree import frame_on_body
 from varpin.support.frozen import Frozen
+
+if TYPE_CHECKING:
+    from varpin.model.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,13 @@ def links(tree: Tree, body: int | None = None) -> Links:
     index = {int(b): k for k, b in enumerate(members)}
     parent = np.array([index.get(int(tree.parent[b]), -1) for b in members], dtype=np.int64)
     return Links(parent, **{name: getattr(tree, name)[members] for name in _BODY[1:]}, dof=tree.armature.size)
+
+
+def place_on_body(tree: Tree, q: Floats, body: int, point: Floats) -> Floats:
+    """World positions (N, 3) [m] of a point (3,) on a body, -1 for the world, at configurations q (N, n)."""
+    if body < 0:
+        return np.tile(point, (len(q), 1))
+    return links(tree, body).core.place_frame(np.eye(3), np.ascontiguousarray(point), np.ascontiguousarray(q), False)[1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
@@ -19,7 +18,8 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.errors import MissingDependency, RobotError
 from varpin.model.equalities import Closure, End, Equality, Gear, rounded_plane
-from varpin.model.urdf import captured_stderr, decoded, parsed
+from varpin.model.meshes import MeshPart, coal_shape
+from varpin.model.urdf import captured_stderr, read_xml
 
 coal = pin.coal
 logger = logging.getLogger(__name__)
@@ -68,8 +68,8 @@ def root_tag(path: Path) -> str:
         FileError: The file cannot be read.
     """
     try:
-        return parsed(decoded(path)[0]).tag
-    except expat.ExpatError:
+        return read_xml(path)[0].tag
+    except RobotError:
         return ""
 
 
@@ -288,12 +288,7 @@ class _Walk:
                 corner, face = int(mesh.vertadr[0]), int(mesh.faceadr[0])
                 vertices = m.mesh_vert[corner : corner + int(mesh.vertnum[0])].astype(float)
                 faces = m.mesh_face[face : face + int(mesh.facenum[0])].astype(np.int64)
-                form = coal.BVHModelOBBRSS()
-                form.beginModel(len(faces), len(vertices))
-                form.addVertices(vertices)
-                form.addTriangles(faces)
-                form.endModel()
-                return form
+                return coal_shape([MeshPart(vertices, faces)])
         return None
 
     def _color(self, geom: int) -> Floats:

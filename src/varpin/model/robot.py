@@ -17,9 +17,10 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
 from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
-from varpin.model.angles import ADVICE, looks_like_degrees
 from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
+from varpin.model.kinematics import place_on_body
+from varpin.model.meshes import Reader, read_mesh, with_own_meshes
 from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.payload import Payload, carry
@@ -27,15 +28,14 @@ from varpin.model.sources import Description, describe, hang_shapes
 from varpin.model.srdf import Posture, of_joints
 from varpin.model.tree import (
     flatten,
-    frame_index,
-    frame_on_body,
     is_unbounded,
     joint_axis,
-    place_on_body,
+    place_of_frame,
     to_pinocchio,
     tree_mass_matrix,
 )
-from varpin.model.urdf import build_model, build_shapes, missing_meshes, missing_meshes_message, read_urdf
+from varpin.model.units import ADVICE, NO_LIMIT, looks_like_degrees
+from varpin.model.urdf import build_model, build_shapes, read_urdf
 from varpin.support.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed, table
@@ -222,13 +222,8 @@ class Robot(Frozen):
         if q.ndim not in (1, 2) or q.shape[-1] != self.dof:
             raise InputError(f"q must have shape (N, {self.dof}) or ({self.dof},), got {q.shape}")
         name = self.end_effector if frame is None else frame
-        found = self.free_model.frames[frame_index(self.free_model, name, self.name)]
-        rows = np.atleast_2d(q)
-        if found.parentJoint == 0:
-            positions = np.tile(found.placement.translation, (len(rows), 1))
-        else:
-            body, _, place = frame_on_body(self.free_model, name, self.name)
-            positions = place_on_body(self.tree, rows, body, place)
+        body, _, place = place_of_frame(self.free_model, name, self.name)
+        positions = place_on_body(self.tree, np.atleast_2d(q), body, place)
         return np.asarray(positions.reshape(*q.shape[:-1], 3), dtype=np.float64)
 
     @property
@@ -241,30 +236,63 @@ class Robot(Frozen):
     def position_limits(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds (n,), (n,) [rad or m]; infinite where there are none.
 
-        Two bounds of 0 count as none, since a URDF without limits is read so; to hold a joint still, lock it.
+        Two bounds of 0 count as none, since a URDF without limits is read so; to hold a joint still, lock it. A leader
+        keeps within the limits of the mimic joints that follow it, unless they leave it no room.
         """
+        return self._position_limits[:2]
+
+    @cached_property
+    def _position_limits(self) -> tuple[Floats, Floats, tuple[str, ...]]:
+        """:attr:`position_limits`, and the followers whose limits would leave their leader no room."""
         lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
-        joints, lowest, highest = self.model.joints, self.model.lowerPositionLimit, self.model.upperPositionLimit
-        for c, name in enumerate(self.joint_names):
-            joint = joints[self.model.getJointId(name)]
-            if joint.nq == 1:
-                lower[c], upper[c] = lowest[joint.idx_q], highest[joint.idx_q]
-        # No limit is the largest double in Pinocchio, and 0 and 0 in a URDF.
-        none = (lower == 0.0) & (upper == 0.0)
-        lower[none | (lower <= -1e300)], upper[none | (upper >= 1e300)] = -np.inf, np.inf
+        tree, model, left_out = self.tree, self.free_model, []
+        followers = {tie.follower for tie in self.ties}
+        for body, joint in enumerate(list(model.joints)[1:]):
+            if joint.nq != 1:
+                continue
+            low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+            # No limit is the largest double in Pinocchio, and 0 and 0 in a URDF.
+            none = low == high == 0.0
+            low, high = -np.inf if none or low < -NO_LIMIT else low, np.inf if none or high > NO_LIMIT else high
+            c, ratio = int(tree.coordinate[body]), float(tree.ratio[body])
+            if body + 1 in followers:
+                if ratio == 0.0:
+                    continue
+                low, high = (
+                    (limit - tree.offset[body]) / ratio for limit in ((low, high) if ratio > 0.0 else (high, low))
+                )
+                low, high = max(low, lower[c]), min(high, upper[c])
+                if not low < high:
+                    left_out.append(model.names[body + 1])
+                    continue
+            lower[c], upper[c] = low, high
         for limit in (lower, upper):
             limit.setflags(write=False)
-        return lower, upper
+        return lower, upper, tuple(left_out)
 
     @cached_property
     def velocity_limit(self) -> Floats:
-        """Bound (n,) [rad/s or m/s]; infinite where there is none, or one of 0."""
-        return self._limit("velocityLimit")
+        """Bound (n,) [rad/s or m/s]; infinite where there is none, or one of 0.
+
+        The bound of a mimic joint is one of its leader.
+        """
+        return self._limit("velocityLimit", -1)
 
     @cached_property
     def effort_limit(self) -> Floats:
-        """Bound (n,) [N m or N]; infinite where there is none, or one of 0."""
-        return self._limit("effortLimit")
+        """Bound (n,) [N m or N]; infinite where there is none, or one of 0.
+
+        The bound of a mimic joint is one of its leader: what the leader exerts, the follower has to bear.
+        """
+        return self._limit("effortLimit", 1)
+
+    def limit_remarks(self) -> list[str]:
+        """A sentence about mimic joints whose limits are left out, if there are any."""
+        left_out = self._position_limits[2]
+        if not left_out:
+            return []
+        more = f" (and {len(left_out) - 1} more)" if len(left_out) > 1 else ""
+        return [f"the limits of mimic joint {left_out[0]!r}{more} leave the joint that it follows no room: left out"]
 
     @property
     def damping(self) -> Floats:
@@ -303,12 +331,15 @@ class Robot(Frozen):
         sums = np.bincount(self.tree.coordinate, np.asarray(values, dtype=float) * weights, minlength=self.dof)
         return np.asarray(sums, dtype=np.float64)
 
-    def _limit(self, attribute: str) -> Floats:
-        index = joint_index(self.model)
-        values = np.asarray(getattr(self.model, attribute), dtype=float)
-        limit = np.array([values[self.model.joints[index[name]].idx_v] for name in self.joint_names])
-        # No limit is the largest double or infinity in Pinocchio, and 0 in a URDF.
-        limit = np.where((limit >= 1e300) | ~(limit > 0.0), np.inf, limit)
+    def _limit(self, attribute: str, power: int) -> Floats:
+        """The least limit (n,) of the joints that each coordinate moves, times their ratios to a power."""
+        limit = np.full(self.dof, np.inf)
+        for body, joint in enumerate(list(self.free_model.joints)[1:]):
+            value, ratio = float(getattr(self.free_model, attribute)[joint.idx_v]), abs(float(self.tree.ratio[body]))
+            # No limit is the largest double or infinity in Pinocchio, and 0 in a URDF.
+            if 0.0 < value < 1e300 and ratio > 0.0:
+                c = int(self.tree.coordinate[body])
+                limit[c] = min(limit[c], value * ratio**power)
         limit.setflags(write=False)
         return limit
 
@@ -340,6 +371,7 @@ def load_robot(
     *,
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     lock: Mapping[str, ArrayLike] | None = None,
+    keep: Sequence[str] | None = None,
     mimic: Literal["tied", "free"] = "tied",
     payload: Payload | Sequence[Payload] = (),
     xacro_args: Mapping[str, object] | None = None,
@@ -361,6 +393,8 @@ def load_robot(
             ``pin.Model``; or a ``RobotWrapper``. :func:`varpin.robot_names` lists the names that need no download.
         lock: Joints to lock and their positions by name: ``{"panda_finger_joint1": 0.02}`` [rad or m]. They are removed
             from the model. A joint with several axes (a free-flyer, say) takes its Pinocchio configuration.
+        keep: Names of the joints that stay: ``["shoulder", "elbow"]``. All others are locked, where ``lock`` says or
+            else at 0, or at the limit that is nearest to 0. Mimic joints stay with their leaders. All stay if left out.
 
     Other Args:
         package_dirs: Folders in which ``package://`` mesh paths, and ``$(find package)`` in xacro files, are looked up.
@@ -398,11 +432,12 @@ def load_robot(
         raise InputError(f"inertia must be 'file' or 'meshes', got {inertia!r}")
     shaped = inertia == "meshes"
     robot, description = _built(
-        source, package_dirs, lock, mimic, payload, xacro_args, srdf, base, armature, density if shaped else None
+        source, package_dirs, lock, keep, mimic, payload, xacro_args, srdf, base, armature, density if shaped else None
     )
-    for remark in (*description.remarks, *faults(robot.free_model, description.inertials)):
+    wrong = (*description.faults, *faults(robot.free_model, description.inertials))
+    for remark in (*description.remarks, *wrong, *robot.limit_remarks()):
         logger.warning("robot %r: %s", robot.name, remark)
-    check_inertia(robot)
+    check_inertia(robot, description.faults)
     return robot
 
 
@@ -411,6 +446,7 @@ def build_robot(
     *,
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     lock: Mapping[str, ArrayLike] | None = None,
+    keep: Sequence[str] | None = None,
     mimic: Literal["tied", "free"] = "tied",
     payload: Payload | Sequence[Payload] = (),
     xacro_args: Mapping[str, object] | None = None,
@@ -419,13 +455,39 @@ def build_robot(
     armature: JointValues | None = None,
 ) -> Robot:
     """:func:`load_robot` without its checks of inertia, to inspect faulty models."""
-    return _built(source, package_dirs, lock, mimic, payload, xacro_args, srdf, base, armature, None)[0]
+    return _built(source, package_dirs, lock, keep, mimic, payload, xacro_args, srdf, base, armature, None)[0]
+
+
+def hold_joints(robot: Robot, positions: Mapping[str, ArrayLike]) -> Robot:
+    """A robot that is no combined one, with further joints locked at ``positions`` by name [rad or m].
+
+    Raises:
+        UnknownJoint: The robot has no such joint.
+        RobotError: No joint is left.
+    """
+    whole = Description(robot.name, robot.free_model, robot.ties, visuals=robot.visuals)
+    model, ties, visuals, locked = _lock(whole, positions)
+    followers = {tie.follower for tie in ties}
+    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
+    if not coordinates:
+        raise RobotError(f"robot {robot.name!r} has no joint left that moves")
+    return robot.changed(
+        model=tied_model(model, ties),
+        joint_names=tuple(model.names[joint] for joint in coordinates),
+        free_model=model,
+        ties=ties,
+        tree=flatten(model, ties, coordinates),
+        locked=MappingProxyType({**robot.locked, **locked}),
+        visuals=visuals,
+        loops=_open(robot.loops, model),
+    )
 
 
 def _built(
     source: object,
     package_dirs: Sequence[str | os.PathLike[str]] | None,
     lock: Mapping[str, ArrayLike] | None,
+    keep: Sequence[str] | None,
     mimic: Literal["tied", "free"],
     payload: Payload | Sequence[Payload],
     xacro_args: Mapping[str, object] | None,
@@ -447,7 +509,7 @@ def _built(
         raise RobotError(f"robot {description.name!r} has several joints named {', '.join(map(repr, twice))}")
     if mimic == "free":
         description = replace(description, ties=())
-    model, ties, visuals, locked = _lock(description, lock)
+    model, ties, visuals, locked = _lock(description, _locks(description, lock, keep))
     unwound = _unwound(model, ties)
     if visuals is not None:
         hang_shapes(visuals, model, unwound)
@@ -455,7 +517,8 @@ def _built(
     followers = {tie.follower for tie in ties}
     coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
     if not coordinates:
-        raise RobotError(f"robot {description.name!r} has no joint that moves")
+        why = "".join(f"; {remark}" for remark in description.remarks[:1])
+        raise RobotError(f"robot {description.name!r} has no joint that moves{why}")
     with_rotors(model, armature, coordinates, tuple(locked))
     tree = flatten(model, ties, coordinates)
     robot = Robot(
@@ -478,19 +541,53 @@ def _built(
     return robot, description
 
 
+def _locks(
+    description: Description, lock: Mapping[str, ArrayLike] | None, keep: Sequence[str] | None
+) -> Mapping[str, ArrayLike]:
+    """The joints to lock and their positions: those of ``lock``, and those that ``keep`` does not name."""
+    if not (lock is None or isinstance(lock, Mapping)):
+        raise InputError(f"lock must map joint names to positions, as in {{'elbow': 0.5}}, got {lock!r}")
+    given = dict(lock or {})
+    if keep is None:
+        return given
+    if isinstance(keep, str | Mapping) or not all(isinstance(name, str) for name in keep):
+        raise InputError(f"keep must be a list of joint names, got {keep!r}")
+    model = description.model
+    leaders = {model.names[tie.follower]: model.names[tie.leader] for tie in description.ties}
+    for name in keep:
+        if name not in joint_index(model):
+            raise UnknownJoint(name, joint_index(model), f"keep of robot {description.name!r}")
+        if name in given:
+            raise InputError(f"joint {name!r} is in keep and in lock")
+        if leaders.get(name, name) not in keep:
+            raise InputError(f"keep: joint {name!r} mimics {leaders[name]!r}; keeping {leaders[name]!r} keeps both")
+    neutral = pin.neutral(model)
+    for joint, name in enumerate(model.names):
+        if joint == 0 or name in keep or name in leaders or name in given:
+            continue
+        kind = model.joints[joint]
+        at = slice(kind.idx_q, kind.idx_q + kind.nq)
+        if kind.nv > 1:
+            given[name] = neutral[at]
+        elif kind.nq == 2:
+            given[name] = 0.0
+        else:
+            low, high = float(model.lowerPositionLimit[at][0]), float(model.upperPositionLimit[at][0])
+            given[name] = min(max(0.0, low), high) if low < high else 0.0
+    return given
+
+
 def _lock(
-    description: Description, lock: Mapping[str, ArrayLike] | None
+    description: Description, lock: Mapping[str, ArrayLike]
 ) -> tuple[pin.Model, tuple[Tie, ...], pin.GeometryModel | None, dict[str, float | tuple[float, ...]]]:
     """Remove the locked joints, and the followers of locked leaders, from model, ties and geometry."""
     model, visuals = description.model, description.visuals
     index = joint_index(model)
     leaders = {tie.follower: tie for tie in description.ties}
-    if not (lock is None or isinstance(lock, Mapping)):
-        raise InputError(f"lock must map joint names to positions, as in {{'elbow': 0.5}}, got {lock!r}")
     reference = pin.neutral(model)
     locked: dict[str, float | tuple[float, ...]] = {}
     positions: dict[int, Floats] = {}
-    for name, value in (lock or {}).items():
+    for name, value in lock.items():
         if name not in index:
             raise UnknownJoint(str(name), index, f"lock of robot {description.name!r}")
         joint = index[name]
@@ -597,67 +694,49 @@ def geometry(robot: Robot) -> pin.GeometryModel:
     Raises:
         RobotError: A mesh is missing or cannot be read; the message names it.
     """
-    if robot.parts:
-        return _of_parts(robot, [geometry(part.robot) for part in robot.parts])
-    if robot.visuals is not None:
-        return robot.visuals
-    if robot.mjcf is not None:
-        return _on_joints(robot, *mjcf_shapes(robot.mjcf))
-    if robot.urdf is None:
-        return pin.GeometryModel()
-    urdf = read_urdf(robot.urdf, robot.expanded)
-    full = build_model(urdf)
-    return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, pin.coal.MeshLoader()))
+    shapes, faulty = readable_geometry(robot)
+    for _, what in faulty.values():
+        raise RobotError(what)
+    for shape in shapes.geometryObjects:
+        if getattr(shape.geometry, "build_state", None) == pin.coal.BVHBuildState.BVH_BUILD_STATE_BEGUN:
+            shape.geometry.endModel()
+    return shapes
 
 
-def readable_geometry(robot: Robot) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
+def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.GeometryModel, dict[str, tuple[int, str]]]:
     """The readable part of :func:`geometry`, link by link.
+
+    Args:
+        robot: The robot.
+        read: Reads a mesh file.
 
     Returns:
         The shapes of the links that can be read, and for each other link by name, its joint in ``free_model`` and its
         fault in words; missing meshes share one message.
     """
     if robot.parts:
-        found = [readable_geometry(part.robot) for part in robot.parts]
+        found = [readable_geometry(part.robot, read) for part in robot.parts]
         faults_of_links = {
             part.prefix + name: (joint + part.shift if joint else 0, what)
             for part, (_, faulty) in zip(robot.parts, found, strict=True)
             for name, (joint, what) in faulty.items()
         }
         return _of_parts(robot, [shapes for shapes, _ in found]), faults_of_links
-    if robot.mjcf is not None:
-        try:
-            return geometry(robot), {}
-        except RobotError as error:
-            faulty = str(error)
-        return pin.GeometryModel(), {frame.name: (frame.parentJoint, faulty) for frame in _links(robot.free_model)}
-    if robot.visuals is not None or robot.urdf is None:
-        return geometry(robot), {}
-    urdf = read_urdf(robot.urdf, robot.expanded)
-    full = build_model(urdf)
-    loader = pin.coal.CachedMeshLoader()
+    frames = [frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY]
     try:
-        return _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader)), {}
+        if robot.visuals is not None:
+            return with_own_meshes(robot.visuals, read), {}
+        if robot.mjcf is not None:
+            return _on_joints(robot, *mjcf_shapes(robot.mjcf)), {}
+        if robot.urdf is None:
+            return pin.GeometryModel(), {}
+        urdf = read_urdf(robot.urdf, robot.expanded)
+        full = build_model(urdf)
+        shapes, faulty = build_shapes(urdf, full, robot.package_dirs, read)
     except RobotError as error:
-        problem = str(error)
-    found, missing = pin.GeometryModel(), {}
-    absent = missing_meshes(urdf, robot.package_dirs)
-    absent_message = missing_meshes_message(urdf, absent, robot.package_dirs)
-    for link in urdf.elements("link"):
-        name = link.get("name", "")
-        if link.find("visual") is None:
-            continue
-        try:
-            part = _on_joints(robot, full, build_shapes(urdf, full, robot.package_dirs, loader, name))
-        except RobotError as error:
-            frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.BODY)]
-            missing[name] = frame.parentJoint, absent_message if name in absent else str(error)
-        else:
-            for shape in part.geometryObjects:
-                found.addGeometryObject(shape)
-    if urdf.root is None:
-        missing = {frame.name: (frame.parentJoint, problem) for frame in _links(robot.free_model)}
-    return found, missing
+        return pin.GeometryModel(), {frame.name: (frame.parentJoint, str(error)) for frame in frames}
+    joints = {frame.name: frame.parentJoint for frame in frames}
+    return _on_joints(robot, full, shapes), {link: (joints[link], what) for link, what in faulty.items()}
 
 
 def _of_parts(robot: Robot, shapes: Sequence[pin.GeometryModel]) -> pin.GeometryModel:
@@ -675,10 +754,6 @@ def _of_parts(robot: Robot, shapes: Sequence[pin.GeometryModel]) -> pin.Geometry
                 shape.placement = part.place * given.placement
             together.addGeometryObject(shape)
     return together
-
-
-def _links(model: pin.Model) -> list[pin.Frame]:
-    return [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
 
 
 def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin.GeometryModel:
@@ -710,8 +785,12 @@ def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin
     return visuals
 
 
-def check_inertia(robot: Robot) -> None:
+def check_inertia(robot: Robot, known: Sequence[str] = ()) -> None:
     """Refuse a robot whose mass matrix is singular at q = 0 or at a few seeded random configurations.
+
+    Args:
+        robot: The robot.
+        known: What its masses lack, in words.
 
     Raises:
         SingularMassMatrix: The mass matrix is singular; the message names the joints that move no inertia.
@@ -723,18 +802,24 @@ def check_inertia(robot: Robot) -> None:
             M = tree_mass_matrix(robot.tree, q)
         if not np.isfinite(M).all():
             raise RobotError(
-                f"the mass matrix of robot {robot.name!r} is not finite at q = {q}: masses, inertias, distances or "
+                f"the mass matrix of robot {robot.name!r} is not finite: masses, inertias, distances or "
                 "mimic multipliers are beyond the range of floating-point numbers"
             )
         inertia = np.diag(M)
-        if not (inertia > 0.0).all():
-            negative = bool((inertia < 0.0).any())
-            wrong = inertia < 0.0 if negative else inertia == 0.0
-            raise SingularMassMatrix(np.array(robot.joint_names)[wrong].tolist(), q, negative=negative)
-        scale = np.sqrt(inertia)
-        values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
-        rounding = robot.dof * np.finfo(float).eps
-        if values[0] <= rounding:
-            worst = np.abs(vectors[:, 0])
-            moving = [name for name, x in zip(robot.joint_names, worst, strict=True) if x >= 0.5 * worst.max()]
-            raise SingularMassMatrix(moving, q, negative=bool(values[0] < -rounding))
+        faulty = inertia <= 0.0
+        negative = bool((inertia < 0.0).any())
+        if negative:
+            faulty = inertia < 0.0
+        elif not faulty.any():
+            scale = np.sqrt(inertia)
+            values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
+            rounding = robot.dof * np.finfo(float).eps
+            if values[0] > rounding:
+                continue
+            worst, negative = np.abs(vectors[:, 0]), bool(values[0] < -rounding)
+            faulty = worst >= 0.5 * worst.max()
+        # Beside a link of a billion kg every other inertia is a rounding error.
+        heavy = next((text for text in faults(robot.free_model, ()) if " has a mass of " in text), "")
+        raise SingularMassMatrix(
+            np.array(robot.joint_names)[faulty].tolist(), negative=negative, cause=heavy, hint="".join(known[:1])
+        )

@@ -23,11 +23,15 @@ from varpin.model.mimic import (
     untied_model,
 )
 from varpin.model.mjcf import is_mjcf, read_mjcf, root_tag
-from varpin.model.srdf import Posture, beside, read_postures, reference_postures
-from varpin.model.urdf import Inertial, Mimic, build_model, read_urdf
-from varpin.model.xacro import enclosing_packages, expand, is_xacro, plain_name
+from varpin.model.packages import Packages
+from varpin.model.srdf import Posture, beside, read_postures, read_rotors, reference_postures
+from varpin.model.urdf import Inertial, compared_model, read_inertials, read_urdf
+from varpin.model.xacro import expand, is_xacro, plain_name
 
 logger = logging.getLogger(__name__)
+
+# Suffixes of robots' files.
+_SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,7 @@ class Description:
         visuals: Geometry of a RobotWrapper.
         inertials: Inertias of the links of a URDF, which the model merges into bodies.
         remarks: What the source leaves out, in words.
+        faults: What its masses lack, in words.
         postures: Postures of the joints of ``model``.
         loops: Pairs of frames that the source closes to loops, and the tree leaves open.
         equalities: Equality constraints of the source.
@@ -60,6 +65,7 @@ class Description:
     visuals: pin.GeometryModel | None = None
     inertials: tuple[Inertial, ...] = ()
     remarks: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
     postures: tuple[Posture, ...] = ()
     loops: tuple[tuple[str, str], ...] = ()
     equalities: tuple[Equality, ...] = ()
@@ -106,7 +112,7 @@ def describe(
         return description
     if not isinstance(srdf, str | os.PathLike):
         raise InputError(f"srdf must be the path of a file, got {type(srdf).__name__}")
-    return replace(description, postures=_postures(Path(srdf).expanduser(), folders, xacro_args or {}))
+    return _with_srdf(description, Path(srdf).expanduser(), folders, xacro_args or {})
 
 
 def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, object], *, mimic: bool) -> Description:
@@ -120,6 +126,10 @@ def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, ob
             f"got {type(source).__name__}"
         )
     text = os.fspath(source)
+    if text.lstrip("\ufeff \t\r\n").startswith("<"):
+        raise InputError(
+            "source is the text of a file, not its path: write it to a file, or give pin.buildModelFromXML(text)"
+        )
     path = Path(text).expanduser()
     is_path = isinstance(source, os.PathLike) or path.suffix or os.sep in text
     if is_path and _is_file(path):
@@ -139,10 +149,15 @@ def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, ob
         return _of_downloaded(text, folders, xacro_args, mimic=mimic)
     if is_path and path.is_dir():
         raise RobotError(f"{path} is a folder, not a URDF file; it contains {_urdf_files(path)}")
-    note = "" if path.suffix not in (".urdf", ".xacro") else f" (looked in {path.absolute().parent})"
+    if is_path:
+        folder = path.absolute().parent
+        if not folder.is_dir():
+            raise RobotNotFound(text, (), f": there is no folder {folder}")
+        there = [file.name for file in folder.iterdir() if file.suffix in _SUFFIXES]
+        raise RobotNotFound(path.name, there, f" in the folder {folder}")
     # Without the package its names are unknown.
-    more = "" if downloadable or is_path else robot_descriptions.INSTALL
-    raise RobotNotFound(text, [*bundled, *example_robot_data.installed(), *downloadable], note, more)
+    more = "" if downloadable else robot_descriptions.INSTALL
+    raise RobotNotFound(text, [*bundled, *example_robot_data.installed(), *downloadable], more=more)
 
 
 def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[str] | None) -> tuple[str, ...]:
@@ -251,9 +266,7 @@ def _of_example(name: str, folders: tuple[str, ...], *, mimic: bool) -> Descript
     folders = (*folders, str(example_robot_data.package_dir(urdf)))
     description = _of_urdf(urdf, name, folders, mimic=mimic)
     if name in example_robot_data.ROTORS:
-        model = description.model
-        pin.loadRotorParameters(model, str(example_robot_data.locate(example_robot_data.ROTORS[name])), False)
-        model.armature = np.asarray(model.rotorInertia) * np.asarray(model.rotorGearRatio) ** 2
+        _add_rotors(description.model, read_rotors(example_robot_data.locate(example_robot_data.ROTORS[name])))
     return description
 
 
@@ -264,8 +277,7 @@ def _of_downloaded(name: str, folders: tuple[str, ...], arguments: Mapping[str, 
     description = _of_file(found.path, name, folders, xacro_args, found.packages, mimic=mimic)
     if found.srdf is None:
         return description
-    postures = _postures(found.srdf, folders, {**found.srdf_args, **arguments}, found.packages)
-    return replace(description, postures=postures)
+    return _with_srdf(description, found.srdf, folders, {**found.srdf_args, **arguments}, found.packages)
 
 
 def _of_file(
@@ -302,7 +314,7 @@ def _of_mjcf(path: Path, name: str) -> Description:
 
 def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
     """Folders in which the packages of a file are looked up: ``folders``, those of its enclosing packages, its own."""
-    around = (str(package.parent) for package in enclosing_packages(path).values())
+    around = (str(package.parent) for package in Packages(path).around.values())
     return tuple(dict.fromkeys((*folders, *around, str(path.parent))))
 
 
@@ -310,46 +322,55 @@ def _of_urdf(
     path: Path, name: str, folders: tuple[str, ...], *, mimic: bool, expanded: str | None = None
 ) -> Description:
     urdf = read_urdf(path, expanded)
-    model, mimics, remarks = build_model(urdf), urdf.mimics, urdf.remarks
-    if urdf.root is None:
-        remarks = (*remarks, f"{urdf.fault}; varpin uses what Pinocchio's parser, which is more lenient, reads")
-        mimics = _mimics_of(build_model(urdf, mimic=True))
+    model, differences = compared_model(urdf, expanded)
+    inertials, lacks = read_inertials(urdf, model)
+    remarks = (*urdf.remarks, *differences)
+    for note in urdf.notes:
+        logger.info("robot %r: %s", name, note)
     ties: tuple[Tie, ...] = ()
     if mimic:
-        ties = ties_of(mimics, model)
+        ties = ties_of(urdf.mimics, model)
         order = depth_first(model, ties)
         if order != sorted(order):
             model, ties = reordered(model, ties, order)
-    postures: tuple[Posture, ...] = ()
-    if srdf := beside(path, "" if urdf.root is None else urdf.root.get("name", "")):
-        try:
-            postures = read_postures(srdf)
-        except (RobotError, FileError) as error:
-            # Not an error: the user did not ask for this file.
-            remarks = (*remarks, f"{error}; the robot has no postures")
-    return Description(
+    description = Description(
         name=name,
         model=model,
         ties=ties,
         urdf=path,
         expanded=expanded,
         package_dirs=_places(path, folders),
-        inertials=urdf.inertials,
+        inertials=inertials,
         remarks=remarks,
-        postures=postures,
+        faults=lacks,
         loops=urdf.loops,
     )
+    if srdf := beside(path, urdf.root.get("name", "")):
+        try:
+            return _with_srdf(description, srdf, folders, {})
+        except (RobotError, FileError) as error:
+            # Not an error: the user did not ask for this file.
+            return replace(description, remarks=(*remarks, f"the robot has no postures: {error}"))
+    return description
 
 
-def _postures(
-    path: Path, folders: tuple[str, ...], arguments: Mapping[str, object], packages: Mapping[str, str] | None = None
-) -> tuple[Posture, ...]:
-    """The postures in an SRDF file or its xacro file, which need not take all of the robot's arguments."""
+def _with_srdf(
+    description: Description,
+    path: Path,
+    folders: tuple[str, ...],
+    arguments: Mapping[str, object],
+    packages: Mapping[str, str] | None = None,
+) -> Description:
+    """The postures and rotors in an SRDF file or its xacro file, which need not take all of the robot's arguments."""
     text = expand(path, arguments, _places(path, folders), packages, strict=False) if is_xacro(path) else None
-    return read_postures(path, text)
+    _add_rotors(description.model, read_rotors(path, text))
+    return replace(description, postures=read_postures(path, text))
 
 
-def _mimics_of(model: pin.Model) -> dict[str, Mimic]:
-    """The mimic joints of a model by name."""
-    free, ties = untied_model(model)
-    return {free.names[tie.follower]: Mimic(free.names[tie.leader], tie.ratio, tie.offset) for tie in ties}
+def _add_rotors(model: pin.Model, armature: Mapping[str, float]) -> None:
+    """Set the armature of joints by name [kg m^2 or kg]; names of no joint are ignored."""
+    values = np.array(model.armature)
+    for joint in range(1, model.njoints):
+        if model.names[joint] in armature:
+            values[model.joints[joint].idx_v] = armature[model.names[joint]]
+    model.armature = values

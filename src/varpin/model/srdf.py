@@ -5,12 +5,11 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.parsers import expat
 
 import pinocchio as pin
 
-from varpin.errors import RobotError
-from varpin.model.urdf import decoded, finite_number, parsed
+from varpin.errors import FileError, RobotError
+from varpin.model.urdf import finite_number, read_xml
 from varpin.model.xacro import plain_name
 
 logger = logging.getLogger(__name__)
@@ -44,6 +43,24 @@ def beside(path: Path, robot: str) -> Path | None:
     return named[0] if len(named) == 1 else None
 
 
+def read_rotors(path: Path, text: str | None = None) -> dict[str, float]:
+    """The armature of joints [kg m^2 or kg] in an SRDF file, rotor inertia times squared gear ratio.
+
+    Raises:
+        FileError: The file cannot be read.
+        RobotError: It is not an SRDF, or a number in it is none.
+    """
+    armature = {}
+    for joint in read_xml(path, text)[0].iterfind("rotor_params/joint"):
+        name = joint.get("name", "")
+        mass, ratio = (
+            finite_number(joint.get(key, "0"), f"{path}: {key} of the rotor of joint {name!r}")
+            for key in ("mass", "gear_ratio")
+        )
+        armature[name] = mass * ratio**2
+    return armature
+
+
 def read_postures(path: Path, text: str | None = None) -> tuple[Posture, ...]:
     """The postures in an SRDF file.
 
@@ -55,10 +72,7 @@ def read_postures(path: Path, text: str | None = None) -> tuple[Posture, ...]:
         FileError: The file cannot be read.
         RobotError: It is not an SRDF, or a position in it is not a number.
     """
-    try:
-        root = parsed(decoded(path)[0] if text is None else text)
-    except expat.ExpatError as error:
-        raise RobotError(f"{path} is not an SRDF: it is not well-formed XML: {error}") from None
+    root, _ = read_xml(path, text)
     if root.tag != "robot":
         raise RobotError(f"{path} is not an SRDF: its root element is <{root.tag}>, not <robot>")
     postures = []
@@ -100,6 +114,6 @@ def _angle(numbers: Sequence[float]) -> float:
 def _robot_of(path: Path) -> str:
     """The name of the robot in a file; empty if the file cannot be read."""
     try:
-        return parsed(decoded(path)[0]).get("name", "")
-    except (expat.ExpatError, OSError):
+        return read_xml(path)[0].get("name", "")
+    except (RobotError, FileError):
         return ""

@@ -379,22 +379,6 @@ def _turn(angle: float) -> Floats:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def place_on_body(tree: Tree, q: Floats, body: int, point_on_body: Floats) -> Floats:
-    """World positions (N, 3) [m] of a point (3,) on a body at configurations q (N, n)."""
-    at = q[:, tree.coordinate] * tree.ratio + tree.offset
-    point = np.broadcast_to(point_on_body, (len(q), 3))
-    while body >= 0:
-        if tree.prismatic[body]:
-            point = point + np.stack([np.zeros(len(q)), np.zeros(len(q)), at[:, body]], axis=1)
-        else:
-            c, s = np.cos(at[:, body]), np.sin(at[:, body])
-            x, y, z = point.T
-            point = np.stack([c * x - s * y, s * x + c * y, z], axis=1)
-        point = point @ tree.rotation[body].T + tree.translation[body]
-        body = int(tree.parent[body])
-    return point
-
-
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:
     """Groups of coordinates coupled by inertia or mimic joints: a label (n,) from 0 on for each coordinate.
 

@@ -1,14 +1,37 @@
-"""Units of joints in messages."""
+"""Units of joints, and numbers that look as if they were given in other units."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+
+from varpin.arrays import Floats
 
 if TYPE_CHECKING:
     from varpin.model.robot import Robot
+
+# Largest plausible angle [rad]: two turns.
+_TURNS = 4.0 * math.pi
+# Degrees up to this are plausible, in degrees or degrees per second.
+_DEGREES = 1e6
+# Velocities beyond this multiple of a joint's limit are implausible in radians.
+_SEVERAL = 6.0
+ADVICE = "angles are in radians, np.deg2rad makes them of degrees"
+
+# A joint whose limit is larger [rad or m] has none: exporters write 1e9, 1e16 or the largest double.
+NO_LIMIT = 1e6
+
+# Largest plausible length in a robot's surroundings, in units of its reach: a larger one looks like millimetres.
+AFAR = 50.0
+# Largest plausible clearance, in the same units.
+ASIDE = 2.0
+# Least reach that counts [m]: a wheel has none.
+_LEAST = 0.1
+IN_MILLIMETRES = "it may be in millimetres, and lengths are in metres"
 
 
 def joint_unit(robot: Robot, coordinates: int | Sequence[int] | slice = slice(None), *, speed: bool = False) -> str:
@@ -24,3 +47,95 @@ def joint_unit(robot: Robot, coordinates: int | Sequence[int] | slice = slice(No
     if slides.all():
         return sliding
     return f"{turning} or {sliding}" if slides.any() else turning
+
+
+def looks_like_degrees(angle: float) -> bool:
+    """Whether an angle [rad] is larger than two turns."""
+    return abs(angle) > _TURNS
+
+
+def limits_in_degrees(lower: float, upper: float) -> bool:
+    """Whether the limits of a joint [rad] look like degrees: larger than two turns, with at most one decimal."""
+    limits = 10.0 * np.array([lower, upper])
+    typed = bool((limits == np.round(limits)).all())
+    return typed and _TURNS < max(abs(lower), abs(upper)) < _DEGREES
+
+
+def degrees_hint(robot: Robot, name: str, q: Floats) -> str:
+    """A sentence about the joint of a configuration that looks most like degrees; empty if none does.
+
+    Joints without limits may have turned many times in an earlier motion. Of these joints only values with at most two
+    decimals count, as someone types them.
+
+    Args:
+        robot: The robot.
+        name: Name of the configuration, for the sentence.
+        q: Configuration (n,) [rad or m].
+    """
+    lower, upper = robot.position_limits
+    bounded = np.isfinite(lower) | np.isfinite(upper)
+    wrong: NDArray[np.bool_] = ~robot.slides & np.where(bounded, (q < lower) | (q > upper), _typed(q))
+    angles = np.where(wrong, np.abs(q), 0.0)
+    joint = int(np.argmax(angles))
+    if not looks_like_degrees(float(angles[joint])):
+        return ""
+    turns = f"{angles[joint] / (2.0 * math.pi):.0f} turns"
+    return f"{name} of {robot.joint_names[joint]!r} is {q[joint]:.4g} rad, {turns}, and looks like degrees: {ADVICE}"
+
+
+def degrees_per_second_hint(robot: Robot, name: str, v: Floats) -> str:
+    """A sentence about the joint of a velocity that looks most like degrees per second; empty if none does.
+
+    That is a number of at most two decimals, several times the joint's limit, where the angles of all joints with
+    limits are within them if they are in degrees per second.
+
+    Args:
+        robot: The robot.
+        name: Name of the velocity, for the sentence.
+        v: Velocity (n,) [rad/s or m/s].
+    """
+    if not v.any():
+        return ""
+    limit = robot.velocity_limit
+    limited = ~robot.slides & np.isfinite(limit) & (limit > 0.0)
+    times = np.where(limited, np.abs(v), 0.0) / np.where(limited, limit, 1.0)
+    joint = int(np.argmax(np.where(_typed(v), times, 0.0)))
+    if not times[joint] > _SEVERAL or np.deg2rad(times.max()) > 1.0:
+        return ""
+    return (
+        f"{name} of {robot.joint_names[joint]!r} is {v[joint]:.4g} rad/s, {times[joint]:.3g} times its limit of "
+        f"{limit[joint]:.4g}, and looks like degrees per second: {ADVICE}"
+    )
+
+
+def _typed(values: Floats) -> NDArray[np.bool_]:
+    """Whether numbers have at most two decimals, as someone types them."""
+    hundredths = 100.0 * np.clip(values, -_DEGREES, _DEGREES)
+    whole: NDArray[np.bool_] = np.abs(hundredths - np.round(hundredths)) <= 1e-9 * np.abs(hundredths)
+    return (np.abs(values) < _DEGREES) & whole
+
+
+def longest_reach(robot: Robot) -> float:
+    """Upper bound on the distance of a centre of mass from the root of its tree [m]; infinite on free rails."""
+    tree = robot.tree
+    lower, upper = robot.position_limits
+    path = np.zeros(len(tree.parent))
+    for body, parent in enumerate(tree.parent):
+        if parent >= 0:
+            path[body] = path[parent] + np.linalg.norm(tree.translation[body])
+        if tree.prismatic[body]:
+            ends = np.array([lower[tree.coordinate[body]], upper[tree.coordinate[body]]])
+            path[body] += float(np.abs(tree.ratio[body] * ends + tree.offset[body]).max())
+    return float((path + np.linalg.norm(tree.center, axis=1)).max())
+
+
+def millimetres_hint(robot: Robot, lengths: dict[str, float], plausible: float = AFAR) -> str:
+    """A sentence about the largest of some named lengths [m] that look like millimetres; empty if none does.
+
+    Lengths up to ``plausible`` times the robot's reach do not.
+    """
+    name, length = max(lengths.items(), key=lambda own: own[1])
+    reach = longest_reach(robot)
+    if not length > plausible * max(reach, _LEAST):
+        return ""
+    return f"{name} is {length:.4g} m, and the reach of {robot.name} at most {reach:.3g} m: {IN_MILLIMETRES}"

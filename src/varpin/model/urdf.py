@@ -1,13 +1,12 @@
-"""Reading URDF files: Pinocchio's parser builds the model; what it drops is read here or reported.
+"""Reading URDF files: Pinocchio's parser builds the model; what it leaves out of a file or refuses is told here.
 
-Pinocchio drops what it cannot read (an inertia that is not a number, a joint that closes a loop) with at most a line on
-stderr, and returns a robot that differs from the file. It merges links on fixed joints into one body, and it refuses
-some useful mimic elements.
+The file is parsed here as well, for what Pinocchio has no word for: mimic elements, loops, textures, the limits that
+exporters write for "none". Everything else, with the version of URDF that it depends on, is Pinocchio's reading.
 """
 
-import codecs
+from __future__ import annotations
+
 import contextlib
-import copy
 import logging
 import math
 import os
@@ -17,11 +16,9 @@ import sys
 import tempfile
 import threading
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 from xml.parsers import expat
 
 import numpy as np
@@ -29,29 +26,29 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from varpin.errors import FileError, RobotError
+from varpin.model.meshes import Reader, put_mesh, read_mesh, with_own_meshes
+from varpin.model.packages import LFS_POINTER, Packages
+from varpin.model.units import NO_LIMIT, limits_in_degrees
 
 logger = logging.getLogger(__name__)
 
-T = TypeVar("T")
+VERSIONS = ("1.0", "1.1", "1.2")  # of URDF, which Pinocchio reads
 
-_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+# The attributes of a URDF that hold numbers, by element.
+_NUMBERS = {
+    "origin": ("xyz", "rpy", "quat_xyzw"),
+    "mass": ("value",),
+    "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
+    "axis": ("xyz",),
+    "limit": ("lower", "upper", "effort", "velocity"),
+    "dynamics": ("damping", "friction"),
+}
+_COUNTS = {"xyz": 3, "rpy": 3, "quat_xyzw": 4}
 
-# Numbers that Python and C++ parse to the same value.
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+# A bound in words that Pinocchio reads and :class:`varpin.Robot` takes as none.
+_NONE = "1e308"
 
-_BYTE_ORDER_MARKS = (
-    (codecs.BOM_UTF32_LE, "utf-32"),
-    (codecs.BOM_UTF32_BE, "utf-32"),
-    (codecs.BOM_UTF16_LE, "utf-16"),
-    (codecs.BOM_UTF16_BE, "utf-16"),
-    (codecs.BOM_UTF8, "utf-8-sig"),
-)
-_DECLARED = re.compile(rb"\s*<\?xml[^>]*?encoding\s*=\s*[\"']([\w.:-]+)[\"']")
-_COMMENT = re.compile(r"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
-
-# Pinocchio's parser is recursive and needs some 2.5 kB of stack a link. Files of more than _DEEP links are parsed in a
-# thread with _STACK_OF_LINK bytes of stack a link.
-_DEEP, _STACK_OF_LINK = 1000, 10_000
+_COMMENT = re.compile(rb"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
 
 # One thread at a time redirects the stderr of the process.
 _STDERR = threading.Lock()
@@ -89,33 +86,26 @@ class Urdf:
 
     Attributes:
         path: Path of the file.
-        text: URDF text.
-        root: The ``<robot>`` element, with prefixes of names as written. None if the text is not well-formed XML, which
-            Pinocchio's parser may still read; the next two are then empty.
-        inertials: Inertias of the links that have one.
+        root: The ``<robot>`` element, with prefixes of names as written.
         mimics: Mimic elements by joint.
-        remarks: What the file leaves out and how it is read, in words.
-        fault: The fault of the XML, in words; empty if there is none.
+        remarks: How the file is read where that is not plain, one sentence a kind.
+        notes: What of the file has no effect on purpose, likewise.
+        plain: Whether nothing in it was tidied or mended: Pinocchio's own reading is varpin's.
     """
 
     path: Path
-    text: str = field(repr=False)
-    root: ET.Element | None = field(repr=False)
-    inertials: tuple[Inertial, ...] = ()
-    mimics: Mapping[str, Mimic] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
-    fault: str = ""
+    root: ET.Element = field(repr=False)
+    mimics: Mapping[str, Mimic]
+    remarks: tuple[str, ...]
+    notes: tuple[str, ...]
+    plain: bool
 
     @property
     def loops(self) -> tuple[tuple[str, str], ...]:
         """The links of each ``<loop_joint>``, which no tree has."""
-        ends = [[joint.find(end) for end in ("link1", "link2")] for joint in self.elements("loop_joint")]
+        ends = [[joint.find(end) for end in ("link1", "link2")] for joint in self.root.findall("loop_joint")]
         names = [[end.get("link", "") for end in pair if end is not None] for pair in ends]
         return tuple((pair[0], pair[1]) for pair in names if len(pair) == 2 and all(pair))
-
-    def elements(self, tag: str) -> list[ET.Element]:
-        """The children of the root with a tag."""
-        return [] if self.root is None else self.root.findall(tag)
 
 
 def read_urdf(path: Path, text: str | None = None) -> Urdf:
@@ -129,270 +119,350 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
 
     Raises:
         FileError: The file cannot be read.
-        RobotError: It is not a URDF, its bodies do not form a tree, or a number in a mimic element is invalid.
+        RobotError: It is not a URDF, a link is the child of two joints, or a number in a mimic element is invalid.
     """
-    text, remarks = decoded(path) if text is None else (text, [])
-    if not text.strip("\0 \t\r\n"):
-        raise RobotError(f"{path} is not a URDF: it is empty")
-    try:
-        root = parsed(text)
-    except expat.ExpatError as error:
-        if text[:200].lower().startswith(("<!doctype html", "<html")):
-            raise RobotError(f"{path} is a web page, not a URDF") from None
-        return Urdf(path, text, None, remarks=tuple(remarks), fault=f"it is not well-formed XML: {error}")
-    _require_robot(root, path)
-    _require_tree(root, path)
-    found = [_inertial(link, remarks) for link in root.findall("link")]
+    root, fault = read_xml(path, text)
+    if root.tag != "robot":
+        raise RobotError(f"{path} is not a URDF: its root element is <{root.tag}>, not <robot>")
+    _require_expanded(root, path)
+    if not root.get("name"):
+        raise RobotError(f"{path} is not a URDF: its <robot> has no name")
+    if root.find("link") is None:
+        raise RobotError(
+            f"{path} is not a URDF: it describes no link" + ("; it has xacro to expand" * bool(_xacro(root)))
+        )
+    if root.get("version", "1.0") not in VERSIONS:
+        raise RobotError(
+            f"{path}: there is no URDF version {root.get('version')!r}; Pinocchio reads {', '.join(VERSIONS)}"
+        )
+    parent: dict[str, str] = {}
+    for joint in root.findall("joint"):
+        child, name = joint.find("child"), joint.get("name", "")
+        link = "" if child is None else child.get("link", "")
+        if link and parent.setdefault(link, name) != name:
+            raise RobotError(
+                f"{path}: link {link!r} is the child of joints {parent[link]!r} and {name!r}: "
+                "varpin takes trees, no closed loops"
+            )
+    tidied = False
+    for element in (part for tag in ("link/inertial", "joint") for found in root.iterfind(tag) for part in found):
+        for key in _NUMBERS.get(element.tag, ()):
+            if (words := element.get(key)) is not None and (tidy := " ".join(words.split())) != words:
+                element.set(key, tidy)
+                tidied = True
+    remarks = [*([f"its XML is not well-formed, and was mended: {fault}"] if fault else []), *_remarks(root)]
     mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
-    return Urdf(path, text, root, tuple(x for x in found if x is not None), mimics, tuple(remarks))
+    soft = _joints_with(root, "safety_controller")
+    notes = (f"soft limits of <safety_controller> have no effect: {listed(soft, 'joints')}",) if soft else ()
+    return Urdf(path, root, mimics, tuple(remarks), notes, plain=not (tidied or remarks))
 
 
-def build_model(urdf: Urdf, *, mimic: bool = False) -> pin.Model:
-    """Pinocchio's model of a file; mimic joints are independent unless ``mimic`` is set.
+def build_model(urdf: Urdf) -> pin.Model:
+    """Pinocchio's model of a file; mimic joints are independent.
 
     Raises:
-        RobotError: Pinocchio cannot read the file, or drops mass.
+        RobotError: Pinocchio cannot read the file, or leaves links out.
     """
-    massive = {inertial.link for inertial in urdf.inertials}
-    text = urdf.text if urdf.root is None else _written(urdf, _dynamics(urdf.root, massive))
-    options = {"mimic": True} if mimic else {}
-    with captured_stderr() as complaints:
-        try:
-            model = _on_a_stack(urdf, lambda: pin.buildModelFromXML(text, **options))
-        except (ValueError, RuntimeError, IndexError) as error:
-            detail = "; ".join(complaints()) or str(error)
-            fault = f": {urdf.fault}" if urdf.fault else f" that Pinocchio can read: {detail}"
-            raise RobotError(f"{urdf.path} is not a URDF{fault}") from None
-        for line in complaints():
-            logger.warning("%s: %s", urdf.path, line)
-    described = sum(inertial.mass for inertial in urdf.inertials)
-    read = sum(body.mass for body in model.inertias)
-    largest = max((abs(inertial.mass) for inertial in urdf.inertials), default=0.0)
-    if urdf.root is not None and not math.isclose(described, read, rel_tol=1e-9, abs_tol=1e-9 * largest):
-        raise RobotError(
-            f"{urdf.path} describes links of {described:.6g} kg in all, of which Pinocchio reads {read:.6g} kg"
-        )
+    model = _build(_part(urdf.root, "link/inertial", "joint"))
+    if isinstance(model, str):
+        why = next(_faults(urdf.root), f"Pinocchio cannot read it: {model[:120]}")
+        raise RobotError(f"{urdf.path} is not a URDF: {why}")
+    return _require_all_links(urdf, model)
+
+
+def _require_all_links(urdf: Urdf, model: pin.Model) -> pin.Model:
+    bodies = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
+    links = [link.get("name", "") for link in urdf.root.findall("link")]
+    if lost := [repr(link) for link in links if link not in bodies]:
+        raise RobotError(f"{urdf.path}: links {listed(lost, 'links')} are on a loop of joints without a root")
     return model
 
 
+def read_inertials(urdf: Urdf, model: pin.Model) -> tuple[tuple[Inertial, ...], tuple[str, ...]]:
+    """The inertias of the links that have one, as Pinocchio reads them, and remarks about those it reads in part."""
+    given = {link.get("name", ""): link for link in urdf.root.findall("link") if link.find("inertial") is not None}
+    frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given]
+    if len({frame.parentJoint for frame in frames}) < len(frames):
+        # Pinocchio merges links on fixed joints into one body; a joint that moves keeps them apart.
+        small = _part(urdf.root, "link/inertial", "joint/parent", "joint/child")
+        for joint in small.findall("joint"):
+            child = joint.find("child")
+            joint.set("type", "floating" if child is not None and child.get("link") in given else "fixed")
+        apart = _build(small)
+        if isinstance(apart, str):
+            return (), ()
+        model = apart
+    found, remarks = [], []
+    for frame in (frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given):
+        name, link = frame.name, given[frame.name]
+        body = frame.placement.actInv(model.inertias[frame.parentJoint])
+        if fault := next(_faults_of_numbers(link.findall("inertial")[0], required=True), ""):
+            effect = "massless" if body.mass == 0.0 else "a point mass"
+            remarks.append(f"link {name!r} is {effect}, as Pinocchio reads it: {fault}")
+        if body.mass or body.inertia.any():
+            found.append(Inertial(name, body.mass, np.array(body.lever), np.array(body.inertia)))
+    more = f" ({len(remarks) - 1} more links are read in part)" if len(remarks) > 1 else ""
+    return tuple(found), tuple(remark + more for remark in remarks[:1])
+
+
+def compared_model(urdf: Urdf, text: str | None) -> tuple[pin.Model, tuple[str, ...]]:
+    """Pinocchio's model of a file, and where it is not what Pinocchio reads from the file as it is, if it reads that.
+
+    Args:
+        urdf: The file.
+        text: The URDF text, if not the file's content.
+
+    Raises:
+        RobotError: As for :func:`build_model`.
+    """
+    try:
+        with captured_stderr():
+            own = pin.buildModelFromUrdf(str(urdf.path)) if text is None else pin.buildModelFromXML(text)
+        theirs = list(own.names)[1:]
+    except (ValueError, RuntimeError, IndexError):
+        return build_model(urdf), ()
+    # Pinocchio's parser knows no entities.
+    if urdf.plain and b"<!ENTITY" not in (urdf.path.read_bytes() if text is None else text.encode()):
+        return _require_all_links(urdf, own), ()
+    model = build_model(urdf)
+    if own == model:
+        return model, ()
+    if theirs != list(model.names)[1:]:
+        return model, (f"Pinocchio's own reading of the file has other joints: {listed(theirs, 'joints')}",)
+    odd = [
+        repr(name)
+        for j, name in enumerate(model.names)
+        if model.inertias[j] != own.inertias[j] or model.jointPlacements[j] != own.jointPlacements[j]
+    ]
+    what = f"in the masses or places of {listed(odd, 'joints')}" if odd else "in limits or frames"
+    return model, (f"Pinocchio's own reading of the file differs {what}: it reads numbers less leniently",)
+
+
 def build_shapes(
-    urdf: Urdf, model: pin.Model, package_dirs: Sequence[str], loader: pin.coal.MeshLoader, link: str | None = None
-) -> pin.GeometryModel:
-    """The visual geometry in a file, as Pinocchio reads it.
+    urdf: Urdf, model: pin.Model, package_dirs: Sequence[str], read: Reader = read_mesh
+) -> tuple[pin.GeometryModel, dict[str, str]]:
+    """The visual geometry in a file, as Pinocchio reads it, except for meshes.
 
     Args:
         urdf: The file.
         model: From :func:`build_model`.
         package_dirs: Folders in which ``package://`` paths are looked up.
-        loader: Loader of the meshes.
-        link: Read only this link, which needs well-formed XML; all links if left out.
+        read: Reads a mesh file.
+
+    Returns:
+        The shapes of the links whose meshes can all be read, and the fault of each other link in words.
 
     Raises:
-        RobotError: A mesh is missing or cannot be read; the message names it.
+        RobotError: A shape is no shape; the message names the file.
     """
-    text, textures = urdf.text, dict[str, str]()
-    if urdf.root is not None:
-        absent = missing_meshes(urdf, package_dirs)
-        if absent := {name: files for name, files in absent.items() if link in (None, name)}:
-            raise RobotError(missing_meshes_message(urdf, absent, package_dirs))
-        looks, textures = _looks(urdf, urdf.root, package_dirs, link)
-        text = _written(urdf, looks)
-
-    def read() -> pin.GeometryModel:
-        return pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, list(package_dirs), loader)
-
+    root, looks = _looks(urdf.root)
+    text = ET.tostring(root, encoding="unicode")
     with captured_stderr() as complaints:
         try:
-            shapes = _on_a_stack(urdf, read)
+            shapes = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, [*package_dirs])
         except (ValueError, RuntimeError, IndexError) as error:
-            whose = "" if link is None else f" of link {link!r}"
-            raise RobotError(f"the meshes{whose} in {urdf.path} cannot be read: {error}") from None
-        for line in complaints():
-            logger.warning("%s: %s", urdf.path, line)
+            raise RobotError(f"the shapes in {urdf.path} cannot be read: {error}") from None
+        lines = complaints()
+    if lines:
+        logger.warning("%s: shapes are read in part: %s", urdf.path, "; ".join(lines)[:120])
+    absent = missing_meshes(urdf, package_dirs)
+    faults = dict.fromkeys(absent, missing_meshes_message(urdf, absent, package_dirs))
     for shape in shapes.geometryObjects:
-        if shape.name in textures:
-            texture = _located(textures[shape.name], urdf.path, package_dirs)
+        look = looks.get(shape.name, _Look(""))
+        if look.texture:
+            texture = _located(look.texture, urdf.path, package_dirs)
             if texture is None:
-                logger.warning("%s: texture %r is not there", urdf.path, textures[shape.name])
+                logger.warning("%s: texture %r is not there", urdf.path, look.texture)
             shape.meshTexturePath = "" if texture is None else str(texture)
-    return shapes
+        if look.mesh and look.link not in faults:
+            scale = [_number(word) for word in look.scale.split()]
+            try:
+                if len(scale) != 3 or not all(math.isfinite(number) and number for number in scale):
+                    raise FileError(f"mesh {look.mesh} has the scale {look.scale!r}: give three numbers other than 0")
+                put_mesh(shape, str(_located(look.mesh, urdf.path, package_dirs)), scale, read)
+            except FileError as error:
+                faults[look.link] = f"link {look.link!r}: {error}"
+    found = pin.GeometryModel()
+    for shape in with_own_meshes(shapes, read).geometryObjects:
+        if shape.name not in looks or looks[shape.name].link not in faults:
+            found.addGeometryObject(shape)
+    return found, faults
 
 
 def missing_meshes(urdf: Urdf, package_dirs: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """The missing visual meshes by link, as the file names them."""
-    missing = {}
-    for element in urdf.elements("link"):
+    missing, packages = {}, Packages(urdf.path, tuple(package_dirs))
+    for element in urdf.root.findall("link"):
         files = [mesh.get("filename", "") for mesh in element.iterfind("visual/geometry/mesh")]
-        if absent := tuple(file for file in files if _located(file, urdf.path, package_dirs) is None):
+        if absent := tuple(file for file in files if packages.locate(file) is None):
             missing[element.get("name", "")] = absent
     return missing
 
 
 def missing_meshes_message(urdf: Urdf, missing: Mapping[str, Sequence[str]], package_dirs: Sequence[str]) -> str:
     """The error message for meshes from :func:`missing_meshes`."""
-    links = "; ".join(f"link {link!r}: {', '.join(files)}" for link, files in missing.items())
-    places = ", ".join(_places(package_dirs)) or "no folder"
+    packages = Packages(urdf.path, tuple(package_dirs))
+    links = listed((f"link {link!r}: {', '.join(files)}" for link, files in missing.items()), "links")
+    first = next(iter(missing.values()), ("",))[0]
+    if there := packages.in_other_case(first):
+        return f"meshes of {urdf.path} are missing: {links}; {there} is there, in other upper and lower case"
+    places = ", ".join(map(str, packages.places)) or "no folder"
     return (
-        f"meshes of {urdf.path} are missing: {links}; package:// was looked up in {places}, other paths beside the "
-        "file; package_dirs=[...] adds folders that contain packages"
+        f"meshes of {urdf.path} are missing: {links}; looked beside the file and in {places} (package_dirs=[...] adds)"
     )
 
 
-def decoded(path: Path) -> tuple[str, list[str]]:
-    """A file's text, decoded as the file declares, and remarks about its encoding.
+def _mended(content: bytes) -> str:
+    """Text of a file that expat cannot decode, as UTF-8, without its declaration and what follows the root element."""
+    text = content.decode("utf-8", errors="replace").lstrip("\ufeff \t\r\n")
+    text = re.sub(r"^<\?xml.*?\?>", "", text, flags=re.DOTALL)
+    text = re.sub(r"&(?!#?\w+;)", "&amp;", text)
+    return text[: text.rfind("</robot>") + len("</robot>")] if "</robot>" in text else text
+
+
+def read_xml(path: Path, text: str | None = None) -> tuple[ET.Element, str]:
+    """The root element of an XML file, with prefixes as written, and the fault that was mended; empty if none was.
+
+    Args:
+        path: Path of the file.
+        text: The XML text, if not the file's content.
 
     Raises:
         FileError: The file cannot be read.
+        RobotError: It is not well-formed XML.
     """
     try:
-        content = path.read_bytes()
+        content = path.read_bytes() if text is None else text.encode()
     except OSError as error:
         raise FileError(f"cannot read {path}: {error.strerror}") from None
-    declared = _DECLARED.match(content)
-    encoding = next((name for mark, name in _BYTE_ORDER_MARKS if content.startswith(mark)), "")
-    remarks = []
-    if not encoding:
-        encoding = declared[1].decode() if declared else "utf-8"
-        try:
-            name = codecs.lookup(encoding).name
-        except LookupError:
-            remarks.append(f"its encoding {encoding!r} is unknown; it is read as utf-8")
-            encoding = "utf-8"
-        else:
-            # A declaration that is readable byte by byte cannot be in UTF-16 or UTF-32.
-            encoding = "utf-8" if name.startswith(("utf-16", "utf-32")) else encoding
+    if not content.strip(b"\0 \t\r\n"):
+        raise RobotError(f"{path} is empty")
+    if content.startswith(LFS_POINTER):
+        raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
+    # Comments often contain "--", which XML forbids. Their line breaks stay, for line numbers.
+    content = _COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), content.lstrip(b" \t\r\n"))
     try:
-        text = content.decode(encoding)
-    except (UnicodeError, LookupError) as error:
-        remarks.append(f"it is not valid {encoding} ({error}); what cannot be read is replaced by \ufffd")
-        text = content.decode("utf-8", errors="replace")
-    return text.lstrip("\ufeff \t\r\n"), remarks
+        return _tree(content), ""
+    except (expat.ExpatError, LookupError) as error:
+        fault = str(error)
+    if content[:200].lower().startswith((b"<!doctype html", b"<html")):
+        raise RobotError(f"{path} is a web page, not a robot's file")
+    try:
+        return _tree(_mended(content)), fault
+    except expat.ExpatError:
+        raise RobotError(f"{path} is not well-formed XML: {fault}") from None
 
 
-def parsed(text: str) -> ET.Element:
-    """The root element of an XML text, prefixes kept as they are written.
-
-    Raises:
-        ExpatError: The text is not well-formed.
-    """
-    # Comments are removed: they often contain "--", which XML forbids. Their line breaks stay, for line numbers.
-    text = _COMMENT.sub(lambda found: found[1] or "\n" * found[0].count("\n"), text)
+def _tree(content: bytes | str) -> ET.Element:
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
     parser.buffer_text = True
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.CharacterDataHandler = builder.data
-    parser.Parse(text, True)
+    parser.Parse(content, True)
     return builder.close()
 
 
-def _require_robot(root: ET.Element, path: Path) -> None:
-    if root.tag.lower() == "html":
-        raise RobotError(f"{path} is a web page, not a URDF")
-    if root.tag != "robot":
-        raise RobotError(f"{path} is not a URDF: its root element is <{root.tag}>, not <robot>")
-    if leftover := _xacro(root):
-        name = path.name.removesuffix(".xacro").removesuffix(".urdf")
-        raise RobotError(
-            f"{path} is a xacro file: expand it first, with xacro {path.name} > {name}.expanded.urdf, "
-            f"or name it {name}.xacro; it has {leftover}"
-        )
-    if not root.get("name"):
-        raise RobotError(f"{path}: its <robot> has no name, which a URDF must have")
-    if root.find("link") is None:
-        raise RobotError(f"{path} describes no link")
+def _require_expanded(root: ET.Element, path: Path) -> None:
+    """Refuse a xacro file that was not expanded: a value that xacro has to fill in is missing."""
+    for element in (part for tag in ("link", "joint") for found in root.iterfind(tag) for part in found.iter()):
+        for key, value in element.items():
+            if key != "filename" and ("${" in value or value.startswith("$(")):
+                name = path.name.removesuffix(".xacro").removesuffix(".urdf")
+                raise RobotError(
+                    f"{path} is a xacro file, to be expanded: it has <{element.tag} {key}={value!r}>. Name it "
+                    f"{name}.urdf.xacro, or expand it with xacro {path.name} > {name}.urdf"
+                )
 
 
-def _xacro(root: ET.Element) -> str:
-    """The first element or attribute that xacro would replace; empty if there is none."""
+def _xacro(root: ET.Element) -> dict[str, None]:
+    """The kinds of xacro elements in a file."""
     prefixes = {"xacro"} | {key.removeprefix("xmlns:") for key, value in root.items() if "wiki/xacro" in value}
-    for element in root.iter():
-        prefix, colon, _ = element.tag.partition(":")
-        if colon and prefix in prefixes:
-            return f"<{element.tag}>"
-    for part in root:
-        for element in part.iter() if part.tag in ("link", "joint") else ():
-            for key, value in element.items():
-                if "${" in value or value.startswith("$("):
-                    return f"<{element.tag} {key}={value!r}>"
-    return ""
+    return dict.fromkeys(f"<{part.tag}>" for part in root.iter() if part.tag.partition(":")[0] in prefixes)
 
 
-def _require_tree(root: ET.Element, path: Path) -> None:
-    above: dict[str, tuple[str, str]] = {}
+def _remarks(root: ET.Element) -> Iterator[str]:
+    """How limits and elements without effect are read, one sentence a kind. Limits that mean none become none."""
+    if left := _xacro(root):
+        yield f"leftover xacro elements have no effect: {listed(left, 'kinds')}"
+    none, degrees, ignored, crossed = [], [], [], []
     for joint in root.findall("joint"):
-        parent, child = joint.find("parent"), joint.find("child")
-        if parent is None or child is None:
+        name, kind = repr(joint.get("name", "")), joint.get("type")
+        limit = joint.find("limit")
+        if limit is None and kind in ("revolute", "prismatic"):
+            limit = ET.SubElement(joint, "limit")
+        if limit is None:
             continue
-        name, link = joint.get("name", ""), child.get("link", "")
-        if link in above and above[link][1] != name:
-            raise RobotError(
-                f"{path}: link {link!r} is the child of joints {above[link][1]!r} and {name!r}: "
-                "varpin takes trees, no closed loops"
-            )
-        above[link] = parent.get("link", ""), name
-    rooted: set[str] = set()
-    for start in above:
-        link, way = start, dict[str, None]()
-        while link in above and link not in rooted:
-            if link in way:
-                loop = list(way)[list(way).index(link) :]
-                raise RobotError(f"{path}: links {', '.join(map(repr, loop))} form a loop without a root")
-            way[link] = None
-            link = above[link][0]
-        rooted.update(way)
+        low, high = (_number(limit.get(key)) for key in ("lower", "upper"))
+        if kind == "continuous" and low < high and high - low < NO_LIMIT:
+            ignored.append(name)
+        if kind != "continuous" and low > high:
+            crossed.append(f"{low:g} to {high:g} of {name}")
+        if kind == "revolute" and limits_in_degrees(low, high):
+            degrees.append(f"{low:g} to {high:g} of {name}")
+        # Before version 1.2, a bound that is missing is 0, and two bounds of 0 are none.
+        stated = root.get("version") == "1.2"
+        bounds = [key for key in ("lower", "upper") if key in limit.attrib] or (["lower", "upper"] if stated else [])
+        for key in (*bounds, "effort", "velocity"):
+            value, drive = _number(limit.get(key)), key in ("effort", "velocity")
+            unread = key not in limit.attrib or (drive and value < 0.0) or math.isinf(value)
+            if key in limit.attrib and (unread or (not drive and abs(value) > NO_LIMIT)):
+                none.append(f"{key} {limit.attrib[key]} of {name}")
+            elif unread and not (drive and stated):
+                none.append(f"no {key} of {name}")
+            if unread and not (drive and stated and key not in limit.attrib):
+                limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)
+    if none:
+        yield f"limits that are missing, infinite, negative or huge count as none: {listed(none, 'limits')}"
+    if crossed:
+        yield f"limits whose lower bound is above the upper one leave no room: {listed(crossed, 'joints')}"
+    if degrees:
+        yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
+    if ignored:
+        yield f"limits of continuous joints have no effect (type revolute has limits): {listed(ignored, 'joints')}"
+    if named := _joints_with(root, "joint_properties"):
+        yield f"<joint_properties> has no effect, URDF calls it <dynamics>: {listed(named, 'joints')}"
 
 
-def _inertial(link: ET.Element, remarks: list[str]) -> Inertial | None:
-    """Mass and inertia of a link as Pinocchio reads them, or None if it has none.
+def _joints_with(root: ET.Element, tag: str) -> list[str]:
+    return [repr(joint.get("name", "")) for joint in root.findall("joint") if joint.find(tag) is not None]
 
-    A remark is added for each missing or invalid number of the link's ``<inertial>``.
+
+def _faults(root: ET.Element) -> Iterator[str]:
+    """What Pinocchio cannot read in links and joints."""
+    for joint in root.findall("joint"):
+        for fault in _faults_of_numbers(joint):
+            yield f"joint {joint.get('name')!r}: {fault}"
+        for tag in ("parent", "child"):
+            end = joint.find(tag)
+            link = None if end is None else end.get("link")
+            if link not in [known.get("name") for known in root.findall("link")]:
+                yield f"joint {joint.get('name')!r} has the {tag} {link!r}, which is no link of the file"
+
+
+def _faults_of_numbers(parent: ET.Element, *, required: bool = False) -> Iterator[str]:
+    """The numbers in an ``<inertial>`` or ``<joint>`` that Pinocchio cannot read.
+
+    Args:
+        parent: The element.
+        required: Whether mass and moments have to be there.
     """
-    inertial = link.find("inertial")
-    if inertial is None:
-        return None
-    name = link.get("name", "")
-    mass, moments, origin = inertial.find("mass"), inertial.find("inertia"), inertial.find("origin")
-
-    fault, value = "", None if mass is None else _finite(mass.get("value"))
-    if mass is None or mass.get("value") is None:
-        fault = "its <inertial> has no <mass>"
-    elif value is None:
-        fault = f"its mass is {reprlib.repr(mass.get('value'))}, no finite number"
-    xyz_rpy = np.zeros((2, 3))
-    for row, entry in zip(xyz_rpy, ("xyz", "rpy"), strict=True):
-        words = ("0 0 0" if origin is None else origin.get(entry, "0 0 0")).split()
-        numbers = [number for word in words if (number := _finite(word)) is not None]
-        if len(words) == len(numbers) == 3:
-            row[:] = numbers
-        else:
-            given = reprlib.repr(" ".join(words))
-            fault = fault or f"the {entry} of its <inertial> is {given}, no three finite numbers"
-    if fault or value is None:
-        remarks.append(f"link {name!r}: {fault}: it is massless, as Pinocchio reads it")
-        return None
-    numbers_given = _moments(moments)
-    if numbers_given is None:
-        absent = [key for key in _MOMENTS if key not in _words(moments)]
-        wrong = [f"{key} {reprlib.repr(word)}" for key, word in _words(moments).items() if _finite(word) is None]
-        fault = f"no {', '.join(absent)}" if absent else f"{', '.join(wrong)}, no finite number"
-        fault = "no <inertia>" if moments is None else fault
-        remarks.append(f"link {name!r}: its <inertial> has {fault}: it is a point mass, as Pinocchio reads it")
-    xx, xy, xz, yy, yz, zz = numbers_given or np.zeros(6)
-    turn = pin.rpy.rpyToMatrix(*xyz_rpy[1])
-    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    with np.errstate(over="ignore", invalid="ignore"):
-        return Inertial(name, value, xyz_rpy[0], turn @ matrix @ turn.T)
-
-
-def _words(moments: ET.Element | None) -> dict[str, str]:
-    """The given moments of an ``<inertia>``, as text."""
-    return {} if moments is None else {key: moments.get(key, "") for key in _MOMENTS if moments.get(key) is not None}
-
-
-def _moments(moments: ET.Element | None) -> list[float] | None:
-    """The six numbers of an ``<inertia>``; None, for a point mass, unless all are given and finite."""
-    numbers = [number for word in _words(moments).values() if (number := _finite(word)) is not None]
-    return numbers if len(numbers) == len(_MOMENTS) else None
+    for tag, keys in _NUMBERS.items():
+        element = parent.find(tag)
+        needed = required and tag in ("mass", "inertia")
+        if element is None and needed:
+            yield f"its <inertial> has no <{tag}>"
+        if element is None:
+            continue
+        for key in keys:
+            words = element.get(key, "").split()
+            if key in element.attrib and not (
+                len(words) == _COUNTS.get(key, 1) and all(math.isfinite(_number(word)) for word in words)
+            ):
+                comma = "; the decimal sign is a point" if "," in element.attrib[key] else ""
+                numbers = "no finite number" if key not in _COUNTS else f"not {_COUNTS[key]} finite numbers"
+                yield f"{key} of <{tag}> is {reprlib.repr(element.attrib[key])}, {numbers}{comma}"
+            elif key not in element.attrib and needed:
+                yield f"<{tag}> of its <inertial> has no {key}"
 
 
 def _mimic(joint: ET.Element, path: Path) -> Mimic:
@@ -408,10 +478,15 @@ def _mimic(joint: ET.Element, path: Path) -> Mimic:
     )
 
 
-def _finite(word: str | None) -> float | None:
-    """A word as a finite number; None if it is not one."""
-    number = float(word) if word is not None and _NUMBER.fullmatch(word.strip()) else math.nan
-    return number if math.isfinite(number) else None
+def _number(word: str | None) -> float:
+    """A word as a number, as Python and C++ read it alike; NaN if it is none."""
+    # Python also takes digits of other scripts, and underscores.
+    if word is None or not word.isascii() or "_" in word:
+        return math.nan
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
 
 
 def finite_number(word: str, what: str) -> float:
@@ -420,70 +495,63 @@ def finite_number(word: str, what: str) -> float:
     Raises:
         RobotError: It is not one; the message calls it ``what``.
     """
-    if (value := _finite(word)) is None:
+    if not math.isfinite(value := _number(word)):
         raise RobotError(f"{what} is {reprlib.repr(word)}, where a finite number belongs")
     return value
 
 
-def _dynamics(root: ET.Element, massive: Collection[str]) -> ET.Element:
-    """The part of a URDF for Pinocchio's model: joints and links, with the inertias of the links ``massive``."""
-    small = ET.Element("robot", {"name": root.get("name", "")})
-    for link in root.findall("link"):
-        part = ET.SubElement(small, "link", _named(link))
-        if link.get("name", "") in massive:
-            part.extend(_tidy(inertial) for inertial in link.findall("inertial")[:1])
-    small.extend(root.findall("joint"))
-    return small
+def listed(names: Iterable[str], what: str) -> str:
+    """The first three of some names, and how many more there are."""
+    names = list(names)
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more {what}" if len(names) > 3 else "")
 
 
-def _looks(
-    urdf: Urdf, root: ET.Element, package_dirs: Sequence[str], only: str | None
-) -> tuple[ET.Element, dict[str, str]]:
-    """The part of a URDF for Pinocchio's shapes: joints, and links with their visuals; and the textures of shapes.
+@dataclass(frozen=True)
+class _Look:
+    """What Pinocchio does not read of a ``<visual>``: names of its mesh and texture, as in the file, or empty."""
 
-    Mesh paths are made absolute, as Pinocchio resolves relative ones against the working folder.
+    link: str
+    texture: str = ""
+    mesh: str = ""
+    scale: str = "1 1 1"
+
+
+def _looks(root: ET.Element) -> tuple[ET.Element, dict[str, _Look]]:
+    """The part of a URDF for Pinocchio's shapes: joints, and links with their visuals; and the rest by shape.
+
+    Spheres stand for the meshes, as coal's loader misreads some.
 
     Pinocchio ignores textures and shows a material without a colour in black. Such a material is left out, as is black
     beside a texture, which converters write for want of a colour: the mesh then keeps the colours of its file.
-
-    Args:
-        urdf: The file.
-        root: Its root element.
-        package_dirs: Folders in which ``package://`` paths are looked up.
-        only: Name of the only link with visuals; all links if None.
     """
-    small = ET.Element("robot", {"name": root.get("name", "")})
+    small = ET.Element("robot", _head(root))
     shared = {material.get("name"): material for material in root.findall("material")}
     small.extend(material for material in shared.values() if _has_color(material))
-    textures = {}
+    looks = {}
     for link in root.findall("link"):
-        part = ET.SubElement(small, "link", _named(link))
-        for k, visual in enumerate(link.findall("visual") if only in (None, link.get("name")) else ()):
-            declared = visual.find("material")
+        part = ET.SubElement(small, "link", {"name": link.get("name", "")})
+        for k, visual in enumerate(link.findall("visual")):
+            declared, mesh = visual.find("material"), visual.find("geometry/mesh")
             material = declared if declared is None or len(declared) else shared.get(declared.get("name"), declared)
             texture = None if material is None else material.find("texture")
-            if texture is not None and texture.get("filename"):
-                # The name that Pinocchio gives to the shape.
-                textures[f"{link.get('name')}_{k}"] = texture.get("filename", "")
             plain = ET.SubElement(part, "visual", visual.attrib)
-            plain.extend(
-                _with_absolute_paths(child, urdf, package_dirs)
-                for child in visual
-                if child is not declared or (material is not None and _has_color(material))
+            for child in visual:
+                if child is declared and not (material is not None and _has_color(material)):
+                    continue
+                if child.tag == "geometry" and mesh is not None:
+                    ET.SubElement(ET.SubElement(plain, "geometry"), "sphere", radius="1")
+                else:
+                    plain.append(child)
+            # The name that Pinocchio gives to the shape.
+            name = link.get("name", "")
+            looks[f"{name}_{k}"] = _Look(
+                name,
+                "" if texture is None else texture.get("filename", ""),
+                "" if mesh is None else mesh.get("filename", ""),
+                "1 1 1" if mesh is None else mesh.get("scale", "1 1 1"),
             )
     small.extend(root.findall("joint"))
-    return small, textures
-
-
-def _with_absolute_paths(part: ET.Element, urdf: Urdf, package_dirs: Sequence[str]) -> ET.Element:
-    """A part of a visual with absolute mesh paths."""
-    if part.find("mesh") is None:
-        return part
-    resolved = copy.deepcopy(part)
-    for mesh in resolved.iterfind("mesh"):
-        file = mesh.get("filename", "")
-        mesh.set("filename", str(_located(file, urdf.path, package_dirs) or file))
-    return resolved
+    return small, looks
 
 
 def _has_color(material: ET.Element) -> bool:
@@ -495,59 +563,30 @@ def _has_color(material: ET.Element) -> bool:
 
 def _located(name: str, urdf: Path, package_dirs: Sequence[str]) -> Path | None:
     """The path of a file named in a URDF; None if it does not exist."""
-    scheme, separator, rest = name.partition("://")
-    if not separator:
-        paths = [urdf.parent / name, Path(name)]
-    elif scheme == "file":
-        paths = [Path(rest)]
-    else:
-        # Gazebo uses model:// for package://.
-        paths = [Path(folder, rest) for folder in _places(package_dirs)] if scheme in ("package", "model") else []
-    return next((path.absolute() for path in paths if path.is_file()), None)
+    return Packages(urdf, tuple(package_dirs)).locate(name)
 
 
-def _places(package_dirs: Sequence[str]) -> list[str]:
-    """Folders in which packages are looked up: ``package_dirs``, then those of a sourced ROS."""
-    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-    ament = [folder for folder in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if folder]
-    return [*package_dirs, *ros, *(f"{folder}/share" for folder in ament)]
+def _head(root: ET.Element) -> dict[str, str]:
+    return {key: root.get(key, "") for key in ("name", "version") if key in root.attrib}
 
 
-def _named(link: ET.Element) -> dict[str, str]:
-    return {key: value for key, value in link.items() if key == "name"}
+def _part(root: ET.Element, *paths: str) -> ET.Element:
+    """A URDF of the links and joints of another, with the children at ``paths`` or, without a child, all of them."""
+    small = ET.Element("robot", _head(root))
+    for part in root:
+        if part.tag in ("link", "joint"):
+            copied = ET.SubElement(small, part.tag, part.attrib)
+            copied.extend(child for child in part if {part.tag, f"{part.tag}/{child.tag}"} & set(paths))
+    return small
 
 
-def _tidy(inertial: ET.Element) -> ET.Element:
-    """The complete ``<inertial>`` of a massive link, without white space that Pinocchio cannot parse."""
-    tidy = ET.Element("inertial")
-    mass, moments, origin = inertial.find("mass"), inertial.find("inertia"), inertial.find("origin")
-    if origin is not None:
-        ET.SubElement(tidy, "origin", {key: " ".join(origin.get(key, "0 0 0").split()) for key in ("xyz", "rpy")})
-    ET.SubElement(tidy, "mass", {"value": "" if mass is None else mass.get("value", "").strip()})
-    words = {key: word.strip() for key, word in _words(moments).items()}
-    ET.SubElement(tidy, "inertia", dict.fromkeys(_MOMENTS, "0") if _moments(moments) is None else words)
-    return tidy
-
-
-def _written(urdf: Urdf, root: ET.Element) -> str:
-    try:
-        return ET.tostring(root, encoding="unicode")
-    except RecursionError:
-        raise RobotError(f"{urdf.path} is not a URDF: its elements are nested too deep") from None
-
-
-def _on_a_stack(urdf: Urdf, read: Callable[[], T]) -> T:
-    """What ``read`` returns, run on a stack that is large enough for Pinocchio's recursive parser."""
-    links = urdf.text.count("<link")
-    if links <= _DEEP:
-        return read()
-    # This sets the size for all threads that start from now on, until it is restored; a larger one does no harm.
-    before = threading.stack_size(max(links * _STACK_OF_LINK // 4096 * 4096, 16 * 2**20))
-    try:
-        with ThreadPoolExecutor(1) as thread:
-            return thread.submit(read).result()
-    finally:
-        threading.stack_size(before)
+def _build(root: ET.Element) -> pin.Model | str:
+    """Pinocchio's model of a URDF, or what it says of it if it cannot read it."""
+    with captured_stderr() as complaints:
+        try:
+            return pin.buildModelFromXML(ET.tostring(root, encoding="unicode"))
+        except (ValueError, RuntimeError, IndexError) as error:
+            return "; ".join(complaints()) or str(error)
 
 
 @contextlib.contextmanager

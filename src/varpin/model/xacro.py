@@ -7,7 +7,6 @@ import logging
 import os
 import re
 import threading
-import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -15,8 +14,12 @@ from typing import Any
 from xml.parsers import expat
 
 from varpin.errors import InputError, MissingDependency, RobotError
+from varpin.model.packages import LFS_POINTER, Packages
 
 logger = logging.getLogger(__name__)
+
+# What xacro says of an argument that has no value.
+_UNDEFINED = re.compile(r"(?:Undefined substitution argument,? *'?|xacro\.arg\(')([\w.-]+)")
 
 # The package xacro keeps its state in its modules: one expansion at a time.
 _LOCK = threading.Lock()
@@ -71,12 +74,19 @@ def expand(
         RobotError: The file cannot be expanded.
     """
     xacro, substitution = _package(path)
+    if path.read_bytes().startswith(LFS_POINTER):
+        raise RobotError(f"{path} is a Git LFS pointer, not the file itself: git lfs pull downloads it")
     given = _Arguments({name: _word(value) for name, value in arguments.items()})
     notes = io.StringIO()
     with _LOCK, contextlib.redirect_stderr(notes), _finding(substitution, path, package_dirs, packages or {}):
         try:
             text = str(xacro.process_file(str(path), mappings=given).toxml())
         except Exception as error:  # Expressions in the file may raise anything.
+            if found := _UNDEFINED.search(", ".join(_messages(error))):
+                raise RobotError(
+                    f"{path} needs the xacro argument {found[1]!r}, which has no default: "
+                    f"give xacro_args={{{found[1]!r}: ...}}"
+                ) from None
             before = len(notes.getvalue())
             xacro.print_location()
             where = "; ".join(line.strip() for line in notes.getvalue()[before:].splitlines())
@@ -88,18 +98,6 @@ def expand(
         known = ", ".join(sorted(given.used)) or "none"
         raise InputError(f"{path} has no xacro argument {', '.join(map(repr, unknown))}; it takes: {known}")
     return text
-
-
-def enclosing_packages(path: Path) -> dict[str, Path]:
-    """The ROS packages (folders with a ``package.xml``) that contain a file, by name, innermost first."""
-    found: dict[str, Path] = {}
-    for folder in path.absolute().parents:
-        manifest = folder / "package.xml"
-        if manifest.is_file():
-            with contextlib.suppress(ET.ParseError, OSError):
-                name = ET.parse(manifest).getroot().findtext("name") or folder.name
-                found.setdefault(name.strip(), folder)
-    return found
 
 
 def _package(path: Path) -> tuple[ModuleType, Any]:
@@ -130,19 +128,14 @@ def _word(value: object) -> str:
 @contextlib.contextmanager
 def _finding(substitution: Any, path: Path, package_dirs: Sequence[str], packages: Mapping[str, str]) -> Iterator[None]:
     """Make xacro look packages up in the folders around the file first, and by ROS only after them."""
-    enclosing = enclosing_packages(path)
+    known = Packages(path, tuple(package_dirs))
     by_ros: Callable[[str], str] = substitution._eval_find
 
     def find(name: str) -> str:
         if name in packages:
             return packages[name]
-        if name in enclosing:
-            return str(enclosing[name])
-        around = [folder for folder in path.absolute().parents if folder.name == name]
-        around += [Path(folder, name).absolute() for folder in package_dirs]
-        for folder in around:
-            if folder.is_dir():
-                return str(folder)
+        if folder := known.folder(name):
+            return str(folder)
         try:
             return by_ros(name)
         except Exception:  # There is no ROS or no such package; the exception depends on the version of ROS.

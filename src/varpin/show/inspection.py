@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, product
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,12 +17,12 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Guard, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.model import Robot, build_robot, check_inertia
+from varpin.model import Robot, build_robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.additions import Base
-from varpin.model.inertia import fault, principal_moments
+from varpin.model.inertia import fault, one_of_each, principal_moments
 from varpin.model.mimic import joint_index
 from varpin.model.tree import is_unbounded, joint_axis
-from varpin.model.urdf import Urdf, read_urdf
+from varpin.model.urdf import Inertial, Urdf, build_model, listed, read_inertials, read_urdf
 from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
 from varpin.support.checks import JointValues, joint_array
 
@@ -33,6 +35,12 @@ CONDITION = 1e6
 # for an arm with all joints in one place.
 LENGTH_RATIO = 2.0
 LENGTH = 10.0
+# A radius of gyration beyond this multiple of the distance of a link's farthest point from its centre of mass is
+# impossible; motors may be left out of a shape, hence not 1.
+SIZE_RATIO = 1.5
+# Plausible sizes of the largest mesh of a moving link, as multiples of the arm's reach: inches taken for metres are 39
+# times too large. Those of the robots of example-robot-data are 0.25 to 1.2.
+MESH_RATIOS = (0.01, 10.0)
 # Density of osmium, the densest element [kg/m^3].
 DENSITY = 22_600.0
 
@@ -42,6 +50,7 @@ def inspect_robot(
     *,
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     lock: Mapping[str, ArrayLike] | None = None,
+    keep: Sequence[str] | None = None,
     mimic: Literal["tied", "free"] = "tied",
     q: JointValues | None = None,
     v: JointValues | None = None,
@@ -54,6 +63,7 @@ def inspect_robot(
     Main args:
         source: A source as for :func:`varpin.load_robot`, or a loaded robot.
         lock: Joints to lock, as for :func:`varpin.load_robot`.
+        keep: Joints that stay, as for :func:`varpin.load_robot`.
         q: Configuration of the report: one number, (n,) or by joint name [rad or m]; 0 if left out.
         v: Velocity of the report, likewise [rad/s or m/s]; 0 if left out.
 
@@ -70,13 +80,15 @@ def inspect_robot(
             given with a loaded robot.
     """
     if isinstance(source, Robot):
-        if lock or package_dirs or mimic != "tied" or base is not None or armature is not None:
+        if lock or keep or package_dirs or mimic != "tied" or base is not None or armature is not None:
             raise InputError(
-                "lock, package_dirs, mimic, base and armature are options of loading; the given robot is already loaded"
+                "lock, keep, package_dirs, mimic, base and armature are options of loading; the robot is already loaded"
             )
         robot = source
     else:
-        robot = build_robot(source, package_dirs=package_dirs, lock=lock, mimic=mimic, base=base, armature=armature)
+        robot = build_robot(
+            source, package_dirs=package_dirs, lock=lock, keep=keep, mimic=mimic, base=base, armature=armature
+        )
     scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
     velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
@@ -87,18 +99,19 @@ def inspect_robot(
     margin = Guard().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
     urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
-    joints, links = _joints(robot), _links(robot, urdf)
+    inertials, lacks = ((), ()) if urdf is None else read_inertials(urdf, build_model(urdf))
+    joints, links = _joints(robot), _links(robot, inertials)
     warnings = [
-        *(() if urdf is None else urdf.remarks),
-        *_mass_warnings(robot),
-        *_inertia_warnings(robot, links),
-        *_ratio_warnings(robot),
+        *(() if urdf is None else (*urdf.remarks, *urdf.notes)),
+        *lacks,
+        *robot.limit_remarks(),
+        *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links), _ratio_warnings(robot))),
+        *_mesh_warnings(robot),
         *_matrix_warnings(robot, scaled),
-        *_limit_warnings(joints, robot, None if q is None else configuration),
-        *_mimic_warnings(robot, urdf, joints, tied=mimic == "tied"),
+        *one_of_each(_limit_warnings(joints, robot, None if q is None else configuration)),
+        *one_of_each(_mimic_warnings(robot, urdf, joints, tied=mimic == "tied")),
         *_damping_warnings(robot),
         *_loop_warnings(robot),
-        *(f"joint {name!r} is locked at {_position(at)}" for name, at in robot.locked.items()),
     ]
     return RobotReport(
         robot=robot,
@@ -166,8 +179,8 @@ def _limit(value: float) -> float:
     return float(np.copysign(np.inf, value)) if abs(value) >= 1e300 else float(value)
 
 
-def _links(robot: Robot, urdf: Urdf | None) -> tuple[LinkReport, ...]:
-    if urdf is None or urdf.root is None:
+def _links(robot: Robot, inertials: Sequence[Inertial]) -> tuple[LinkReport, ...]:
+    if not inertials:
         bodies = range(1, robot.free_model.njoints)
         return tuple(_body(robot, joint) for joint in bodies)
     # The links of the URDF: Pinocchio merges links on fixed joints into one body, which can hide a faulty inertia.
@@ -182,7 +195,7 @@ def _links(robot: Robot, urdf: Urdf | None) -> tuple[LinkReport, ...]:
             inertia=link.inertia,
             moments=principal_moments(link.inertia),
         )
-        for link in urdf.inertials
+        for link in inertials
         if link.link in joints
     )
 
@@ -228,48 +241,70 @@ def _body_name(robot: Robot, joint: int) -> str:
     return str(robot.free_model.names[joint])
 
 
-def _mass_warnings(robot: Robot) -> Iterator[str]:
+def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
     for body, mass in enumerate(robot.tree.mass):
+        name, joint = _body_name(robot, body + 1), robot.free_model.names[body + 1]
         if mass == 0.0:
-            name, joint = _body_name(robot, body + 1), robot.free_model.names[body + 1]
             carries = "only the links that it carries give the joint inertia"
             if body not in robot.tree.parent:
                 carries = "and it carries nothing"
-            yield f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
+            yield "massless", name, f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
         elif not np.array(robot.free_model.inertias[body + 1].inertia).any():
-            name = _body_name(robot, body + 1)
-            yield f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
+            yield "point mass", name, f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
 
 
-def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[str]:
-    length = LENGTH_RATIO * _reach(robot) or LENGTH
+def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tuple[str, str, str]]:
+    length, corners = LENGTH_RATIO * _reach(robot) or LENGTH, _corners(robot)
+    frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
         if not link.joint or not link.inertia.any():
             continue
-        if warning := fault(link.name, link.mass, link.moments):
-            yield warning
-        elif link.mass > 0.0:
-            # A ball has the least inertia of all bodies of a given mass and density.
+        name, frame = link.name, frames.get(link.name)
+        kind, sentence = fault(name, link.mass, link.moments)
+        if kind or link.mass <= 0.0:
+            yield kind, name, sentence
+            continue
+        # A ball has the least inertia of all bodies of a given mass and density.
+        radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
+        gyration, against, size = float(np.sqrt(link.moments[-1] / link.mass)), _against_reach(robot), np.inf
+        near = [points for _, joint, points in corners if frame is not None and joint == frame.parentJoint]
+        if frame is not None and near:
+            size = float(np.linalg.norm(np.vstack(near) - frame.placement.act(link.center), axis=1).max())
+        if SIZE_RATIO * size < length:
+            against = f"and its body reaches {size:.2g} m from its centre of mass"
+        if link.moments.sum() < 1.2 * link.mass * radius**2:
             moments = ", ".join(f"{moment:.3g}" for moment in link.moments)
-            radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
-            gyration = float(np.sqrt(link.moments[-1] / link.mass))
-            if link.moments.sum() < 1.2 * link.mass * radius**2:
-                yield (
-                    f"link {link.name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
-                    f"{moments} kg m^2 would be denser than osmium"
-                )
-            elif gyration > length:
-                yield (
-                    f"link {link.name!r} has an implausibly large inertia: its radius of gyration is {gyration:.3g} m, "
-                    f"{_against_reach(robot)}"
-                )
+            sentence = (
+                f"link {name!r} has an implausibly small inertia: {link.mass:g} kg with principal moments "
+                f"{moments} kg m^2 would be denser than osmium"
+            )
+            yield "small", name, sentence
+        elif gyration > min(length, SIZE_RATIO * size):
+            large = (
+                f"link {name!r} has an implausibly large inertia: its radius of gyration is {gyration:.3g} m, {against}"
+            )
+            yield "large", name, large
     for link in links:
         away = float(np.linalg.norm(link.center))
         if link.joint and away > length:
-            yield (
-                f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, {_against_reach(robot)}; "
-                "are these millimetres?"
-            )
+            far = f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, {_against_reach(robot)}"
+            yield "away", link.name, f"{far}; are these millimetres?"
+
+
+def _corners(robot: Robot) -> list[tuple[str, int, Floats]]:
+    """The link, the joint and the corners (8, 3) [m], in the joint's frame, of the box around each readable shape."""
+    found = []
+    for shape in readable_geometry(robot)[0].geometryObjects:
+        if isinstance(shape.geometry, pin.coal.BVHModelBase):
+            vertices = np.asarray(shape.geometry.vertices(), dtype=np.float64)
+            low, high = vertices.min(axis=0), vertices.max(axis=0)
+        else:
+            shape.geometry.computeLocalAABB()
+            low, high = shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_
+        corners = np.array(list(product(*zip(low, high, strict=True))))
+        placed = corners @ shape.placement.rotation.T + shape.placement.translation
+        found.append((robot.free_model.frames[shape.parentFrame].name, shape.parentJoint, placed))
+    return found
 
 
 def _reach(robot: Robot) -> float:
@@ -286,7 +321,7 @@ def _against_reach(robot: Robot) -> str:
     return f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
 
 
-def _ratio_warnings(robot: Robot) -> Iterator[str]:
+def _ratio_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
     tree = robot.tree
     moments = [np.linalg.eigvalsh(np.array(body.inertia))[-1] for body in list(robot.free_model.inertias)[1:]]
     for body, parent in enumerate(tree.parent):
@@ -300,9 +335,31 @@ def _ratio_warnings(robot: Robot) -> Iterator[str]:
             light, heavy = sorted((values[parent], values[body]))
             if light > 0.0 and heavy > most * light:
                 yield (
-                    f"the {what} of neighbouring links {pair} differ by a factor of {heavy / light:.1g}: "
-                    f"{values[parent]:.3g} and {values[body]:.3g} {unit}"
+                    what,
+                    _body_name(robot, body + 1),
+                    (
+                        f"the {what} of neighbouring links {pair} differ by a factor of {heavy / light:.1g}: "
+                        f"{values[parent]:.3g} and {values[body]:.3g} {unit}"
+                    ),
                 )
+
+
+def _mesh_warnings(robot: Robot) -> Iterator[str]:
+    sizes = {
+        shape: float(np.ptp(shape.geometry.vertices(), axis=0).max())
+        for shape in readable_geometry(robot)[0].geometryObjects
+        if shape.parentJoint and isinstance(shape.geometry, pin.coal.BVHModelBase)
+    }
+    reach = longest_reach(robot)
+    if not sizes or not 0.0 < reach < np.inf:
+        return
+    shape, size = max(sizes.items(), key=lambda own: own[1])
+    if not MESH_RATIOS[0] * reach <= size <= MESH_RATIOS[1] * reach:
+        name, link = Path(shape.meshPath).name or shape.name, robot.free_model.frames[shape.parentFrame].name
+        yield (
+            f"mesh {name!r} of link {link!r} is {size:.3g} m long, where the arm reaches {reach:.3g} m: if it is not "
+            "in metres, its scale= must make it so"
+        )
 
 
 def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
@@ -318,7 +375,7 @@ def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
         )
 
 
-def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[str]:
+def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[tuple[str, str, str]]:
     bounded = [joint for joint in joints if joint.kind in ("revolute", "prismatic")]
     driven = [joint for joint in joints if joint.kind != "mimic"]
     missing = {
@@ -328,39 +385,54 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
     }
     for what, names in missing.items():
         if names:
-            yield f"no {what} limit, or one of 0: {', '.join(map(repr, names))}"
+            yield what, "", f"no {what} limit, or one of 0: {listed(map(repr, names), 'joints')}"
     for joint in bounded:
         if joint.lower == joint.upper == 0.0:
             yield (
-                f"joint {joint.name!r} has the limits 0 and 0, which count as none, as in a URDF without limits; "
-                "lock a joint to keep it from moving"
+                "zeros",
+                joint.name,
+                (
+                    f"joint {joint.name!r} has the limits 0 and 0, which count as none, as in a URDF without limits; "
+                    "lock a joint to keep it from moving"
+                ),
             )
         elif joint.lower >= joint.upper:
-            yield f"joint {joint.name!r} has no room to move: limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
+            words = f"limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
+            yield "no room", joint.name, f"joint {joint.name!r} has no room to move: {words}"
     at_zero = q is None
     for name, at, low, high in zip(
         robot.joint_names, np.zeros(robot.dof) if q is None else q, *robot.position_limits, strict=True
     ):
         if low < high and not low <= at <= high:
             where = f"q = 0 is no posture of joint {name!r}: it is" if at_zero else f"q puts joint {name!r} at {at:g},"
-            yield f"{where} outside its limits {low:g} and {high:g}"
+            yield "outside", name, f"{where} outside its limits {low:g} and {high:g}"
 
 
-def _mimic_warnings(robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool) -> Iterator[str]:
+def _mimic_warnings(
+    robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool
+) -> Iterator[tuple[str, str, str]]:
     for joint in joints:
         if joint.follows:
-            yield f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}; it is not a coordinate"
+            yield (
+                "tied",
+                joint.name,
+                f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}: no coordinate",
+            )
     if urdf is None:
         return
     index = joint_index(robot.free_model)
-    moving = {joint.get("name") for joint in urdf.elements("joint") if joint.get("type") not in (None, "fixed")}
+    moving = {joint.get("name") for joint in urdf.root.findall("joint") if joint.get("type") not in (None, "fixed")}
     for name, mimic in urdf.mimics.items():
         if name not in index:
             continue
         if mimic.leader not in moving:
-            yield f"joint {name!r} mimics {mimic.leader!r}, which is not a moving joint of the robot: it stays free"
+            yield (
+                "alone",
+                name,
+                (f"joint {name!r} mimics {mimic.leader!r}, which is not a moving joint of the robot: it stays free"),
+            )
         elif not tied:
-            yield f"joint {name!r} mimics {mimic.leader!r}, but mimic='free' makes it free"
+            yield "free", name, f"joint {name!r} mimics {mimic.leader!r}, but mimic='free' makes it free"
 
 
 def _damping_warnings(robot: Robot) -> Iterator[str]:
@@ -373,19 +445,15 @@ def _damping_warnings(robot: Robot) -> Iterator[str]:
             "which a scene uses with friction='robot'",
         ),
     ):
-        given = ", ".join(f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value)
+        given = [f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value]
         if given:
-            yield f"the description gives joint {what} [{unit}], {usage}: {given}"
+            yield f"the description gives joint {what} [{unit}], {usage}: {listed(given, 'joints')}"
 
 
 def _loop_warnings(robot: Robot) -> Iterator[str]:
     if robot.loops:
-        pairs = ", ".join(f"{a!r} on {b!r}" for a, b in robot.loops)
+        pairs = listed((f"{a!r} on {b!r}" for a, b in robot.loops), "pairs")
         yield f"the description has loops, which the tree leaves open for a scene's constraints to close: {pairs}"
     if robot.equalities:
-        named = ", ".join(equality.name for equality in robot.equalities)
+        named = listed((equality.name for equality in robot.equalities), "of them")
         yield f"the description has equality constraints, which a scene uses with constraints='robot': {named}"
-
-
-def _position(value: float | tuple[float, ...]) -> str:
-    return f"{value:g}" if isinstance(value, float) else f"({', '.join(f'{x:g}' for x in value)})"

@@ -60,6 +60,7 @@ def _passed(
     name, peak = scene.robot.joint_names[joint], int(excess[:, joint].argmax())
     unit = _UNITS[kind][int(scene.robot.slides[joint])]
     limit = limits[int(values[peak, joint] > 0.5 * (limits[0][joint] + limits[1][joint]))][joint]
+    limit = abs(limit) if kind else limit
     what = ("position", "velocity", "effort")[kind]
     stopped = kind == 0 and any(stop.coordinate == joint for stop in of_kind(scene.elements, "JointStop"))
     soft = " (its JointStop gives way)" if stopped else "; nothing stops it there" if kind == 0 else ""

@@ -186,7 +186,8 @@ class KeepInHalfSpace(_Region):
             robot: The robot.
             frame: Name of the frame.
             normal: Normal of the plane (3,), towards the allowed side; of any length.
-            offset: Distance of the plane from the world's origin along its normal [m].
+            offset: Least normal . p, with the normal as given; for a unit normal, the distance of the plane from the
+                world's origin along it [m].
             margin: In standard deviations of the distance under noise.
 
         Raises:
@@ -199,7 +200,7 @@ class KeepInHalfSpace(_Region):
         if not length > 0.0:
             raise InputError("KeepInHalfSpace normal must not be zero")
         self.normal = given / length
-        self.offset = finite("KeepInHalfSpace offset", offset)
+        self.offset = finite("KeepInHalfSpace offset", offset) / length
         self.margin = checked_margin(self, margin)
 
     @property

@@ -1,11 +1,12 @@
-"""The hard constraints of a plan in scene files."""
+"""The hard constraints of a plan in scene files: their keys are the arguments of the API's constraints."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import scipy
@@ -22,122 +23,100 @@ from varpin.control.constraints import (
     WithinJointLimits,
     WithinVelocityLimits,
 )
-from varpin.io.scenefile.keys import FLAG, TEXT, Rule, checked, either, existing_file, number, numbers, values
+from varpin.io.scenefile.reading import FILE, FLAG, TEXT, Rule, checked, either, entries, keys, number, values
 from varpin.model import Robot
 from varpin.model.clearance import Obstacle
 
-Given = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of constraint.
-
-    Attributes:
-        make: Function that builds it for a robot.
-        rules: Its keys, each with its rule and its default, ``...`` for a required key.
-    """
-
-    make: Callable[[Robot, Given], PlanConstraint]
-    rules: Mapping[str, tuple[Rule, Any]]
-
-
-def _limits(given: Given) -> Any:
-    """(lower, upper), infinite where one is left out; None where both are."""
-    lower, upper = (given[side] for side in ("lower", "upper"))
-    if lower is None and upper is None:
-        return None
-    return -np.inf if lower is None else _plain(lower), np.inf if upper is None else _plain(upper)
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _goal(robot: Robot, given: Given) -> PlanConstraint:
-    rotation = None
-    if given["rotation"] is not None:
-        rotation = scipy.spatial.transform.Rotation.from_euler("xyz", given["rotation"]).as_matrix()
-    return ReachFrame(robot, given["frame"], given["position"], rotation)
-
-
-def _clear(robot: Robot, given: Given) -> PlanConstraint:
-    obstacles = [Obstacle.sphere(x[:3], x[3], f"sphere[{k}]") for k, x in enumerate(given["spheres"])]
-    obstacles += [Obstacle.capsule(x[:3], x[3:6], x[6], f"capsule[{k}]") for k, x in enumerate(given["capsules"])]
-    obstacles += [Obstacle.box(x[:3], x[3:], name=f"box[{k}]") for k, x in enumerate(given["boxes"])]
-    for k, x in enumerate(given["hulls"]):
-        of = Obstacle.mesh if isinstance(x, Path) else Obstacle.convex
-        obstacles.append(of(x, name=f"hull[{k}]"))
-    links = None if given["links"] is None else list(given["links"])
-    return KeepClear(
-        robot,
-        obstacles,
-        given["distance"],
-        links=links,
-        itself=given["itself"],
-        srdf=given["srdf"],
-        margin=given["margin"],
-    )
+KINDS: Mapping[str, Callable[..., PlanConstraint]] = {
+    "joint_limits": WithinJointLimits,
+    "velocity_limits": WithinVelocityLimits,
+    "control_rate": WithinControlRate,
+    "reach_frame": ReachFrame,
+    "half_space": KeepInHalfSpace,
+    "box": KeepInBox,
+    "inside_sphere": KeepInSphere,
+    "outside_sphere": KeepOutOfSphere,
+    "clearance": KeepClear,
+}
 
 
 def _rows(length: int) -> Rule:
-    one = Annotated[tuple[float, ...], numbers(length, "m")]
-    return Rule(tuple[one, ...], f"a list of lists of {length} numbers [m]", parts=True)
+    return entries(entries(number("m"), length))
 
 
+_THREE = entries(number("m"), 3)
 _HULL = either(
-    "a list of points, each of 3 numbers [m], or the path of a mesh file in metres",
-    list=Annotated[tuple[float, ...], _rows(3)],
-    text=Annotated[Path, checked(TEXT, existing_file)],
+    "a list of points, each of 3 numbers [m], or the path of a mesh file in metres", list=_rows(3), text=FILE
 )
-_HULLS = Rule(tuple[Annotated[Any, _HULL], ...], "a list of hulls", parts=True)
-_MARGIN = {"margin": (number(least=0.0), 0.0)}
-_FRAME = {"frame": (TEXT, ...)}
-_SPHERE = _FRAME | {"center": (numbers(3, "m"), ...), "radius": (number("m", above=0.0), ...)} | _MARGIN
-
-
-def _within(unit: str) -> dict[str, tuple[Rule, Any]]:
-    return {"lower": (values(unit), None), "upper": (values(unit), None)} | _MARGIN
-
-
-PLAN_CONSTRAINTS: dict[str, Kind] = {
-    "joint_limits": Kind(
-        lambda robot, g: WithinJointLimits(robot, _limits(g), margin=g["margin"]), _within("rad or m")
-    ),
-    "velocity_limits": Kind(
-        lambda robot, g: WithinVelocityLimits(robot, _limits(g), margin=g["margin"]), _within("rad/s or m/s")
-    ),
-    "control_rate": Kind(
-        lambda _, g: WithinControlRate(_plain(g["limit"]), _plain(g["before"])),
-        {"limit": (values("control/s", least=0.0), ...), "before": (values(), None)},
-    ),
-    "reach_frame": Kind(_goal, _FRAME | {"position": (numbers(3, "m"), None), "rotation": (numbers(3, "rad"), None)}),
-    "half_space": Kind(
-        lambda robot, g: KeepInHalfSpace(robot, g["frame"], g["normal"], g["offset"], margin=g["margin"]),
-        _FRAME | {"normal": (numbers(3), ...), "offset": (number("m"), ...)} | _MARGIN,
-    ),
-    "box": Kind(
-        lambda robot, g: KeepInBox(robot, g["frame"], g["lower"], g["upper"], margin=g["margin"]),
-        _FRAME | {"lower": (numbers(3, "m"), ...), "upper": (numbers(3, "m"), ...)} | _MARGIN,
-    ),
-    "inside_sphere": Kind(
-        lambda robot, g: KeepInSphere(robot, g["frame"], g["center"], g["radius"], margin=g["margin"]), _SPHERE
-    ),
-    "outside_sphere": Kind(
-        lambda robot, g: KeepOutOfSphere(robot, g["frame"], g["center"], g["radius"], margin=g["margin"]), _SPHERE
-    ),
-    "clearance": Kind(
-        _clear,
-        {
-            "distance": (number("m"), 0.0),
-            "spheres": (_rows(4), ()),
-            "capsules": (_rows(7), ()),
-            "boxes": (_rows(6), ()),
-            "hulls": (_HULLS, ()),
-            "links": (Rule(tuple[Annotated[str, TEXT], ...], "a list of texts", parts=True), None),
-            "itself": (FLAG, False),
-            "srdf": (checked(TEXT, existing_file), None),
-        }
-        | _MARGIN,
-    ),
+# Rules of arguments; others are no keys.
+_RULES = {
+    "frame": TEXT,
+    "position": _THREE,
+    "rotation": entries(number("rad"), 3),
+    "normal": entries(number(), 3),
+    "offset": number("m"),
+    "lower": _THREE,
+    "upper": _THREE,
+    "center": _THREE,
+    "radius": number("m", above=0.0),
+    "limit": values("control/s", least=0.0),
+    "before": values(),
+    "distance": number("m"),
+    "links": entries(TEXT),
+    "itself": FLAG,
+    "srdf": FILE,
+    "margin": number(least=0.0),
 }
+# What is written in place of an argument.
+_INSTEAD = {
+    "limits": {"lower": values("rad or m, or per s"), "upper": values("rad or m, or per s")},
+    "obstacles": {"spheres": _rows(4), "capsules": _rows(7), "boxes": _rows(6), "hulls": entries(_HULL)},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PlanTable:
+    """[[plan_constraint]].
+
+    Attributes:
+        kind: Its type in the file.
+        given: Its keys.
+    """
+
+    kind: str
+    given: Mapping[str, Any]
+
+    def make(self, robot: Robot) -> PlanConstraint:
+        """The constraint of a robot."""
+        own = {name: list(value) if type(value) is tuple else value for name, value in self.given.items()}
+        arguments = inspect.signature(KINDS[self.kind]).parameters
+        if "limits" in arguments and not own.keys().isdisjoint(("lower", "upper")):
+            own["limits"] = own.pop("lower", -np.inf), own.pop("upper", np.inf)
+        if "rotation" in own:
+            own["rotation"] = scipy.spatial.transform.Rotation.from_euler("xyz", own["rotation"]).as_matrix()
+        if "obstacles" in arguments:
+            own["obstacles"] = _obstacles(*(own.pop(name, ()) for name in _INSTEAD["obstacles"]))
+        if "robot" in arguments:
+            own["robot"] = robot
+        return KINDS[self.kind](**own)
+
+
+def _obstacles(spheres: Any, capsules: Any, boxes: Any, hulls: Any) -> list[Obstacle]:
+    found = [Obstacle.sphere(x[:3], x[3], f"sphere[{k}]") for k, x in enumerate(spheres)]
+    found += [Obstacle.capsule(x[:3], x[3:6], x[6], f"capsule[{k}]") for k, x in enumerate(capsules)]
+    found += [Obstacle.box(x[:3], x[3:], name=f"box[{k}]") for k, x in enumerate(boxes)]
+    for k, x in enumerate(hulls):
+        found.append((Obstacle.mesh if isinstance(x, Path) else Obstacle.convex)(x, name=f"hull[{k}]"))
+    return found
+
+
+def _rule(kind: str) -> Rule:
+    rules: dict[str, tuple[Rule, bool]] = {}
+    for name, item in inspect.signature(KINDS[kind]).parameters.items():
+        rules |= {key: (rule, False) for key, rule in _INSTEAD.get(name, {}).items()}
+        if name in _RULES:
+            rules[name] = _RULES[name], item.default is item.empty
+    return checked(keys(rules), lambda given, _: PlanTable(kind, given))
+
+
+PLAN_CONSTRAINTS: Mapping[str, Rule] = {kind: _rule(kind) for kind in KINDS}

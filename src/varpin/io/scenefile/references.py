@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
-import array
-import csv
+import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
-from varpin.errors import FileError
+from varpin.errors import FileError, InputError
 from varpin.io.archive import read_npz
-from varpin.io.scenefile.table import ByName, Table, shown, suggestion
+from varpin.io.scenefile.reading import (
+    TEXT,
+    ByName,
+    Rule,
+    Where,
+    checked,
+    entries,
+    existing,
+    number,
+    rules_of,
+    shown,
+    suggestion,
+    table,
+    values,
+    word,
+)
 from varpin.model import Robot
 
 
@@ -100,92 +115,122 @@ class _Linear:
         return np.column_stack([np.interp(t, self.times, column) for column in self.rows.T])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Sine:
     """amplitude sin(2 pi frequency t + phase), added to one component."""
 
-    of: str
-    amplitude: float
-    frequency: float  # [Hz]
-    phase: float  # [rad]
+    of: Annotated[str, TEXT]
+    amplitude: Annotated[float, number()]
+    frequency: Annotated[float, number("Hz", above=0.0)]
+    phase: Annotated[float, number("rad")] = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class ReferenceSignal:
-    """A reference in a file, before it is applied to a robot.
+@dataclass(frozen=True)
+class Sines:
+    """A reference of sines."""
 
-    Attributes:
-        table: The table that contains it.
-        name: Its key.
-        offset: Constant part of constants and sines; or the name of a posture, for constants of joints.
-        sines: Sines added to the offset.
-        times: Times of waypoints [s].
-        values: Waypoints, one row each.
-        smooth: Whether a monotone cubic, instead of straight lines, connects the waypoints.
-        file: CSV or npz file.
+    sines: Annotated[tuple[Sine, ...], entries(table(Sine))]
+    offset: Annotated[ByName, values()] = 0.0
+
+
+@dataclass(frozen=True)
+class Waypoints:
+    """A reference of waypoints: straight lines, or a monotone cubic, between them."""
+
+    times: Annotated[tuple[float, ...], entries(number("s"))]
+    values: Annotated[tuple[tuple[float, ...], ...], entries(entries(number()))]
+    between: Annotated[str, word("lines", "smooth")] = "lines"
+
+    def __post_init__(self) -> None:
+        if len(self.times) < 2 or not all(b > a for a, b in itertools.pairwise(self.times)):
+            raise InputError(f"must be two or more, and increase [s], got {list(self.times)}", "times")
+        if len(self.values) != len(self.times):
+            raise InputError(
+                f"must have {len(self.times)} rows, one for each of times; got {len(self.values)}", "values"
+            )
+
+
+def _values_file(text: str, where: Where) -> Path:
+    if Path(text).suffix not in (".csv", ".npz"):
+        raise where.error(f"must be a .csv or .npz file, got {text!r}")
+    return existing(text, where)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A reference in a file."""
+
+    file: Annotated[Path, checked(TEXT, _values_file)]
+
+
+REFERENCES: tuple[Any, ...] = (Samples, Waypoints, Sines)
+
+
+def reference(**others: Any) -> Rule:
+    """A reference: constant values, one of ``REFERENCES``, or one of ``others`` by type."""
+    constants = values(**others)
+
+    def read(value: Any, where: Where) -> Any:
+        given = set(value) if isinstance(value, dict) else set()
+        if any(isinstance(value[key], list | dict) for key in given & {"constant", "value"}):
+            raise where.error("constant values are given without a table, as in target = [0.4, 0.2, 0.3]")
+        kind = next((kind for kind in REFERENCES if given & set(rules_of(kind))), None)
+        return constants.read(value, where) if kind is None else table(kind).read(value, where)
+
+    return Rule("a number for all, a list, a table by name, sines, waypoints or a file", read)
+
+
+def timeline(
+    given: Any, where: Where, names: Sequence[str], what: str, robot: Robot, dt: float, duration: float
+) -> Timeline:
+    """The values over time of a reference that was read at ``where``, for the components ``names``.
+
+    Raises:
+        SceneFileError: It has other components or another length, or does not last for the horizon.
     """
+    if isinstance(given, Samples):
+        return _of_file(given.file, where.at("file"), names, duration, what)
+    if isinstance(given, Waypoints):
+        for index, row in enumerate(given.values):
+            where.at("values").at(index).spread(row, names)
+        try:
+            with np.errstate(all="ignore"):
+                return _between(np.array(given.times), np.array(given.values), smooth=given.between == "smooth")
+        except ValueError as error:
+            raise where.at("values").error(f"no smooth curve goes through them: {error}") from None
+    if not isinstance(given, Sines):
+        is_posture = isinstance(given, str)
+        return constant(where.positions(given, robot) if is_posture else where.spread(given, names, what))
+    offset = where.at("offset").spread(given.offset, names, what)
+    for index, sine in enumerate(given.sines):
+        place = where.at("sines").at(index)
+        if sine.of not in names:
+            raise place.at("of").error(f"there is no {what} {sine.of!r}; {suggestion(sine.of, names, what + 's')}")
+        if sine.frequency > 0.5 / dt:
+            most = f"<= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves"
+            raise place.at("frequency").error(f"must be {most}, got {sine.frequency:g}")
+    if not given.sines:
+        return constant(offset)
+    return Timeline(_Sines(offset, given.sines, tuple(names.index(sine.of) for sine in given.sines)), constant=False)
 
-    table: Table
-    name: str
-    offset: ByName | str = 0.0
-    sines: tuple[Sine, ...] = ()
-    times: tuple[float, ...] = ()
-    values: tuple[tuple[float, ...], ...] = ()
-    smooth: bool = False
-    file: Path | None = None
 
-    def timeline(self, names: Sequence[str], duration: float, what: str, robot: Robot) -> Timeline:
-        """Its values over time for the components ``names``.
+def _of_file(path: Path, where: Where, names: Sequence[str], duration: float, what: str) -> Timeline:
+    def wrong(problem: str) -> Exception:
+        return where.error(f"{path.name}: {problem}")
 
-        Raises:
-            SceneFileError: It has other components or another length, or does not last for ``duration`` [s].
-        """
-        if self.file is not None:
-            return self._of_file(self.file, names, duration, what)
-        if self.times:
-            for index, row in enumerate(self.values):
-                if len(row) != len(names):
-                    raise self.table.error(
-                        f"{self.name}.values[{index}]",
-                        f"must have {len(names)} numbers, for {', '.join(names)}; got {len(row)}",
-                    )
-            try:
-                with np.errstate(all="ignore"):
-                    return _between(np.array(self.times), np.array(self.values), smooth=self.smooth)
-            except ValueError as error:
-                raise self.table.error(f"{self.name}.values", f"no smooth curve goes through them: {error}") from None
-        where = f"{self.name}.offset" if self.sines else self.name
-        if isinstance(self.offset, str):
-            return constant(self.table.positions(where, self.offset, robot))
-        offset = self.table.spread(where, self.offset, names, what)
-        if not self.sines:
-            return constant(offset)
-        for index, sine in enumerate(self.sines):
-            if sine.of not in names:
-                raise self.table.error(
-                    f"{self.name}.sines[{index}].of",
-                    f"there is no {what} {sine.of!r}; {suggestion(sine.of, names, what + 's')}",
-                )
-        columns = tuple(names.index(sine.of) for sine in self.sines)
-        return Timeline(_Sines(offset, self.sines, columns), constant=False)
-
-    def _of_file(self, path: Path, names: Sequence[str], duration: float, what: str) -> Timeline:
-        def wrong(problem: str) -> Exception:
-            return self.table.error(f"{self.name}.file", f"{path.name}: {problem}")
-
-        columns = _npz(path, wrong) if path.suffix == ".npz" else _csv(path, wrong)
-        if "t" not in columns:
-            raise wrong(f"it has no column t of times [s]; it has {', '.join(columns)}")
-        missing = [name for name in names if name not in columns]
-        if missing:
-            raise wrong(f"it has no column {missing[0]!r}; {what}s: {', '.join(names)}; columns: {', '.join(columns)}")
-        t = columns["t"]
-        rows = np.column_stack([columns[name] for name in names])
-        if len(t) < 2 or not (np.diff(t) > 0.0).all():
-            raise wrong("it must have two or more increasing times")
-        if t[0] > 1e-9 * duration or t[-1] < duration * (1.0 - 1e-9):
-            raise wrong(f"its times go from {t[0]:g} to {t[-1]:g} s, but the scene lasts from 0 to {duration:g} s")
-        return _between(t, rows, smooth=False)
+    columns = _npz(path, wrong) if path.suffix == ".npz" else _csv(path, wrong)
+    if "t" not in columns:
+        raise wrong(f"it has no column t of times [s]; it has {', '.join(columns)}")
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise wrong(f"it has no column {missing[0]!r}; {what}s: {', '.join(names)}; columns: {', '.join(columns)}")
+    t = columns["t"]
+    rows = np.column_stack([columns[name] for name in names])
+    if len(t) < 2 or not (np.diff(t) > 0.0).all():
+        raise wrong("it must have two or more increasing times")
+    if t[0] > 1e-9 * duration or t[-1] < duration * (1.0 - 1e-9):
+        raise wrong(f"its times go from {t[0]:g} to {t[-1]:g} s, but the scene lasts from 0 to {duration:g} s")
+    return _between(t, rows, smooth=False)
 
 
 def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
@@ -196,34 +241,24 @@ def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
 
 
 def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
-    numbers = array.array("d")
-    head: list[str] = []
+    """The columns of a CSV file: a line of names, then lines of numbers."""
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            for number, row in enumerate(filter(None, csv.reader(stream)), start=1):
-                if not head:
-                    head = [name.strip() for name in row]
-                    twice = [name for name, times in Counter(head).items() if times > 1]
-                    if twice:
-                        raise wrong(f"it has two columns {shown(twice[0])}")
-                    continue
-                if len(row) != len(head):
-                    raise wrong(f"row {number} has {len(row)} entries, but there are {len(head)} columns")
-                for column, word in zip(head, row, strict=True):
-                    try:
-                        value = float(word)
-                    except ValueError:
-                        raise wrong(
-                            f"row {number}, column {shown(column)}: {shown(word.strip())} is not a number"
-                        ) from None
-                    if not math.isfinite(value):
-                        raise wrong(f"row {number}, column {shown(column)} is not finite")
-                    numbers.append(value)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise wrong(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if not len(numbers):
+        head, *lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()] or [""]
+        names = [name.strip(' "\t') for name in head.split(",")]
+        numbers = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2) if lines else np.zeros((0, 0))
+    except (OSError, ValueError) as error:
+        told = getattr(error, "strerror", None) or f"{str(error).partition(';')[0]} (row 0 is the first of numbers)"
+        raise wrong(f"cannot be read: {told}") from None
+    if twice := [name for name, times in Counter(names).items() if times > 1]:
+        raise wrong(f"it has two columns {shown(twice[0])}")
+    if not numbers.size:
         raise wrong("it must have a line of column names and lines of numbers")
-    return dict(zip(head, np.array(numbers).reshape(-1, len(head)).T, strict=True))
+    if numbers.shape[1] != len(names):
+        raise wrong(f"its rows have {numbers.shape[1]} entries, but there are {len(names)} columns")
+    if not np.isfinite(numbers).all():
+        row, column = np.argwhere(~np.isfinite(numbers))[0].tolist()
+        raise wrong(f"row {row + 2}, column {shown(names[column])} is not finite")
+    return dict(zip(names, numbers.T, strict=True))
 
 
 def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
@@ -237,9 +272,9 @@ def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
         if len(joints) == arrays["q"].shape[1]:
             arrays = {"t": arrays["t"]} | dict(zip(joints, arrays["q"].T, strict=True))
     length = arrays["t"].shape if "t" in arrays else ()
-    for name, values in arrays.items():
-        if values.dtype.kind not in "fi" or values.ndim != 1 or values.shape != length:
-            raise wrong(f"its array {shown(name)} must have the shape of t, {length}, got {values.shape}")
-        if not np.isfinite(values).all():
+    for name, column in arrays.items():
+        if column.dtype.kind not in "fi" or column.ndim != 1 or column.shape != length:
+            raise wrong(f"its array {shown(name)} must have the shape of t, {length}, got {column.shape}")
+        if not np.isfinite(column).all():
             raise wrong(f"its array {shown(name)} is not finite")
-    return {name: np.asarray(values, dtype=np.float64) for name, values in arrays.items()}
+    return {name: np.asarray(column, dtype=np.float64) for name, column in arrays.items()}

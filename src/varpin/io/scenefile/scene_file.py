@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,23 +16,22 @@ from varpin.arrays import Floats
 from varpin.control import OptimalControlProblem, Solution, solve
 from varpin.control.costs import CostError
 from varpin.control.problem import integrator_for
-from varpin.errors import InputError, VarpinError
+from varpin.errors import FileError, InputError, VarpinError
 from varpin.integrators import Integrator
-from varpin.io.scenefile.layout import Layout, holding_controls, lay_out
-from varpin.io.scenefile.reading import find_scene, read_scene
+from varpin.io.scenefile.reading import suggestion
 from varpin.io.scenefile.references import Timeline
-from varpin.io.scenefile.required import Required, idle_joints, requirements
 from varpin.io.scenefile.shown import marks_of
-from varpin.mechanics.scene import Scene
-from varpin.model import Robot
+from varpin.io.scenefile.tables import SceneTables, read_scene
+from varpin.io.scenefile.task import Task, required_of, task_of
+from varpin.mechanics.reduction import Required
+from varpin.mechanics.scene import Scene, closest_controls
+from varpin.model import Robot, models_dir
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.choice import usual_integrator
 from varpin.simulation.simulate import simulate
+from varpin.support.checks import is_file
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from varpin.io.scenefile.tables import SceneSpec
 
 # Measured time to set up a part, in units of linear algebra: the cube of the number of joints, times steps.
 _SETUP = 200_000
@@ -49,12 +49,12 @@ class SceneFile:
         v0: Initial velocity (n,) [rad/s or m/s].
     """
 
-    spec: SceneSpec
+    spec: SceneTables
     required: Required
     scene: Scene
     q0: Floats
     v0: Floats
-    _layout: Layout = field(repr=False)
+    _task: Task = field(repr=False)
 
     def __repr__(self) -> str:
         return f"SceneFile({self.spec.name}: {self.spec.title})"
@@ -82,9 +82,9 @@ class SceneFile:
         """
         if self.spec.integrator is not None:
             return self.spec.integrator
-        if self.spec.costs:
+        if self.spec.cost:
             return integrator_for(self.scene, self.q0, self.spec.dt)
-        return usual_integrator(self.scene, self.q0, self.v0, self.spec.dt, noisy=self.spec.seed is not None)
+        return usual_integrator(self.scene, self.q0, self.v0, self.spec.dt, noisy=self.spec.simulate.seed is not None)
 
     @cached_property
     def problem(self) -> OptimalControlProblem:
@@ -93,46 +93,43 @@ class SceneFile:
         Raises:
             SceneFileError: The file has no cost, or a cost does not fit the robot.
         """
-        return self._problem(self._layout, self.scene)
+        return self._problem(self._task)
 
-    def _problem(self, layout: Layout, scene: Scene) -> OptimalControlProblem:
-        spec = self.spec
-        if not spec.costs:
-            raise spec.root.error("cost", "is missing; a scene to solve needs at least one [[cost]]")
-        most = layout.control_limit
-        constraints = []
-        for constraint in spec.plan_constraints:
+    def _problem(self, task: Task) -> OptimalControlProblem:
+        spec, horizon = self.spec, self.spec.horizon
+        if not spec.cost:
+            raise spec.where.at("cost").error("is missing; a scene to solve needs at least one [[cost]]")
+        most, constraints = task.control_limit, []
+        for index, given in enumerate(spec.plan_constraint):
             try:
-                constraints.append(constraint.kind.make(scene.robot, constraint.given))
+                constraints.append(given.make(task.scene.robot))
             except VarpinError as error:
-                raise constraint.table.error("", str(error)) from None
+                raise spec.where.at("plan_constraint").at(index).of(error, given.given) from None
         try:
             return OptimalControlProblem(
-                scene,
-                layout.cost(scene),
-                layout.q0,
-                layout.v0,
+                task.scene,
+                task.cost(),
+                task.q0,
+                task.v0,
                 dt=spec.dt,
                 steps=spec.steps,
                 integrator=self.integrator,
-                sampling=spec.sampling,  # type: ignore[arg-type]
-                hold=spec.hold,
+                sampling=horizon.sampling,  # type: ignore[arg-type]
+                hold=horizon.hold,
                 control_limits=(-most, most),
-                controls=spec.shape,  # type: ignore[arg-type]
+                controls=horizon.controls,  # type: ignore[arg-type]
                 constraints=constraints,
-                between_nodes=spec.between_nodes,
+                between_nodes=horizon.between_nodes,
             )
-        except CostError as error:
-            raise spec.root.error("cost", str(error)) from None
-        except InputError as error:
-            places = {f"constraints[{i}]": (keys.table, "") for i, keys in enumerate(spec.plan_constraints)}
-            places |= {name: (spec.root, f"horizon.{name}") for name in ("controls", "sampling")}
-            table, key = places.get(error.argument or "", (spec.root, "cost"))
-            raise table.error(key, str(error)) from None
+        except (CostError, InputError) as error:
+            about = (error.argument or "") if isinstance(error, InputError) else ""
+            key = about.replace("constraints[", "plan_constraint[") if about else "cost"
+            key = f"horizon.{about}" if about in ("controls", "sampling") else key
+            raise spec.where.at(key).error(str(error)) from None
 
     def controls(self) -> Floats | None:
         """Controls of a simulation, (N, m) or (m,), or None for none."""
-        given = self._layout.controls
+        given = self._task.controls
         if given is None:
             return None
         if isinstance(given, Timeline):
@@ -143,7 +140,7 @@ class SceneFile:
             found[:, moved] = given.at((k + 1.0) * self.spec.dt)[:, moved]
             cubic = [place for place, rate in zip(moved, self.scene.rates, strict=True) if rate >= 0]
             return np.hstack([found, self._rates(given)[:, cubic]]) if cubic else found
-        return holding_controls(self.scene, self.q0)
+        return closest_controls(self.scene, self.q0)
 
     def _rates(self, given: Timeline) -> Floats:
         """Time derivatives of controls at the ends of steps, by backward differences of fourth order."""
@@ -166,8 +163,8 @@ class SceneFile:
             dt=spec.dt,
             steps=spec.steps,
             controls=self.controls(),
-            integrator=self.integrator if spec.costs else spec.integrator,
-            rng=spec.seed,
+            integrator=self.integrator if spec.cost else spec.integrator,
+            rng=spec.simulate.seed,
             progress=progress,
         )
 
@@ -190,14 +187,14 @@ class SceneFile:
                 ``resume``.
             **options: Options of :func:`varpin.solve` that replace those of the file.
         """
-        given = {**self.spec.options, **options}
+        given = {name: value for name, value in vars(self.spec.solve).items() if value is not None} | options
         if controls is None and resume is None and (self._pays_apart() if apart is None else apart):
             controls = self._planned_apart(given)
         return solve(self.problem, controls, resume=resume, **given)
 
     def _pays_apart(self) -> bool:
         """Whether planning groups separately saves more linear algebra than setting up the parts costs."""
-        if self.spec.plan_constraints:
+        if self.spec.plan_constraint:
             return False
         parts = self.required.parts
         saved = self.robot.dof**3 - sum(len(part) ** 3 for part in parts)
@@ -212,8 +209,8 @@ class SceneFile:
         Args:
             duration: Duration of the motion [s]; the horizon if left out.
         """
-        marks = marks_of(self._layout, self.spec.duration if duration is None else duration)
-        if self.spec.plan_constraints:
+        marks = marks_of(self._task, self.spec.duration if duration is None else duration)
+        if self.spec.plan_constraint:
             marks["constraints"] = self.problem
         elif self.scene.constraints:
             marks["constraints"] = self.scene
@@ -224,32 +221,32 @@ class SceneFile:
         return Solution.load(path, self.problem)
 
     @cached_property
-    def _parts(self) -> tuple[tuple[Layout, OptimalControlProblem], ...]:
+    def _parts(self) -> tuple[tuple[Task, OptimalControlProblem], ...]:
         """The groups of joints as problems of their own; empty if a group has no control or no cost.
 
         Empty, too, for several robots, for a part does not have all of them.
         """
-        if self.spec.prefixes is not None:
+        if self.spec.prefixes:
             return ()
         names, parts = self.robot.joint_names, []
         for part in self.required.parts:
-            layout = self._layout.without([name for name in names if name not in part])
-            if not layout.driven or not layout.costs:
+            task = self._task.without([name for name in names if name not in part])
+            if not task.driven or not task.costs:
                 return ()
-            parts.append((layout, self._problem(layout, layout.scene())))
+            parts.append((task, self._problem(task)))
         return tuple(parts)
 
     def _planned_apart(self, options: dict[str, Any]) -> LinearPolicy | None:
         """The policies of all groups of joints in one; None where they cannot be planned separately."""
-        if not self._parts or self.spec.shape == "linear":
+        if not self._parts or self.spec.horizon.controls == "linear":
             return None
-        problem, driven = self.problem, self._layout.driven
+        problem, driven = self.problem, self._task.driven
         names, n, m, R = self.robot.joint_names, self.robot.dof, self.scene.controls, problem.decisions
         u, gains, reference = np.zeros((R, m)), np.zeros((R, m, 2 * n)), np.zeros((R, 2 * n))
-        for layout, part in self._parts:
+        for task, part in self._parts:
             plan = solve(part, **{**options, "true_cost": None}, check=False).policy
-            rows = np.array([driven.index(name) for name in layout.driven])
-            order = np.array([names.index(name) for name in layout.robot.joint_names])
+            rows = np.array([driven.index(name) for name in task.driven])
+            order = np.array([names.index(name) for name in task.scene.robot.joint_names])
             x = np.concatenate([order, n + order])
             u[:, rows], reference[:, x] = plan.u, plan.reference
             gains[:, rows[:, None], x] = plan.gains
@@ -289,25 +286,35 @@ def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
         FileError: There is no such file, or it cannot be read.
         SceneFileError: There is a mistake in the file: the message names the key, the given value and allowed ones.
     """
-    path = find_scene(source)
-    spec = read_scene(path)
-    whole = lay_out(spec)
-    scene = whole.scene()
-    idle: Sequence[str] = ()
-    if required_only:
-        stays = idle_joints(whole, scene)
-        idle = [name for name, out in zip(whole.robot.joint_names, stays, strict=True) if out]
-    layout = whole.without(idle)
-    scene = scene if layout is whole else layout.scene()
-    file = SceneFile(
-        spec=spec,
-        required=requirements(layout, whole, idle, scene),
-        scene=scene,
-        q0=layout.q0,
-        v0=layout.v0,
-        _layout=layout,
-    )
-    if spec.costs:
+    tables = read_scene(find_scene(source))
+    task, required = required_of(task_of(tables), idle=required_only)
+    file = SceneFile(tables, required, task.scene, task.q0, task.v0, task)
+    if tables.cost:
         # Raise a mistake in the cost now, not at the first use of the problem.
         file.problem  # noqa: B018
     return file
+
+
+def scenes() -> dict[str, Path]:
+    """Files of the scenes bundled with varpin, by name."""
+    return {path.stem: path for path in sorted((models_dir() / "scenes").glob("*.toml"))}
+
+
+def find_scene(source: str | Path) -> Path:
+    """The scene file at a path, or the bundled one of that name.
+
+    Raises:
+        FileError: There is no such file; similar names are listed.
+        InputError: ``source`` is not a path.
+    """
+    if not isinstance(source, str | Path) or "\0" in str(source):
+        raise InputError(f"a scene must be the path of a TOML file or a name, got {type(source).__name__}")
+    bundled = scenes()
+    if str(source) in bundled:
+        return bundled[str(source)]
+    path = Path(source).expanduser()
+    if is_file(path):
+        return path
+    if os.path.isdir(path):  # noqa: PTH112 - of a path that is too long for any, pathlib raises an OSError
+        raise FileError(f"{path} is a folder, not a scene file")
+    raise FileError(f"no scene file {str(source)!r}; {suggestion(path.stem, bundled, 'bundled scenes')}")

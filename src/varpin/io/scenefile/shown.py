@@ -8,30 +8,30 @@ import numpy as np
 import scipy
 
 from varpin.arrays import Floats
-from varpin.io.scenefile.layout import CostTerm, Layout
+from varpin.io.scenefile.task import CostTerm, Task
 
 # Points of a path.
 _POINTS = 400
 
 
-def marks_of(layout: Layout, duration: float) -> dict[str, Any]:
+def marks_of(task: Task, duration: float) -> dict[str, Any]:
     """Options of :func:`varpin.replay` from the cost: traces, targets, references and a ghost.
 
     Args:
-        layout: The scene.
+        task: The scene.
         duration: Duration of the motion [s].
     """
-    wanted = [term for term in layout.costs if term.target is not None and term.weight.all()]
-    positions = [term for term in wanted if term.spec.kind == "frame_position"]
-    orientations = [term for term in wanted if term.spec.kind == "frame_orientation"]
+    wanted = [term for term in task.costs if term.target is not None and term.weight.all()]
+    positions = [term for term in wanted if term.table.kind == "frame_position"]
+    orientations = [term for term in wanted if term.table.kind == "frame_orientation"]
     marks: dict[str, Any] = {}
     if positions:
-        marks["trace"] = list(dict.fromkeys(term.spec.frame for term in positions))
+        marks["trace"] = list(dict.fromkeys(term.table.frame for term in positions))
     targets: dict[str, Floats] = {}
     references: dict[str, Floats] = {}
     for term in positions:
         orientation = next((other for other in orientations if _of_one_frame(term, other)), None)
-        name = "target" if len(positions) == 1 else f"target of {term.spec.frame}"
+        name = "target" if len(positions) == 1 else f"target of {term.table.frame}"
         while name in targets:
             name += "'"
         targets[name] = _target(term, orientation, duration)
@@ -42,7 +42,7 @@ def marks_of(layout: Layout, duration: float) -> dict[str, Any]:
         marks["targets"] = targets
     if references:
         marks["reference"] = references
-    if (ghost := _ghost(layout, duration)) is not None:
+    if (ghost := _ghost(task, duration)) is not None:
         marks["ghost"] = ghost
         marks.setdefault("trace", True)
     return marks
@@ -50,14 +50,14 @@ def marks_of(layout: Layout, duration: float) -> dict[str, Any]:
 
 def _of_one_frame(position: CostTerm, orientation: CostTerm) -> bool:
     """Whether two terms have the same frame, both over time or both at the end."""
-    one, other = position.spec, orientation.spec
+    one, other = position.table, orientation.table
     return one.frame == other.frame and one.terminal == other.terminal
 
 
 def _values(term: CostTerm, duration: float) -> Floats:
     """A target over time (K, c), or (1, c) if it is constant or the target of a terminal term."""
     assert term.target is not None
-    if term.spec.terminal:
+    if term.table.terminal:
         return term.target.at(np.array([duration]))
     t = np.linspace(0.0, duration, _POINTS if duration > 0.0 else 1)
     return term.target.at(t[:1] if term.target.constant else t)
@@ -77,11 +77,11 @@ def _target(position: CostTerm, orientation: CostTerm | None, duration: float) -
     return poses
 
 
-def _ghost(layout: Layout, duration: float) -> Floats | None:
+def _ghost(task: Task, duration: float) -> Floats | None:
     """Configurations (K, n) that the joints should follow or reach; None if there is no such cost."""
-    terms = [term for term in layout.costs if term.spec.kind == "tracking" and term.weight.any()]
+    terms = [term for term in task.costs if term.table.kind == "tracking" and term.weight.any()]
     if not terms:
         return None
-    term = next((term for term in terms if not term.spec.terminal), terms[0])
+    term = next((term for term in terms if not term.table.terminal), terms[0])
     # Joints without weight are drawn where they start.
-    return np.asarray(np.where(term.weight != 0.0, _values(term, duration), layout.q0))
+    return np.asarray(np.where(term.weight != 0.0, _values(term, duration), task.q0))

@@ -1,9 +1,10 @@
-"""The terms of a cost in scene files."""
+"""The terms of a cost in scene files: their keys are the arguments of the API's costs."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -24,45 +25,58 @@ from varpin.control.costs import (
     VelocityCost,
     VelocityLimitBarrier,
 )
-from varpin.io.scenefile.references import Timeline
+from varpin.io.scenefile.reading import FLAG, TEXT, TRUE, Rule, Where, checked, keys, number, values, word
+from varpin.io.scenefile.references import Timeline, reference
 from varpin.model import Robot
 
-Space = Literal["q", "v", "u", "frame", "robot"]
+_XYZ = ("x", "y", "z")
+_TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 @dataclass(frozen=True, eq=False)
-class Given:
-    """The values from which a term is built.
+class Term:
+    """A kind of cost term.
 
     Attributes:
-        robot: The robot, without the joints that are left out.
-        weight: One weight for each axis.
-        target: Its reference, if it has one.
-        frame: Name of its frame, if it has one.
-        numbers: Its other keys with numbers.
-        words: Its other keys with words.
+        kind: The cost.
+        space: Its argument: q, v or u, whose components are joints; a frame; or the whole robot.
+        components: Names of the target's components, if they are not joints.
+        axes: Names of the components with weights of their own, if they are not joints; empty for one weight.
+        limits: Function that returns the robot's limits (n,), (n,) for a barrier; None for other terms.
     """
 
-    robot: Robot
-    weight: Floats
-    target: Timeline | None
-    frame: str
-    numbers: Mapping[str, float]
-    words: Mapping[str, str]
+    kind: Callable[..., Cost]
+    space: Literal["q", "v", "u", "frame", "robot"]
+    components: tuple[str, ...] = ()
+    axes: tuple[str, ...] = _XYZ
+    limits: Callable[[Robot], tuple[Floats, Floats]] | None = None
 
     @property
-    def reference(self) -> Any:
-        """The target as costs take it: a constant array, or a function of time."""
-        if self.target is None:
-            return 0.0
-        return self.target(0.0) if self.target.constant else self.target
+    def of_joints(self) -> bool:
+        """Whether its components are joints, or the controls of joints."""
+        return self.space in ("q", "v", "u")
 
     @property
-    def rotation(self) -> Any:
-        """The target roll, pitch and yaw as a rotation matrix (3, 3), or as a function of time."""
-        assert self.target is not None
-        angles = self.target
-        return _matrix(angles(0.0)) if angles.constant else _Turning(angles)
+    def target(self) -> str:
+        """The key of its target; empty if it has none."""
+        return next((key for key in ("reference", "target", "before") if key in self.arguments), "")
+
+    @property
+    def arguments(self) -> Mapping[str, inspect.Parameter]:
+        """The arguments of the cost that are keys, and the robot."""
+        return {name: item for name, item in inspect.signature(self.kind).parameters.items() if name != "limits"}
+
+    def make(self, robot: Robot, weight: Floats, target: Timeline | None, given: Mapping[str, Any]) -> Cost:
+        """The cost of these weights and this target, and of other keys."""
+        own = {name: value for name, value in given.items() if name in self.arguments}
+        own["weight"] = weight if self.of_joints or self.axes else float(weight[0])
+        if "robot" in self.arguments:
+            own["robot"] = robot
+        if target is not None and self.kind is FrameOrientationCost:
+            own["target"] = _matrix(target(0.0)) if target.constant else _Turning(target)
+        elif self.target:
+            own[self.target] = None if target is None else target(0.0) if target.constant else target
+        return self.kind(**own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,100 +94,80 @@ def _matrix(angles: Floats) -> Floats:
     return np.asarray(scipy.spatial.transform.Rotation.from_euler("xyz", angles).as_matrix())
 
 
-@dataclass(frozen=True, eq=False)
-class Term:
-    """A kind of cost term.
-
-    Attributes:
-        make: Function that builds it.
-        space: Its argument: q, v or u, whose components are joints; a frame; or the whole robot.
-        reference: Key of its target, or None if it has none.
-        components: Names of the target's components, if they are not joints.
-        axes: Names of the components with weights of their own, if they are not joints; with one, the weight is a
-            number.
-        optional: Whether the target may be left out; it is then 0.
-        holding: Whether ``hold`` may replace the reference by the torques that hold the robot at a configuration.
-        initial: Whether the target is constant and concerns the first step alone; None if it is left out.
-        can_end: Whether it can be a terminal term.
-        numbers: Other keys with numbers >= 0, and their defaults, None for a required key.
-        words: Other keys with words, and the allowed words, the default first.
-        limits: Function that returns the robot's limits (n,), (n,) for a barrier; None for other terms.
-    """
-
-    make: Callable[[Given], Cost]
-    space: Space
-    reference: str | None = None
-    components: tuple[str, ...] = ()
-    axes: tuple[str, ...] = ()
-    optional: bool = False
-    holding: bool = False
-    initial: bool = False
-    can_end: bool = True
-    numbers: Mapping[str, float | None] = field(default_factory=dict)
-    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    limits: Callable[[Robot], tuple[Floats, Floats]] | None = None
-
-    @property
-    def frame(self) -> bool:
-        """Whether it takes a frame."""
-        return self.space == "frame"
-
-    @property
-    def of_joints(self) -> bool:
-        """Whether its components are joints, or the controls of joints."""
-        return self.space in ("q", "v", "u")
-
-
-_XYZ = ("x", "y", "z")
-_RPY = ("roll", "pitch", "yaw")
-_TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
-
-TERMS: dict[str, Term] = {
-    "tracking": Term(lambda g: TrackingCost(g.reference, g.weight), "q", "reference"),
-    "velocity": Term(lambda g: VelocityCost(g.weight, g.reference), "v", "reference", optional=True),
-    "control": Term(
-        lambda g: ControlCost(g.weight, g.reference), "u", "reference", optional=True, holding=True, can_end=False
-    ),
-    "control_rate": Term(
-        lambda g: ControlRateCost(g.weight, None if g.target is None else g.target(0.0)),
-        "u",
-        "before",
-        holding=True,
-        initial=True,
-        can_end=False,
-    ),
-    "frame_position": Term(
-        lambda g: FramePositionCost(g.robot, g.frame, g.reference, g.weight), "frame", "target", _XYZ, _XYZ
-    ),
-    "frame_orientation": Term(
-        lambda g: FrameOrientationCost(g.robot, g.frame, g.rotation, g.weight), "frame", "target", _RPY, _XYZ
-    ),
-    "frame_velocity": Term(
-        lambda g: FrameVelocityCost(g.robot, g.frame, g.reference, g.weight),
-        "frame",
-        "target",
-        _TWIST,
-        _TWIST,
-        optional=True,
-    ),
-    "center_of_mass": Term(lambda g: CenterOfMassCost(g.robot, g.reference, g.weight), "robot", "target", _XYZ, _XYZ),
-    "manipulability": Term(
-        lambda g: ManipulabilityCost(g.robot, g.frame, g.numbers["least"], float(g.weight[0]), g.words["directions"]),
-        "frame",
-        axes=("weight",),
-        numbers={"least": None},
-        words={"directions": ("all", "linear", "angular")},
-    ),
-    "joint_limits": Term(
-        lambda g: JointLimitBarrier(g.robot, g.weight, g.numbers["margin"]),
-        "q",
-        numbers={"margin": 0.0},
-        limits=lambda robot: robot.position_limits,
-    ),
+TERMS: Mapping[str, Term] = {
+    "tracking": Term(TrackingCost, "q"),
+    "velocity": Term(VelocityCost, "v"),
+    "control": Term(ControlCost, "u"),
+    "control_rate": Term(ControlRateCost, "u"),
+    "frame_position": Term(FramePositionCost, "frame", _XYZ),
+    "frame_orientation": Term(FrameOrientationCost, "frame", ("roll", "pitch", "yaw")),
+    "frame_velocity": Term(FrameVelocityCost, "frame", _TWIST, _TWIST),
+    "center_of_mass": Term(CenterOfMassCost, "robot", _XYZ),
+    "manipulability": Term(ManipulabilityCost, "frame", axes=()),
+    "joint_limits": Term(JointLimitBarrier, "q", limits=lambda robot: robot.position_limits),
     "velocity_limits": Term(
-        lambda g: VelocityLimitBarrier(g.robot, g.weight, g.numbers["margin"]),
-        "v",
-        numbers={"margin": 0.0},
-        limits=lambda robot: (-robot.velocity_limit, robot.velocity_limit),
+        VelocityLimitBarrier, "v", limits=lambda robot: (-robot.velocity_limit, robot.velocity_limit)
     ),
 }
+
+
+@dataclass(frozen=True, eq=False)
+class CostTable:
+    """[[cost]].
+
+    Attributes:
+        kind: Its type in the file.
+        given: Its keys.
+    """
+
+    kind: str
+    given: Mapping[str, Any]
+
+    @property
+    def term(self) -> Term:
+        """The kind of term."""
+        return TERMS[self.kind]
+
+    @property
+    def terminal(self) -> bool:
+        """Whether it is a terminal cost instead of an integral over time."""
+        return bool(self.given.get("terminal", False))
+
+    @property
+    def frame(self) -> str:
+        """Name of its frame; empty for terms without one."""
+        return str(self.given.get("frame", ""))
+
+
+def cost_keys(kind: str) -> dict[str, tuple[Rule, bool]]:
+    """The keys of a term: the arguments of its cost, and what they may be in a file."""
+    term = TERMS[kind]
+    postures = {"text": TEXT} if term.space == "q" else {}
+    rules = {
+        "frame": TEXT,
+        "weight": values(least=0.0) if term.of_joints or term.axes else number(least=0.0),
+        "reference": reference(**postures),
+        "target": reference(),
+        "before": values(),
+        "directions": word("all", "linear", "angular"),
+    }
+    needed = {name: item.default is item.empty for name, item in term.arguments.items() if name != "robot"}
+    found = {name: (rules.get(name, number(least=0.0)), must) for name, must in needed.items()}
+    if term.space == "u":
+        found["hold"] = values("rad or m", flag=TRUE, text=TEXT), False
+    else:
+        found["terminal"] = FLAG, False
+    return found
+
+
+def _cost_rule(kind: str) -> Rule:
+    def made(given: Mapping[str, Any], where: Where) -> CostTable:
+        target = TERMS[kind].target
+        if "hold" in given and target in given:
+            raise where.error(f"hold and {target} exclude each other: give one of them")
+        return CostTable(kind, given)
+
+    return checked(keys(cost_keys(kind)), made)
+
+
+COST_RULES = {kind: _cost_rule(kind) for kind in TERMS}

@@ -168,18 +168,18 @@ class _Drawing:
                 self.viewer[node.removesuffix("/moving")].set_transform(joint.homogeneous)
                 self.viewer[node].set_transform(joint_motion(bool(tree.prismatic[j]), rows[0, j]))
                 self._animate(node, joint_track(bool(tree.prismatic[j])), "number", rows[:, j])
-            shapes = zip(picture.shapes, picture.bodies, picture.placements, strict=True)
-            for k, (shape, body, placement) in enumerate(shapes):
+            shapes = zip(picture.shapes, picture.meshes, picture.bodies, picture.placements, strict=True)
+            for k, (shape, parts, body, placement) in enumerate(shapes):
                 parent = nodes[body] if body >= 0 else f"{root}/base"
                 node = f"{parent}/shapes/{k} {label(shape.name)}"
                 if kind == "ghost":
                     if body >= 0:
-                        self.loader.load_ghost(shape, placement, node)
+                        self.loader.load_ghost(shape, parts, placement, node)
                 elif actor.effort is not None and body >= 0:
-                    self.loader.load_plain(shape, placement, node)
+                    self.loader.load_plain(shape, parts, placement, node)
                     self._color(f"{node}/<object>", actor.effort[:, body])
                 else:
-                    self.loader.load(shape, placement, node)
+                    self.loader.load(shape, parts, placement, node)
             for name, step in zip(actor.frames, labels(actor.frames), strict=True) if kind == "robot" else ():
                 body, placement = picture.frame(name)
                 node = f"{nodes[body] if body >= 0 else f'{root}/base'}/frames/{step}"

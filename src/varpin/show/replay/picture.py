@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import pinocchio as pin
 
 from varpin.arrays import Floats
 from varpin.model import Robot, readable_geometry
+from varpin.model.meshes import MeshPart, parts_of, read_mesh
 from varpin.model.tree import frame_index, joint_axis, z_to
 
 logger = logging.getLogger(__name__)
@@ -28,19 +30,22 @@ class Picture:
     Attributes:
         robot: The robot.
         shapes: Its visual geometry, or a skeleton; on joints of ``robot.free_model``.
+        meshes: Parts of the mesh of each shape; none for a shape of another kind.
         bodies: Body of each shape, -1 for the base.
         placements: Placement of each shape in its body's frame.
     """
 
     robot: Robot
     shapes: Sequence[pin.GeometryObject]
+    meshes: Sequence[tuple[MeshPart, ...]]
     bodies: Sequence[int]
     placements: Sequence[pin.SE3]
 
     @classmethod
     def of(cls, robot: Robot) -> Picture:
         """The picture of a robot from the meshes that can be read."""
-        visuals, missing = readable_geometry(robot)
+        read = functools.cache(read_mesh)
+        visuals, missing = readable_geometry(robot, read)
         shapes = list(visuals.geometryObjects)
         problem = "; ".join(dict.fromkeys(error for _, error in missing.values()))
         problem = problem or f"robot {robot.name!r} comes without visual geometry"
@@ -56,6 +61,7 @@ class Picture:
         return cls(
             robot,
             shapes,
+            [parts_of(shape, read) for shape in shapes],
             [shape.parentJoint - 1 for shape in shapes],
             [turns[shape.parentJoint] * shape.placement for shape in shapes],
         )
