@@ -168,6 +168,9 @@ def test_errors_below_the_references_own_are_flagged():
     assert not record.at_floor(coarse)
     assert record.at_floor(fine)
     assert record.error_of(fine) == record.reference_error
+    at = record.columns().index("error in q [rad or m]")
+    assert record.row(fine)[at] == f"<{record.reference_error:.3g}"
+    assert record.row(coarse)[at] == f"{coarse.error:.3g}"
 
 
 def test_references_error_is_seen_where_one_step_inside_is_enough():
@@ -368,6 +371,8 @@ def test_advice_says_when_a_wish_is_out_of_reach():
     advice = vp.advise(scene, rest, rest, duration=1.0, tolerance=1e-20)
     assert not advice.reached
     assert about(str(advice), "out of reach")
+    # Rounding leaves no more, even where a motion and its repetition agree to the last bit.
+    assert advice.error > 1e-14
     members = [vp.RungeKutta4(), vp.Gauss(4)]
     chaotic = vp.advise(scene, rest, rest, duration=60.0, tolerance=1e-9, patience=2.0, integrators=members)
     assert not chaotic.reached
