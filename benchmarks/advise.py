@@ -25,8 +25,8 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 import varpin as vp
-from varpin.study.tradeoff import INTEGRATORS
-from varpin.study.tradeoff.setting import Setting
+from varpin.simulation.ladder import INTEGRATORS
+from varpin.study.motion import Setting
 
 ROBOTS = ("finger", "ur5", "xarm7", "talos_arm", "z1", "chain2", "chain3", "chain5", "chain7")
 RATIO = 2.0**0.25
@@ -80,7 +80,7 @@ def exhaustive(setting: Setting, exact: np.ndarray, tolerance: float, most: floa
             outcome = setting.run(integrator, round(steps), repeats=2)
             if outcome.seconds > 3.0 * min(seconds, most):
                 break
-            if not outcome.failure and np.abs(outcome.q[-1] - exact).max() <= tolerance:
+            if not outcome.failure and np.abs(outcome.motion.q[-1] - exact).max() <= tolerance:
                 cost = setting.run(integrator, round(steps), repeats=REPEATS).seconds
                 if cost < seconds:
                     best, seconds = f"{integrator} at {setting.duration / round(steps):.3g} s", cost
@@ -94,13 +94,13 @@ def judge(rng: np.random.Generator) -> Verdict | None:
     """One case, or None where the reference itself does not know the end well enough to judge."""
     name, scene, q0, v0, duration, tolerance = random_case(rng)
     setting = Setting.of(scene, q0, v0, None, duration)
-    tight, loose = (setting.run(vp.Reference(rtol=rtol), 1).q[-1] for rtol in (1e-13, 1e-12))
+    tight, loose = (setting.run(vp.Reference(rtol=rtol), 1).motion.q[-1] for rtol in (1e-13, 1e-12))
     if not np.abs(tight - loose).max() <= 0.1 * tolerance:
         return None
     advice = vp.advise(scene, q0, v0, duration=duration, tolerance=tolerance)
     outcome = setting.run(advice.integrator, advice.steps, repeats=REPEATS)
     best, best_seconds = exhaustive(setting, tight, tolerance, outcome.seconds)
-    error = float(np.abs(outcome.q[-1] - tight).max())
+    error = float(np.abs(outcome.motion.q[-1] - tight).max())
     what = f"{name}, {duration:g} s{', damped' if scene.damping.any() else ''}"
     return Verdict(what, tolerance, advice, error, outcome.seconds, best, best_seconds)
 

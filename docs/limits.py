@@ -1,13 +1,14 @@
 """The table of other simulators of docs/limits.md, from a record of the battery of scenes.
 
     python benchmarks/extremes.py FOLDER --scenes
-    python docs/limits.py FOLDER/scenes.json
+    python docs/limits.py FOLDER/scenes.pickle
 
 Other simulators take part where they are installed (``pip install "varpin[peers]"``; trep has no release for Python 3).
 """
 
 from __future__ import annotations
 
+import pickle
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -16,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.study.extremes.exact import Exact
-from varpin.study.extremes.record import LEVELS
+from varpin.study.checks import LEVELS
+from varpin.study.exact import Exact
 
 DOCUMENT = Path(__file__).resolve().parent / "limits.md"
 sys.path[:0] = [str(DOCUMENT.parents[1] / name) for name in ("benchmarks", "tests")]
@@ -51,7 +52,7 @@ def main() -> None:
     """Rewrite the table."""
     if len(sys.argv) != 2:
         raise SystemExit("usage: limits.py RECORD")
-    record = Record.load(sys.argv[1])
+    record: Record = pickle.loads(Path(sys.argv[1]).read_bytes())
     missing = [name for name in ("mujoco", "pydrake", "trep") if peers.available(name) is None]
     if missing:
         sys.stderr.write(f"not installed: {', '.join(missing)}; the table of the others stays as it is\n")
@@ -61,7 +62,7 @@ def main() -> None:
 
 def peers_table(record: Record) -> Iterator[str]:
     """A row for each shared scene: varpin's integrators, and what others make of it and say."""
-    cells = {(cell.trial, cell.integrator): cell for cell in record.cells}
+    cells = {(cell.trial, cell.integrator): cell for cell in record.runs}
     rows: dict[str, dict[str, str]] = {}
     for trial in TRIALS:
         if trial.name in SHARED:
@@ -114,7 +115,7 @@ def in_words(trial: Trial, motion: Callable[[peers.Case, float], peers.Motion | 
     exact = truth(trial)
     known = exact.nodes < len(q)
     with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(q[exact.nodes[known]] - exact.q[known]).max(initial=0.0) / exact.way
+        error = np.abs(q[exact.nodes[known]] - exact.q[known]).max(initial=0.0) / exact.travel
         at = np.unique(np.linspace(0, len(q) - 1, 200).astype(int))
         jets = [lagrangian_jet(setup.scene, q[k], v[k]) for k in at]
         kinetic = np.array([0.5 * v[k] @ jet.Lv for k, jet in zip(at, jets, strict=True)])

@@ -2,24 +2,21 @@
 
 import csv
 import dataclasses
-import logging
 import math
-import subprocess
-import sys
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from findings import about
-from refusals import naming, refused
+from refusals import refused
 
 import varpin as vp
 from varpin.show.plots import plot_optimal_control_tradeoff, plot_work_precision
-from varpin.show.tradeoff_report import write_report
-from varpin.study.tradeoff import INTEGRATORS, optimal_control, precision
-from varpin.study.tradeoff import advice as advising
-from varpin.study.tradeoff.records import pareto_front
-from varpin.study.tradeoff.setting import Setting
+from varpin.show.study_report import write_report
+from varpin.simulation.ladder import INTEGRATORS
+from varpin.study import advice as advising
+from varpin.study.motion import Setting
+from varpin.study.record import pareto_front
 
 OMEGA = 3.0
 
@@ -132,16 +129,14 @@ def test_pareto_front_is_what_nothing_beats(oscillator):
 
 def test_the_first_run_of_a_member_does_not_count(monkeypatch):
     """Caches are cold then: here it takes a hundred times as long; a long one counts, and is not done in vain."""
-    original, calls = Setting._once, []
+    original, calls = Setting._timed, []
 
-    def slow_at_first(self, integrator, steps, samples):
-        outcome = original(self, integrator, steps, samples)
-        if steps == 1:
-            return outcome
+    def slow_at_first(self, integrator, steps):
+        motion, _ = original(self, integrator, steps)
         calls.append(steps)
-        return dataclasses.replace(outcome, seconds=times[len(calls) - 1])
+        return motion, times[len(calls) - 1]
 
-    monkeypatch.setattr(Setting, "_once", slow_at_first)
+    monkeypatch.setattr(Setting, "_timed", slow_at_first)
     options = {"duration": 1.0, "dts": [0.1], "integrators": [vp.RungeKutta4()]}
     options["reference"] = vp.Reference(rtol=1e-9)
     for times, repeats, seconds, spread in (
@@ -173,6 +168,9 @@ def test_errors_below_the_references_own_are_flagged():
     assert not record.at_floor(coarse)
     assert record.at_floor(fine)
     assert record.error_of(fine) == record.reference_error
+    at = record.columns().index("error in q [rad or m]")
+    assert record.row(fine)[at] == f"<{record.reference_error:.3g}"
+    assert record.row(coarse)[at] == f"{coarse.error:.3g}"
 
 
 def test_references_error_is_seen_where_one_step_inside_is_enough():
@@ -189,7 +187,7 @@ def test_references_error_is_seen_where_one_step_inside_is_enough():
     )
     exact = [0.7 * np.cos(OMEGA * t) + 0.1 * np.sin(OMEGA * t) for t in np.linspace(0, 2, record.samples + 1)]
     setting = Setting.of(spring(), [0.7], [0.3], None, 2.0)
-    q = setting.run(vp.Reference(rtol=1e-3), 2 * record.samples, samples=record.samples).q[:, 0]
+    q = setting.run(vp.Reference(rtol=1e-3), 2 * record.samples).motion.q[::2, 0]
     assert 0.0 < np.abs(q - exact).max() < record.reference_error
 
 
@@ -214,116 +212,35 @@ def test_members_that_fail_do_not_stop_the_others():
     assert sound.survived
     assert record.pareto() == (sound,)
     assert "2 failed" in repr(record)
+    assert record.failures[1].endswith(", dt = 0.001 s: ZeroDivisionError: on purpose")
+    assert record.failures[0].startswith("ExplicitEuler, dt = 0.001 s: step ")
 
 
-def count_runs(monkeypatch):
-    measured, original = [], precision._measure
-
-    def counting(setting, exact, repeats, job):
-        measured.append((str(job[0]), job[1]))
-        return original(setting, exact, repeats, job)
-
-    monkeypatch.setattr(precision, "_measure", counting)
-    return measured
-
-
-def test_interrupted_measurement_goes_on_where_it_stopped(tmp_path, monkeypatch, caplog):
-    measured, path = count_runs(monkeypatch), tmp_path / "a.npz"
-    four = [vp.ExplicitEuler(), vp.SemiImplicitEuler(), vp.RungeKutta4(), vp.Midpoint()]
-    options = {"duration": 1.0, "dts": [0.1, 0.05], "repeats": 1, "save": path}
-
+def test_interrupted_studies_hold_the_runs_that_are_done(problem):
     def interrupt(done, runs):
+        assert runs == 4
         if done == 3:
             raise KeyboardInterrupt
 
-    with caplog.at_level(logging.WARNING, "varpin"):
-        part = vp.work_precision(spring(), [0.7], [0.3], integrators=four, progress=interrupt, **options)
-    assert naming(caplog.messages, "3 of 8")
-    assert (len(part.runs), part.missing) == (3, 5)
-    assert vp.WorkPrecision.load(path).runs == part.runs
-    whole = vp.work_precision(spring(), [0.7], [0.3], integrators=four, **options)
-    assert len(measured) == len(set(measured)) == 8
-    assert whole.missing == 0
-    assert whole.runs[:3] == part.runs
-    again = vp.work_precision(spring(), [0.7], [0.3], integrators=four, **options)
-    assert len(measured) == 8
-    assert again.runs == whole.runs == vp.WorkPrecision.load(path).runs
-    more = vp.work_precision(spring(), [0.7], [0.3], integrators=[vp.Midpoint(alpha=0.3)], **options)
-    assert len(measured) == 10
-    assert set(more.runs) > set(whole.runs)
+    options = {"integrators": [vp.RungeKutta4(), vp.Midpoint()], "dts": [0.1, 0.05], "progress": interrupt}
+    with pytest.raises(vp.StudyInterrupted) as motions:
+        vp.work_precision(spring(), [0.7], [0.3], duration=1.0, **options)
+    with pytest.raises(vp.StudyInterrupted) as plans:
+        vp.optimal_control_tradeoff(problem, max_iterations=1, **options)
+    for stop in (motions.value, plans.value):
+        assert isinstance(stop, KeyboardInterrupt)
+        assert stop.record.missing == 1
+        assert [(run.integrator, run.dt) for run in stop.record.runs] == [
+            ("RungeKutta4", 0.1), ("RungeKutta4", 0.05), ("Midpoint(alpha=0.5)", 0.1)
+        ]  # fmt: skip
+        assert "1 missing" in repr(stop.record)
 
 
-def test_interruption_of_the_reference_loses_nothing(tmp_path, monkeypatch):
-    def stop(*given):
-        raise KeyboardInterrupt
-
-    path = tmp_path / "a.npz"
-    options = {"duration": 1.0, "repeats": 1, "save": path}
-    with monkeypatch.context() as patch:
-        patch.setattr(precision, "_Exact", stop)
-        none = vp.work_precision(spring(), [0.7], [0.3], integrators=[vp.Midpoint()], dts=[0.1], **options)
-    assert (none.runs, none.missing, path.exists()) == ((), 1, False)
-    assert math.isnan(none.reference_error)
-    assert "1 missing" in repr(none)
-    first = vp.work_precision(spring(), [0.7], [0.3], integrators=[vp.Midpoint()], dts=[0.1, 0.05], **options)
-    monkeypatch.setattr(precision, "_Exact", stop)
-    both = [vp.RungeKutta4(), vp.Midpoint()]
-    part = vp.work_precision(spring(), [0.7], [0.3], integrators=both, dts=[0.05], **options)
-    assert (set(part.runs), part.missing) == (set(first.runs), 1)
-    assert part.reference_error == first.reference_error
-    assert vp.WorkPrecision.load(path).runs == first.runs
-
-
-def test_saved_record_takes_other_steps(tmp_path, monkeypatch):
-    """What is there stays as it is; what is new is what it would have been, at the times that both share."""
-    measured, path = count_runs(monkeypatch), tmp_path / "a.npz"
-    options = {"duration": 1.0, "integrators": [vp.Midpoint(), vp.RungeKutta4()], "repeats": 1}
-    first = vp.work_precision(spring(), [0.7], [0.3], dts=[0.1, 0.05], save=path, **options)
-    assert (first.samples, len(measured)) == (10, 4)
-    second = vp.work_precision(spring(), [0.7], [0.3], dts=[0.05, 0.025, 0.04], save=path, **options)
-    assert len(measured) == len(set(measured)) == 8
-    assert set(second.runs) > set(first.runs)
-    assert vp.WorkPrecision.load(path).runs == second.runs
-    assert second.missing == 0
-    assert {run.steps: run.samples for run in second.runs} == {10: 10, 20: 10, 40: 10, 25: 5}
-    alone = vp.work_precision(spring(), [0.7], [0.3], dts=[0.1, 0.05, 0.025], **options)
-    for run in alone.runs:
-        (same,) = [other for other in second.runs if (other.options, other.steps) == (run.options, run.steps)]
-        assert same.error == pytest.approx(run.error, rel=1e-9)
-    odd = next(run for run in second.runs if run.steps == 25 and run.order == 2)
-    states, R = [np.array([0.7, 0.3])], linear_step(vp.Midpoint(), 0.04)
-    for _ in range(25):
-        states.append(R @ states[-1])
-    t = np.linspace(0, 1, 26)
-    off = np.abs(np.array(states)[:, 0] - 0.7 * np.cos(OMEGA * t) - 0.1 * np.sin(OMEGA * t))
-    assert odd.error == pytest.approx(off[::5].max(), rel=1e-5)
-
-
-def test_another_motions_record_is_not_overwritten(tmp_path):
-    path = tmp_path / "a.npz"
-    options = {"duration": 1.0, "dts": [0.1], "integrators": [vp.Midpoint()], "repeats": 1, "save": path}
-    vp.work_precision(spring(), [0.7], [0.3], **options)
-    with refused(vp.FileError, "initial state"):
-        vp.work_precision(spring(), [0.7], [0.31], **options)
-    with refused(vp.FileError, "scene, duration"):
-        vp.work_precision(vp.Scene(vp.planar_chain(1)), [0.7], [0.3], **options | {"duration": 2.0})
-    with refused(vp.FileError, "controls, reference"):
-        vp.work_precision(spring(), [0.7], [0.3], controls=[1.0], reference=vp.Reference(rtol=1e-9), **options)
-    path.write_bytes(b"no record")
-    with refused(vp.FileError, "npz"):
-        vp.work_precision(spring(), [0.7], [0.3], **options)
-
-
-def test_record_as_npz_and_csv(oscillator, tmp_path):
-    back = vp.WorkPrecision.load(oscillator.save(tmp_path / "a.npz"))
-    assert back.runs == oscillator.runs
-    assert repr(back) == repr(oscillator)
-    assert back.reference == "Reference(rtol=1e-13)"
+def test_record_as_csv(oscillator, tmp_path):
     rows = list(csv.DictReader(oscillator.to_csv(tmp_path / "a.csv").open()))
     assert len(rows) == len(oscillator.runs)
-    assert float(rows[0]["largest error in q [rad or m]"]) == oscillator.runs[0].error
-    with refused(vp.FileError, "format"):
-        vp.OptimalControlTradeoff.load(tmp_path / "a.npz")
+    assert float(rows[0]["error in q [rad or m]"]) == oscillator.runs[0].error
+    assert {"wall time [s]", "energy error [J]", "sweeps"} <= rows[0].keys()
 
 
 @pytest.mark.parametrize(
@@ -361,7 +278,7 @@ def test_figure_and_report(oscillator, tmp_path):
         assert names == [*(str(integrator) for integrator in INTEGRATORS), "Pareto front", *reference]
     strokes = [(line.get_color(), line.get_linestyle()) for line in axes.get_lines()]
     assert len(set(strokes)) == len(strokes)
-    paths = write_report(tmp_path, oscillator, "A <spring>")
+    paths = write_report(tmp_path, "tradeoff", oscillator, "A <spring>")
     assert [path.name for path in paths] == ["tradeoff.csv", "tradeoff.png", "tradeoff.html"]
     page = paths[2].read_text()
     assert "<h1>A &lt;spring&gt;</h1>" in page
@@ -374,84 +291,21 @@ def problem():
     return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(1)), cost, [0.0], [0.0], dt=0.05, steps=20)
 
 
-def test_true_costs_of_plans(problem, tmp_path, monkeypatch):
-    """Plans of better integrators cost what they promise; records go on where they stopped."""
-    path = tmp_path / "a.npz"
+def test_true_costs_of_plans(problem, tmp_path):
+    """Plans of better integrators cost what they promise."""
     members, dts = [vp.ExplicitEuler(), vp.Midpoint()], [0.1, 0.05, 0.025]
-    record = vp.optimal_control_tradeoff(problem, members, dts, period=0.1, save=path)
+    record = vp.optimal_control_tradeoff(problem, members, dts, period=0.1)
     assert [run.hold for run in record.runs] == [1, 2, 4] * 2
     assert all(run.survived and run.status == "converged" and run.accuracy < 1e-8 for run in record.runs)
     gaps = np.array([abs(run.planned_cost - run.open_loop_cost) for run in record.runs]).reshape(2, 3)
     assert (np.log2(gaps[1, :-1] / gaps[1, 1:]) > 1.7).all()
     assert (gaps[1] < gaps[0]).all()
-    assert vp.OptimalControlTradeoff.load(path).runs == record.runs
     assert record.pareto()
     plot_optimal_control_tradeoff(record)
-    monkeypatch.setattr(optimal_control, "_measured", lambda *_: pytest.fail("it is there already"))
-    assert vp.optimal_control_tradeoff(problem, members, dts, period=0.1, save=path).runs == record.runs
-    with refused(vp.FileError, "problem"):
-        vp.optimal_control_tradeoff(problem.at(q0=[0.1]), members, dts, save=path)
-    assert len(list(csv.reader(record.to_csv(tmp_path / "a.csv").open()))) == 7
-
-
-_ANOTHER_PROCESS = """
-import sys
-import numpy as np
-import varpin as vp
-
-cost = vp.TrackingCost([1.0]) + vp.ControlCost(1e-2)
-problem = vp.OptimalControlProblem(vp.Scene(vp.planar_chain(1)), cost, [0.0], [0.0], dt=0.05, steps=20)
-vp.optimal_control_tradeoff(
-    problem, [vp.Midpoint()], [0.05], save=sys.argv[1], callback=lambda _: None, controls=np.zeros(1), armijo=1e-4
-)
-"""
-
-
-def test_a_run_with_a_callback_goes_on_in_another_process(tmp_path, problem, monkeypatch):
-    path = tmp_path / "a.npz"
-    subprocess.run([sys.executable, "-c", _ANOTHER_PROCESS, str(path)], check=True, timeout=600)
-    monkeypatch.setattr(optimal_control, "_measured", lambda *_: pytest.fail("it is there already"))
-    options = {"save": path, "callback": lambda _: None, "controls": np.zeros(1), "armijo": 1e-4}
-    (run,) = vp.optimal_control_tradeoff(problem, [vp.Midpoint()], [0.05], **options).runs
-    assert run == vp.OptimalControlTradeoff.load(path).runs[0]
-
-
-def test_a_record_knows_the_options_that_matter(problem):
-    def mark(**options):
-        return optimal_control._fingerprint(problem, options)
-
-    assert mark() == mark(callback=print) == mark(progress=print, callback=None)
-    plan = vp.solve(problem, max_iterations=1)
-    marks = [
-        mark(), mark(armijo=1e-3), mark(forward="open"), mark(controls=np.zeros(1)), mark(controls=np.zeros((20, 1))),
-        mark(controls=np.ones(1)), mark(controls=plan), mark(max_iterations=1),
+    assert [path.name for path in write_report(tmp_path, "plans", record, "Plans")] == [
+        "plans.csv", "plans.png", "plans.html"
     ]  # fmt: skip
-    assert len(set(marks)) == len(marks)
-    # Long arrays are told apart in the middle, too.
-    rows = np.zeros((5000, 1))
-    rows[2500] = 1e-9
-    assert mark(controls=rows) != mark(controls=np.zeros((5000, 1)))
-    with refused(vp.InputError, "function"):
-        mark(controls=lambda t: t)
-
-
-@pytest.mark.parametrize("kind", ["motion", "plan"])
-def test_interruption_keeps_saved_runs_that_come_later(tmp_path, problem, kind):
-    """Of a measurement that begins with other integrators than the saved one."""
-
-    def measure(members, progress=None):
-        options = {"integrators": members, "repeats": 1, "save": tmp_path / "a.npz", "progress": progress}
-        if kind == "plan":
-            return vp.optimal_control_tradeoff(problem, dts=[0.05], max_iterations=1, **options)
-        return vp.work_precision(spring(), [0.7], [0.3], duration=1.0, dts=[0.1], **options)
-
-    def interrupt(done, runs):
-        raise KeyboardInterrupt
-
-    first = measure([vp.Midpoint()])
-    part = measure([vp.RungeKutta4(), vp.Midpoint()], interrupt)
-    assert (len(part.runs), part.missing) == (2, 0)
-    assert part.runs[1] == first.runs[0] == type(part).load(tmp_path / "a.npz").runs[1]
+    assert len(list(csv.reader((tmp_path / "plans.csv").open()))) == 7
 
 
 def test_plans_that_fail_do_not_stop_the_others(problem):
@@ -517,6 +371,8 @@ def test_advice_says_when_a_wish_is_out_of_reach():
     advice = vp.advise(scene, rest, rest, duration=1.0, tolerance=1e-20)
     assert not advice.reached
     assert about(str(advice), "out of reach")
+    # Rounding leaves no more, even where a motion and its repetition agree to the last bit.
+    assert advice.error > 1e-14
     members = [vp.RungeKutta4(), vp.Gauss(4)]
     chaotic = vp.advise(scene, rest, rest, duration=60.0, tolerance=1e-9, patience=2.0, integrators=members)
     assert not chaotic.reached

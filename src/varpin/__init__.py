@@ -164,18 +164,19 @@ if TYPE_CHECKING:
     from varpin.show.inspection_report import LinkReport as LinkReport
     from varpin.show.inspection_report import RobotReport as RobotReport
     from varpin.show.replay.live import LiveView as LiveView
+    from varpin.study.advice import Advice as Advice
+    from varpin.study.advice import Choice as Choice
+    from varpin.study.advice import advise as advise
     from varpin.study.extremes import check_robot as check_robot
     from varpin.study.linearization_check import LinearizationCheck as LinearizationCheck
     from varpin.study.linearization_check import check_linearization as check_linearization
-    from varpin.study.tradeoff import Advice as Advice
-    from varpin.study.tradeoff import Choice as Choice
-    from varpin.study.tradeoff import OptimalControlRun as OptimalControlRun
-    from varpin.study.tradeoff import OptimalControlTradeoff as OptimalControlTradeoff
-    from varpin.study.tradeoff import WorkPrecision as WorkPrecision
-    from varpin.study.tradeoff import WorkPrecisionRun as WorkPrecisionRun
-    from varpin.study.tradeoff import advise as advise
-    from varpin.study.tradeoff import optimal_control_tradeoff as optimal_control_tradeoff
-    from varpin.study.tradeoff import work_precision as work_precision
+    from varpin.study.plans import OptimalControlRun as OptimalControlRun
+    from varpin.study.plans import OptimalControlTradeoff as OptimalControlTradeoff
+    from varpin.study.plans import optimal_control_tradeoff as optimal_control_tradeoff
+    from varpin.study.precision import WorkPrecision as WorkPrecision
+    from varpin.study.precision import WorkPrecisionRun as WorkPrecisionRun
+    from varpin.study.precision import work_precision as work_precision
+    from varpin.study.record import StudyInterrupted as StudyInterrupted
 
 # What a simulation has no need of is imported with its first use: all of it at once takes as long as Pinocchio.
 _LATE: dict[str, tuple[str, ...]] = {
@@ -239,17 +240,10 @@ _LATE: dict[str, tuple[str, ...]] = {
         "Violations",
         "solve",
     ),
-    "varpin.study.tradeoff": (
-        "Advice",
-        "Choice",
-        "OptimalControlRun",
-        "OptimalControlTradeoff",
-        "WorkPrecision",
-        "WorkPrecisionRun",
-        "advise",
-        "optimal_control_tradeoff",
-        "work_precision",
-    ),
+    "varpin.study.advice": ("Advice", "Choice", "advise"),
+    "varpin.study.plans": ("OptimalControlRun", "OptimalControlTradeoff", "optimal_control_tradeoff"),
+    "varpin.study.precision": ("WorkPrecision", "WorkPrecisionRun", "work_precision"),
+    "varpin.study.record": ("StudyInterrupted",),
 }
 
 # Submodules that a user takes from the top level.

@@ -2,7 +2,6 @@
 
 from battery.plans import PLANS as PLANS
 from battery.plans import Plan as Plan
-from battery.running import Progress as Progress
 from battery.running import measures as measures
 from battery.running import run as run
 from battery.scenes import TRIALS as TRIALS

@@ -1,7 +1,7 @@
 """Exact motions with noise, in closed form and from nodes all over a motion, beside those of varpin's own check.
 
 The exact motion is LSODA's at 1e-11: it takes stiff dampers, and shares nothing with the integrator. From which error
-on a motion is wrong is in :mod:`varpin.study.extremes.units`.
+on a motion is wrong is in :data:`varpin.study.checks.LEVELS`.
 """
 
 from __future__ import annotations
@@ -18,18 +18,20 @@ from varpin.core import ForwardDynamics
 from varpin.errors import VarpinError
 from varpin.integrators import ExplicitEuler, Integrator
 from varpin.mechanics.scene import Scene
-from varpin.study.extremes.exact import (
+from varpin.study.checks import LEVELS
+from varpin.study.exact import (
+    DISTURBANCE,
     NODES,
     PATIENCE,
     START,
     EndsHereError,
     Exact,
+    grown,
     impulse,
     in_units,
     integrated,
     kicked,
 )
-from varpin.study.extremes.units import DISTURBANCE, WRONG_MOTION, WRONG_VELOCITY, grown
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -191,6 +193,6 @@ def _error_from(scene: Scene, integrator: Integrator, trajectory: Trajectory, st
         return math.nan
     nodes, plain = slice(step, step + known + 1), plain[: known + 1]
     with np.errstate(over="ignore", invalid="ignore"):
-        q = np.abs(plain[:, :n] - trajectory.q[nodes]) / units.travels / WRONG_MOTION
-        v = np.abs(plain[:, n:] - trajectory.v[nodes]) / units.speeds / WRONG_VELOCITY
+        q = np.abs(plain[:, :n] - trajectory.q[nodes]) / units.travels / LEVELS["error"]
+        v = np.abs(plain[:, n:] - trajectory.v[nodes]) / units.speeds / LEVELS["velocity"]
     return float(max(q.max(), v.max()))

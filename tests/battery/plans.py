@@ -23,8 +23,8 @@ from varpin.mechanics.scene import Scene
 from varpin.model import Robot
 from varpin.model.chain import rod_chain
 from varpin.simulation.simulate import simulate
-from varpin.study.extremes.checks import energy_error
-from varpin.study.extremes.record import LEVELS, Kind
+from varpin.study.checks import LEVELS, energy_error
+from varpin.study.extremes import Kind
 from varpin.trajectory import Trajectory
 
 Floats = NDArray[np.float64]

@@ -1,16 +1,12 @@
-"""Runs trials with integrators, judges what comes of each, and keeps the record."""
+"""Runs trials with integrators, and judges what comes of each."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
 import time
-from collections.abc import Sequence
-from functools import cache, cached_property
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 
-import varpin
 from battery.exact import before_step, exact_motion, period_error
 from battery.plans import PLANS, Plan, judge_plan
 from battery.scenes import TRIALS, trials_on
@@ -18,20 +14,16 @@ from battery.trial import Outcome, Setup, Trial
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator
 from varpin.model import Robot
-from varpin.study.extremes import checks
-from varpin.study.extremes.checks import condition, findings
-from varpin.study.extremes.exact import Exact
-from varpin.study.extremes.record import LEVELS, Cell, Kind, Record
-from varpin.study.extremes.robot import INTEGRATORS, Progress, attempt, judge
-from varpin.support.checks import positive, writable
+from varpin.study import checks
+from varpin.study.checks import LEVELS, condition, findings
+from varpin.study.exact import Exact
+from varpin.study.extremes import INTEGRATORS, Cell, Kind, Record, attempt, judge
+from varpin.study.record import Progress, collect
+from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
 
 # A motion gets this long, and the plain battery half a minute at most for one [s].
 _PATIENCE, _DEEP_PATIENCE = 20.0, 900.0
-# Between two looks at the disk [s].
-_SAVED_EVERY = 2.0
-
-_MEASURES = tuple(LEVELS)
 
 
 def run(
@@ -40,7 +32,6 @@ def run(
     deep: bool = False,
     trials: Sequence[Trial | Plan] | None = None,
     integrators: Sequence[Integrator] | None = None,
-    save: str | os.PathLike[str] | None = None,
     patience: float | None = None,
     progress: Progress | None = None,
 ) -> Record:
@@ -53,81 +44,35 @@ def run(
     Other Args:
         trials: These instead.
         integrators: These instead of all.
-        save: Keep the record in this JSON file; cells that it holds already are not run again.
         patience: Processor time that a motion may take before it is judged by what there is [s]; if given, plans get
             as much.
-        progress: Called with (cells done, cells in all, the next one's name).
-
-    Returns:
-        The record; after Ctrl-C, of what was done.
+        progress: Called with (cells done, cells in all).
 
     Raises:
-        FileError: ``save`` cannot be written, or holds something else.
+        StudyInterrupted: Ctrl-C; holds what was done.
     """
     if trials is None:
         trials = (*TRIALS, *PLANS) if robot is None else trials_on(robot)
         trials = [trial for trial in trials if deep or not trial.deep]
     members = INTEGRATORS if integrators is None else tuple(integrators)
     limit = positive("patience", patience or (_DEEP_PATIENCE if deep else _PATIENCE), "s")
+    jobs = [(trial, [member for member in members if trial.takes(member)]) for trial in trials]
+
+    def cells() -> Iterator[Cell]:
+        for trial, own in jobs:
+            bench = Bench(trial)
+            for member in own:
+                # A plan cut short is another plan; it has its number of iterations.
+                yield bench.run(member, limit if isinstance(trial, Trial) or patience else math.inf)
+
     name = "the battery" if robot is None else robot.name
-    path = None if save is None else writable(save)
-    known = Record.load(path).cells if path is not None and path.exists() else ()
-    done = {cell.fingerprint: cell for cell in known}
-    jobs = {
-        fingerprint(trial, member, name, limit): (trial, member)
-        for trial in trials
-        for member in members
-        if trial.takes(member)
-    }
-    cells = {key: done[key] for key in jobs if key in done}
-    saved = time.monotonic()
-
-    def current() -> Record:
-        # Cells of an earlier run stay, however early an interruption comes.
-        return Record(tuple(cells[key] for key in jobs if key in cells), name, deep, len(jobs) - len(cells))
-
-    try:
-        bench = None
-        for key, (trial, member) in jobs.items():
-            if key in cells:
-                continue
-            if progress is not None:
-                progress(len(cells), len(jobs), f"{trial.name}, {member}")
-            if bench is None or bench.trial is not trial:
-                bench = Bench(trial)
-            # A plan cut short is another plan; it has its number of iterations.
-            cells[key] = bench.run(member, limit if isinstance(trial, Trial) or patience else math.inf, key)
-            if path is not None and time.monotonic() - saved > _SAVED_EVERY:
-                current().save(path)
-                saved = time.monotonic()
-    except KeyboardInterrupt:
-        pass
-    if path is not None:
-        current().save(path)
-    return current()
+    return collect(Record((), name), cells(), sum(len(own) for _, own in jobs), progress)
 
 
 def measures(setup: Setup, integrator: Integrator, trajectory: Trajectory, exact: Exact | None) -> dict[str, float]:
     """Every check of a motion by its name in :class:`Cell`: those of ``check_robot``, and from nodes all over it."""
     own = checks.measures(setup.scene, integrator, trajectory, exact)
     return own | {"period": period_error(setup.scene, integrator, trajectory)}
-
-
-@cache
-def _sources() -> str:
-    """SHA-256 over varpin's own sources and these: no record outlives the code that made it."""
-    digest = hashlib.sha256()
-    for folder in (Path(varpin.__file__).parent, Path(__file__).parent):
-        for source in sorted(folder.rglob("*.py")):
-            digest.update(str(source.relative_to(folder)).encode())
-            digest.update(source.read_bytes())
-    return digest.hexdigest()
-
-
-def fingerprint(trial: Trial | Plan, integrator: Integrator, robot: str, patience: float) -> str:
-    """What a cell is known by when a run goes on."""
-    parts = robot, patience, trial.family, trial.name, trial.dt, trial.steps, repr(integrator), _sources()
-    return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
 
 
 class Bench:
@@ -137,7 +82,7 @@ class Bench:
         self.trial = trial
         self._exact: dict[float | None, Exact | None] = {}
 
-    def run(self, integrator: Integrator, patience: float, key: str = "") -> Cell:
+    def run(self, integrator: Integrator, patience: float) -> Cell:
         """The trial with one integrator."""
         trial, begin = self.trial, time.perf_counter()
         if isinstance(trial, Plan):
@@ -148,7 +93,6 @@ class Bench:
             except Exception as error:
                 outcome = Outcome.of_error(error, Kind.REFUSED)
         return Cell(
-            family=trial.family,
             trial=trial.name,
             integrator=str(integrator),
             kind=outcome.kind,
@@ -157,8 +101,7 @@ class Bench:
             done=outcome.done,
             steps=trial.steps,
             seconds=round(time.perf_counter() - begin, 3),
-            fingerprint=key,
-            **dict.fromkeys(_MEASURES, math.nan) | outcome.measures,
+            **dict.fromkeys(LEVELS, math.nan) | outcome.measures,
         )
 
     @cached_property

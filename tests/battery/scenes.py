@@ -17,7 +17,7 @@ from varpin.mechanics.scene import Scene
 from varpin.mechanics.wiener import wiener_increments
 from varpin.model import Robot, load_robot
 from varpin.model.chain import rod_chain
-from varpin.study.extremes.robot import Motion, flipping, motions_of
+from varpin.study.extremes import Motion, flipping, motions_of
 
 Floats = NDArray[np.float64]
 
@@ -220,6 +220,6 @@ def trials_on(robot: Robot) -> list[Trial | Plan]:
     def trial(m: Motion) -> Trial:
         twin = m.scene if m.ahead.any() else None
         setup = Setup(m.scene, m.q0, m.v0, m.controls, m.increments, twin=twin, shift=m.ahead)
-        return Trial(m.name, m.family, lambda: setup, m.dt, m.steps, window=m.window)
+        return Trial(m.name, "robot", lambda: setup, m.dt, m.steps, window=m.window)
 
     return [*map(trial, motions_of(robot)), *plans_on(robot)]

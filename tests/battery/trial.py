@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene
-from varpin.study.extremes.record import Kind, line_of
+from varpin.study.extremes import Kind, line_of
 
 Floats = NDArray[np.float64]
 

@@ -1,9 +1,8 @@
-"""Records in files: frozen dataclasses of arrays and plain values, as npz without pickle or as JSON.
+"""Records in files: frozen dataclasses of arrays and plain values, as npz without pickle.
 
 An entry of a file is a field of the record, under its name: ``dt``. The entry of a field of a nested record is
-``statistics.jets``. A tuple of records has one array for each of their fields: ``runs.dt``. The annotations of the
-fields define type and shape of the entries; a field with a default may be missing. Every file has a ``format``: a name
-and a version.
+``statistics.jets``. The annotations of the fields define type and shape of the entries; a field with a default may be
+missing. Every file has a ``format``: a name and a version.
 """
 
 from __future__ import annotations
@@ -11,8 +10,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import json
-import math
 import os
 import reprlib
 import secrets
@@ -20,7 +17,6 @@ import typing
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
-from enum import Enum
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, BinaryIO, TypeVar
@@ -30,7 +26,7 @@ from numpy.typing import NDArray
 
 from varpin.errors import FileError, InputError
 from varpin.finding import Finding
-from varpin.support.checks import is_file, path_like, writable
+from varpin.support.checks import is_file, writable
 
 T = TypeVar("T")
 Members = Mapping[str, NDArray[Any]]
@@ -56,48 +52,6 @@ def save_npz(path: str | os.PathLike[str], form: str, record: Any) -> Path:
         FileError: The path cannot be written.
     """
     return write_npz(path, form, members_of(record))
-
-
-def load_npz(path: str | os.PathLike[str], form: str, kind: type[T]) -> T:
-    """Read a record of the dataclass ``kind`` that :func:`save_npz` wrote.
-
-    Raises:
-        FileError: As :func:`read_npz` and :func:`record_of`.
-    """
-    source = path_like("path", path)
-    return record_of(kind, read_npz(source, form), source)
-
-
-def save_json(path: str | os.PathLike[str], form: str, record: Any) -> Path:
-    """Write a record of plain values as JSON; returns its path. NaN is written as null, infinity as "inf".
-
-    Raises:
-        FileError: The path cannot be written.
-    """
-    text = json.dumps({"format": form} | _plain(record), indent=1, allow_nan=False)
-    with atomic_file(path) as stream:
-        stream.write(text.encode())
-    return Path(path)
-
-
-def load_json(path: str | os.PathLike[str], form: str, kind: type[T]) -> T:
-    """Read a record of the dataclass ``kind`` that :func:`save_json` wrote.
-
-    Raises:
-        FileError: The file is missing, not JSON or of another format, or an entry does not fit the record.
-    """
-    source = path_like("path", path)
-    if not is_file(source):
-        raise FileError(f"there is no file {source}")
-    try:
-        entries = json.loads(source.read_bytes())
-    except OSError as error:
-        raise FileError(f"cannot read {source}: {error.strerror or error}") from None
-    except (ValueError, RecursionError) as error:
-        raise FileError(f"{source} is truncated or not a JSON file: {error}") from None
-    _require_format(source, entries.get("format") if isinstance(entries, dict) else None, form)
-    record: T = _Builder(source, {}).build(kind, entries, "")
-    return record
 
 
 def write_npz(path: str | os.PathLike[str], form: str, members: Mapping[str, Any]) -> Path:
@@ -193,9 +147,6 @@ def members_of(record: Any, prefix: str = "") -> dict[str, Any]:
             members |= members_of(value, f"{name}.")
         elif isinstance(value, Mapping):
             members |= {f"{name}.{key}": array for key, array in value.items()}
-        elif row := _row(hint):
-            columns = [column.name for column in fields(row)]
-            members |= {f"{name}.{key}": np.array([getattr(entry, key) for entry in value]) for key in columns}
         else:
             members[name] = np.array([_text(own) for own in value], dtype=np.str_) if _texts(hint) else value
     return members
@@ -235,7 +186,7 @@ class _Builder:
         self.sizes = sizes
 
     def tables(self, kind: Any, members: Members, prefix: str) -> dict[str, Any]:
-        """The entries of an npz file in the structure of JSON: records are tables, tuples of records are lists."""
+        """The entries of an npz file by field: records are tables."""
         tables: dict[str, Any] = {}
         hints = _hints(kind)
         for item in fields(kind):
@@ -250,22 +201,13 @@ class _Builder:
                 tables[key] = members[name]
             elif typing.get_origin(hint) is Mapping:
                 tables[key] = below
-            elif (row := _row(hint)) and below:
-                columns = {member.name: below[member.name] for member in fields(row) if member.name in below}
-                for member, array in columns.items():
-                    if array.ndim != 1 or array.size != next(iter(columns.values())).size:
-                        raise self.error(
-                            f"{name}.{member}", f"{array.dtype} {array.shape}", "a list as long as the others"
-                        )
-                rows = zip(*(array.tolist() for array in columns.values()), strict=True)
-                tables[key] = [dict(zip(columns, row, strict=True)) for row in rows]
         return tables
 
     def error(self, entry: str, found: str, expected: str) -> FileError:
         return FileError(f"{self.source}: {entry or 'the file'} is {found} instead of {expected}")
 
     def build(self, hint: Any, value: Any, entry: str) -> Any:
-        """Convert ``value``, an array or a value from JSON, to the type ``hint`` of a field."""
+        """Convert ``value``, an array or a table, to the type ``hint`` of a field."""
         hint, optional = _required(hint), hint
         if value is None and hint is not optional:
             return None
@@ -323,31 +265,11 @@ class _Builder:
     def _scalar(self, kind: Any, value: Any, entry: str) -> Any:
         if issubclass(kind, Finding):
             return kind.of_entry(self._scalar(str, value, entry))
-        if issubclass(kind, Enum):
-            allowed = [member.value for member in kind]
-            if value not in allowed:
-                raise self.error(entry, reprlib.repr(value), f"one of {', '.join(map(str, allowed))}")
-            return kind(value)
-        if kind is float and (value is None or value in ("inf", "-inf")):
-            return math.nan if value is None else float(value)
         if kind is float and type(value) is int and abs(value) < 2**53:
             return float(value)
         if type(value) is not kind:
             raise self.error(entry, reprlib.repr(value), f"a value of type {kind.__name__}")
         return value
-
-
-def _plain(value: Any) -> Any:
-    """A record as values for JSON."""
-    if is_dataclass(value):
-        return {_entry(item): _plain(getattr(value, item.name)) for item in fields(value)}
-    if isinstance(value, tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, Enum):
-        return value.value
-    if isinstance(value, float) and not math.isfinite(value):
-        return None if math.isnan(value) else str(value)
-    return value
 
 
 @functools.cache
@@ -366,12 +288,6 @@ def _required(hint: Any) -> Any:
         return hint
     (option,) = (option for option in typing.get_args(hint) if option is not NoneType)
     return option
-
-
-def _row(hint: Any) -> Any:
-    """The dataclass of an annotation ``tuple[record, ...]``; None for other annotations."""
-    first, *_ = typing.get_args(hint) or (None,)
-    return first if typing.get_origin(hint) is tuple and is_dataclass(first) else None
 
 
 def _texts(hint: Any) -> bool:

@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     # Imported for types alone: plotting a joint needs no optimizer.
     from varpin.control import Solution
     from varpin.control.mpc import MpcRun
-    from varpin.study.tradeoff import Advice, OptimalControlTradeoff, WorkPrecision
-    from varpin.study.tradeoff.precision import Quantity
+    from varpin.study.advice import Advice
+    from varpin.study.plans import OptimalControlTradeoff
+    from varpin.study.precision import Quantity, WorkPrecision
 Motion: TypeAlias = "Trajectory | Solution | MpcRun"
 
 # Okabe and Ito's palette for colour-blind readers, without its yellow, which is faint on white.

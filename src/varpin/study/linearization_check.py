@@ -33,8 +33,8 @@ class LinearizationCheck:
     """Errors of the derivatives of one step against differences of the step.
 
     Errors and norms are the largest entries, in units of the variables: 1 rad or m for positions, 1 / (M^-1)_ii for the
-    momentum of joint i, which moves it alone at 1 rad/s or m/s, and 1 for velocities, controls and increments; dt for
-    positions of kinematic inputs. Under constraints the columns of A are velocities that these allow, of unit length.
+    momentum of joint i, and 1 for velocities, controls and increments; dt for positions of kinematic inputs. A is taken
+    along positions and velocities, under constraints along those that these allow.
 
     Attributes:
         A: Error and norm of dx1/dx0.
@@ -119,42 +119,34 @@ def check_linearization(
     options: dict[str, Any] = {"dt": dt, "steps": 1, "integrator": method, "check": False}
     motion = simulate(scene, q, v, controls=u, increments=0.0, **options)
     lin = linearize(scene, motion, integrator=method)
-    second = motion.p[0] if method.variational else v
-    mass = lagrangian_jet(scene, q, np.zeros(n)).Lvv
-    size = 1.0 / np.diag(np.linalg.inv(mass)) if method.variational else np.ones(n)
-    rows = np.concatenate([np.ones(n), size])
+    size = np.ones(n)
+    if method.variational:
+        size = 1.0 / np.diag(np.linalg.inv(lagrangian_jet(scene, q, np.zeros(n)).Lvv))
+    rows, zero = np.concatenate([np.ones(n), size]), np.zeros(k)
+    Z = _kept_by_constraints(scene, q) if scene.constraints else np.eye(n)
 
     def ends(at: Floats, velocity: Floats, control: Floats, dw: Floats) -> Floats:
-        """The state at both ends of the step (2, 2n)."""
+        """The state at both ends of the step (4n,)."""
         taken = simulate(scene, at, velocity, controls=control, increments=dw[None], **options)
-        return np.concatenate([taken.q, taken.p if method.variational else taken.v], axis=1)
-
-    def take(x: Floats, control: Floats, dw: Floats) -> Floats:
-        velocity = x[n:]
-        if method.variational:
-            M = lagrangian_jet(scene, x[:n], np.zeros(n)).Lvv
-            velocity = np.asarray(np.linalg.solve(M, x[n:]), dtype=np.float64)
-        after: Floats = ends(x[:n], velocity, control, dw)[1]
-        return after
+        return np.concatenate([taken.q, taken.p if method.variational else taken.v], axis=1).ravel()
 
     def along(y: Floats) -> Floats:
-        at = nearest(scene, q + Z @ y[: Z.shape[1]])
-        return ends(at, along_constraints(scene, at, v + Z @ y[Z.shape[1] :]), u, zero)
+        at, velocity = q + Z @ y[: Z.shape[1]], v + Z @ y[Z.shape[1] :]
+        if scene.constraints:
+            at = nearest(scene, at)
+            velocity = along_constraints(scene, at, velocity)
+        return ends(at, velocity, u, zero)
 
-    x, zero = np.concatenate([q, second]), np.zeros(k)
-    if scene.constraints:
-        Z = _kept_by_constraints(scene, q)
-        begins, after = np.split(_slope(lambda y: along(y).ravel(), np.zeros(2 * Z.shape[1]), step), 2)
-        A = _largest(lin.A[0] @ begins, after, rows, np.ones(2 * Z.shape[1]))
-    else:
-        A = _compare(lin.A[0], lambda y: take(y, u, zero), x, step, rows, rows)
+    begins, after = np.split(_slope(along, np.zeros(2 * Z.shape[1]), step), 2)
     # A position at the end of the step, in a unit that moves the joint at 1 rad/s or m/s.
     of_controls = np.ones(m)
     of_controls[scene.prescribed[: len(scene.inputs)]] = dt
+    by_u = _slope(lambda y: ends(q, v, y, zero), u, step * of_controls)[2 * n :]
+    by_w = _slope(lambda y: ends(q, v, u, y), zero, step)[2 * n :]
     return LinearizationCheck(
-        A=A,
-        B=_compare(lin.B[0], lambda y: take(x, y, zero), u, step, rows, of_controls),
-        G=_compare(lin.G[0], lambda y: take(x, u, y), zero, step, rows, np.ones(k)),
+        A=_largest(lin.A[0] @ begins, after, rows, np.ones(begins.shape[1])),
+        B=_largest(lin.B[0], by_u, rows, of_controls),
+        G=_largest(lin.G[0], by_w, rows, np.ones(k)),
     )
 
 
@@ -171,17 +163,10 @@ def _relative(part: tuple[float, float]) -> float:
     return error / norm if norm > 0.0 else error
 
 
-def _compare(
-    given: Floats, function: Callable[[Floats], Floats], x: Floats, step: float, rows: Floats, columns: Floats
-) -> tuple[float, float]:
-    """Largest error of a derivative and largest entry of the differences, in the units of rows and columns."""
-    if not x.size:
-        return 0.0, 0.0
-    return _largest(given, _slope(function, x, step * columns), rows, columns)
-
-
 def _slope(function: Callable[[Floats], Floats], x: Floats, step: Floats | float) -> Floats:
     """The derivative of a function by differences; ``step`` is that of each variable, or of all."""
+    if not x.size:
+        return np.zeros((len(function(x)), 0))
     derivative = []
     for e in np.diag(np.broadcast_to(step, x.shape)):
         total = sum(w * (function(x + i * e) - function(x - i * e)) for i, w in _WEIGHTS.items())

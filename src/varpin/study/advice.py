@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,19 +17,12 @@ from varpin.errors import InputError
 from varpin.integrators import Guard, Integrator, Reference, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import open_loop
-from varpin.simulation.check import distance, repeated
 from varpin.simulation.ladder import Ladder, Rung, Trial, first_steps
-from varpin.simulation.record import rollout
-from varpin.study.tradeoff.setting import Setting, integrators_of
+from varpin.study.motion import Setting, integrators_of
+from varpin.study.record import Study
 from varpin.support.checks import JointValues, positive
-from varpin.support.markup import facts, table
-from varpin.trajectory import Trajectory
 
-# Headings of a choice's entries in a table.
-COLUMNS = ("integrator", "dt [s]", "steps", "predicted time [s]", "predicted error in q", "note")
-
-# Total time of the repetitions of a short run [s], and their largest number: the first ones find caches cold.
+# Total time of the repetitions of a short run [s], and their largest number.
 _TIMING, _REPEATS = 0.02, 5
 # Nodes at which the midpoint integrator's largest step is computed: a bound by samples, for information.
 _NODES = 32
@@ -61,21 +54,14 @@ class Choice:
         error = f"error {self.error:.1e}" if math.isfinite(self.error) else "unknown error"
         return f"{self.integrator} at dt = {self.dt:.4g} s: {error} in {_time(self.seconds)}"
 
-    def cells(self) -> tuple[str, ...]:
-        """The entries of :data:`COLUMNS`."""
-        error = f"{self.error:.2e}" if math.isfinite(self.error) else "unknown"
-        note = "" if self.measured else "by the method's order"
-        return str(self.integrator), f"{self.dt:.4g}", str(self.steps), f"{self.seconds:.2e}", error, note
 
-
-@dataclass(frozen=True, eq=False)
-class Advice:
+@dataclass(frozen=True, eq=False, repr=False)
+class Advice(Study[Choice]):
     """Which integrator to take, at which step, and why.
 
     Attributes:
-        best: The choice; its fields are this object's, too.
-        reached: Whether it meets the wish, as far as can be predicted.
-        alternatives: The best of every other method that has one, cheapest (or most accurate) first.
+        runs: The best choice of each method, the advised one first, then cheapest (or most accurate) first.
+        reached: Whether the first meets the wish, as far as can be predicted.
         largest_step: The step [s] from which on the midpoint integrator's branch guard splits steps somewhere along
             this motion; infinite if none is too large, NaN under constraints, whose guard looks at more.
         tolerance: What was asked for [rad or m], or None.
@@ -84,21 +70,43 @@ class Advice:
         reason: In words.
     """
 
-    best: Choice
+    headings: ClassVar = {"seconds": "predicted time [s]"}
+    shown: ClassVar = ("integrator", "dt", "steps", "seconds", "error")
+
     reached: bool
-    alternatives: tuple[Choice, ...]
     largest_step: float
     tolerance: float | None
     budget: float | None
     calibration: float
     reason: str = field(repr=False)
 
-    def __repr__(self) -> str:
-        return f"Advice({self.best}{'' if self.reached else ', which is not what was asked for'})"
+    @property
+    def summary(self) -> str:
+        """The choice."""
+        return f"{self.best}{'' if self.reached else ', which is not what was asked for'}"
 
-    def _repr_html_(self) -> str:
-        rows = [choice.cells() for choice in (self.best, *self.alternatives)]
-        return facts("Advice", [("", line) for line in self.reason.splitlines()], table(COLUMNS, rows, [0]))
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The reason, line by line."""
+        return tuple(self.reason.splitlines())
+
+    def note(self, run: Choice) -> str:
+        """Whether a choice was measured."""
+        return "" if run.measured else "extrapolated"
+
+    def pareto(self) -> tuple[Choice, ...]:
+        """The choice, if it meets the wish."""
+        return (self.best,) if self.reached else ()
+
+    @property
+    def best(self) -> Choice:
+        """The choice; its fields are this object's, too."""
+        return self.runs[0]
+
+    @property
+    def alternatives(self) -> tuple[Choice, ...]:
+        """The best of every other method that has one."""
+        return self.runs[1:]
 
     @property
     def integrator(self) -> Integrator:
@@ -174,46 +182,30 @@ def advise(
     rows = len(setting.controls)
     first = first_steps(scene, setting.q0, setting.v0, setting.duration, rows)
     begin = time.perf_counter()
-    late = partial(_later, begin + patience)
-    ladder = Ladder(partial(_timed, setting), members, first, rows, late)
+    ladder = Ladder(
+        lambda member, steps: _timed(setting, member, steps),
+        members,
+        first,
+        rows,
+        lambda: time.perf_counter() > begin + patience,
+    )
     if tolerance is not None:
         choices, reached = ladder.for_tolerance(positive("tolerance", tolerance, "rad or m"))
     else:
         choices, reached = ladder.for_budget(_PLANNED * positive("budget", budget, "s"))
     bound = _largest_step(setting, ladder.rungs)
-    best, *others = (
+    runs = tuple(
         Choice(each.integrator, setting.duration / each.steps, each.steps, each.error, each.cost, each.measured)
         for each in choices
     )
-    reason = _reason(best, others, reached, bound, tolerance, budget, duration)
-    return Advice(best, reached, tuple(others), bound, tolerance, budget, time.perf_counter() - begin, reason)
-
-
-def _later(end: float) -> bool:
-    """Whether a time has passed."""
-    return time.perf_counter() > end
+    reason = _reason(runs, reached, bound, tolerance, budget, duration)
+    calibration = time.perf_counter() - begin
+    return Advice(runs, scene.robot.name, reached, bound, tolerance, budget, calibration, reason)
 
 
 def _timed(setting: Setting, integrator: Integrator, steps: int) -> Trial:
     """A trial and its wall time, the best of several short ones."""
-    outcome = setting.run(integrator, steps)
-    begin, seconds = time.perf_counter(), [outcome.seconds]
-    while len(seconds) < _REPEATS and time.perf_counter() - begin < _TIMING:
-        seconds.append(setting.run(integrator, steps).seconds)
-    if outcome.failure:
-        return Trial(steps, math.inf, min(seconds))
-    motion = _motion(setting, integrator, steps)
-    if motion.steps < steps:
-        return Trial(steps, math.inf, min(seconds))
-    off = float(distance(repeated(setting.scene, integrator, motion), motion)[0].max())
-    whole = motion.statistics.split_steps == 0
-    return Trial(steps, off if math.isfinite(off) else math.inf, min(seconds), whole=whole)
-
-
-def _motion(setting: Setting, integrator: Integrator, steps: int) -> Trajectory:
-    """The motion in so many steps, up to one that fails."""
-    dt, commands = setting.duration / steps, open_loop(setting.rows(steps))
-    return rollout(setting.scene, integrator, setting.q0, setting.v0, commands, dt)[0]
+    return setting.trial(integrator, steps, repeats=_REPEATS, within=_TIMING)
 
 
 def _largest_step(setting: Setting, rungs: Sequence[Rung]) -> float:
@@ -222,7 +214,7 @@ def _largest_step(setting: Setting, rungs: Sequence[Rung]) -> float:
     if not able or setting.scene.constraints:
         return math.nan
     method = max(able, key=lambda rung: (rung.integrator.order, rung.trials[-1].steps))
-    motion = _motion(setting, method.integrator, method.trials[-1].steps)
+    motion = setting.run(method.integrator, method.trials[-1].steps).motion
     jets = (
         lagrangian_jet(setting.scene, motion.q[node], motion.v[node])
         for node in np.linspace(0, motion.steps, _NODES).astype(np.int64)
@@ -231,14 +223,14 @@ def _largest_step(setting: Setting, rungs: Sequence[Rung]) -> float:
 
 
 def _reason(
-    best: Choice,
-    others: Sequence[Choice],
+    choices: Sequence[Choice],
     reached: bool,
     bound: float,
     tolerance: float | None,
     budget: float | None,
     duration: float,
 ) -> str:
+    best, *others = choices
     wish = f"an error of {tolerance:g} in q" if tolerance is not None else f"{_time(budget or 0.0)}"
     if not reached:
         lines = [f"{wish} is not within reach of what was tried; the best is {best}"]

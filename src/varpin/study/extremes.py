@@ -1,13 +1,14 @@
-"""A robot's own motions where it is hard, each with every integrator and judged by independent checks."""
+"""A robot where it is hard: its own motions with every integrator, each judged by independent checks."""
 
 from __future__ import annotations
 
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from enum import Enum
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,13 +24,11 @@ from varpin.model import Robot, load_robot
 from varpin.simulation import limits
 from varpin.simulation.failures import Interrupted
 from varpin.simulation.simulate import simulate
-from varpin.study.extremes.checks import condition, findings, finite, measures
-from varpin.study.extremes.exact import exact_motion
-from varpin.study.extremes.record import LEVELS, Cell, Kind, Record, line_of
+from varpin.study.checks import LEVELS, condition, findings, finite, measures
+from varpin.study.exact import exact_motion
+from varpin.study.record import Progress, Study, collect
 from varpin.support.checks import positive
 from varpin.trajectory import Trajectory
-
-Progress = Callable[[int, int, str], None]
 
 INTEGRATORS: tuple[Integrator, ...] = (
     *(Midpoint(alpha=alpha) for alpha in (0.0, 0.5, 1.0)),
@@ -46,13 +45,142 @@ _FIRST = 40
 _STRUCTURE = ("record", "symplecticity")
 
 
+class Kind(Enum):
+    """The judgement of a motion; the value is its name in texts."""
+
+    ACCURATE = "accurate"
+    DEGRADED = "degraded"
+    REFUSED = "refused"
+    STOPPED = "stopped"
+    WRONG = "silent wrong"
+
+    @property
+    def letter(self) -> str:
+        """Its letter in tables."""
+        return "W" if self is Kind.WRONG else self.value[0].upper()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A motion with one integrator. Measures are NaN where they do not apply.
+
+    Attributes:
+        trial: Name of the motion.
+        integrator: As text.
+        kind: One of the five.
+        error: Largest distance in q from the exact motion over its window, in units of how far that goes.
+        joint: The same distance, each joint in units of its own travel.
+        velocity: The same of v, in units of each joint's largest velocity.
+        period: Largest error over a period from any of many nodes of the whole motion, in units of what is wrong.
+        energy: Largest error of the energy balance, in units of the energy there is to turn over.
+        momentum: Largest change of the momentum that is to be conserved, in units of the largest one.
+        reversal: Distance in q from where the reversed motion is to end, as a share of the joint travel.
+        symplecticity: Largest entry of A' J A - J, in units of the sum of magnitudes that cancel in it.
+        record: Largest distance of recorded momenta and energies from Pinocchio's, in their own units.
+        said: varpin's warnings, or its error.
+        found: The failed checks.
+        done: Number of steps taken.
+        steps: Number of steps of a complete motion.
+        seconds: Wall time, checks included [s].
+    """
+
+    trial: str
+    integrator: str
+    kind: Kind
+    error: float
+    joint: float
+    velocity: float
+    period: float
+    energy: float
+    momentum: float
+    reversal: float
+    symplecticity: float
+    record: float
+    said: tuple[str, ...]
+    found: tuple[str, ...]
+    done: int
+    steps: int
+    seconds: float
+
+    @property
+    def needless(self) -> bool:
+        """Whether it warns although no check finds anything: a false alarm."""
+        return self.kind is Kind.DEGRADED and not self.found
+
+    def measures(self) -> dict[str, float]:
+        """The measures by name."""
+        return {name: getattr(self, name) for name in LEVELS}
+
+    def __str__(self) -> str:
+        """The kind's letter with the error, or E with that of the energy where no exact motion is known; the steps."""
+        known = self.error if not math.isnan(self.error) else self.energy
+        error = (
+            "" if math.isnan(known) else f" {'E ' if math.isnan(self.error) else ''}{f'{known:.0e}' if known else 0}"
+        )
+        if self.kind in (Kind.REFUSED, Kind.STOPPED):
+            error = ""
+        steps = "" if self.done == self.steps or self.kind is Kind.REFUSED else f" {self.done}/{self.steps}"
+        return self.kind.letter + error + steps
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Record(Study[Cell]):
+    """What came of a robot's motions.
+
+    Attributes:
+        runs: In the order of the motions, and of the integrators within.
+    """
+
+    headings: ClassVar = {
+        "trial": "motion",
+        "kind": "result",
+        "error": "error / travel",
+        "joint": "error / joint's travel",
+        "velocity": "error / joint's speed",
+        "energy": "energy error / turnover",
+    }
+    shown: ClassVar = ("trial", "integrator", "kind", "error", "energy")
+
+    @property
+    def summary(self) -> str:
+        """How many there are of each kind."""
+        return ", ".join(f"{count} {kind.value}" for kind, count in self.counts().items() if count) or "no runs"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the table has to know."""
+        return (
+            "errors: the largest distance in q from the exact motion, as a share of its travel; E: the largest error "
+            "of the energy balance, as a share of the energy that the motion exchanges",
+        )
+
+    def note(self, run: Cell) -> str:
+        """The failed checks."""
+        return "; ".join(run.found)
+
+    def pareto(self) -> tuple[Cell, ...]:
+        """None: accuracy is not set against time here."""
+        return ()
+
+    def counts(self) -> dict[Kind, int]:
+        """How many motions there are of each kind."""
+        return {kind: sum(cell.kind is kind for cell in self.runs) for kind in Kind}
+
+    def wrong(self) -> tuple[Cell, ...]:
+        """The motions that are wrong without a warning."""
+        return tuple(cell for cell in self.runs if cell.kind is Kind.WRONG)
+
+    def needless(self) -> tuple[Cell, ...]:
+        """The motions with a warning although every check passes: false alarms."""
+        return tuple(cell for cell in self.runs if cell.needless)
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A motion that is hard to integrate.
 
     Attributes:
         name: Unique among a robot's.
-        family: What is extreme about it.
         dt: Time step [s].
         steps: N.
         scene: The scene.
@@ -65,7 +193,6 @@ class Motion:
     """
 
     name: str
-    family: str
     dt: float
     steps: int
     scene: Scene
@@ -87,7 +214,6 @@ def motions_of(robot: Robot) -> list[Motion]:
     found: list[Motion] = []
 
     def add(
-        family: str,
         name: str,
         dt: float,
         steps: int,
@@ -101,28 +227,28 @@ def motions_of(robot: Robot) -> list[Motion]:
     ) -> None:
         v0, shift = (np.broadcast_to(np.asarray(x, dtype=np.float64), (n,)).copy() for x in (v, ahead))
         whole = Scene(robot, **{"damping": 0.0} | scene)
-        found.append(Motion(name, family, dt, steps, whole, 0.3 + shift, v0, controls, increments, shift, window))
+        found.append(Motion(name, dt, steps, whole, 0.3 + shift, v0, controls, increments, shift, window))
 
     # What starts to slide down is behind by half a step with any method of first order: much of its first steps, little
     # of its motion.
     for dt, steps in ((1e-6, 500), (1e-4, 1000), (1e-3, 1000), (0.01, 500), (0.1, 100), (0.5, 40)):
-        add("time step", f"falls, dt = {dt:g} s", dt, steps, max(0.3, _FIRST * dt))
+        add(f"falls, dt = {dt:g} s", dt, steps, max(0.3, _FIRST * dt))
     for rate in (10.0, 1e3):
-        add("joint rate", f"{rate:g} rad/s", 1e-3, 500, max(1.0 / rate, _FIRST * 1e-3), v=rate, gravity=False)
+        add(f"{rate:g} rad/s", 1e-3, 500, max(1.0 / rate, _FIRST * 1e-3), v=rate, gravity=False)
     # A mimic joint that follows turns by a part of it, and no motion is the same then.
     turns = np.where(robot.slides | bool(robot.ties), 0.0, 2.0 * math.pi * 1e6)
-    add("turns", "after 1e6 turns", 1e-3, 500, 0.3, ahead=turns)
-    add("gravity", "no gravity", 1e-2, 500, 0.5, v=1.0, gravity=False)
-    add("gravity", "gravity 1e4 m/s^2", 1e-3, 500, _FIRST * 1e-3, gravity=(0.0, 0.0, -1e4))
+    add("after 1e6 turns", 1e-3, 500, 0.3, ahead=turns)
+    add("no gravity", 1e-2, 500, 0.5, v=1.0, gravity=False)
+    add("gravity 1e4 m/s^2", 1e-3, 500, _FIRST * 1e-3, gravity=(0.0, 0.0, -1e4))
     for turned in (0.1, 2.4, 50.0):
-        add("stiffness", f"springs, h omega = {turned:g}", 1e-3, 500, 0.01, stiffness=(turned / 1e-3) ** 2 * inertia)
+        add(f"springs, h omega = {turned:g}", 1e-3, 500, 0.01, stiffness=(turned / 1e-3) ** 2 * inertia)
     for lost in (0.1, 10.0, 1e4):
-        add("damping", f"dampers, h d / I = {lost:g}", 1e-3, 500, 0.05, v=1.0, damping=lost / 1e-3 * inertia)
+        add(f"dampers, h d / I = {lost:g}", 1e-3, 500, 0.05, v=1.0, damping=lost / 1e-3 * inertia)
     for share in (10.0, 1e6):
-        add("torque", f"+-{share:g} times its weight", 1e-3, 200, controls=flipping(share * weight))
+        add(f"+-{share:g} times its weight", 1e-3, 200, controls=flipping(share * weight))
     for strength in (1e-12, 1.0):
         noise, dw = AdditiveNoise(strength * weight), wiener_increments(n, 1e-3, 100, 0)
-        add("noise", f"noise of {strength:g} times its weight", 1e-3, 100, noise=noise, increments=dw)
+        add(f"noise of {strength:g} times its weight", 1e-3, 100, noise=noise, increments=dw)
     return found
 
 
@@ -151,27 +277,21 @@ def check_robot(
 
     Other Args:
         patience: Processor time that a motion may take before it is judged by what there is [s].
-        progress: Called with (cells done, cells in all, the next one's name).
+        progress: Called with (motions done, motions in all).
 
     Returns:
-        The record; after Ctrl-C, of what was done. ``record.wrong()`` are results that are wrong without a warning.
+        The record; ``record.wrong()`` are results that are wrong without a warning.
 
     Raises:
         RobotError: There is no such robot, or its file cannot be read.
         InputError: ``patience`` is not positive.
+        StudyInterrupted: Ctrl-C; holds the motions so far. It is a KeyboardInterrupt.
     """
     arm = robot if isinstance(robot, Robot) else load_robot(robot)
     limit = positive("patience", patience, "s")
-    jobs = [(m, i) for m in motions_of(arm) for i in (INTEGRATORS if integrators is None else integrators)]
-    cells: list[Cell] = []
-    try:
-        for motion, integrator in jobs:
-            if progress is not None:
-                progress(len(cells), len(jobs), f"{motion.name}, {integrator}")
-            cells.append(_cell(motion, integrator, limit))
-    except KeyboardInterrupt:
-        pass
-    return Record(tuple(cells), arm.name, deep=False, missing=len(jobs) - len(cells))
+    members = INTEGRATORS if integrators is None else integrators
+    jobs = [(motion, member) for motion in motions_of(arm) for member in members]
+    return collect(Record((), arm.name), (_cell(*job, limit) for job in jobs), len(jobs), progress)
 
 
 def _cell(motion: Motion, integrator: Integrator, patience: float) -> Cell:
@@ -191,8 +311,8 @@ def _cell(motion: Motion, integrator: Integrator, patience: float) -> Cell:
         found, done = measures(scene, integrator, trajectory, exact), trajectory.steps
         kind, said, wrong = judge(trajectory, error, findings(found, integrator, condition(scene, motion.q0)))
     return Cell(
-        family=motion.family, trial=motion.name, integrator=str(integrator), kind=kind, said=said, found=wrong,
-        done=done, steps=motion.steps, seconds=round(time.perf_counter() - begin, 3), fingerprint="",
+        trial=motion.name, integrator=str(integrator), kind=kind, said=said, found=wrong,
+        done=done, steps=motion.steps, seconds=round(time.perf_counter() - begin, 3),
         **dict.fromkeys(LEVELS, math.nan) | found,
     )  # fmt: skip
 
@@ -248,3 +368,8 @@ def attempt(
         if getattr(error, "trajectory", None) is None:
             raise
         return error.trajectory, error  # type: ignore[attr-defined]
+
+
+def line_of(error: Exception) -> str:
+    """An error in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -1,7 +1,7 @@
 """The exact motion of a scene, and the distance of an integrator's motion from it.
 
 The exact motion is LSODA's at 1e-11: it takes stiff dampers, and shares nothing with the integrator. From which error
-on a motion is wrong is in :mod:`varpin.study.extremes.units`.
+on a motion is wrong is in :data:`LEVELS` of :mod:`varpin.study.extremes`, in units of the motion itself.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from varpin.integrators import ExplicitEuler, Integrator
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
+from varpin.simulation.scales import largest_of_its_kind
 from varpin.simulation.spectrum import masses
-from varpin.study.extremes.units import DISTURBANCE, error_units, grown, light_joint_speed, velocity_change
 from varpin.trajectory import Trajectory
 
 _TOLERANCE = 1e-11
@@ -31,6 +31,13 @@ _SLOWEST = 1e-3
 SHORTEST = 1e-6
 # Processor time for the motion of a window, which other programs do not change [s].
 PATIENCE = 3.0
+# Growth of a disturbance from which on a motion counts as unpredictable; and the disturbance, relative to q and v.
+_PREDICTABLE, DISTURBANCE = 10.0, 1e-7
+# For a joint that hardly moves, the unit of errors is at least the smaller of two: this share of the largest travel or
+# speed among joints of its kind, and of the speed at which the joint would have their energy.
+_LITTLE, _LIGHT = 1e-2, 1e-2
+# Least change of a speed, as a share of it, for joints at constant speed.
+_EVEN = 1e-3
 # Nodes of a window, and those at its start, where what is stiff dies out.
 NODES, START = 32, 4
 
@@ -180,13 +187,26 @@ def in_units(
 ) -> Exact:
     """An exact motion with travels and speeds: each joint's own, or a small share of the others'."""
     velocities = np.vstack([v0, v])
-    M = lagrangian_jet(scene, q0, np.zeros_like(q0), backend="pinocchio").Lvv
-    travels, speeds = error_units(
-        scene,
-        np.abs(q - q0).max(axis=0),
-        np.abs(velocities).max(axis=0),
-        light_joint_speed(np.diag(M), velocity_change(velocities)),
-        np.asarray(float(nodes[-1]) * dt),
-    )
-    travel = max(float(np.abs(q - q0).max()), SHORTEST)
+    travels, speeds = np.abs(q - q0).max(axis=0), np.abs(velocities).max(axis=0)
+    root = np.sqrt(np.diag(lagrangian_jet(scene, q0, np.zeros_like(q0), backend="pinocchio").Lvv))
+    # The speed at which a joint has the energy of the largest change.
+    light = _LIGHT * (root * velocity_change(velocities)).max() / root
+    least = np.minimum(_LITTLE * largest_of_its_kind(scene, speeds), light)
+    least_travel = np.minimum(_LITTLE * largest_of_its_kind(scene, travels), light * float(nodes[-1]) * dt)
+    travel = max(float(travels.max()), SHORTEST)
+    travels, speeds = np.maximum(travels, least_travel), np.maximum(speeds, least)
     return Exact(nodes, q, v, travel, np.maximum(travels, SHORTEST), np.maximum(speeds, SHORTEST), cut)
+
+
+def grown(plain: Floats, disturbed: Floats, disturbance: float) -> int:
+    """Steps, one at least, until the distance of two motions' q (K + 1, n) is a multiple of the disturbance."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = ~(np.abs(disturbed - plain).max(axis=1) <= _PREDICTABLE * disturbance)
+    return max(1, int(apart.argmax())) if apart.any() else len(plain) - 1
+
+
+def velocity_change(v: Floats) -> Floats:
+    """The change of velocities over the nodes (K, ...): the range they cover, at most the largest speed."""
+    fastest = np.abs(v).max(axis=0)
+    change: Floats = np.clip(np.ptp(v, axis=0), _EVEN * fastest, fastest)
+    return change

@@ -3,81 +3,91 @@
 from __future__ import annotations
 
 import math
-import os
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
+from typing import Any, ClassVar
 
 from varpin.control import OptimalControlProblem, Solution, solve
-from varpin.errors import FileError, InputError
+from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import refuse_inputs
-from varpin.study.tradeoff.records import pareto_front
-from varpin.study.tradeoff.runs import Progress, Run, Tradeoff, complete
-from varpin.study.tradeoff.setting import Setting, digest, fastest, integrators_of
-from varpin.support.checks import count, positive, writable
+from varpin.study.motion import fastest, integrators_of
+from varpin.study.record import Progress, Study, collect, pareto_front
+from varpin.support.checks import count, positive
 
-# Options of solve that observe a search and do not change it.
-_ONLOOKERS = ("callback", "progress")
-
-HEADINGS = {
-    "integrator": "integrator",
-    "order": "order",
-    "dt": "dt [s]",
-    "steps": "steps",
-    "hold": "steps a decision",
-    "seconds": "solve time [s]",
-    "spread": "spread of solve time [s]",
-    "iterations": "iterations",
-    "planned_cost": "planned cost",
-    "open_loop_cost": "true cost, open loop",
-    "closed_loop_cost": "true cost, with feedback",
-    "accuracy": "accuracy of true cost",
-    "status": "status",
-    "failure": "failure",
-}
+_COSTS = ("planned_cost", "open_loop_cost", "closed_loop_cost", "accuracy")
 
 
 @dataclass(frozen=True)
-class OptimalControlRun(Run):
-    """A problem solved with an integrator at one step, with the attributes of :class:`varpin.study.tradeoff.runs.Run`.
+class OptimalControlRun:
+    """A problem solved with an integrator at one step. Its measures are NaN where it failed.
 
     Attributes:
+        integrator: As text.
+        order: Of its error in dt.
+        dt: Time step [s].
+        steps: N.
         hold: Steps that share a control.
+        seconds: Solve time, the best of the repetitions [s].
+        spread: Distance of the median of the repetitions from the best [s].
         iterations: Of the solver.
         planned_cost: What the solver believes, without noise.
         open_loop_cost: Of the controls on the continuous system.
         closed_loop_cost: The same with the plan's feedback.
         accuracy: Relative, of these two.
         status: Of the solver, in a word.
+        failure: Reason of a failure; empty if there is none.
     """
 
+    integrator: str
+    order: int
+    dt: float
+    steps: int
     hold: int
+    seconds: float
+    spread: float
     iterations: int
     planned_cost: float
     open_loop_cost: float
     closed_loop_cost: float
     accuracy: float
     status: str
+    failure: str = ""
 
     @property
-    def key(self) -> Hashable:
-        """Identity of the run in its record."""
-        return self.options, self.steps, self.hold
+    def survived(self) -> bool:
+        """Whether there is a plan."""
+        return not self.failure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class OptimalControlTradeoff(Tradeoff):
-    """Solutions of one problem, :class:`OptimalControlRun`, with the attributes of a :class:`Tradeoff`."""
+class OptimalControlTradeoff(Study[OptimalControlRun]):
+    """Solutions of one problem, in the order of the integrators, each from its largest step down.
 
-    _format = "varpin.optimal-control-tradeoff/2"
-    _headings = HEADINGS
-    _columns = ("integrator", "dt", "seconds", "planned_cost", "open_loop_cost", "closed_loop_cost", "failure")
+    Attributes:
+        runs: The runs.
+        duration: Of the plan [s].
+    """
 
-    runs: tuple[OptimalControlRun, ...]
+    headings: ClassVar = {"seconds": "solve time [s]"}
+    shown: ClassVar = ("integrator", "dt", "seconds", "planned_cost", "open_loop_cost", "closed_loop_cost")
+
+    duration: float
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the table has to know."""
+        return (
+            f"plans of {self.duration:g} s; true costs are those of the continuous robot",
+            "Pareto: no other plan has both a smaller solve time and a smaller true cost in open loop",
+        )
+
+    def note(self, run: OptimalControlRun) -> str:
+        """Whether a run is on the front, or how it ended otherwise."""
+        if run.failure:
+            return "failed"
+        return "Pareto" if run in self.pareto() else "" if run.status == "converged" else run.status
 
     def pareto(self) -> tuple[OptimalControlRun, ...]:
         """The runs than which no other is better in both solve time and true open-loop cost, from the fastest up."""
@@ -92,7 +102,6 @@ def optimal_control_tradeoff(
     period: float | None = None,
     repeats: int = 1,
     progress: Progress | None = None,
-    save: str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> OptimalControlTradeoff:
     """Solve a problem with different integrators and steps, and replay each plan on the continuous system.
@@ -107,34 +116,20 @@ def optimal_control_tradeoff(
     Other Args:
         repeats: Of each solution; the fastest counts. One more goes before them where they are short.
         progress: Called with (runs done, runs in all).
-        save: Keep the record in this npz, run by run; runs that it holds already are not run again.
-        options: Handed on to :func:`varpin.solve`. Runs with other options are other runs; ``callback`` and
-            ``progress`` do not count.
+        options: Handed on to :func:`varpin.solve`.
 
     Raises:
         InputError: Wrong arguments.
-        FileError: ``save`` cannot be written, or holds another problem's runs.
+        StudyInterrupted: Ctrl-C; holds the runs so far. It is a KeyboardInterrupt.
     """
     if not isinstance(problem, OptimalControlProblem):
         raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
     refuse_inputs(problem.scene, "optimal_control_tradeoff")
     members, repeats = integrators_of(problem.scene, integrators), count("repeats", repeats, least=1)
     steps = (2.0 * problem.dt, problem.dt, 0.5 * problem.dt) if dts is None else tuple(dts)
-    plan = [_discretized(problem, member, dt, period) for member in members for dt in sorted(steps, reverse=True)]
-    path = None if save is None else writable(save)
-    mark = _fingerprint(problem, options)
-    base = OptimalControlTradeoff((), problem.scene.robot.name, problem.duration, fingerprint=mark)
-    if path is not None and path.exists():
-        base = OptimalControlTradeoff.load(path)
-        if base.fingerprint != mark:
-            raise FileError(f"{path} holds runs of another problem: choose another file")
-    return complete(
-        base,
-        {(repr(each.integrator), each.steps, each.hold): each for each in plan},
-        lambda record, missing: (record, (_measured(each, repeats, options) for each in missing)),
-        path=path,
-        progress=progress,
-    )
+    jobs = [_discretized(problem, member, dt, period) for member in members for dt in sorted(steps, reverse=True)]
+    base = OptimalControlTradeoff((), problem.scene.robot.name, problem.duration)
+    return collect(base, (_measured(job, repeats, options) for job in jobs), len(jobs), progress)
 
 
 def _discretized(
@@ -149,22 +144,6 @@ def _discretized(
     return problem.at(dt=dt, integrator=member, hold=hold)
 
 
-def _fingerprint(problem: OptimalControlProblem, options: dict[str, Any]) -> str:
-    """SHA-256 over the scene, the state, the horizon, the options, and the cost of a motion that visits many states."""
-    scene, steps = problem.scene, 64
-    rng = np.random.default_rng(0)
-    q, v = rng.normal(size=(2, steps + 1, scene.robot.dof))
-    u = rng.normal(size=(steps, scene.controls))
-    costs = problem.at(dt=problem.duration / steps, steps=steps, hold=1).costs(q, v, u)
-    quiet = Setting(scene, problem.q0, problem.v0, np.zeros((1, scene.controls)), problem.duration).fingerprint
-    given = {
-        name: value.policy if isinstance(value, Solution) else value
-        for name, value in sorted(options.items())
-        if name not in _ONLOOKERS
-    }
-    return digest((quiet, f"{float(costs):.12e}", problem.sampling, given))
-
-
 def _solved(problem: OptimalControlProblem, options: dict[str, Any]) -> tuple[Solution, float]:
     begin = time.perf_counter()
     solution = solve(problem, **{"check": False, **options})
@@ -176,7 +155,7 @@ def _solved(problem: OptimalControlProblem, options: dict[str, Any]) -> tuple[So
 
 
 def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, Any]) -> OptimalControlRun:
-    costs = {"planned_cost": math.nan, "open_loop_cost": math.nan, "closed_loop_cost": math.nan, "accuracy": math.nan}
+    costs = dict.fromkeys(_COSTS, math.nan)
     seconds, spread, iterations, status, failure = math.nan, 0.0, 0, "", ""
     # An error of one run, whatever it is, does not stop the others.
     try:
@@ -189,16 +168,6 @@ def _measured(problem: OptimalControlProblem, repeats: int, options: dict[str, A
     except Exception as error:
         failure = f"{type(error).__name__}: {error}"
     return OptimalControlRun(
-        integrator=str(problem.integrator),
-        options=repr(problem.integrator),
-        order=problem.integrator.order,
-        dt=problem.dt,
-        steps=problem.steps,
-        hold=problem.hold,
-        seconds=seconds,
-        spread=spread,
-        iterations=iterations,
-        status=status,
-        failure=failure,
-        **costs,
-    )
+        str(problem.integrator), problem.integrator.order, problem.dt, problem.steps, problem.hold, seconds, spread,
+        iterations, **costs, status=status, failure=failure,
+    )  # fmt: skip

@@ -1,0 +1,177 @@
+"""One motion to integrate in many ways: a scene, a state, controls and a duration; and a timed run of it."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from varpin.arrays import Floats
+from varpin.errors import InputError
+from varpin.finding import announce
+from varpin.integrators import Integrator
+from varpin.mechanics.scene import Scene, require_scene
+from varpin.signals.commands import open_loop
+from varpin.signals.controls import held_rows
+from varpin.signals.inputs import held_in_parts
+from varpin.simulation.check import distance, repeated
+from varpin.simulation.ladder import ROUNDING, Trial, candidates
+from varpin.simulation.record import trajectory_of
+from varpin.simulation.start import on_constraints
+from varpin.support.checks import JointValues, joint_array, positive
+from varpin.support.frozen import Frozen
+from varpin.trajectory import Trajectory
+
+Result = TypeVar("Result")
+
+logger = logging.getLogger(__name__)
+
+# Steps of one joint between two chances for Ctrl-C: a tenth of a second.
+_CHUNK = 100_000
+# A first run this long [s] is as good as the next.
+_LONG = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A timed run.
+
+    Attributes:
+        motion: Up to the step that failed, if one did.
+        failure: Why it did not get to the end; empty if it did.
+        seconds: Wall time, the best of the repetitions [s].
+        spread: How far the middle one of the repetitions is above the best [s].
+    """
+
+    motion: Trajectory
+    failure: str
+    seconds: float
+    spread: float
+
+
+@dataclass(frozen=True, eq=False)
+class Setting(Frozen):
+    """A motion to integrate.
+
+    Attributes:
+        scene: Without noise.
+        q0: (n,) [rad or m].
+        v0: (n,) [rad/s or m/s].
+        controls: (R, m), each row held over duration / R; kinematic inputs reach their positions in that time.
+        duration: [s].
+    """
+
+    scene: Scene
+    q0: Floats
+    v0: Floats
+    controls: Floats
+    duration: float
+
+    @classmethod
+    def of(
+        cls, scene: Scene, q0: JointValues, v0: JointValues, controls: JointValues | None, duration: float
+    ) -> Setting:
+        """The setting of checked arguments. A start near constraints is moved onto them; the log has the distance.
+
+        Raises:
+            InputError: Wrong shapes or values, a scene with noise, controls that are a function.
+            AssemblyError: The scene's constraints cannot be kept next to q0.
+        """
+        joints = require_scene(scene).robot.joint_names
+        if scene.processes:
+            raise InputError("errors of single motions are compared here: leave the noise out of the scene")
+        if callable(controls):
+            raise InputError("controls must be rows (R, m), each held over duration / R, or one row (m,)")
+        begin, speed = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
+        rows = held_rows(scene, scene.command_at(begin) if controls is None else controls)
+        duration = positive("duration", duration, "s")
+        if scene.constraints:
+            begin, speed, moved = on_constraints(scene, begin, speed)
+            announce(logger, scene.announced, duration / len(rows), moved)
+        return cls(scene, begin, speed, rows, duration)
+
+    @property
+    def conservative(self) -> bool:
+        """Whether the energy is to stay."""
+        still = not (self.controls @ self.scene.actuation.T).any() and not self.scene.inputs
+        return self.scene.conservative and still
+
+    def run(self, integrator: Integrator, steps: int, *, repeats: int = 0, within: float = math.inf) -> Outcome:
+        """The motion in ``steps`` steps, a multiple of R; arguments for the time as for :func:`fastest`."""
+        (motion, failure), seconds, spread = fastest(lambda: self._timed(integrator, steps), repeats, within)
+        return Outcome(motion, failure, seconds, spread)
+
+    def _timed(self, integrator: Integrator, steps: int) -> tuple[tuple[Trajectory, str], float]:
+        """The motion once, why it failed, and its time [s]."""
+        scene, R, dt = self.scene, len(self.controls), self.duration / steps
+        rows = held_in_parts(scene, self.controls, self.q0, self.v0, self.duration / R, steps // R)
+        chunk, parts, failure = max(1, _CHUNK // len(self.q0)), [], ""
+        begin = time.perf_counter()
+        state, (first,) = integrator.start(scene, self.q0[None], self.v0[None])
+        for done in range(0, steps, chunk):
+            commands = open_loop(rows[done : done + chunk])
+            (segment,) = integrator.rollout(scene, state, commands, np.zeros((0, 0, 0)), dt)
+            parts.append(segment)
+            if segment.failure is not None:
+                step = done + len(segment.q)
+                failure = f"step {step} of {steps} (t = {step * dt:.4g} s): {segment.failure.reason}"
+                break
+        seconds = time.perf_counter() - begin
+        return (trajectory_of(scene, integrator, dt, first, parts, None, None), failure), seconds
+
+    def trial(self, integrator: Integrator, steps: int, *, repeats: int = 0, within: float = math.inf) -> Trial:
+        """A run and its error, from its repetition by a better method, as a trial of a ladder."""
+        outcome = self.run(integrator, steps, repeats=repeats, within=within)
+        motion, off = outcome.motion, math.inf
+        if not outcome.failure:
+            again = repeated(self.scene, integrator, motion)
+            off = max(float(distance(again, motion)[0].max()), ROUNDING * max(1.0, float(np.abs(motion.q).max())))
+        whole = motion.statistics.split_steps == 0
+        return Trial(steps, off if math.isfinite(off) else math.inf, outcome.seconds, whole=whole)
+
+
+def fastest(
+    run: Callable[[], tuple[Result, float]], repeats: int, within: float = math.inf
+) -> tuple[Result, float, float]:
+    """The result, the time and the spread [s] of the fastest of several runs; each returns its result and time.
+
+    The first run finds caches cold and a processor at rest: it does not count unless it is so long that this is
+    nothing.
+
+    Args:
+        run: Makes a run.
+        repeats: How many count; 0 for the first alone.
+        within: Time after which none is begun if one counts [s].
+    """
+    begin, first = time.perf_counter(), run()
+    counted = [first] if not repeats or first[1] >= min(_LONG, within) else []
+    while not counted or (len(counted) < repeats and time.perf_counter() - begin < within):
+        counted.append(run())
+    result, seconds = min(counted, key=lambda done: done[1])
+    return result, seconds, float(np.median([done[1] for done in counted])) - seconds
+
+
+def integrators_of(scene: Scene, integrators: Sequence[Integrator] | None) -> tuple[Integrator, ...]:
+    """The integrators to compare.
+
+    Raises:
+        InputError: None is given, one twice, or one that is no integrator, or does not keep the scene's constraints.
+    """
+    if integrators is None:
+        return candidates(scene)
+    if not isinstance(integrators, Iterable):
+        raise InputError(f"integrators must be a list of varpin's, got {integrators!r}")
+    members = tuple(integrators)
+    for member in members:
+        if not isinstance(member, Integrator):
+            raise InputError(f"integrators must be varpin's, for example varpin.Midpoint(), got {member!r}")
+        if scene.constraints and not member.keeps_constraints:
+            raise InputError(f"{member} keeps no constraints: varpin.Midpoint() and varpin.Gauss(stages) do")
+    if not members or len(set(map(repr, members))) < len(members):
+        raise InputError("integrators must be one or more, each once")
+    return members

@@ -1,0 +1,310 @@
+"""Work and precision: the error of each integrator at each step, and the time it takes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from varpin.arrays import Floats
+from varpin.ensemble.paths import without_geometry
+from varpin.errors import InputError, VarpinError
+from varpin.integrators import Gauss, Integrator, Reference
+from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
+from varpin.simulation.check import repeated
+from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, first_steps
+from varpin.study.motion import Outcome, Setting, integrators_of
+from varpin.study.record import Progress, Study, collect, pareto_front
+from varpin.support.checks import JointValues, count, positive
+from varpin.support.executors import in_order, require_executor
+
+Quantity = Literal["q", "end", "energy", "tip"]
+
+# The largest of the steps where none are named [s], and the number of its halvings: down to 0.16 ms, from which on
+# methods of fourth order are at the rounding of an arm's motion.
+_COARSEST, _HALVINGS = 0.04, 8
+# Times at which motions are compared, at most; more if the controls change more often. A largest error is found to a
+# few per cent on motions of some ten oscillations.
+_SAMPLES = 64
+# Ratio of the reference's two tolerances: an error proportional to the tolerance differs by nine tenths of itself.
+_LOOSER = 10.0
+# The reference under constraints, which ``Reference`` does not keep, and its most steps.
+_CONSTRAINED, _MOST = Gauss(4), 2**18
+
+
+@dataclass(frozen=True)
+class WorkPrecisionRun:
+    """An integrator at one step. Its measures are NaN where it failed.
+
+    Attributes:
+        integrator: As text.
+        order: Of its error in dt.
+        dt: Time step [s].
+        steps: N.
+        seconds: Wall time, the best of the repetitions [s].
+        spread: Distance of the median of the repetitions from the best [s].
+        error: Largest error in q over the joints and the record's times [rad or m].
+        end_error: Largest error in q over the joints at the end [rad or m].
+        energy_error: Largest distance from the initial energy over all nodes [J]; NaN unless energy is to stay.
+        tip_error: Largest error of the end effector's position over the record's times [m].
+        newton_iterations: In all.
+        jets: Evaluations of the whole jet.
+        sweeps: Evaluations of its first derivatives alone, or of forward dynamics.
+        split_steps: Steps that a guard took in parts.
+        failure: Reason of a failure; empty if there is none.
+    """
+
+    integrator: str
+    order: int
+    dt: float
+    steps: int
+    seconds: float
+    spread: float
+    error: float
+    end_error: float
+    energy_error: float
+    tip_error: float
+    newton_iterations: int
+    jets: int
+    sweeps: int
+    split_steps: int
+    failure: str = ""
+
+    @property
+    def survived(self) -> bool:
+        """Whether it got to the end."""
+        return not self.failure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class WorkPrecision(Study[WorkPrecisionRun]):
+    """Measured runs of one motion, in the order of the integrators, each from its largest step down.
+
+    Attributes:
+        runs: The runs.
+        duration: Of the motion [s].
+        reference: What errors are measured against, as text.
+        reference_error: Largest distance in q of the reference from the same at a ten times looser tolerance, or under
+            constraints from its repetition by a better method [rad or m]. It is above the reference's own error; errors
+            below it say that, and no more.
+        tip_reference_error: The same of the end effector [m].
+        samples: K: errors are taken at K evenly spaced times, the end being the last.
+    """
+
+    shown: ClassVar = ("integrator", "dt", "seconds", "error", "energy_error")
+
+    duration: float
+    reference: str
+    reference_error: float
+    tip_reference_error: float
+    samples: int
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the table has to know."""
+        return (
+            f"{self.duration:g} s of motion; wall times on one thread",
+            f"errors in q: the largest over joints and {self.samples} instant{'s' * (self.samples > 1)}, against "
+            f"{self.reference}, which is accurate to {self.reference_error:.1e}; smaller ones show as <",
+            "Pareto: no other run has both a smaller time and a smaller error",
+        )
+
+    def note(self, run: WorkPrecisionRun) -> str:
+        """Whether a run is on the front, failed, or has divided steps."""
+        marks = ["failed"] if run.failure else ["Pareto"] if run in self.pareto() else []
+        return "; ".join([*marks, *([f"{run.split_steps} split"] if run.split_steps else [])])
+
+    def row(self, run: WorkPrecisionRun) -> tuple[str, ...]:
+        """A run as entries of the columns that screens show."""
+        texts = dict(zip((*self.shown, "note"), super().row(run), strict=True))
+        if self.at_floor(run) and self.reference_error > 0.0:
+            texts["error"] = f"<{self.reference_error:.3g}"
+        return tuple(texts.values())
+
+    def error_of(self, run: WorkPrecisionRun, quantity: Quantity = "q") -> float:
+        """The error of a run, not below what the reference can tell; energy errors need no reference."""
+        values = {
+            "q": (run.error, self.reference_error),
+            "end": (run.end_error, self.reference_error),
+            "tip": (run.tip_error, self.tip_reference_error),
+            "energy": (run.energy_error, 0.0),
+        }
+        if quantity not in values:
+            raise InputError(f"quantity must be one of {', '.join(values)}, got {quantity!r}")
+        error, floor = values[quantity]
+        return max(error, floor) if math.isfinite(error) else math.nan
+
+    def at_floor(self, run: WorkPrecisionRun) -> bool:
+        """Whether the error of a run in q is too small for the reference to tell."""
+        return run.error <= self.reference_error
+
+    def pareto(self, quantity: Quantity = "q") -> tuple[WorkPrecisionRun, ...]:
+        """The runs than which no other is both faster and more accurate, from the fastest up."""
+        return pareto_front(self.runs, lambda run: run.seconds, lambda run: self.error_of(run, quantity))
+
+
+def work_precision(
+    scene: Scene,
+    q0: JointValues,
+    v0: JointValues,
+    *,
+    duration: float,
+    controls: JointValues | None = None,
+    integrators: Sequence[Integrator] | None = None,
+    dts: Sequence[float] | None = None,
+    reference: Reference | None = None,
+    repeats: int = 3,
+    progress: Progress | None = None,
+    executor: Executor | None = None,
+) -> WorkPrecision:
+    """Measure errors and wall times of integrators over steps, on one motion.
+
+    A run has one thread to itself. A run that fails is in the record with its reason, and the others go on.
+
+    Main args:
+        scene: Without noise.
+        q0: Initial configuration, (n,) or by joint name [rad or m].
+        v0: Initial velocity, (n,) or by joint name [rad/s or m/s].
+        duration: Of the motion [s].
+        controls: None for none, one row (m,), by joint name too, or rows (R, m) that are held over duration / R each.
+        integrators: varpin's own fixed-step ones if left out.
+        dts: Time steps [s], each rounded so that the controls' intervals hold whole numbers of steps.
+
+    Other Args:
+        reference: The reference of the errors; its own error is estimated with another tolerance. Scenes with
+            constraints have ``Gauss(4)``, in steps that are reduced until nothing changes.
+        repeats: Number of repetitions of each run; the fastest counts. Short runs have one more, which is not timed.
+        progress: Called with (runs done, runs in all).
+        executor: Any ``concurrent.futures.Executor`` that takes the runs, one at a time each; they follow each other
+            here if left out. Errors are the same; wall times are those of its workers, and to be trusted where each
+            has a core, and all have the same kind.
+
+    Raises:
+        InputError: Wrong arguments.
+        VarpinError: The reference cannot integrate the motion.
+        StudyInterrupted: Ctrl-C; holds the runs so far. It is a KeyboardInterrupt.
+    """
+    setting = Setting.of(without_geometry(require_scene(scene)), q0, v0, controls, duration)
+    members, repeats = integrators_of(scene, integrators), count("repeats", repeats, least=1)
+    executor = None if executor is None else require_executor(executor)
+    if reference is not None:
+        if not isinstance(reference, Reference):
+            raise InputError(f"reference must be a varpin.Reference, got {reference!r}")
+        refuse_constraints(scene, str(reference), "leave reference= out, for varpin.Gauss(4) in ever smaller steps")
+    elif not scene.constraints:
+        reference = Reference(rtol=1e-13)
+    grids = _grids(setting, dts)
+    jobs = [(member, steps) for member in members for steps in grids]
+    exact = _Exact(setting, reference, _samples(grids, len(setting.controls)))
+    text = f"{_CONSTRAINED} in ever smaller steps" if reference is None else str(reference)
+    base = WorkPrecision((), scene.robot.name, setting.duration, text, exact.error, exact.tip_error, len(exact.q) - 1)
+    measure = partial(_measure, setting, exact, repeats)
+    runs = (measure(job) for job in jobs) if executor is None else in_order(executor, measure, jobs)
+    return collect(base, runs, len(jobs), progress)
+
+
+class _Exact:
+    """The reference's motion at the compared times, and its distance from one less accurate, or more.
+
+    No reference is that of scenes with constraints.
+    """
+
+    def __init__(self, setting: Setting, reference: Reference | None, samples: int) -> None:
+        self.q, other = _constrained(setting, samples) if reference is None else _by(setting, reference, samples)
+        place = setting.scene.robot.frame_positions
+        self.tip = place(self.q)
+        self.error = float(np.abs(self.q - other).max())
+        self.tip_error = _largest(place(other) - self.tip)
+
+
+def _by(setting: Setting, reference: Reference, samples: int) -> tuple[Floats, Floats]:
+    """The motion (K + 1, n) at a tolerance, and at one ten times looser."""
+    looser = Reference(rtol=_LOOSER * reference.rtol, atol=None if reference.atol is None else _LOOSER * reference.atol)
+    # Over short intervals both tolerances may take the same steps and agree, exact or not: halved they do not.
+    tight, loose = setting.run(reference, 2 * samples), setting.run(looser, samples)
+    for outcome in (tight, loose):
+        if outcome.failure:
+            raise VarpinError(f"the reference cannot integrate this motion: {outcome.failure}")
+    return tight.motion.q[::2], loose.motion.q
+
+
+def _constrained(setting: Setting, samples: int) -> tuple[Floats, Floats]:
+    """A motion under constraints (K + 1, n) in steps that leave nothing but rounding, and its repetition."""
+    first = samples * math.ceil(first_steps(setting.scene, setting.q0, setting.v0, setting.duration, 1) / samples)
+    taken = [0]
+
+    def trial(member: Integrator, steps: int) -> Trial:
+        taken.append(steps)
+        return setting.trial(member, steps)
+
+    ladder = Ladder(trial, [_CONSTRAINED], first, samples, lambda: taken[-1] > _MOST)
+    best = ladder.for_tolerance(ROUNDING * max(1.0, float(np.abs(setting.q0).max())))[0][0]
+    if not best.error < SENSIBLE:
+        raise VarpinError("no steps are small enough for a reference of this motion")
+    motion = setting.run(_CONSTRAINED, best.steps).motion
+    stride = best.steps // samples
+    return motion.q[::stride], repeated(setting.scene, _CONSTRAINED, motion)[0][::stride]
+
+
+def _grids(setting: Setting, dts: Sequence[float] | None) -> list[int]:
+    """Numbers of steps, multiples of R, from the fewest up."""
+    rows = len(setting.controls)
+    if dts is None:
+        coarsest = rows * math.ceil(setting.duration / (_COARSEST * rows))
+        return [coarsest * 2**k for k in range(_HALVINGS + 1)]
+    grids = set()
+    for dt in dts:
+        ratio = setting.duration / positive("dts", dt, "s") / rows
+        if ratio < 0.5:
+            raise InputError(f"dts: {dt:g} s is longer than what the controls are held for")
+        grids.add(rows * round(ratio))
+    if not grids:
+        raise InputError("dts must be one step or more")
+    return sorted(grids)
+
+
+def _samples(grids: Sequence[int], rows: int) -> int:
+    """K, the most times up to a limit that all grids and the controls' intervals share."""
+    shared = math.gcd(*grids) // rows
+    most = max(1, _SAMPLES // rows)
+    return rows * max(k for k in range(1, min(shared, most) + 1) if shared % k == 0)
+
+
+def _measure(setting: Setting, exact: _Exact, repeats: int, job: tuple[Integrator, int]) -> WorkPrecisionRun:
+    member, steps = job
+    error = end = tip = energy = seconds = math.nan
+    spread, counts, failure = 0.0, (0, 0, 0, 0), ""
+    # An error of one run, whatever it is, does not stop the others.
+    try:
+        outcome = setting.run(member, steps, repeats=repeats)
+    except Exception as reason:
+        failure = f"{type(reason).__name__}: {reason}"
+    else:
+        failure, counts = outcome.failure, _counts(outcome)
+        if not failure:
+            seconds, spread = outcome.seconds, outcome.spread
+            q = outcome.motion.q[:: steps // (len(exact.q) - 1)]
+            error, end = float(np.abs(q - exact.q).max()), float(np.abs(q[-1] - exact.q[-1]).max())
+            tip = _largest(setting.scene.robot.frame_positions(q) - exact.tip)
+            if setting.conservative:
+                energy = float(np.abs(outcome.motion.energy - outcome.motion.energy[0]).max())
+    return WorkPrecisionRun(
+        str(member), member.order, setting.duration / steps, steps, seconds, spread, error, end, energy, tip, *counts,
+        failure,
+    )  # fmt: skip
+
+
+def _counts(outcome: Outcome) -> tuple[int, int, int, int]:
+    """Newton iterations, jets, sweeps and split steps of a run."""
+    own = outcome.motion.statistics
+    return int(own.newton_iterations.sum()), int(own.jets.sum()), int(own.sweeps.sum()), own.split_steps
+
+
+def _largest(vectors: Floats) -> float:
+    """The length of the longest row."""
+    return float(np.linalg.norm(vectors, axis=1).max())
