@@ -27,20 +27,13 @@ std::vector<double> places_of(const Tableau& tableau, In<2> places) {
     return {places.data(), places.data() + places.size()};
 }
 
-// The stepper with sizes known at compile time, if there is one for the mechanism.
-std::shared_ptr<AnyConstrainedStepper> stepper_of(const Mechanism& mechanism, const Tableau& tableau,
-                                                  const std::vector<double>& places, double tolerance,
-                                                  const Guards& guards) {
-    if (auto small = small_constrained_stepper(mechanism, tableau, places, tolerance, guards)) return small;
-    return std::make_shared<ConstrainedStepper<>>(mechanism, tableau, places, tolerance, guards);
-}
-
-class ConstrainedRollout : public Rollout<AnyConstrainedStepper, ConstrainedState> {
+class ConstrainedRollout : public Rollout<ConstrainedStepper, ConstrainedState> {
   public:
     ConstrainedRollout(const Mechanism& mechanism, const Tableau& tableau, In<2> places, double tolerance,
                        const Guards& guards, std::size_t paths, bool held)
         : Rollout(mechanism, tableau, guards, paths, held,
-                  stepper_of(mechanism, tableau, places_of(tableau, places), tolerance, guards)) {}
+                  std::make_shared<ConstrainedStepper>(mechanism, tableau, places_of(tableau, places), tolerance,
+                                                       guards, kernels_of(mechanism))) {}
 
     ConstrainedRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
@@ -71,7 +64,8 @@ std::tuple<Out, Out, Out, std::int64_t, std::size_t> constrained_derivatives(
     In<2> q, In<2> p, In<3> force, In<2> rates, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp,
     bool external) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    ConstrainedLinearization work(mechanism, tableau, places_of(tableau, places), tolerance, guards);
+    ConstrainedLinearization work(mechanism, tableau, places_of(tableau, places), tolerance, guards,
+                                  kernels_of(mechanism));
     work.varies = at.varies;
     work.ramp = ramp;
     if (external) work.take_external();

@@ -22,7 +22,6 @@
 #include "small_arms.hpp"
 #include "varpin/dense.hpp"
 #include "varpin/jet.hpp"
-#include "varpin/velocity_slopes.hpp"
 
 namespace varpin::border {
 
@@ -363,8 +362,7 @@ Out velocity_slopes_at(const Mechanism& mechanism, In<2> q, In<2> v) {
     double* slopes = nullptr;
     const Out out = array_for(slopes, {rows, n, 2 * n});
     nb::gil_scoped_release release;
-    if (!small_velocity_slopes(mechanism, rows, q.data(), v.data(), slopes))
-        velocity_slopes<int>(mechanism, rows, q.data(), v.data(), slopes);
+    kernels_of(mechanism).velocity_slopes(mechanism, rows, q.data(), v.data(), slopes);
     return out;
 }
 

@@ -12,6 +12,7 @@
 #include "rollout.hpp"
 #include "rollout_arrays.hpp"
 #include "small_arms.hpp"
+#include "varpin/linearization.hpp"
 #include "watched.hpp"
 
 namespace varpin::border {
@@ -42,19 +43,13 @@ Guards guards_of(bool active, double branch_margin, double energy_balance, doubl
     return {active, branch_margin, energy_balance, energy_budget, most_halvings};
 }
 
-// The stepper with sizes known at compile time, if there is one for the mechanism.
-std::shared_ptr<Stepper> stepper_of(const Mechanism& mechanism, const Tableau& tableau, double tolerance,
-                                    const Guards& guards, double left, Solver solver) {
-    if (auto small = small_stepper(mechanism, tableau, tolerance, guards, left, solver)) return small;
-    return std::make_shared<VariationalStepper<>>(mechanism, tableau, tolerance, guards, left, solver);
-}
-
-class VariationalRollout : public Rollout<Stepper, PathState> {
+class VariationalRollout : public Rollout<VariationalStepper, PathState> {
   public:
     VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
                        double left, std::size_t paths, Solver solver, bool held)
         : Rollout(mechanism, tableau, guards, paths, held,
-                  stepper_of(mechanism, tableau, tolerance, guards, left, solver)) {}
+                  std::make_shared<VariationalStepper>(mechanism, tableau, tolerance, guards, left, solver,
+                                                       kernels_of(mechanism))) {}
 
     VariationalRollout fork(const Guards& guards) const { return forked(*this, guards); }
 
@@ -74,16 +69,15 @@ std::tuple<Out, Out, Out, std::int64_t, std::size_t> variational_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double h, In<2> q,
     In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, bool external, Solver solver) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    std::unique_ptr<StepDerivatives> work = small_derivatives(mechanism, tableau, tolerance, guards, solver);
-    if (!work) work = std::make_unique<VariationalLinearization<>>(mechanism, tableau, tolerance, guards, solver);
-    work->varies = at.varies;
-    if (external) work->take_external();
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
+    work.varies = at.varies;
+    if (external) work.take_external();
     double* in_ramps = nullptr;
     const Out R = array_for(in_ramps, {ramp ? at.N : 0, 2 * at.n, at.n});
     const auto [X, F, outcome, done] =
         derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
             double* Jr = ramp ? in_ramps + s * 2 * at.n * at.n : nullptr;
-            return work->first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf, at.past(s), Jr);
+            return work.first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf, at.past(s), Jr);
         });
     return {X, F, R, outcome, done};
 }
@@ -99,7 +93,7 @@ std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanis
     require(z, "z", {N, 2 * n});
     double* H = nullptr;
     const Out curvatures = array_for(H, {N, 3 * n, 3 * n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
     work.varies = at.varies;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.second(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
@@ -120,7 +114,7 @@ std::tuple<Out, std::int64_t, std::size_t> variational_bends(const Mechanism& me
     require(weights, "weights", {N, 2 * n, 3 * n});
     double* slopes = nullptr;
     const Out found = array_for(slopes, {N, 3 * n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
     work.varies = at.varies;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.bend(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
@@ -138,7 +132,7 @@ std::tuple<Out, Out, std::int64_t, std::size_t> variational_ends(const Mechanism
     const std::size_t N = at.N, n = at.n;
     double *q1 = nullptr, *v1 = nullptr;
     const Out Q = array_for(q1, {N, n}), V = array_for(v1, {N, n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver);
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
     work.varies = at.varies;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.end(h, at.q(s), at.p(s), at.force(s), at.halvings(s), q1 + s * n, v1 + s * n);

@@ -18,13 +18,13 @@
 #include <cstdint>
 #include <limits>
 #include <optional>
-#include <type_traits>
 #include <vector>
 
 #include "varpin/compensated.hpp"
 #include "varpin/dense.hpp"
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/kernels.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/size.hpp"
 #include "varpin/stage_elimination.hpp"
@@ -58,17 +58,17 @@ struct Start {
     const double* force_at(int stage) const { return force + stage * stride; }
 };
 
-// The step equation: (D3) with the forces (D4), the paper's (1.8) and (1.9). Numbers of joints and stages may be known
-// at compile time.
-template <class Size = int, class Stages = int>
+// The step equation: (D3) with the forces (D4), the paper's (1.8) and (1.9).
 class Collocation {
   public:
-    Collocation(const Mechanism& mechanism, const Tableau& tableau, Solver solver)
+    Collocation(const Mechanism& mechanism, const Tableau& tableau, Solver solver,
+                const Kernels& kernels = kernels_for<>)
         : mechanism(mechanism),
           tableau(tableau),
+          kernels(kernels),
           n(mechanism.dof()),
           stages(tableau.stages),
-          stage(stages, Jet<double, Size>(mechanism.tree, false)),
+          stage(stages, Jet<double>(mechanism.tree, false)),
           V(stages * n),
           Q(stages * n),
           slope(stages * n),
@@ -78,13 +78,13 @@ class Collocation {
           residual(stages * n),
           delta(stages * n),
           next(stages * n) {
-        for (Jet<double, Size>& jet : stage) mechanism.couplings.fit(jet.couplings);
+        for (Jet<double>& jet : stage) mechanism.couplings.fit(jet.couplings);
         measure_turning();
         if (mechanism.couplings.pushes()) {
             coupled_q.resize(entries(stages * n, n));
             coupled_v.resize(stages * n * n);
         }
-        if (known || stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
+        if (stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
             allocate();
             return;
         }
@@ -100,13 +100,12 @@ class Collocation {
             eliminated_columns = eliminated_columns || block.end - block.begin >= few_columns;
     }
 
-    static constexpr bool known = !std::is_same_v<Size, int>;
-
     const Mechanism& mechanism;
     const Tableau& tableau;
-    [[no_unique_address]] Size n;
-    [[no_unique_address]] Stages stages;
-    std::vector<Jet<double, Size>> stage;    // without matrices if there is an elimination
+    const Kernels& kernels;
+    int n;
+    int stages;
+    std::vector<Jet<double>> stage;          // without matrices if there is an elimination
     std::optional<Elimination> elimination;  // at the iterate of the last factors; for one stage without ties
     std::optional<StageElimination> stage_elimination;
     std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
@@ -157,7 +156,7 @@ class Collocation {
         return outcome;
     }
 
-    bool eliminated() const { return !known && (elimination || stage_elimination); }
+    bool eliminated() const { return elimination || stage_elimination; }
 
     // Factor N from the stages' jets; false where its determinant is not positive.
     bool factor(double h) {
@@ -196,17 +195,13 @@ class Collocation {
 
     // `factor` for the matrices in the stages' jets.
     bool factor_blocks(double h) {
+        if (stages == 1) return kernels.factor(*this, h);
         double* matrix = lu.data();
         int* rows = order.data();
         for (const Block& block : blocks_of(mechanism.tree, n)) {
             const int size = stages * (block.end - block.begin);
             assemble(h, block, matrix);
-            if (stages == 1) {
-                // On the desired branch, the symmetric part is positive definite.
-                if (!factor_lu(matrix, size, {0, size})) return false;
-            } else if (factor_lu_pivoting(matrix, size, rows) <= 0) {
-                return false;
-            }
+            if (factor_lu_pivoting(matrix, size, rows) <= 0) return false;
             matrix += size * size;
             rows += size;
         }
@@ -217,6 +212,14 @@ class Collocation {
     // (2n, 2n), Jf (2n, n). Only blocks of dV are written.
     void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
         if (eliminated_columns) return eliminate_derivatives(h, dV, Jx, Jf);
+        if (stages == 1) return kernels.derivatives(*this, h, dV, Jx, Jf);
+        derivatives(n, stages, h, dV, Jx, Jf);
+    }
+
+    // The same by blocks, without elimination. Numbers of joints and stages may be known at compile time, here and in
+    // the three parts of it.
+    template <class Size, class Stages>
+    void derivatives(Size n, Stages stages, double h, std::vector<double>& dV, double* Jx, double* Jf) {
         const auto& blocks = blocks_of(mechanism.tree, n);
         if (blocks.size() > 1) {
             std::fill(Jx, Jx + 4 * n * n, 0.0);
@@ -227,9 +230,9 @@ class Collocation {
         const int* rows = order.data();
         for (const Block& block : blocks) {
             const int width = block.end - block.begin, size = stages * width;
-            right_sides(h, block, dV);
-            solve_columns(h, matrix, rows, block, dV);
-            end_derivatives(h, block, dV, Jx, Jf);
+            right_sides(n, stages, h, block, dV);
+            solve_columns(n, stages, h, matrix, rows, block, dV);
+            end_derivatives(n, stages, h, block, dV, Jx, Jf);
             matrix += size * size;
             rows += size;
         }
@@ -238,12 +241,9 @@ class Collocation {
     // x with N x = right (s, n), from the factors of `factor`.
     void solve_factored(const double* right, double* x) {
         if (eliminated()) return elimination ? elimination->solve(right, x) : stage_elimination->solve(right, x);
-        solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
-            if (stages == 1) {
-                solve_lu(matrix, size, {0, size}, b, y);
-            } else {
-                solve_lu_pivoting(matrix, size, rows, b, y);
-            }
+        if (stages == 1) return kernels.solve(*this, right, x);
+        solve_blocks(right, x, [](const double* matrix, int size, const int* rows, double* b, double* y) {
+            solve_lu_pivoting(matrix, size, rows, b, y);
         });
     }
 
@@ -264,7 +264,8 @@ class Collocation {
     double by_momentum(double h, int c) const { return h * (weight[0] * tableau.force[0] + changed(0, c)); }
 
   private:
-    template <class, class>
+    template <class>
+    friend struct Sized;
     friend class ConstrainedStepper;  // adds rows and columns of constraints to the matrix
 
     template <class Solve>
@@ -428,7 +429,7 @@ class Collocation {
             size = entries(1, std::int64_t{size} + entries(unknowns, unknowns));
             largest = std::max(largest, unknowns);
         }
-        for (Jet<double, Size>& jet : stage) jet.allocate();
+        for (Jet<double>& jet : stage) jet.allocate();
         lu.resize(size);
         order.resize(stages * n);
         change.resize(stages * largest);
@@ -438,15 +439,13 @@ class Collocation {
     // Compute the matrices of the jets at an iterate of elimination, which does not need them.
     void write_jets() {
         if (lu.empty()) allocate();
-        for (int i = 0; i < stages; ++i) lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
+        for (int i = 0; i < stages; ++i) kernels.jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
         take_over();
     }
 
     void take_over() {
-        if constexpr (!known) {
-            if (elimination) elimination->take(stage[0]);
-            for (int i = 0; i < stages && stage_elimination; ++i) stage_elimination->take(i, stage[i]);
-        }
+        if (elimination) elimination->take(stage[0]);
+        for (int i = 0; i < stages && stage_elimination; ++i) stage_elimination->take(i, stage[i]);
     }
 
     [[gnu::always_inline]] inline void move_stages(const int stages, double h, const Start& start) {
@@ -463,9 +462,9 @@ class Collocation {
         stages == 1 ? move_stages(1, h, start) : move_stages(stages, h, start);
         for (int i = 0; i < stages; ++i) {
             if (second && !eliminated()) {
-                lagrangian_jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
+                kernels.jet(mechanism, &Q[i * n], &V[i * n], stage[i]);
             } else {
-                first_order(mechanism, &Q[i * n], &V[i * n], stage[i]);
+                kernels.first_order(mechanism, &Q[i * n], &V[i * n], stage[i]);
             }
         }
         if (second) take_over();
@@ -529,12 +528,13 @@ class Collocation {
 
     // r(V); returns its largest entry in rounding units of its terms.
     double residuals(double h, const Start& start) {
-        return stages == 1 ? residuals_of(1, h, start) : residuals_of(stages, h, start);
+        return stages == 1 ? kernels.residuals(*this, h, start) : residuals_of(n, stages, h, start);
     }
 
     // The discrete Euler-Lagrange residual r_i(V) of each stage, (S1) and (C1), into `residual`; returns the largest in
-    // rounding units. Called with the constant 1 for one stage, so that the compiler removes the loops over stages.
-    [[gnu::always_inline]] inline double residuals_of(const int stages, double h, const Start& start) {
+    // rounding units.
+    template <class Size, class Stages>
+    double residuals_of(Size n, Stages stages, double h, const Start& start) {
         double worst = 0.0;
         for (int i = 0; i < stages; ++i) {
             const double* force = start.force_at(i);
@@ -567,7 +567,7 @@ class Collocation {
 
     // The block (s width, s width) of N, (C3).
     void assemble(double h, Block block, double* matrix) {
-        if (stages == 1) return assemble_one(h, block, matrix);
+        if (stages == 1) return assemble_one(n, h, block, matrix);
         const int width = block.end - block.begin, size = stages * width;
         std::fill(matrix, matrix + size * size, 0.0);
         // Row r of the derivative of slope j in all of V, added to the rows of N in one long loop.
@@ -603,7 +603,8 @@ class Collocation {
     }
 
     // `assemble` for a single stage, without sums over stages.
-    void assemble_one(double h, Block block, double* matrix) const {
+    template <class Size>
+    void assemble_one(Size n, double h, Block block, double* matrix) const {
         const double ahead = h * tableau.a[0], behind = h * tableau.gradient[0];
         const double *M = stage[0].M.data(), *A = stage[0].A.data(), *Lqq = stage[0].Lqq.data();
         const bool elements = mechanism.forces.any();
@@ -635,6 +636,7 @@ class Collocation {
     // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
     double kinetic_size(const double* x) {
         if (eliminated()) return elimination ? elimination->kinetic_size(x) : stage_elimination->kinetic_size(x);
+        if (stages == 1) return kernels.kinetic_size(*this, x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
             for (const Block& block : blocks_of(mechanism.tree, n))
@@ -774,7 +776,8 @@ class Collocation {
     }
 
     // dr_i in (q0, p0, f): h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, and h sum_j f_ij w_j F_f,j.
-    void right_sides(double h, Block block, std::vector<double>& dV) const {
+    template <class Size, class Stages>
+    void right_sides(Size n, Stages stages, double h, Block block, std::vector<double>& dV) const {
         for (int i = 0; i < stages; ++i) {
             double share = 0.0;
             for (int j = 0; j < stages; ++j) share += weight[j] * tableau.force[i * stages + j];
@@ -797,7 +800,9 @@ class Collocation {
     }
 
     // N dV = dr in place, whole rows at a time.
-    void solve_columns(double h, const double* matrix, const int* rows, Block block, std::vector<double>& dV) {
+    template <class Size, class Stages>
+    void solve_columns(Size n, Stages stages, double h, const double* matrix, const int* rows, Block block,
+                       std::vector<double>& dV) {
         const int width = block.end - block.begin, size = stages * width;
         if (stages == 1 && width == n) {
             solve_lu_rows(matrix, n, {0, n}, dV.data(), 2 * n, 3 * n);
@@ -827,7 +832,9 @@ class Collocation {
     // Equations (L1) and (L2) for any number of stages:
     // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h F_f df + h sum_i b_i K_i dq0 + sum_j G_j dV_j, with K = L_qq + F_q
     // and G_j = h b_j (A_j' + F_v,j) + h^2 sum_i b_i a_ij K_i.
-    void end_derivatives(double h, Block block, const std::vector<double>& dV, double* Jx, double* Jf) {
+    template <class Size, class Stages>
+    void end_derivatives(Size n, Stages stages, double h, Block block, const std::vector<double>& dV, double* Jx,
+                         double* Jf) {
         const int width = block.end - block.begin, size = stages * width;
         gain.resize(size);
         const auto curvature = [&](int i, int r, int c) {
@@ -885,5 +892,48 @@ class Collocation {
         }
     }
 };
+
+template <class Size>
+double Sized<Size>::residuals(Collocation& step, double h, const Start& start) {
+    return step.residuals_of(Size(step.n), Known<1>(1), h, start);
+}
+
+// On the desired branch, the symmetric part of N is positive definite.
+template <class Size>
+bool Sized<Size>::factor(Collocation& step, double h) {
+    const Size n = step.n;
+    double* matrix = step.lu.data();
+    for (const Block& block : blocks_of(step.mechanism.tree, n)) {
+        const int width = block.end - block.begin;
+        step.assemble_one(n, h, block, matrix);
+        if (!factor_lu(matrix, width, {0, width})) return false;
+        matrix += width * width;
+    }
+    return true;
+}
+
+template <class Size>
+void Sized<Size>::solve(const Collocation& step, const double* right, double* x) {
+    const double* matrix = step.lu.data();
+    for (const Block& block : blocks_of(step.mechanism.tree, Size(step.n))) {
+        const int width = block.end - block.begin;
+        solve_lu(matrix, width, {0, width}, right + block.begin, x + block.begin);
+        matrix += width * width;
+    }
+}
+
+template <class Size>
+double Sized<Size>::kinetic_size(const Collocation& step, const double* x) {
+    const Size n = step.n;
+    double total = 0.0;
+    for (const Block& block : blocks_of(step.mechanism.tree, n))
+        total += step.tableau.b[0] * quadratic_form(step.stage[0].M.data(), n, block, x);
+    return total;
+}
+
+template <class Size>
+void Sized<Size>::derivatives(Collocation& step, double h, std::vector<double>& dV, double* Jx, double* Jf) {
+    step.derivatives(Size(step.n), Known<1>(1), h, dV, Jx, Jf);
+}
 
 }  // namespace varpin

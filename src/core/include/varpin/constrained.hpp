@@ -74,37 +74,18 @@ struct ConstrainedState {
     std::vector<double> impulses;      // (steps, m) impulses of the last roll
 };
 
-// A stepper under constraints for any number of joints and stages.
-class AnyConstrainedStepper {
-  public:
-    explicit AnyConstrainedStepper(const Guards& guards) : guards(guards) {}
-    AnyConstrainedStepper(const AnyConstrainedStepper&) = delete;
-    AnyConstrainedStepper& operator=(const AnyConstrainedStepper&) = delete;
-    virtual ~AnyConstrainedStepper() = default;
-
-    Guards guards;
-    bool held = false;  // whether the noise of a step is a force that is constant over it, instead of an impulse
-
-    virtual bool begin(const double* q, const double* v, ConstrainedState& state) = 0;
-    virtual bool look_at(ConstrainedState& state) = 0;
-    virtual void kick(const double* push, ConstrainedState& state) = 0;
-    virtual void roll(double h, const Commands& commands, const double* increments, const double* drift,
-                      const double* impulses, std::vector<ConstrainedState>& states, const Nodes& nodes) = 0;
-};
-
-// Steps that make the action (H1) stationary. Numbers of joints and stages may be known at compile time.
-template <class Size = int, class Stages = int>
-class ConstrainedStepper final : public AnyConstrainedStepper {
+// Steps that make the action (H1) stationary.
+class ConstrainedStepper {
   public:
     // `places` is t_kj (s + 1, s).
     ConstrainedStepper(const Mechanism& mechanism, const Tableau& tableau, const std::vector<double>& places,
-                       double tolerance, const Guards& guards)
-        : AnyConstrainedStepper(guards),
+                       double tolerance, const Guards& guards, const Kernels& kernels = kernels_for<>)
+        : guards(guards),
           mechanism(mechanism),
           tableau(tableau),
           tolerance(tolerance),
-          equation(mechanism, this->tableau, Solver::dense),
-          energy_guard(mechanism, Solver::dense, true),
+          equation(mechanism, this->tableau, Solver::dense, kernels),
+          energy_guard(mechanism, Solver::dense, true, kernels),
           n(mechanism.dof()),
           m(mechanism.constraints.rows()),
           stages(tableau.stages),
@@ -146,15 +127,19 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
         curved_paths = std::any_of(driven.begin(), driven.end(), [](const DrivenRow& own) { return own.rate >= 0; });
         if (curved_paths) from_q.resize(n), from_v.resize(n);
     }
+    ConstrainedStepper(const ConstrainedStepper&) = delete;
+    ConstrainedStepper& operator=(const ConstrainedStepper&) = delete;
 
+    Guards guards;
+    bool held = false;  // whether the noise of a step is a force that is constant over it, instead of an impulse
     const Mechanism& mechanism;
     const Tableau tableau;
     double tolerance;
-    Collocation<Size, Stages> equation;
-    EnergyGuard<Size> energy_guard;
-    [[no_unique_address]] Size n;
+    Collocation equation;
+    EnergyGuard energy_guard;
+    int n;
     int m;
-    [[no_unique_address]] Stages stages;
+    int stages;
     std::vector<double> force;           // (n) constant over the step; (s, n) at its stages, or those of a part of it
     int stride = 0;                      // from one row of `force` to the next
     const double* outer = nullptr;       // (n) external force, null for none
@@ -190,15 +175,15 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     }
 
     // Set a path's state to (q, v).
-    bool begin(const double* q, const double* v, ConstrainedState& state) override {
-        Jet<double, Size>& jet = equation.stage[0];
-        first_order(mechanism, q, v, jet);
+    bool begin(const double* q, const double* v, ConstrainedState& state) {
+        Jet<double>& jet = equation.stage[0];
+        equation.kernels.first_order(mechanism, q, v, jet);
         const std::vector<double> p = jet.Lv;
         return begin_at(q, p.data(), state);
     }
 
     // The constraints and the factors of M at a path's node.
-    bool look_at(ConstrainedState& state) override {
+    bool look_at(ConstrainedState& state) {
         for (int i = 0; i < n; ++i) unit[i] = state.path.position[i].value.high;
         if (!find_basis(unit.data(), state.rank, here)) return false;
         energy_guard.velocity(state.path.momentum.data(), state.path.v.data());
@@ -206,7 +191,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     }
 
     // Add an impulse (n) to the momentum; constraints absorb its normal part.
-    void kick(const double* push, ConstrainedState& state) override {
+    void kick(const double* push, ConstrainedState& state) {
         PathState& path = state.path;
         for (int i = 0; i < n; ++i) {
             path.p[i] = path.p[i].plus(push[i]);
@@ -223,7 +208,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     // Take the force (n) of a step, constant over it, or (s, n) at its stages if it `varies`. The entry of a driven
     // joint is its goal, at all stages.
     void take_force(const double* own, bool varies) {
-        stride = varies ? static_cast<int>(n) : 0;
+        stride = varies ? n : 0;
         std::copy(own, own + n, force.begin());
         take_goals();
         if (varies) take_stages(own);
@@ -283,7 +268,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
 
     // As of VariationalStepper; `impulses` (P, N, 2, n) are held over the step, as the noise is.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
-              std::vector<ConstrainedState>& states, const Nodes& nodes) override {
+              std::vector<ConstrainedState>& states, const Nodes& nodes) {
         const std::int64_t steps = nodes.steps;
         const int controls = mechanism.controls;
         const std::int64_t width = increments_of_step(mechanism, commands);
@@ -315,7 +300,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
                     held_noise(mechanism, h, row_of(drift, row, n), row_of(impulses, row, 2 * n), path.q.data(),
                                path.center.data(), felt, held ? dw : nullptr, extras.data());
                 outer = extra.external;
-                stride = within ? static_cast<int>(n) : 0;
+                stride = within ? n : 0;
                 constant_force(mechanism, extra.driven, u + s * controls, force.data());
                 take_goals();
                 if (within) {
@@ -458,7 +443,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     void state_columns(double h) {
         const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
         dV.resize(entries(wide, w));
-        equation.right_sides(h, {0, n}, dV);
+        equation.right_sides(n, stages, h, {0, n}, dV);
         for (int row = 0; equation.kinds() == 2 && row < n; ++row) {
             for (int c = 0; c < n; ++c) dV[row * w + 2 * n + c] = equation.by_momentum(h, c) * dV[row * w + n + c];
         }
@@ -510,7 +495,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
     // from the momentum: v = M^-1 p, M dv = dp - L_vq dq.
     void join_rates(double* Jx, double* Jr) {
         const std::vector<DrivenRow>& driven = mechanism.constraints.driven();
-        lagrangian_jet(mechanism, from_q.data(), from_v.data(), equation.stage[0]);
+        equation.kernels.jet(mechanism, from_q.data(), from_v.data(), equation.stage[0]);
         for (std::size_t d = 0; d < driven.size(); ++d) {
             const double *at_begin = by_rates[0].data() + 4 * n * n, *at_end = by_rates[1].data() + 4 * n * n;
             for (int i = 0; i < 2 * n; ++i)
@@ -543,7 +528,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
         for (int i = 0; i < wide; ++i) {
             for (int c = 0; c < w; ++c) dV[i * w + c] = scaled[i % n] * sorted[i * w + c];
         }
-        equation.end_derivatives(h, {0, n}, dV, Jx, Jf);
+        equation.end_derivatives(n, stages, h, {0, n}, dV, Jx, Jf);
         // The impulses up to the last one contribute C_k' dLam_k + Lam_k . g_qq dQ~_k.
         std::vector<double> dQ(n);
         for (int c = 0; c < w; ++c) {
@@ -575,8 +560,8 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
         const auto end = [&](int row, int c) -> double& { return entry(Jx, Jf, row, c); };
         const int r = here.rank();
         for (int i = 0; i < n; ++i) unit[i] = path.position[i].value.high;
-        Jet<double, Size>& jet = equation.stage[0];
-        lagrangian_jet(mechanism, unit.data(), path.v.data(), jet);
+        Jet<double>& jet = equation.stage[0];
+        equation.kernels.jet(mechanism, unit.data(), path.v.data(), jet);
         std::vector<double> bend(m * n), curvature(n * n), z(n), along(r), dq(n), turned(n);
         mechanism.constraints.bend(path.v.data(), here.jet, bend.data());
         mechanism.constraints.add_curvature(last.data(), 1.0, here.jet, curvature.data());
@@ -673,7 +658,7 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
         basis.Q.clear();
         basis.least = 1.0;
         basis.weakest = 0;
-        const int most = rank < 0 ? std::min<int>(m, n) : rank;
+        const int most = rank < 0 ? std::min(m, n) : rank;
         for (int k = 0; k <= most && k < m; ++k) {
             const auto [best, farthest] = farthest_row(basis);
             if (k == most) return farthest;
@@ -1359,8 +1344,8 @@ class ConstrainedStepper final : public AnyConstrainedStepper {
 class ConstrainedLinearization {
   public:
     ConstrainedLinearization(const Mechanism& mechanism, const Tableau& tableau, const std::vector<double>& places,
-                             double tolerance, const Guards& guards)
-        : stepper(mechanism, tableau, places, tolerance, guards),
+                             double tolerance, const Guards& guards, const Kernels& kernels = kernels_for<>)
+        : stepper(mechanism, tableau, places, tolerance, guards, kernels),
           n(mechanism.dof()),
           state(mechanism, tableau.stages),
           chained(n, static_cast<int>(mechanism.constraints.driven().size())) {}
@@ -1399,7 +1384,7 @@ class ConstrainedLinearization {
     void take_external() { stepper.equation.by_external = true; }
 
   private:
-    ConstrainedStepper<> stepper;
+    ConstrainedStepper stepper;
     int n;
     ConstrainedState state;
     ChainedDerivatives chained;

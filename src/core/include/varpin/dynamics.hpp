@@ -134,7 +134,7 @@ class ForwardDynamics {
                 momentum_[c] += link.ratio * dot(jet_.body[j].axis, jet_.body[j].momentum);
                 if (link.parent >= 0) jet_.body[link.parent].momentum += jet_.body[j].momentum;
             } else {
-                body_[j].mass = detail::project_mass(tree, j, jet_);
+                body_[j].mass = detail::project_mass(tree, j, jet_.dof, jet_);
             }
             bias_[link.coordinate] += link.ratio * dot(jet_.body[j].axis, body_[j].force);
             if (link.parent >= 0) {

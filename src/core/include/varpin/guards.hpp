@@ -16,7 +16,6 @@
 #include <algorithm>
 #include <cmath>
 #include <optional>
-#include <type_traits>
 #include <vector>
 
 #include "varpin/collocation.hpp"
@@ -24,6 +23,7 @@
 #include "varpin/dense.hpp"
 #include "varpin/elimination.hpp"
 #include "varpin/jet.hpp"
+#include "varpin/kernels.hpp"
 
 namespace varpin {
 
@@ -100,11 +100,11 @@ struct Trial {
     std::vector<double> magnitude;     // (n) sum of |work| of all terms of the force on each coordinate [J]
 };
 
-template <class Size = int>
 class EnergyGuard {
   public:
-    EnergyGuard(const Mechanism& mechanism, Solver solver, bool matrices)
+    EnergyGuard(const Mechanism& mechanism, Solver solver, bool matrices, const Kernels& kernels = kernels_for<>)
         : mechanism(mechanism),
+          kernels(kernels),
           n(mechanism.dof()),
           jet(mechanism.tree, false),
           kinetic(mechanism.tree.groups),
@@ -116,7 +116,7 @@ class EnergyGuard {
           diagonal(n),
           part(Energies(mechanism.tree).part) {
         mechanism.couplings.fit(jet.couplings);
-        if (!known && eliminates(mechanism.tree, solver)) {
+        if (eliminates(mechanism.tree, solver)) {
             articulated.emplace(mechanism.tree);
         } else {
             jet.M.resize(entries(n, n));
@@ -131,54 +131,30 @@ class EnergyGuard {
     // v = M(q)^-1 p at a node, and the kinetic and potential energy there; false where M is not positive definite.
     // Leaves the factors of M.
     bool node(const double* q, const double* p, double* v) {
-        if constexpr (!known) {
-            if (articulated) {
-                if (!articulated->at(mechanism, q, jet)) return false;
-                velocity(p, v);
-                return true;
-            }
-        }
-        if (!factor(q)) return false;
+        if (!(articulated ? articulated->at(mechanism, q, jet) : factor(q))) return false;
         velocity(p, v);
         return true;
     }
 
     // Energies and the factors L D L' of M at q, in the lower triangles of blocks, if bodies are not articulated.
-    bool factor(const double* q) {
-        mass_matrix(mechanism, q, jet);
-        for (const Block& block : blocks_of(mechanism.tree, n)) {
-            for (int i = block.begin; i < block.end; ++i)
-                std::copy(&jet.M[i * n + block.begin], &jet.M[i * n + i] + 1, &ldl[i * n + block.begin]);
-            if (!factor_ldl(ldl.data(), n, block)) return false;
-        }
-        return true;
-    }
+    bool factor(const double* q) { return kernels.factor_mass(*this, q); }
     const std::vector<double>& factors() const { return ldl; }
 
     // v = M^-1 p from the factors of `node`. The shares of the coordinates are the terms of the kinetic energy
     // 1/2 y' D^-1 y with L y = p, which are not negative.
     void velocity(const double* p, double* v) {
         std::fill(kinetic.begin(), kinetic.end(), 0.0);
-        if (!known && articulated) {
+        if (articulated) {
             articulated->solve(p, v, share.data());
-            for (int i = 0; i < n; ++i) kinetic[mechanism.tree.group[i]] += share[i];
-            return;
+        } else {
+            kernels.velocity(*this, p, v);
         }
-        for (const Block& block : blocks_of(mechanism.tree, n)) {
-            solve_lower(ldl.data(), n, block, p, v);
-            for (int i = block.begin; i < block.end; ++i) {
-                const double y = v[i];
-                v[i] /= ldl[i * n + i];
-                share[i] = 0.5 * v[i] * y;
-                kinetic[mechanism.tree.group[i]] += share[i];
-            }
-            solve_upper(ldl.data(), n, block, v);
-        }
+        for (int i = 0; i < n; ++i) kinetic[mechanism.tree.group[i]] += share[i];
     }
 
     // x = M^-1 b.
     void solve(const double* b, double* x) {
-        if (!known && articulated) return articulated->solve(b, x, nullptr);
+        if (articulated) return articulated->solve(b, x, nullptr);
         for (const Block& block : blocks_of(mechanism.tree, n)) solve_ldl(ldl.data(), n, block, b, x);
     }
 
@@ -213,8 +189,7 @@ class EnergyGuard {
     // The distance of the root from the fold where branches of solutions meet, (G1): 1 as h -> 0, <= 0 for a refused
     // root. It is the smallest ratio of a pivot of M - (h/2) dF/dv + h skew (A + A') - h^2 reach (L_qq + dF/dq) / (1 -
     // margin) to the same pivot of M, all averaged over the stages with b.
-    template <class Stages>
-    double branch_margin(double h, const Guards& guards, Collocation<Size, Stages>& step) {
+    double branch_margin(double h, const Guards& guards, Collocation& step) {
         const Tableau& tableau = step.tableau;
         const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
         if (step.eliminated()) {
@@ -224,31 +199,8 @@ class EnergyGuard {
             if (step.elimination) return step.elimination->least_pivot_ratio(coupling, exaggerated, diagonal.data());
             return step.stage_elimination->least_pivot_ratio(coupling, exaggerated, diagonal.data());
         }
-        double least = infinity;
-        for (const Block& block : blocks_of(mechanism.tree, n)) {
-            for (int i = block.begin; i < block.end; ++i) {
-                double *inertia = &mass[i * n], *line = &curved[i * n];
-                std::fill(inertia + block.begin, inertia + i + 1, 0.0);
-                for (int s = 0; s < step.stages; ++s)
-                    detail::subtract_scaled(inertia, -tableau.b[s], &step.stage[s].M[i * n], block.begin, i + 1);
-                std::copy(inertia + block.begin, inertia + i + 1, line + block.begin);
-                for (int s = 0; s < step.stages; ++s) {
-                    const Jet<double, Size>& jet_here = step.stage[s];
-                    detail::subtract_scaled(line, exaggerated * tableau.b[s], &jet_here.Lqq[i * n], block.begin, i + 1);
-                    if (tableau.skew == 0.0) continue;
-                    const double twist = h * tableau.skew * tableau.b[s];
-                    for (int j = block.begin; j <= i; ++j)
-                        line[j] += twist * (jet_here.A[i * n + j] + jet_here.A[j * n + i]);
-                }
-                if (step.coupled()) {
-                    for (int j = block.begin; j <= i; ++j)
-                        line[j] += step.coupled_stiffening(i, j, 0.5 * h, exaggerated);
-                }
-                line[i] += step.stiffening(i, 0.5 * h, exaggerated);
-            }
-            least = std::min(least, least_pivot_ratio(curved.data(), mass.data(), n, block));
-        }
-        return least;
+        if (step.stages == 1) return kernels.branch_margin(*this, h, guards, step);
+        return branch_margin_of(n, step.stages, h, guards, step);
     }
 
     // Velocity and energy at the end of a substep, and whether its energy balance closes; if so, updates the ledgers.
@@ -297,7 +249,8 @@ class EnergyGuard {
     }
 
   private:
-    static constexpr bool known = !std::is_same_v<Size, int>;
+    template <class>
+    friend struct Sized;
     static constexpr double fade = 1.0 / 256.0;     // decay per substep of the recorded variation of kinetic energies
     static constexpr double rounding = 1e-12;       // relative to the magnitudes of the terms of an energy or a work
     static constexpr double part_factor = 4.0;      // for light parts, because of the error of the trapezoidal rule
@@ -319,8 +272,9 @@ class EnergyGuard {
     };
 
     const Mechanism& mechanism;
-    [[no_unique_address]] Size n;
-    Jet<double, Size> jet;
+    const Kernels& kernels;
+    int n;
+    Jet<double> jet;
     std::optional<ArticulatedBodies> articulated;
     std::vector<double> ldl;                // (n, n) factors of M, unless bodies are articulated
     std::vector<double> kinetic, turnover;  // of each group [J]
@@ -330,6 +284,38 @@ class EnergyGuard {
     std::vector<double> diagonal;           // (n) of the branch guard
     std::vector<double> curved, mass;  // (n, n) of the branch guard, unless the step equation is solved by elimination
     std::vector<PartLedger> part;      // at the trial node
+
+    // branch_margin from the matrices of the stages' jets.
+    template <class Size, class Stages>
+    double branch_margin_of(Size n, Stages stages, double h, const Guards& guards, const Collocation& step) {
+        const Tableau& tableau = step.tableau;
+        const double exaggerated = h * h * tableau.reach / (1.0 - guards.branch_margin);
+        double least = infinity;
+        for (const Block& block : blocks_of(mechanism.tree, n)) {
+            for (int i = block.begin; i < block.end; ++i) {
+                double *inertia = &mass[i * n], *line = &curved[i * n];
+                std::fill(inertia + block.begin, inertia + i + 1, 0.0);
+                for (int s = 0; s < stages; ++s)
+                    detail::subtract_scaled(inertia, -tableau.b[s], &step.stage[s].M[i * n], block.begin, i + 1);
+                std::copy(inertia + block.begin, inertia + i + 1, line + block.begin);
+                for (int s = 0; s < stages; ++s) {
+                    const Jet<double>& jet_here = step.stage[s];
+                    detail::subtract_scaled(line, exaggerated * tableau.b[s], &jet_here.Lqq[i * n], block.begin, i + 1);
+                    if (tableau.skew == 0.0) continue;
+                    const double twist = h * tableau.skew * tableau.b[s];
+                    for (int j = block.begin; j <= i; ++j)
+                        line[j] += twist * (jet_here.A[i * n + j] + jet_here.A[j * n + i]);
+                }
+                if (step.coupled()) {
+                    for (int j = block.begin; j <= i; ++j)
+                        line[j] += step.coupled_stiffening(i, j, 0.5 * h, exaggerated);
+                }
+                line[i] += step.stiffening(i, 0.5 * h, exaggerated);
+            }
+            least = std::min(least, least_pivot_ratio(curved.data(), mass.data(), n, block));
+        }
+        return least;
+    }
 
     // The kinetic energy that a coordinate turns over: the recent variation of its share. The share itself would permit
     // any error of what a heavy, evenly turning wheel carries.
@@ -392,7 +378,7 @@ class EnergyGuard {
         const Tree& tree = mechanism.tree;
         const Vec3<double>& g = mechanism.gravity;
         const double strength = detail::norm1(g);
-        first_order(mechanism, q, v, jet);
+        kernels.first_order(mechanism, q, v, jet);
         for (std::size_t r = 0; r < part.size(); ++r) {
             const LightPart& light = tree.light_parts[r];
             PartLedger& ledger = part[r];
@@ -483,5 +469,39 @@ class EnergyGuard {
                part_factor * most + rounding * (old.scale + ledger.scale + exchanged + magnitude) + nothing;
     }
 };
+
+template <class Size>
+double Sized<Size>::branch_margin(EnergyGuard& guard, double h, const Guards& guards, const Collocation& step) {
+    return guard.branch_margin_of(Size(guard.n), Known<1>(1), h, guards, step);
+}
+
+template <class Size>
+bool Sized<Size>::factor_mass(EnergyGuard& guard, const double* q) {
+    const Size n = guard.n;
+    const Mechanism& mechanism = guard.mechanism;
+    double *M = guard.jet.M.data(), *ldl = guard.ldl.data();
+    mass_matrix<Size>(mechanism, q, guard.jet);
+    for (const Block& block : blocks_of(mechanism.tree, n)) {
+        for (int i = block.begin; i < block.end; ++i)
+            std::copy(M + i * n + block.begin, M + i * n + i + 1, ldl + i * n + block.begin);
+        if (!factor_ldl(ldl, n, block)) return false;
+    }
+    return true;
+}
+
+template <class Size>
+void Sized<Size>::velocity(EnergyGuard& guard, const double* p, double* v) {
+    const Size n = guard.n;
+    const double* ldl = guard.ldl.data();
+    for (const Block& block : blocks_of(guard.mechanism.tree, n)) {
+        solve_lower(ldl, n, block, p, v);
+        for (int i = block.begin; i < block.end; ++i) {
+            const double y = v[i];
+            v[i] /= ldl[i * n + i];
+            guard.share[i] = 0.5 * v[i] * y;
+        }
+        solve_upper(ldl, n, block, v);
+    }
+}
 
 }  // namespace varpin

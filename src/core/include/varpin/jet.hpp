@@ -74,7 +74,7 @@ struct AxisAndRate<double> {
 };
 
 // Work arrays and results of a sweep; matrices are (n, n), row-major.
-template <class T, class Size = int>
+template <class T>
 struct Jet {
     // Only steps need the rounding errors of L_q, L_v and the potential.
     static constexpr bool scaled = std::is_same_v<T, double>;
@@ -109,7 +109,7 @@ struct Jet {
     }
 
     std::vector<BodyState> body;
-    [[no_unique_address]] Size dof;
+    int dof;
     T kinetic{};               // [J]
     std::vector<T> potential;  // of each group [J]
     std::vector<T> Lq, Lv, M, A, Lqq;
@@ -132,8 +132,8 @@ double norm1(const Vec3<T>& a) {
 
 // Orientation, position and axis of a body. Functions that every sweep calls for every body are forced inline, which
 // saves 15 % of a sweep.
-template <class T, class Size>
-[[gnu::always_inline]] inline void place_body(const Tree& tree, int j, const T* q, Jet<T, Size>& w) {
+template <class T>
+[[gnu::always_inline]] inline void place_body(const Tree& tree, int j, const T* q, Jet<T>& w) {
     using elementary::turn;
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
@@ -163,8 +163,8 @@ template <class T, class Size>
 }
 
 // Velocity V of a body and the rate W of its axis.
-template <class T, class Size>
-[[gnu::always_inline]] inline void move(const Tree& tree, int j, const T* v, Jet<T, Size>& w) {
+template <class T>
+[[gnu::always_inline]] inline void move(const Tree& tree, int j, const T* v, Jet<T>& w) {
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
     const T rate = link.ratio * v[link.coordinate];
@@ -179,8 +179,8 @@ template <class T, class Size>
 }
 
 // What a body has by itself for second derivatives: its place, its velocity, and its own inertia and momentum.
-template <class T, class Size>
-[[gnu::always_inline]] inline void enter_body(const Tree& tree, int j, const T* q, const T* v, Jet<T, Size>& w) {
+template <class T>
+[[gnu::always_inline]] inline void enter_body(const Tree& tree, int j, const T* q, const T* v, Jet<T>& w) {
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
     place_body(tree, j, q, w);
@@ -190,8 +190,7 @@ template <class T, class Size>
     here.columns = {here.axis, here.axis_rate};
 }
 
-template <class Size>
-[[gnu::always_inline]] inline void measure(const Tree& tree, int j, const double* v, Jet<double, Size>& w) {
+[[gnu::always_inline]] inline void measure(const Tree& tree, int j, const double* v, Jet<double>& w) {
     const Body& link = tree.bodies[j];
     auto& here = w.body[j];
     const double rate = std::abs(link.ratio * v[link.coordinate]);
@@ -209,8 +208,8 @@ template <class Size>
 }
 
 // Potential energy in gravity of the subtree of an origin: from its moments, and from the position of the origin.
-template <class T, class Size>
-void add_potential(const Mechanism& mechanism, int j, const T* q, Jet<T, Size>& w) {
+template <class T>
+void add_potential(const Mechanism& mechanism, int j, const T* q, Jet<T>& w) {
     const Body& link = mechanism.tree.bodies[j];
     const auto& here = w.body[j];
     Vec3<T> shift{T(link.translation.x), T(link.translation.y), T(link.translation.z)};
@@ -218,15 +217,15 @@ void add_potential(const Mechanism& mechanism, int j, const T* q, Jet<T, Size>& 
     if (link.prismatic) shift += (link.ratio * q[link.coordinate] + link.offset) * here.axis.linear;
     const int group = mechanism.tree.group[link.coordinate];
     w.potential[group] -= dot(here.inertia.mass * shift + here.inertia.moment, mechanism.gravity);
-    if constexpr (Jet<T, Size>::scaled) {
+    if constexpr (Jet<T>::scaled) {
         w.potential_scale[group] +=
             norm1(mechanism.gravity) * (here.inertia.mass * norm1(shift) + norm1(here.inertia.moment));
     }
 }
 
 // Contribution of the subtree of body j to L_q and L_v.
-template <class T, class Size>
-[[gnu::always_inline]] inline void project_first(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
+template <class T>
+[[gnu::always_inline]] inline void project_first(const Mechanism& mechanism, int j, Jet<T>& w) {
     const Body& link = mechanism.tree.bodies[j];
     const auto& here = w.body[j];
     const Vec3<double>& g = mechanism.gravity;
@@ -234,7 +233,7 @@ template <class T, class Size>
     const int c = link.coordinate;
     w.Lv[c] += link.ratio * dot(here.axis, here.momentum);
     w.Lq[c] += link.ratio * (dot(here.axis_rate, here.momentum) + dot(here.axis, weight));
-    if constexpr (Jet<T, Size>::scaled) {
+    if constexpr (Jet<T>::scaled) {
         const Magnitudes& magnitude = here.magnitude;
         const Magnitudes up = link.parent >= 0 ? w.body[link.parent].magnitude : Magnitudes{};
         const double shift = norm1(here.axis.linear), turn = norm1(here.axis.angular);
@@ -249,11 +248,10 @@ template <class T, class Size>
 
 // Contribution of the subtree of body j to M and A, and if `curved` to L_qq.
 template <bool curved, class T, class Size>
-void project_second(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
+void project_second(const Mechanism& mechanism, int j, Size n, Jet<T>& w) {
     const Tree& tree = mechanism.tree;
     const Body& link = tree.bodies[j];
     const auto& here = w.body[j];
-    const Size n = w.dof;
     const int cj = link.coordinate;
     const auto [F, moved] = here.columns.moved(here.inertia);
     const Force<T> B = moved + cross(here.axis, here.momentum);
@@ -282,10 +280,9 @@ void project_second(const Mechanism& mechanism, int j, Jet<T, Size>& w) {
 
 // The share of what body j carries in M alone: the composite rigid body algorithm. Returns F.
 template <class T, class Size>
-Force<T> project_mass(const Tree& tree, int j, Jet<T, Size>& w) {
+Force<T> project_mass(const Tree& tree, int j, Size n, Jet<T>& w) {
     const Body& link = tree.bodies[j];
     const Force<T> F = w.body[j].inertia * w.body[j].axis;
-    const Size n = w.dof;
     const int cj = link.coordinate;
     for (int i = j; i >= 0; i = tree.bodies[i].parent) {
         const Body& above = tree.bodies[i];
@@ -306,11 +303,11 @@ template <class T>
     if (second) up.second += carried.second;
 }
 
-template <class T, class Size>
-[[gnu::always_inline]] inline void pass_momentum(const Body& link, int j, Jet<T, Size>& w) {
+template <class T>
+[[gnu::always_inline]] inline void pass_momentum(const Body& link, int j, Jet<T>& w) {
     auto& up = w.body[link.parent];
     up.momentum += w.body[j].momentum;
-    if constexpr (Jet<T, Size>::scaled) {
+    if constexpr (Jet<T>::scaled) {
         up.magnitude.momentum += w.body[j].magnitude.momentum;
         up.magnitude.spin += w.body[j].magnitude.spin;
         up.magnitude.moment += w.body[j].magnitude.moment;
@@ -318,10 +315,10 @@ template <class T, class Size>
 }
 
 template <class T, class Size>
-void clear_first(Jet<T, Size>& w) {
+void clear_first(Size n, Jet<T>& w) {
     std::fill(w.potential.begin(), w.potential.end(), T{});
     std::fill(w.potential_scale.begin(), w.potential_scale.end(), 0.0);
-    for (int c = 0; c < w.dof; ++c) {
+    for (int c = 0; c < n; ++c) {
         w.Lq[c] = w.Lv[c] = T{};
         w.Lq_scale[c] = w.Lv_scale[c] = 0.0;
     }
@@ -343,17 +340,17 @@ void clear_blocks(const Tree& tree, Size n, std::vector<T>& matrix) {
 
 // Potential energy of the couplings and its derivatives up to an order. Not inlined, since that would slow down sweeps
 // without couplings.
-template <class T, class Size>
-[[gnu::noinline]] void add_couplings(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int order) {
+template <class T>
+[[gnu::noinline]] void add_couplings(const Mechanism& mechanism, const T* q, Jet<T>& w, int order) {
     mechanism.couplings.potentials(q, w.couplings,
                                    [&](const auto& arms, const auto& potential, double scale, double size) {
                                        const int group = mechanism.tree.group[arms.front().coordinate];
                                        w.potential[group] += potential.energy;
-                                       if constexpr (Jet<T, Size>::scaled) w.potential_scale[group] += size;
+                                       if constexpr (Jet<T>::scaled) w.potential_scale[group] += size;
                                        if (order == 0) return;
                                        for (const Arm<T>& arm : arms) {
                                            w.Lq[arm.coordinate] += -dot(potential.slope, arm.linear);
-                                           if constexpr (Jet<T, Size>::scaled)
+                                           if constexpr (Jet<T>::scaled)
                                                w.Lq_scale[arm.coordinate] += scale * norm1(arm.linear);
                                        }
                                        if (order > 1)
@@ -362,14 +359,14 @@ template <class T, class Size>
 }
 
 // Potential energy of the elements and its derivatives up to an order.
-template <class T, class Size>
-void add_elements(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int order) {
+template <class T>
+void add_elements(const Mechanism& mechanism, const T* q, Jet<T>& w, int order) {
     mechanism.forces.potentials(q, [&](int c, const Potential<T>& potential) {
         const int group = mechanism.tree.group[c];
         w.potential[group] += potential.energy;
         if (order > 0) w.Lq[c] += potential.force;
         if (order > 1) w.Lqq[c * w.dof + c] += potential.curvature;
-        if constexpr (Jet<T, Size>::scaled) {
+        if constexpr (Jet<T>::scaled) {
             w.potential_scale[group] += std::abs(potential.energy);
             if (order > 0) w.Lq_scale[c] += potential.scale;
         }
@@ -379,33 +376,34 @@ void add_elements(const Mechanism& mechanism, const T* q, Jet<T, Size>& w, int o
 
 // Momentum of the armature, and the kinetic energy.
 template <class T, class Size>
-void add_armature(const Tree& tree, const T* v, Jet<T, Size>& w) {
+void add_armature(const Tree& tree, const T* v, Size n, Jet<T>& w) {
     w.kinetic = T{};
-    for (int c = 0; c < w.dof; ++c) {
+    for (int c = 0; c < n; ++c) {
         const T momentum = tree.armature[c] * v[c];
         w.Lv[c] += momentum;
-        if constexpr (Jet<T, Size>::scaled) w.Lv_scale[c] += std::abs(momentum);
+        if constexpr (Jet<T>::scaled) w.Lv_scale[c] += std::abs(momentum);
         w.kinetic += 0.5 * (v[c] * w.Lv[c]);
     }
 }
 
 }  // namespace detail
 
-// The whole jet, (J1) and (J2), at (q, v) into w.
-template <class T, class Size>
-void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, Size>& w) {
+// The whole jet, (J1) and (J2), at (q, v) into w. The number of joints may be known at compile time, here and below.
+template <class Size = int, class T>
+void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T>& w) {
     const Tree& tree = mechanism.tree;
-    const int bodies = bodies_of(tree, w.dof);
-    detail::clear_first(w);
-    for (auto* matrix : {&w.M, &w.A, &w.Lqq}) detail::clear_blocks(tree, w.dof, *matrix);
+    const Size n = w.dof;
+    const int bodies = bodies_of(tree, n);
+    detail::clear_first(n, w);
+    for (auto* matrix : {&w.M, &w.A, &w.Lqq}) detail::clear_blocks(tree, n, *matrix);
     for (int j = 0; j < bodies; ++j) {
         detail::enter_body(tree, j, q, v, w);
-        if constexpr (Jet<T, Size>::scaled) detail::measure(tree, j, v, w);
+        if constexpr (Jet<T>::scaled) detail::measure(tree, j, v, w);
     }
     for (int j = bodies - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];
         detail::project_first(mechanism, j, w);
-        detail::project_second<true>(mechanism, j, w);
+        detail::project_second<true>(mechanism, j, n, w);
         if (link.parent >= 0) {
             detail::pass_momentum(link, j, w);
             detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, true);
@@ -413,33 +411,35 @@ void lagrangian_jet(const Mechanism& mechanism, const T* q, const T* v, Jet<T, S
         if (link.origin) detail::add_potential(mechanism, j, q, w);
     }
     detail::add_elements(mechanism, q, w, 2);
-    for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += T(tree.armature[c]);
-    detail::add_armature(tree, v, w);
+    for (int c = 0; c < n; ++c) w.M[c * n + c] += T(tree.armature[c]);
+    detail::add_armature(tree, v, n, w);
 }
 
 // Only M and A at (q, v).
-template <class Size>
-void momentum_slopes(const Mechanism& mechanism, const double* q, const double* v, Jet<double, Size>& w) {
+template <class Size = int>
+void momentum_slopes(const Mechanism& mechanism, const double* q, const double* v, Jet<double>& w) {
     const Tree& tree = mechanism.tree;
-    const int bodies = bodies_of(tree, w.dof);
-    for (auto* matrix : {&w.M, &w.A}) detail::clear_blocks(tree, w.dof, *matrix);
+    const Size n = w.dof;
+    const int bodies = bodies_of(tree, n);
+    for (auto* matrix : {&w.M, &w.A}) detail::clear_blocks(tree, n, *matrix);
     for (int j = 0; j < bodies; ++j) detail::enter_body(tree, j, q, v, w);
     for (int j = bodies - 1; j >= 0; --j) {
         const Body& link = tree.bodies[j];
-        detail::project_second<false>(mechanism, j, w);
+        detail::project_second<false>(mechanism, j, n, w);
         if (link.parent < 0) continue;
         w.body[link.parent].momentum += w.body[j].momentum;
         detail::pass_inertia(link, w.body[j].inertia, w.body[link.parent].inertia, true);
     }
-    for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += tree.armature[c];
+    for (int c = 0; c < n; ++c) w.M[c * n + c] += tree.armature[c];
 }
 
 // Only L_q, L_v and the energies at (q, v). Moments of inertia stay in body axes.
-template <class Size>
-void first_order(const Mechanism& mechanism, const double* q, const double* v, Jet<double, Size>& w) {
+template <class Size = int>
+void first_order(const Mechanism& mechanism, const double* q, const double* v, Jet<double>& w) {
     const Tree& tree = mechanism.tree;
-    const int bodies = bodies_of(tree, w.dof);
-    detail::clear_first(w);
+    const Size n = w.dof;
+    const int bodies = bodies_of(tree, n);
+    detail::clear_first(n, w);
     for (int j = 0; j < bodies; ++j) {
         const Body& link = tree.bodies[j];
         auto& here = w.body[j];
@@ -464,16 +464,16 @@ void first_order(const Mechanism& mechanism, const double* q, const double* v, J
         if (link.origin) detail::add_potential(mechanism, j, q, w);
     }
     detail::add_elements(mechanism, q, w, 1);
-    detail::add_armature(tree, v, w);
+    detail::add_armature(tree, v, n, w);
 }
 
 // Only the potential energy at q. `enter` visits each placed body with its own inertia, from the first to the last;
 // then `project` visits each with the inertia of its subtree, from the last to the first.
-template <class Size, class Visit, class Project>
-void inertias(const Mechanism& mechanism, const double* q, Jet<double, Size>& w, const Visit& visit,
-              const Project& project) {
+template <class Size = int, class Visit, class Project>
+void inertias(const Mechanism& mechanism, const double* q, Jet<double>& w, const Visit& visit, const Project& project) {
     const Tree& tree = mechanism.tree;
-    const int bodies = bodies_of(tree, w.dof);
+    const Size n = w.dof;
+    const int bodies = bodies_of(tree, n);
     std::fill(w.potential.begin(), w.potential.end(), 0.0);
     std::fill(w.potential_scale.begin(), w.potential_scale.end(), 0.0);
     for (int j = 0; j < bodies; ++j) {
@@ -493,11 +493,12 @@ void inertias(const Mechanism& mechanism, const double* q, Jet<double, Size>& w,
 }
 
 // Only M and the potential energy at q.
-template <class Size>
-void mass_matrix(const Mechanism& mechanism, const double* q, Jet<double, Size>& w) {
-    detail::clear_blocks(mechanism.tree, w.dof, w.M);
-    inertias(mechanism, q, w, [](int) {}, [&](int j) { detail::project_mass(mechanism.tree, j, w); });
-    for (int c = 0; c < w.dof; ++c) w.M[c * w.dof + c] += mechanism.tree.armature[c];
+template <class Size = int>
+void mass_matrix(const Mechanism& mechanism, const double* q, Jet<double>& w) {
+    const Size n = w.dof;
+    detail::clear_blocks(mechanism.tree, n, w.M);
+    inertias<Size>(mechanism, q, w, [](int) {}, [&](int j) { detail::project_mass(mechanism.tree, j, n, w); });
+    for (int c = 0; c < n; ++c) w.M[c * n + c] += mechanism.tree.armature[c];
 }
 
 }  // namespace varpin

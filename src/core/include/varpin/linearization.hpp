@@ -22,29 +22,13 @@
 
 namespace varpin {
 
-// First derivatives of steps, for any number of joints and stages.
-class StepDerivatives {
-  public:
-    virtual ~StepDerivatives() = default;
-
-    bool varies = false;  // each step has forces (s, n) at its stages instead of a constant force (n)
-
-    // Take derivatives in an external force in the place of f, which drives limit.
-    virtual void take_external() = 0;
-
-    virtual Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                          std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past, double* Jr) = 0;
-};
-
-// Numbers of joints and stages may be known at compile time.
-template <class Size = int, class Stages = int>
-class VariationalLinearization final : public StepDerivatives {
+class VariationalLinearization {
   public:
     // With active guards, a part that they refuse is halved, since a step may need other parts without its noise.
     // Without them, the parts are exactly those given.
     VariationalLinearization(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                             Solver solver = Solver::automatic)
-        : stepper(mechanism, tableau, tolerance, guards, 1.0, solver),
+                             Solver solver = Solver::automatic, const Kernels& kernels = kernels_for<>)
+        : stepper(mechanism, tableau, tolerance, guards, 1.0, solver, kernels),
           n(mechanism.dof()),
           stages(tableau.stages),
           state(mechanism, stages),
@@ -68,15 +52,17 @@ class VariationalLinearization final : public StepDerivatives {
         for (int c = 0; c < n; ++c) df[c * 3 * n + 2 * n + c] = 1.0;
     }
 
-    void take_external() override { stepper.step_equation.by_external = true; }
+    bool varies = false;  // each step has forces (s, n) at its stages instead of a constant force (n)
+
+    // Take derivatives in an external force in the place of f, which drives limit.
+    void take_external() { stepper.step_equation.by_external = true; }
 
     // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f, and unless null
     // Jr (2n, n) in a force that grows linearly from 0 at the start of the step to f at its end. An undivided step
     // is solved again from a guess (s, n) close to its root; the arrays q, p and force have `past` earlier steps before
     // the pointers. A divided step has `halvings`: its parts are repeated, and their derivatives are multiplied.
     Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
-                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0,
-                  double* Jr = nullptr) override {
+                  std::span<const std::uint8_t> halvings, double* Jx, double* Jf, int past = 0, double* Jr = nullptr) {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome == Outcome::solved) {
@@ -176,9 +162,9 @@ class VariationalLinearization final : public StepDerivatives {
         std::vector<double> start;  // (2n, 3n) derivatives from the start of the step to its own
     };
 
-    VariationalStepper<Size, Stages> stepper;
-    [[no_unique_address]] Size n;
-    [[no_unique_address]] Stages stages;
+    VariationalStepper stepper;
+    int n;
+    int stages;
     PathState state;
     std::vector<Coordinate> from;  // where the last part began
     std::vector<Compensated> from_p;
@@ -209,7 +195,7 @@ class VariationalLinearization final : public StepDerivatives {
         const Outcome alone = outcome;
         if (!stepper.begin_at(q - past * n, p - past * n, state)) return alone;
         for (int k = past; k >= 0; --k) {
-            stepper.take_force(force - k * (varies ? stages * n : 1 * n), varies);
+            stepper.take_force(force - k * (varies ? stages * n : n), varies);
             if (stepper.step(h, state) != Outcome::solved) return alone;
         }
         return root_at(h, q, p, force);
@@ -306,7 +292,7 @@ class VariationalLinearization final : public StepDerivatives {
     // Add start' (z . d2(q1, p1)) start, (L4), at the stepper's root, after part_derivatives; `start` (2n, 3n) may be
     // null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
-        const Collocation<Size, Stages>& equation = stepper.step_equation;
+        const Collocation& equation = stepper.step_equation;
         const Mechanism& mechanism = stepper.mechanism;
         const int w = 3 * n;
         write_slopes(h, z);
@@ -342,7 +328,7 @@ class VariationalLinearization final : public StepDerivatives {
     // are those of the end of the step at the part's end.
     void add_bends(double h, const std::vector<double>& rows, const double* start, const double* weights,
                    double* found) {
-        const Collocation<Size, Stages>& equation = stepper.step_equation;
+        const Collocation& equation = stepper.step_equation;
         const int w = 3 * n;
         multipliers.resize(entries(2 * n, stages * n));
         moves.resize(2 * n);
@@ -378,7 +364,7 @@ class VariationalLinearization final : public StepDerivatives {
 
     // dphi/dV_m = h b_m (zq + (A_m + F_v,m) zp) + h^2 sum_i b_i a_im (L_qq,i + F_q,i) zp into `slope`.
     void write_slopes(double h, const double* z) {
-        const Collocation<Size, Stages>& equation = stepper.step_equation;
+        const Collocation& equation = stepper.step_equation;
         const Tableau& tableau = equation.tableau;
         for (int m = 0; m < stages; ++m) {
             for (int c = 0; c < n; ++c) {
@@ -400,7 +386,7 @@ class VariationalLinearization final : public StepDerivatives {
 
     // The jet at stage i and its derivative along (alpha, -multiplier), of which psi is the Lagrangian's share.
     void differentiate_along(double h, int i, const double* z, const double* multiplier) {
-        const Collocation<Size, Stages>& equation = stepper.step_equation;
+        const Collocation& equation = stepper.step_equation;
         const Tableau& tableau = equation.tableau;
         for (int c = 0; c < n; ++c) {
             double alpha = tableau.b[i] * z[n + c];
@@ -443,7 +429,7 @@ class VariationalLinearization final : public StepDerivatives {
 
     // The elements' forces at stage i, with derivatives in q, in v and in f.
     void differentiate_elements(int i) {
-        const Collocation<Size, Stages>& equation = stepper.step_equation;
+        const Collocation& equation = stepper.step_equation;
         for (auto* along : {&along_q, &along_v, &along_f}) {
             for (int c = 0; c < n; ++c) {
                 at_q[c] = {equation.Q[i * n + c], along == &along_q ? 1.0 : 0.0};
@@ -484,7 +470,7 @@ class VariationalLinearization final : public StepDerivatives {
     // Add the second derivatives of gamma . F of couplings at stage i, by columns of the Hessian.
     void add_couplings(double h, int i, const double* z, const double* multiplier, const Moved& moved,
                        const Pulled& pulled) {
-        const Collocation<Size, Stages>& equation = stepper.step_equation;
+        const Collocation& equation = stepper.step_equation;
         const int w = moved.width;
         for (auto* matrix : {&coupled_q, &coupled_v}) matrix->resize(n * n);
         for (int along = 0; along < 2 * n; ++along) {

@@ -92,37 +92,18 @@ inline void record_node(const PathState& state, int n, const Nodes& nodes, std::
     nodes.quality[3 * row + 2] = state.energies.defect();
 }
 
-// A variational stepper for any number of joints and stages.
-class Stepper {
-  public:
-    explicit Stepper(const Guards& guards) : guards(guards) {}
-    Stepper(const Stepper&) = delete;
-    Stepper& operator=(const Stepper&) = delete;
-    virtual ~Stepper() = default;
-
-    Guards guards;
-    bool held = false;  // whether the noise of a step is a force that is constant over it, instead of impulses
-
-    virtual bool begin(const double* q, const double* v, PathState& state) = 0;
-    virtual bool look_at(PathState& state) = 0;
-    virtual void kick(const double* impulse, PathState& state) = 0;
-    virtual void roll(double h, const Commands& commands, const double* increments, const double* drift,
-                      const double* impulses, std::vector<PathState>& states, const Nodes& nodes, Watch* watch) = 0;
-};
-
-// Numbers of joints and stages may be known at compile time.
-template <class Size = int, class Stages = int>
-class VariationalStepper final : public Stepper {
+// With the kernels of a number of joints, the mechanism has to be an arm of so many in a single block (size.hpp).
+class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left, Solver solver = Solver::automatic)
-        : Stepper(guards),
+                       double left, Solver solver = Solver::automatic, const Kernels& kernels = kernels_for<>)
+        : guards(guards),
           mechanism(mechanism),
           tableau(tableau),
           tolerance(tolerance),
           left(left),
-          step_equation(mechanism, this->tableau, solver),
-          energy_guard(mechanism, solver, !step_equation.eliminated()),
+          step_equation(mechanism, this->tableau, solver, kernels),
+          energy_guard(mechanism, solver, !step_equation.eliminated(), kernels),
           n(mechanism.dof()),
           force(step_equation.stages * n),
           trial(n),
@@ -131,14 +112,18 @@ class VariationalStepper final : public Stepper {
           bend(2 * n),
           extras(n),
           at(n) {}
+    VariationalStepper(const VariationalStepper&) = delete;
+    VariationalStepper& operator=(const VariationalStepper&) = delete;
 
+    Guards guards;
+    bool held = false;  // whether the noise of a step is a force that is constant over it, instead of impulses
     const Mechanism& mechanism;
     const Tableau tableau;
     double tolerance;
     double left;  // share of each kick before the step; the rest acts after it
-    Collocation<Size, Stages> step_equation;
-    EnergyGuard<Size> energy_guard;
-    [[no_unique_address]] Size n;
+    Collocation step_equation;
+    EnergyGuard energy_guard;
+    int n;
     std::vector<double> force;           // (n) constant over the step, or (s, n) at the stages of the step or its part
     int stride = 0;                      // distance of rows of `force`; 0 for a constant
     const double* outer = nullptr;       // (n) external force, null for none
@@ -162,22 +147,22 @@ class VariationalStepper final : public Stepper {
     }
 
     // Start a path at (q, v).
-    bool begin(const double* q, const double* v, PathState& state) override {
-        Jet<double, Size>& jet = step_equation.stage[0];
-        first_order(mechanism, q, v, jet);
+    bool begin(const double* q, const double* v, PathState& state) {
+        Jet<double>& jet = step_equation.stage[0];
+        step_equation.kernels.first_order(mechanism, q, v, jet);
         if (!begin_at(q, jet.Lv.data(), state)) return false;
         std::copy(v, v + n, state.v.begin());
         return true;
     }
 
     // Factor M at a path's node, for kicks and guesses.
-    bool look_at(PathState& state) override {
+    bool look_at(PathState& state) {
         for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
         return energy_guard.node(at.data(), state.momentum.data(), state.v.data());
     }
 
     // Add an impulse (n) to the momentum. Its change of the energy counts as work, not as an error.
-    void kick(const double* impulse, PathState& state) override {
+    void kick(const double* impulse, PathState& state) {
         for (int i = 0; i < n; ++i) {
             state.p[i] = state.p[i].plus(impulse[i]);
             state.momentum[i] = state.p[i].high;
@@ -188,8 +173,8 @@ class VariationalStepper final : public Stepper {
 
     // Set the force of a step: (n) constant over it, or (s, n) at its stages if it `varies`.
     void take_force(const double* own, bool varies) {
-        stride = varies ? static_cast<int>(n) : 0;
-        std::copy(own, own + (varies ? step_equation.stages * n : 1 * n), force.begin());
+        stride = varies ? n : 0;
+        std::copy(own, own + (varies ? step_equation.stages * n : n), force.begin());
         if (varies) given = force;
     }
 
@@ -239,7 +224,7 @@ class VariationalStepper final : public Stepper {
     // controls (P, N, n), and `impulses` in addition to the noise, before and after each step, or held over it as the
     // noise (P, N, 2, n). A `watch` may stop a single path.
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
-              std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) override {
+              std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) {
         const std::int64_t steps = nodes.steps;
         const int m = mechanism.controls, stages = step_equation.stages;
         const std::int64_t width = increments_of_step(mechanism, commands);
@@ -265,7 +250,7 @@ class VariationalStepper final : public Stepper {
                     held_noise(mechanism, h, row_of(drift, row, n), row_of(spread, row, 2 * n), state.q.data(),
                                state.center.data(), felt, held ? dw : nullptr, extras.data());
                 outer = extra.external;
-                stride = within ? static_cast<int>(n) : 0;
+                stride = within ? n : 0;
                 if (within) {
                     stage_forces(mechanism, extra.driven, within, stages, given.data());
                 } else {
@@ -369,7 +354,7 @@ class VariationalStepper final : public Stepper {
     // by later kicks of the velocity, and corrected for the change of a constant force. The error of this guess is
     // extrapolated too, by backward differences of the order that would have predicted the last step best.
     void extrapolate(double h, const PathState& state) {
-        const Stages stages = step_equation.stages;
+        const int stages = step_equation.stages;
         double *change = bend.data(), *acceleration = change + n;
         bool changed = false;
         for (int c = 0; c < n; ++c) {

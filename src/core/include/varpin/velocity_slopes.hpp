@@ -18,9 +18,9 @@ template <class Size>
 void velocity_slopes(const Mechanism& mechanism, std::size_t rows, const double* q, const double* v, double* slopes) {
     const Size n = mechanism.dof();
     const int width = 2 * n;
-    Jet<double, Size> jet(mechanism.tree);
+    Jet<double> jet(mechanism.tree);
     for (std::size_t s = 0; s < rows; ++s) {
-        momentum_slopes(mechanism, q + s * n, v + s * n, jet);
+        momentum_slopes<Size>(mechanism, q + s * n, v + s * n, jet);
         double* slope = slopes + s * n * width;
         for (int i = 0; i < n; ++i) {
             for (int j = 0; j < n; ++j) slope[i * width + j] = -jet.A[i * n + j];

@@ -1,0 +1,63 @@
+// The inner loops of steps and of their derivatives, for a number of joints that the compiler knows or does not: the
+// same templates, and the same bytes. Everything above them is compiled once. docs/core.md, "Processors".
+#pragma once
+
+#include <cstddef>
+#include <vector>
+
+#include "varpin/jet.hpp"
+#include "varpin/size.hpp"
+#include "varpin/velocity_slopes.hpp"
+
+namespace varpin {
+
+class Collocation;
+class EnergyGuard;
+struct Guards;
+struct Start;
+
+// The parts of Collocation are those for a single stage.
+struct Kernels {
+    void (*jet)(const Mechanism& mechanism, const double* q, const double* v, Jet<double>& w);
+    void (*first_order)(const Mechanism& mechanism, const double* q, const double* v, Jet<double>& w);
+    double (*residuals)(Collocation& step, double h, const Start& start);
+    bool (*factor)(Collocation& step, double h);
+    void (*solve)(const Collocation& step, const double* right, double* x);
+    double (*kinetic_size)(const Collocation& step, const double* x);
+    void (*derivatives)(Collocation& step, double h, std::vector<double>& dV, double* Jx, double* Jf);
+    double (*branch_margin)(EnergyGuard& guard, double h, const Guards& guards, const Collocation& step);
+    bool (*factor_mass)(EnergyGuard& guard, const double* q);
+    void (*velocity)(EnergyGuard& guard, const double* p, double* v);
+    void (*velocity_slopes)(const Mechanism& mechanism, std::size_t rows, const double* q, const double* v,
+                            double* slopes);
+};
+
+// What Kernels point to, in collocation.hpp and guards.hpp.
+template <class Size>
+struct Sized {
+    static double residuals(Collocation& step, double h, const Start& start);
+    static bool factor(Collocation& step, double h);
+    static void solve(const Collocation& step, const double* right, double* x);
+    static double kinetic_size(const Collocation& step, const double* x);
+    static void derivatives(Collocation& step, double h, std::vector<double>& dV, double* Jx, double* Jf);
+    static double branch_margin(EnergyGuard& guard, double h, const Guards& guards, const Collocation& step);
+    static bool factor_mass(EnergyGuard& guard, const double* q);
+    static void velocity(EnergyGuard& guard, const double* p, double* v);
+};
+
+template <class Size = int>
+inline constexpr Kernels kernels_for{
+    .jet = &lagrangian_jet<Size, double>,
+    .first_order = &first_order<Size>,
+    .residuals = &Sized<Size>::residuals,
+    .factor = &Sized<Size>::factor,
+    .solve = &Sized<Size>::solve,
+    .kinetic_size = &Sized<Size>::kinetic_size,
+    .derivatives = &Sized<Size>::derivatives,
+    .branch_margin = &Sized<Size>::branch_margin,
+    .factor_mass = &Sized<Size>::factor_mass,
+    .velocity = &Sized<Size>::velocity,
+    .velocity_slopes = &velocity_slopes<Size>,
+};
+
+}  // namespace varpin
