@@ -30,6 +30,12 @@ class TestUrdf:
                 vp.load_robot(path)
             assert about(vp.inspect_robot(path).warnings, "no finite number")
 
+    def test_more_links_than_the_parser_survives(self, tmp_path):
+        path = tmp_path / "long.urdf"
+        path.write_text(f'<robot name="r">{"".join(f"<link name={k!r}/>" for k in map(str, range(3001)))}</robot>')
+        with refused(vp.RobotError, "3001", "3000"):
+            vp.load_robot(path)
+
     def test_numbers_in_odd_white_space(self, tmp_path):
         odd = INERTIAL.replace('value="1.3"', 'value=" 1.3&#9;"').replace("0.02 0.05 0.1", "&#10;0.02&#9;0.05  0.1 ")
         body = vp.load_robot(write_urdf(tmp_path, link("l1", odd), joint("j1", "base", "l1"))).model.inertias[1]

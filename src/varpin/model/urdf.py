@@ -33,6 +33,8 @@ from varpin.model.units import NO_LIMIT, limits_in_degrees
 logger = logging.getLogger(__name__)
 
 VERSIONS = ("1.0", "1.1", "1.2")  # of URDF, which Pinocchio reads
+# Most links: its parser ends the process on chains of about 4,000.
+_MOST_LINKS = 3000
 
 # The attributes of a URDF that hold numbers, by element.
 _NUMBERS = {
@@ -135,6 +137,8 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
         raise RobotError(
             f"{path}: there is no URDF version {root.get('version')!r}; Pinocchio reads {', '.join(VERSIONS)}"
         )
+    if (links := len(root.findall("link"))) > _MOST_LINKS:
+        raise RobotError(f"{path} has {links} links, and varpin reads {_MOST_LINKS} at most")
     parent: dict[str, str] = {}
     for joint in root.findall("joint"):
         child, name = joint.find("child"), joint.get("name", "")
