@@ -32,7 +32,9 @@ class TestUrdf:
 
     def test_more_links_than_the_parser_survives(self, tmp_path):
         path = tmp_path / "long.urdf"
-        path.write_text(f'<robot name="r">{"".join(f"<link name={k!r}/>" for k in map(str, range(3001)))}</robot>')
+        joint = "<joint name='j{0}' type='fixed'><parent link='{0}'/><child link='{1}'/></joint>"
+        links = [f"<link name='{k}'/>{joint.format(k - 1, k) if k else ''}" for k in range(3001)]
+        path.write_text(f"<robot name='r'>{''.join(links)}</robot>")
         with refused(vp.RobotError, "3001", "3000"):
             vp.load_robot(path)
 

@@ -405,3 +405,23 @@ def test_planes_are_plates_and_those_without_an_edge_are_left_out(tmp_path):
     np.testing.assert_allclose(2.0 * plate.geometry.halfSide, [0.8, 0.6, 1e-3])
     np.testing.assert_allclose(plate.placement.translation, [0.0, 0.0, -1.0])
     assert vp.replay(robot, [[0.3]], dt=1.0, html=tmp_path / "page.html").exists()
+
+
+def test_parts_of_the_physics_that_a_file_disables(tmp_path, caplog):
+    """Damping, friction and limits are none where MuJoCo has none of them; servos are told as left out."""
+    text = """<mujoco><compiler autolimits="true"/><option><flag {}="disable"/></option><worldbody><body><joint name="a"
+    damping="0.5" frictionloss="0.2" range="-1 1" axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/></body></worldbody>
+    <actuator><position joint="a" kp="5"/></actuator></mujoco>"""
+    found = {}
+    for flag in ("sensor", "damper", "frictionloss", "limit"):
+        path = tmp_path / f"{flag}.xml"
+        path.write_text(text.format(flag))
+        robot = vp.load_robot(path)
+        found[flag] = (robot.damping[0], robot.friction[0], robot.position_limits[1][0] < np.inf)
+        assert "servos of actuators (1)" in caplog.text
+    assert found == {
+        "sensor": (0.5, 0.2, True),
+        "damper": (0.0, 0.2, True),
+        "frictionloss": (0.5, 0.0, True),
+        "limit": (0.5, 0.2, False),
+    }

@@ -288,6 +288,12 @@ class TestKeeping:
         same = vp.load_robot("panda", lock={k: v for k, v in nearest.items() if k not in robot.joint_names})
         assert_same_jet(jet_at(robot, [0.1, 0.2], [1.0, 2.0]), jet_at(same, [0.1, 0.2], [1.0, 2.0]), rtol=0)
 
+    def test_keeps_joints_of_any_iterable_and_the_base(self):
+        names = vp.load_robot("ur5", keep=iter(["elbow_joint"]), base="planar").joint_names
+        assert names == ("base_x", "base_y", "base_turn", "elbow_joint")
+        with refused(vp.InputError, "keep", "3"):
+            vp.load_robot("ur5", keep=3)
+
     def test_keeps_followers_with_their_leader(self):
         robot = vp.load_robot("panda", keep=["panda_finger_joint1"])
         assert robot.joint_names == ("panda_finger_joint1",)

@@ -204,7 +204,6 @@ class TestOdd:
             (lambda text: "hello", "XML"),
             (lambda text: text[:-10], "XML"),
             (lambda text: text.replace('"1.3"', '"${m}"', 1), ("xacro", "<mass value='${m}'>")),
-            (lambda text: text.replace('"l1"', '"$(arg l)"'), ("xacro", "<link name='$(arg l)'>")),
             (lambda text: text.replace("robot", "sdf"), "<sdf>"),
             (lambda text: '<robot name="a"/>', "link"),
             (lambda text: "<!DOCTYPE html><html><body></html>", "web page"),
@@ -509,3 +508,10 @@ class TestMany:
             worker.join()
         os.write(2, b"still here")
         assert "still here" in capfd.readouterr().err
+
+
+def test_xacro_expressions_that_are_no_numbers_are_told_of(tmp_path, caplog):
+    ball = '<visual><geometry><sphere radius="0.1"/></geometry><material name="${color}"/></visual>'
+    robot = vp.load_robot(write_urdf(tmp_path, link("a", extra=ball), joint("j1", "base", "a")))
+    assert robot.dof == 1
+    assert "<material name='${color}'>" in caplog.text

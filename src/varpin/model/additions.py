@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from varpin.errors import InputError, RobotError, UnknownJoint
 from varpin.model.mimic import Tie, joint_index, rebuild
 from varpin.model.sources import Description, hang_shapes
-from varpin.model.urdf import build_model, build_shapes, read_urdf
+from varpin.model.urdf import build_model, build_shapes, listed, read_urdf
 from varpin.support.checks import JointValues, as_floats, broadcast_array, finite, positive
 
 Base: TypeAlias = Literal["planar"] | ArrayLike | pin.SE3 | None
@@ -160,6 +160,6 @@ def with_mesh_inertias(description: Description, density: float) -> Description:
         body = pin.Inertia(density * volume, center, 0.5 * density * (moments + moments.T))
         model.appendBodyToJoint(index.get(full.names[shape.parentJoint], 0), body, shape.placement)
         masses[link] = masses.get(link, 0.0) + density * volume
-    listed = ", ".join(f"{link!r} {mass:.3g} kg" for link, mass in masses.items())
-    remark = f"links without an inertia have that of their shapes at {density:g} kg/m^3: {listed}"
+    weighed = listed((f"{link!r} {mass:.3g} kg" for link, mass in masses.items()), "links")
+    remark = f"links without an inertia have that of their shapes at {density:g} kg/m^3: {weighed}"
     return replace(description, model=model, remarks=(*description.remarks, remark) if masses else description.remarks)

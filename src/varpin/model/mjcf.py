@@ -185,11 +185,12 @@ class _Walk:
     def add_parameters(self) -> None:
         """Gravity, postures, and of each joint its limits, damping, friction and armature."""
         m, model = self.m, self.model
-        weightless = m.opt.disableflags & self.mujoco.mjtDisableBit.mjDSBL_GRAVITY
-        model.gravity.linear = np.zeros(3) if weightless else m.opt.gravity.copy()
+        model.gravity.linear = np.zeros(3) if self._disabled("GRAVITY") else m.opt.gravity.copy()
         model.upperVelocityLimit[:], model.lowerVelocityLimit[:] = np.inf, -np.inf
-        model.damping[:], model.armature[:] = m.dof_damping, m.dof_armature
-        model.upperDryFrictionLimit[:], model.lowerDryFrictionLimit[:] = m.dof_frictionloss, -m.dof_frictionloss
+        damping = np.zeros(m.nv) if self._disabled("DAMPER", "PASSIVE") else m.dof_damping
+        friction = np.zeros(m.nv) if self._disabled("FRICTIONLOSS", "CONSTRAINT") else m.dof_frictionloss
+        model.damping[:], model.armature[:] = damping, m.dof_armature
+        model.upperDryFrictionLimit[:], model.lowerDryFrictionLimit[:] = friction, -friction
         order: list[int] = []
         for joint, index in enumerate(self.indices):
             kind, q = model.joints[index], int(m.jnt_qposadr[joint])
@@ -199,7 +200,7 @@ class _Walk:
                 order += [*range(q, real), real + 1, real + 2, real + 3, real]
                 continue
             order.append(q)
-            if m.jnt_limited[joint]:
+            if m.jnt_limited[joint] and not self._disabled("LIMIT", "CONSTRAINT"):
                 model.lowerPositionLimit[kind.idx_q], model.upperPositionLimit[kind.idx_q] = m.jnt_range[joint]
             self._add_drives(joint, kind.idx_v)
         model.referenceConfigurations["qpos0"] = m.qpos0[order]
@@ -208,8 +209,15 @@ class _Walk:
                 model.referenceConfigurations[name] = m.key_qpos[key][order]
         for name, what in _LEFT_OUT.items():
             self.left_out[what] += int(np.atleast_2d(np.transpose(getattr(m, name, 0))).any(axis=0).sum())
+        servos = m.actuator_biastype != self.mujoco.mjtBias.mjBIAS_NONE
+        self.left_out["servos of actuators"] += int(servos.sum())
         self.left_out["forces of plugins"] += int((m.body_plugin >= 0).sum())
         self.left_out["forces of a fluid"] += int(m.opt.density != 0.0 or m.opt.viscosity != 0.0)
+
+    def _disabled(self, *names: str) -> bool:
+        """Whether the file disables one of these parts of the physics; older versions lack some."""
+        flags = (int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{name}", 0)) for name in names)
+        return any(int(self.m.opt.disableflags) & flag for flag in flags)
 
     def _add_drives(self, joint: int, v: int) -> None:
         """The largest force of all actuators of a joint together, and the inertia and damping of their rotors."""
@@ -310,7 +318,7 @@ class _Walk:
         for k in range(m.neq):
             kind, first, second = _word(self.mujoco.mjtEq, m.eq_type[k]), int(m.eq_obj1id[k]), int(m.eq_obj2id[k])
             data, parts = m.eq_data[k], self._tendon(first) if kind == "TENDON" and second < 0 else []
-            if not m.eq_active0[k]:
+            if not m.eq_active0[k] or self._disabled("EQUALITY", "CONSTRAINT"):
                 self.left_out["inactive equality constraints"] += 1
             elif kind in ("CONNECT", "WELD"):
                 found.append(self._closure(k, kind == "WELD"))
@@ -325,7 +333,9 @@ class _Walk:
                 tied.add(first)
             else:
                 self.left_out[f"equality constraints of kind {kind.lower()}"] += 1
-        self.left_out["tendons"] += m.ntendon - len(tied)
+        forces = m.tendon_stiffness, m.tendon_damping, m.tendon_frictionloss, m.tendon_limited
+        acting = {k for k in tied if any(np.any(each[k]) for each in forces)}
+        self.left_out["tendons"] += m.ntendon - len(tied - acting)
         return tuple(found)
 
     def _tendon(self, tendon: int) -> list[tuple[int, float]]:

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.arrays import Floats
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
-from varpin.model.additions import Base, on_base, with_mesh_inertias, with_rotors
+from varpin.model.additions import PLANAR, Base, on_base, with_mesh_inertias, with_rotors
 from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
 from varpin.model.kinematics import place_on_body
@@ -550,7 +550,10 @@ def _locks(
     given = dict(lock or {})
     if keep is None:
         return given
-    if isinstance(keep, str | Mapping) or not all(isinstance(name, str) for name in keep):
+    if isinstance(keep, str | Mapping) or not isinstance(keep, Iterable):
+        raise InputError(f"keep must be a list of joint names, got {keep!r}")
+    keep = tuple(keep)
+    if not all(isinstance(name, str) for name in keep):
         raise InputError(f"keep must be a list of joint names, got {keep!r}")
     model = description.model
     leaders = {model.names[tie.follower]: model.names[tie.leader] for tie in description.ties}
@@ -563,7 +566,8 @@ def _locks(
             raise InputError(f"keep: joint {name!r} mimics {leaders[name]!r}; keeping {leaders[name]!r} keeps both")
     neutral = pin.neutral(model)
     for joint, name in enumerate(model.names):
-        if joint == 0 or name in keep or name in leaders or name in given:
+        # A planar base was asked for.
+        if joint == 0 or name in (*keep, *PLANAR) or name in leaders or name in given:
             continue
         kind = model.joints[joint]
         at = slice(kind.idx_q, kind.idx_q + kind.nq)

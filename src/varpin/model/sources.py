@@ -363,8 +363,9 @@ def _with_srdf(
 ) -> Description:
     """The postures and rotors in an SRDF file or its xacro file, which need not take all of the robot's arguments."""
     text = expand(path, arguments, _places(path, folders), packages, strict=False) if is_xacro(path) else None
-    _add_rotors(description.model, read_rotors(path, text))
-    return replace(description, postures=read_postures(path, text))
+    postures, rotors = read_postures(path, text), read_rotors(path, text)
+    _add_rotors(description.model, rotors)
+    return replace(description, postures=postures)
 
 
 def _add_rotors(model: pin.Model, armature: Mapping[str, float]) -> None:

@@ -57,6 +57,8 @@ def read_rotors(path: Path, text: str | None = None) -> dict[str, float]:
             finite_number(joint.get(key, "0"), f"{path}: {key} of the rotor of joint {name!r}")
             for key in ("mass", "gear_ratio")
         )
+        if mass < 0.0:
+            raise RobotError(f"{path}: mass of the rotor of joint {name!r} is negative: {mass:g}")
         armature[name] = mass * ratio**2
     return armature
 

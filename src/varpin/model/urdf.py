@@ -14,6 +14,7 @@ import re
 import reprlib
 import sys
 import tempfile
+import textwrap
 import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -33,8 +34,8 @@ from varpin.model.units import NO_LIMIT, limits_in_degrees
 logger = logging.getLogger(__name__)
 
 VERSIONS = ("1.0", "1.1", "1.2")  # of URDF, which Pinocchio reads
-# Most links: its parser ends the process on chains of about 4,000.
-_MOST_LINKS = 3000
+# Most links one after another: its parser ends the process on chains of about 4,000.
+_LONGEST = 3000
 
 # The attributes of a URDF that hold numbers, by element.
 _NUMBERS = {
@@ -45,6 +46,8 @@ _NUMBERS = {
     "limit": ("lower", "upper", "effort", "velocity"),
     "dynamics": ("damping", "friction"),
 }
+# Those of shapes and of mimic joints.
+_SIZES, _MIMIC = ("size", "radius", "length", "scale"), ("multiplier", "offset")
 _COUNTS = {"xyz": 3, "rpy": 3, "quat_xyzw": 4}
 
 # A bound in words that Pinocchio reads and :class:`varpin.Robot` takes as none.
@@ -137,8 +140,6 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
         raise RobotError(
             f"{path}: there is no URDF version {root.get('version')!r}; Pinocchio reads {', '.join(VERSIONS)}"
         )
-    if (links := len(root.findall("link"))) > _MOST_LINKS:
-        raise RobotError(f"{path} has {links} links, and varpin reads {_MOST_LINKS} at most")
     parent: dict[str, str] = {}
     for joint in root.findall("joint"):
         child, name = joint.find("child"), joint.get("name", "")
@@ -148,6 +149,8 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
                 f"{path}: link {link!r} is the child of joints {parent[link]!r} and {name!r}: "
                 "varpin takes trees, no closed loops"
             )
+    if (length := _longest_chain(root)) > _LONGEST:
+        raise RobotError(f"{path} has {length} links one after another, and varpin reads {_LONGEST} at most")
     tidied = False
     for element in (part for tag in ("link/inertial", "joint") for found in root.iterfind(tag) for part in found):
         for key in _NUMBERS.get(element.tag, ()):
@@ -169,7 +172,7 @@ def build_model(urdf: Urdf) -> pin.Model:
     """
     model = _build(_part(urdf.root, "link/inertial", "joint"))
     if isinstance(model, str):
-        why = next(_faults(urdf.root), f"Pinocchio cannot read it: {model[:120]}")
+        why = next(_faults(urdf.root), f"Pinocchio cannot read it: {textwrap.shorten(model, 120)}")
         raise RobotError(f"{urdf.path} is not a URDF: {why}")
     return _require_all_links(urdf, model)
 
@@ -366,15 +369,32 @@ def _tree(content: bytes | str) -> ET.Element:
     return builder.close()
 
 
+def _longest_chain(root: ET.Element) -> int:
+    """The largest number of links one after another."""
+    ends = ([joint.find(tag) for tag in ("parent", "child")] for joint in root.findall("joint"))
+    up = {child.get("link"): parent.get("link") for parent, child in ends if parent is not None and child is not None}
+    depth: dict[str | None, int] = {}
+    for first in up:
+        way: list[str | None] = []
+        link = first
+        while link in up and link not in depth and len(way) <= len(up):
+            way.append(link)
+            link = up[link]
+        for own in reversed(way):
+            depth[own] = depth.get(up[own], 1) + 1
+    return max(depth.values(), default=1)
+
+
 def _require_expanded(root: ET.Element, path: Path) -> None:
     """Refuse a xacro file that was not expanded: a value that xacro has to fill in is missing."""
     for element in (part for tag in ("link", "joint") for found in root.iterfind(tag) for part in found.iter()):
         for key, value in element.items():
-            if key != "filename" and ("${" in value or value.startswith("$(")):
+            numbers = (*_NUMBERS.get(element.tag, ()), *_SIZES, *_MIMIC)
+            if key in numbers and ("${" in value or value.startswith("$(")):
                 name = path.name.removesuffix(".xacro").removesuffix(".urdf")
                 raise RobotError(
                     f"{path} is a xacro file, to be expanded: it has <{element.tag} {key}={value!r}>. Name it "
-                    f"{name}.urdf.xacro, or expand it with xacro {path.name} > {name}.urdf"
+                    f"{name}.urdf.xacro, or expand it with xacro {path.name} > {name}.expanded.urdf"
                 )
 
 
@@ -386,7 +406,14 @@ def _xacro(root: ET.Element) -> dict[str, None]:
 
 def _remarks(root: ET.Element) -> Iterator[str]:
     """How limits and elements without effect are read, one sentence a kind. Limits that mean none become none."""
-    if left := _xacro(root):
+    left = _xacro(root)
+    left |= {
+        f"<{part.tag} {key}={value!r}>": None
+        for part in root.iter()
+        for key, value in part.items()
+        if key != "filename" and ("${" in value or value.startswith("$(")) and part.tag not in left
+    }
+    if left:
         yield f"leftover xacro elements have no effect: {listed(left, 'kinds')}"
     none, degrees, ignored, crossed = [], [], [], []
     for joint in root.findall("joint"):
@@ -409,9 +436,9 @@ def _remarks(root: ET.Element) -> Iterator[str]:
         for key in (*bounds, "effort", "velocity"):
             value, drive = _number(limit.get(key)), key in ("effort", "velocity")
             unread = key not in limit.attrib or (drive and value < 0.0) or math.isinf(value)
-            if key in limit.attrib and (unread or (not drive and abs(value) > NO_LIMIT)):
+            if key in limit.attrib and kind != "fixed" and (unread or (not drive and abs(value) > NO_LIMIT)):
                 none.append(f"{key} {limit.attrib[key]} of {name}")
-            elif unread and not (drive and stated):
+            elif unread and not (drive and stated) and kind != "fixed":
                 none.append(f"no {key} of {name}")
             if unread and not (drive and stated and key not in limit.attrib):
                 limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)

@@ -80,13 +80,10 @@ def in_order(
                 return
             try:
                 result = waiting[0].result()
-            except (pickle.PicklingError, AttributeError, TypeError) as error:
-                if isinstance(executor, ThreadPoolExecutor):
-                    raise
-                raise InputError(
-                    f"the tasks cannot be sent to the workers, or fail there: {error}; functions must be importable "
-                    "there, defined at the top of a module and not in index"
-                ) from error
+            except (pickle.PicklingError, AttributeError, TypeError):
+                if not isinstance(executor, ThreadPoolExecutor):
+                    _require_sendable(function, task)
+                raise
             try:
                 yield result
             finally:
@@ -99,6 +96,17 @@ def in_order(
     finally:
         for future in waiting:
             future.cancel()
+
+
+def _require_sendable(function: Callable[[Task], Result], task: Task) -> None:
+    """Refuse what cannot be pickled."""
+    try:
+        pickle.dumps((function, task))
+    except Exception as error:
+        raise InputError(
+            f"the tasks cannot be sent to the workers ({error!s:.80}): functions must be importable there, defined at "
+            "the top of a module"
+        ) from error
 
 
 def _begun(executor: Executor, futures: Sequence[Future[Result]]) -> Iterator[Result]:
