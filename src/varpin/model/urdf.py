@@ -27,7 +27,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from varpin.errors import FileError, RobotError
-from varpin.model.meshes import Reader, put_mesh, read_mesh, with_own_meshes
+from varpin.model.meshes import Reader, put_mesh, read_mesh
 from varpin.model.packages import LFS_POINTER, Packages
 from varpin.model.units import NO_LIMIT, limits_in_degrees
 
@@ -290,7 +290,7 @@ def build_shapes(
             except FileError as error:
                 faults[look.link] = f"link {look.link!r}: {error}"
     found = pin.GeometryModel()
-    for shape in with_own_meshes(shapes, read).geometryObjects:
+    for shape in shapes.geometryObjects:
         if shape.name not in looks or looks[shape.name].link not in faults:
             found.addGeometryObject(shape)
     return found, faults
