@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 
-from varpin.arrays import Mask
-from varpin.control.watchdog import Watchdog
-from varpin.trajectory import Trajectory
-
-# Default number of iterations, over all rounds where there are any.
+# Default number of iterations.
 ITERATIONS = 500
 
 
@@ -91,58 +87,22 @@ class Iteration:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class SearchState:
-    """The state of a search at the start of its last iteration, from which it can be resumed.
+    """What a search needs, beside its motion and its multipliers, to be resumed.
 
     Attributes:
-        trajectory: The motion.
-        cost: Its cost without noise.
-        above: Its cost minus that of the best motion, without noise.
-        first: Cost at stake on the first motion.
-        best: The motion of least expected cost so far; None before the first backward pass.
-        best_cost: Cost of the best motion without noise.
-        best_noise: Noise cost of the best motion, without the noise of constant strength, which changes no plan.
-        gains: Decrease of the least expected cost in each iteration; those away from the best motion are left out.
+        weight: Weight of the constraints in the merit, in tenths of their ranges.
         regularization: Relative to the diagonal of Quu.
         growth: Last factor of the regularization.
-        bounded: Whether the line search stops trials with many substeps.
-        cut: Whether it has stopped one.
-        whole: Whether the search uses the whole gradient of the noise cost.
-        saturated: Whether it takes into account that drives of servos are at their limits.
-        clips: Whether plans may leave control limits to the clipping of motions where steps are short.
-        follows: Whether trials may follow the states that plans foresee: none has strayed from them.
-        overshot: Whether an extension of the last full step did not lower the cost.
-        returned: Whether it has just gone back from a motion that cannot be linearized.
-        behind: The motion from which a full step led to this one; None after another step.
-        watchdog: Whether it is away from the best motion.
-        rows: Active rows of penalties (M,) at the end of the last backward pass, with which the next one begins; None
-            where no rows were looked for.
-        history: The iterations before.
+        first: Cost at stake on the first motion; -1 before it is known.
+        counts: How often margins have been widened by counting motions.
+        iterations: Number of entries of the history that were made before.
     """
 
-    trajectory: Trajectory
-    cost: float
-    above: float
-    first: float
-    best: Trajectory | None
-    best_cost: float
-    best_noise: float
-    gains: tuple[float, ...]
+    weight: float
     regularization: float
     growth: float
-    bounded: bool
-    cut: bool
-    history: tuple[Iteration, ...]
-    whole: bool = False
-    saturated: bool = False
-    clips: bool = True
-    follows: bool = True
-    overshot: bool = False
-    returned: bool = False
-    behind: Trajectory | None = None
-    watchdog: Watchdog = field(default_factory=Watchdog)
-    rows: Mask | None = None
-
-    def __repr__(self) -> str:
-        return f"SearchState(cost {self.cost:.6g}, after {len(self.history)} iterations)"
+    first: float
+    counts: int
+    iterations: int

@@ -239,16 +239,18 @@ def after_impulse(rule: Floats, hessian: Floats, velocity: Floats, N: int, x: in
     return found
 
 
-def on_lines(rule: Floats, places: Floats, J: Floats, velocity: Floats, m: int) -> list[Floats]:
-    """Derivatives (N, 2n + m, 2n + 2m) of (q, v, u) in (x, w, u), for each sample of a step.
+def on_lines(rule: Floats, places: Floats, J: Floats, velocity: Floats, m: int, *, ramps: bool = True) -> list[Floats]:
+    """Derivatives (N, 2n + m, Z) of (q, v, u) in (x, w, u), or without ``ramps`` in (x, u), for each sample of a step.
 
-    ``J`` (N, 2n, 2n + 2m) are those of the state after the step; see :func:`at_samples`.
+    ``J`` (N, 2n, Z) are those of the state after the step; see :func:`at_samples`.
     """
     x = J.shape[1]
     parts = []
     for D, share in zip(at_samples(rule, J, velocity), places, strict=True):
-        of_controls = np.zeros((len(D), m, x + 2 * m))
-        of_controls[:, :, x : x + m], of_controls[:, :, x + m :] = (1.0 - share) * np.eye(m), share * np.eye(m)
+        of_controls = np.zeros((len(D), m, J.shape[2]))
+        of_controls[:, :, x : x + m] = (1.0 - share if ramps else 1.0) * np.eye(m)
+        if ramps:
+            of_controls[:, :, x + m :] = share * np.eye(m)
         parts.append(np.concatenate([D, of_controls], axis=1))
     return parts
 

@@ -15,9 +15,8 @@ from varpin.arrays import Floats, Mask
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Status
 from varpin.control.linear_controls import in_step
-from varpin.control.multipliers import at_nodes
+from varpin.control.multipliers import at_nodes, split
 from varpin.control.paths import Chunk, chunks_of, sent, shared_by
-from varpin.control.penalties import split
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, decided, of_values, propagated, state_slopes

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats, Integers, Mask
+from varpin.arrays import Floats, Integers
 from varpin.control.between_nodes import NOWHERE, Instants, enforced
 from varpin.control.constraints import BoundConstraint
-from varpin.control.penalties import split
 from varpin.control.problem import OptimalControlProblem
 from varpin.io.archive import Axes
 from varpin.support.frozen import Frozen
@@ -25,60 +25,34 @@ REPORTED = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class Multipliers(Frozen):
-    """Multipliers of a plan's constraints, and the state of the rounds of the augmented Lagrangian.
+    """Multipliers of a plan's constraints, with the rows between nodes and the margins they belong to.
 
-    Arrays (M,) have one number for each place and row of all constraints, one constraint after another. C constraints
-    are the problem's, and then, once more, those that also have rows between nodes.
+    Arrays (M,) have one number for each place and row of all constraints, one constraint after another: the problem's,
+    and then, once more, those that also have rows between nodes.
 
     Attributes:
         values: Multipliers of the plan's motion (M,) [cost / unit of the constraint].
         backoff: ``margin`` standard deviations (M,), and what is ``added`` to them, in the constraint's unit.
-        begun: Multipliers at the beginning of the last round (M,).
-        weights: Weight of each constraint's penalty in the last round (C,) [cost / unit^2].
-        first_weights: The same in the first round (C,), or in the first one with rows between nodes.
-        worst: Violation of each constraint after the round before (C,); infinite in the first round.
-        tolerance: Tolerance of the search in the last round.
-        round: Number of the last round, from 0.
-        iterations: Iterations of all rounds before.
-        stuck: Number of successive rounds that have hardly lowered the worst violation.
         instants: Constraint, step and number (I, 3) of each instant between nodes at which a constraint has rows; None
             where all hold there without.
         moments: Where these rows are in a step of unit length (O,); negative for rows that are not enforced.
         bends: Minus the second derivatives of their values in time where they follow peaks (O,), else zero.
-        begun_moments: The ``moments`` in the last round (O,).
-        begun_bends: The ``bends`` in the last round (O,).
-        added: What is added to margins of the rows at nodes, as motions under noise were counted; None where margins of
-            the linear model suffice.
-        counts: How often margins have become wider for that reason.
-        active: Active rows of the penalties in the last pass of a controller's tick (M,), else None.
         cubic: Whether these rows are on the cubics through the steps, as in a controller's ticks, not of steps
             integrated in parts.
+        added: What is added to margins of the rows at nodes, as motions under noise were counted; None where margins of
+            the linear model suffice.
     """
 
     values: Annotated[Floats, Axes("rows", finite=True)]
     backoff: Annotated[Floats, Axes("rows", finite=True)]
-    begun: Annotated[Floats, Axes("rows", finite=True)]
-    weights: Annotated[Floats, Axes("constraints", finite=True)]
-    first_weights: Annotated[Floats, Axes("constraints", finite=True)]
-    worst: Annotated[Floats, Axes("constraints")]
-    tolerance: float
-    round: int
-    iterations: int
-    stuck: int
     instants: Annotated[Integers, Axes("instants", 3)] | None = None
     moments: Annotated[Floats, Axes("moments", finite=True)] | None = None
     bends: Annotated[Floats, Axes("moments", finite=True)] | None = None
-    begun_moments: Annotated[Floats, Axes("moments", finite=True)] | None = None
-    begun_bends: Annotated[Floats, Axes("moments", finite=True)] | None = None
     cubic: bool = False
     added: Annotated[Floats, Axes("node_rows", finite=True)] | None = None
-    counts: int = 0
-    active: Annotated[Mask, Axes("active_rows")] | None = None
 
     def __post_init__(self) -> None:
-        arrays = (self.values, self.backoff, self.begun, self.weights, self.first_weights, self.worst)
-        between = self.instants, self.moments, self.bends, self.begun_moments, self.begun_bends
-        for array in (*arrays, *between, self.added, self.active):
+        for array in (self.values, self.backoff, self.instants, self.moments, self.bends, self.added):
             if array is not None:
                 array.setflags(write=False)
 
@@ -88,13 +62,6 @@ class Multipliers(Frozen):
         if self.instants is None or self.moments is None or self.bends is None:
             return NOWHERE
         return Instants(self.instants, self.moments, self.bends, self.cubic)
-
-    @property
-    def begun_between(self) -> Instants:
-        """The rows between nodes in the last round; the last step onto the constraints has others."""
-        if self.instants is None or self.begun_moments is None or self.begun_bends is None:
-            return self.between
-        return Instants(self.instants, self.begun_moments, self.begun_bends, self.cubic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +120,16 @@ class ConstraintReport(Frozen):
     __repr__ = __str__
 
 
-def in_between(coarse: BoundConstraint, fine: BoundConstraint, values: Floats) -> Floats:
-    """Values (K, rows) at the places of a constraint, interpolated at its places on a finer grid."""
-    found = [np.interp(fine.times, coarse.times, column) for column in values.T]
-    return np.stack(found, axis=1) if found else np.zeros(fine.shape)
+def flat(parts: Sequence[Floats]) -> Floats:
+    """Concatenate the entries of all parts (M,)."""
+    found: Floats = np.concatenate([np.ravel(part) for part in parts]) if parts else np.zeros(0)
+    return found
+
+
+def split(bound: Sequence[BoundConstraint], flattened: Floats) -> list[Floats]:
+    """Inverse of :func:`flat`: of entries (M,) the parts in the shapes of constraints' values."""
+    ends = np.cumsum([item.size for item in bound])
+    return [part.reshape(item.shape) for part, item in zip(np.split(flattened, ends[:-1]), bound, strict=True)]
 
 
 def at_nodes(problem: OptimalControlProblem, known: Multipliers, values: Floats) -> list[Floats]:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin import core
-from varpin.arrays import Floats, Mask
-from varpin.control.along import Along, Limits, without_limits
+from varpin.arrays import Floats
+from varpin.control.along import Along
 from varpin.control.descent import Model
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.square_root import Squares, squares_of
@@ -37,34 +37,15 @@ class Plan(NamedTuple):
     noise: float  # cost of the noise along the motion
     jumps: Floats  # (N, 2n, n), empty without noise
     spread: Floats  # (N, 2n, 2n)
-    limited: bool
     loss: float  # estimated relative rounding error of Quu, or of its root
     model: Model  # of the cost along the motion
-    left: Floats | None = None  # (R, m) the model's gradient after a full step, which presses controls against limits
-    rows: Mask | None = None  # active rows of all penalties where the last pass to the model's minimum ended
-    holds: bool = False  # whether it holds controls at their limits, where they have no feedback
+    factors: Floats  # (R, m, m) L D L' of the regularized Quu
 
     @property
     def expected_decrease(self) -> float:
         """Decrease of the expected cost with a full step, by the model."""
-        # Without limits the step is the model's minimum, where curvature = -slope.
-        return -self.slope - 0.5 * self.curvature if self.limited else -0.5 * self.slope
-
-    def followed(self, length: float) -> Plan:
-        """The plan after a step of the given length, by the model: the same gains and the rest of the step."""
-        left = 1.0 - length
-        return self._replace(feedforward=left * self.feedforward, gradient=left * self.gradient)
-
-    def free_gradient(self, problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
-        """The gradient (R, m), zero at an optimum.
-
-        Of a plan that holds controls at limits it is zero where it pushes a control of the motion against its limit.
-        """
-        if not self.holds:
-            return self.gradient
-        u, (lower, upper) = problem.decided(trajectory), problem.control_limits
-        held = ((u <= lower) & (self.gradient > 0.0)) | ((u >= upper) & (self.gradient < 0.0))
-        return np.where(held, 0.0, self.gradient)
+        # The step is the model's minimum, where curvature = -slope.
+        return -0.5 * self.slope
 
 
 def noise_shares(
@@ -94,12 +75,6 @@ def impulses(problem: OptimalControlProblem, trajectory: Trajectory, jumps: Floa
     if left < 1.0:
         g[:, n:] += (1.0 - left) * noise_fields(scene, trajectory, q[1:], v[1:], problem.q0).F
     return g
-
-
-def without_feedback(plan: Plan, moves: Floats) -> Plan:
-    """A plan of changes of the controls (R, m) alone."""
-    previous = None if plan.previous is None else np.zeros(plan.previous.shape)
-    return plan._replace(feedforward=moves, feedback=np.zeros(plan.feedback.shape), previous=previous)
 
 
 class Foreseen(NamedTuple):
@@ -153,14 +128,12 @@ def single_pass(
     *,
     costates: bool = False,
     curvature: Floats | None = None,
-    limits: Limits | None = None,
 ) -> tuple[Plan | None, Floats]:
     """The plain recursion, or, where its rounding errors are large and the model is convex, that on square roots."""
-    plain = one_pass(along, regularization, costates, curvature, limits, roots=False)
-    curved = curvature is not None or along.firm is not None
-    if curved or (plain[0] is not None and plain[0].loss <= TRUSTED):
+    plain = one_pass(along, regularization, costates, curvature, roots=False)
+    if curvature is not None or (plain[0] is not None and plain[0].loss <= TRUSTED):
         return plain
-    by_roots = one_pass(along, regularization, costates, None, limits, roots=True)
+    by_roots = one_pass(along, regularization, costates, None, roots=True)
     return plain if by_roots[0] is None else by_roots
 
 
@@ -178,7 +151,6 @@ def one_pass(
     regularization: float,
     costates: bool,
     curvature: Floats | None,
-    limits: Limits | None,
     *,
     roots: bool,
 ) -> tuple[Plan | None, Floats]:
@@ -191,17 +163,17 @@ def one_pass(
         pull = along.terminal.cost.gradient[:, n:]
         by_states = by_states + velocity_curvature(scene, along.trajectory.q[-1:], along.trajectory.v[-1:], pull)[0]
     if problem.linear:
-        return _one_pass_on_lines(along, regularization, costates, curvature, by_states, limits, roots=roots)
+        return _one_pass_on_lines(along, regularization, costates, curvature, by_states, roots=roots)
     noisy = N if k else 0
     jumps, spread = np.empty((noisy, 2 * n, n)), np.empty((noisy, 2 * n, 2 * n))
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, 2 * n)), np.empty((R, m))
-    previous = np.empty(along.rate.shape)
+    previous, factors = np.empty(along.rate.shape), np.empty((R, m, m))
     costate = np.empty((N if costates else 0, 2 * n))
     plain, by_roots = core.BackwardPass(m, by_state, by_states), None
     if roots:
         final, squares = (
             squares_of(along.terminal.cost.gradient, along.terminal.cost.hessian),
-            squares_of(along.slopes, running.hessian),
+            squares_of(along.running.gradient, running.hessian),
         )
         change = squares_of(along.pull, along.rate)
         within = None if along.within is None else squares_of(np.zeros((N, 2 * n)), along.within)
@@ -210,15 +182,13 @@ def one_pass(
         by_roots = _ByRoots(
             core.RootPass(m, final.after(along.terminal.slopes).core, by_state), squares, change, within
         )
-    if limits is None:
-        limits = without_limits(m, 2 * n)
     samples = len(problem.model_rule)
     for begin, end in reversed(along.blocks):
         steps, points = slice(begin, end), slice(begin * samples, end * samples)
         rows = slice(begin // problem.hold, end // problem.hold)
         if k:
             jumps[steps] = along.linearized(begin, end)[0].J
-        given = along.steps(begin, end, curvature, limits)
+        given = along.steps(begin, end, curvature)
         gains = core.Gains(
             feedforward=feedforward[rows],
             feedback=feedback[rows],
@@ -226,7 +196,7 @@ def one_pass(
             control_gradient=gradient[rows],
             costate=costate[steps] if costates else costate,
             spread=spread[steps],
-            **limits.part(rows),
+            factors=factors[rows],
         )
         how = (problem.dt, problem.hold, float(regularization))
         if by_roots is None:
@@ -250,9 +220,9 @@ def one_pass(
         found.noise,
         jumps,
         spread,
-        limits.slack.size > 0,
         found.loss,
         along.model,
+        factors,
     )
     return plan, costate
 
@@ -263,7 +233,6 @@ def _one_pass_on_lines(
     costates: bool,
     curvature: Floats | None,
     by_states: Floats,
-    limits: Limits | None,
     *,
     roots: bool,
 ) -> tuple[Plan | None, Floats]:
@@ -274,10 +243,9 @@ def _one_pass_on_lines(
     end_gradient, end_hessian = np.zeros(X), np.zeros((X, X))
     end_gradient[:x], end_hessian[:x, :x] = by_state, by_states
     feedforward, feedback, gradient = np.empty((R, m)), np.empty((R, m, X)), np.empty((R, m))
-    line, k = along.line, along.processes
+    line, k, factors = along.line, along.processes, np.empty((R, m, m))
     spread, costate = np.empty((R if k else 0, X, X)), np.empty((R if costates else 0, X))
     of_states = costate[1:, :x]
-    limits = without_limits(m, X) if limits is None else limits
     gains = core.Gains(
         feedforward=feedforward,
         feedback=feedback,
@@ -285,9 +253,9 @@ def _one_pass_on_lines(
         control_gradient=gradient,
         costate=costate,
         spread=spread,
-        **limits.part(slice(0, R)),
+        factors=factors,
     )
-    steps = along.steps(0, R, curvature, limits)
+    steps = along.steps(0, R, curvature)
     how = (problem.dt, 1, float(regularization))
     found: core.BackwardPass | core.RootPass
     if roots:
@@ -319,8 +287,8 @@ def _one_pass_on_lines(
         noise,
         jumps,
         after,
-        limits.slack.size > 0,
         found.loss,
         along.model,
+        factors,
     )
     return plan, of_states

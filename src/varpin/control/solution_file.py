@@ -12,13 +12,12 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from varpin.arrays import Floats, Mask
+from varpin.arrays import Floats
 from varpin.control.between_nodes import MOST_INSTANTS, UNUSED, enforced, in_force, watched
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.multipliers import Multipliers
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refined import Refined, Refinement
-from varpin.control.watchdog import Watchdog
 from varpin.errors import FileError
 from varpin.finding import Finding
 from varpin.io.archive import Axes, members_of, read_npz, record_of, write_npz
@@ -29,47 +28,12 @@ from varpin.trajectory import Trajectory
 
 Members = Mapping[str, NDArray[Any]]
 
-_FORMAT = "varpin.solution/2"
+_FORMAT = "varpin.solution/3"
 _PROBLEM = ("q0", "v0", "t0", "steps", "hold", "controls", "between_nodes", "sampling", "control_limits")
 _STATUSES = tuple(Status)
-_NUMBERS = ("cost", "above", "first", "best_cost", "best_noise", "regularization", "growth")
-_FLAGS = ("bounded", "cut", "whole", "saturated", "clips", "follows", "overshot", "returned")
 _REFINED = tuple(item.name for item in fields(Refined) if item.name != "status")
 # The columns of a history; the truth values of `second_order` are an entry of their own, which older files do not have.
 _COLUMNS = tuple(item.name for item in fields(Iteration) if item.type != "bool")
-
-
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """A :class:`SearchState`, with the prefix of its motion's entries and the length of its history."""
-
-    motion: str
-    cost: float
-    above: float
-    first: float
-    best_cost: float
-    best_noise: float
-    gains: Annotated[Floats, Axes("gains", finite=True)]
-    regularization: float
-    growth: float
-    bounded: int
-    cut: int
-    history: int
-    whole: int = 0
-    saturated: int = 0
-    clips: int = 1
-    follows: int = 1
-    overshot: int = 0
-    returned: int = 0
-    watchdog: Annotated[Floats, Axes(len(Watchdog._fields), finite=True)] | None = None
-    rows: Annotated[Mask, Axes("penalty_rows")] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Other:
-    """The prefix of the entries of another motion of a search."""
-
-    motion: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,40 +63,15 @@ class _Plan:
     second_order: Annotated[Floats, Axes("iterations")] | None = None
     refined: Annotated[Floats, Axes("refined", len(_REFINED) + 1)] | None = None
     refinement: _Refinement | None = None
-    search: _Search | None = None
-    best: _Other | None = None
-    behind: _Other | None = None
+    search: SearchState | None = None
     multipliers: Multipliers | None = None
 
 
 def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
     """Write the fields of a :class:`Solution`; see :meth:`Solution.save`."""
     problem: OptimalControlProblem = solution["problem"]
-    state: SearchState | None = solution["search"]
-    motions: dict[str, Trajectory] = {"": solution["trajectory"]}
-    if state is not None:
-        others = {"best.": state.best, "behind.": state.behind}
-        motions |= {"search.": state.trajectory} | {name: each for name, each in others.items() if each is not None}
-    members: dict[str, Any] = {}
-    # These motions are often the same object: each is written once, without the scene, which is the problem's.
-    prefixes: dict[int, str] = {}
-    for prefix, motion in motions.items():
-        if prefixes.setdefault(id(motion), prefix) == prefix:
-            members |= members_of(replace(motion, scene_values={}), prefix)
-    search, best, behind = None, None, None
-    if state is not None:
-        numbers: dict[str, Any] = {name: getattr(state, name) for name in _NUMBERS}
-        numbers |= {name: int(getattr(state, name)) for name in _FLAGS} | {"history": len(state.history)}
-        numbers |= {
-            "rows": state.rows,
-            "gains": np.array(state.gains),
-            "watchdog": np.array(state.watchdog, dtype=np.float64),
-        }
-        search = _Search(prefixes[id(state.trajectory)], **numbers)
-        best, behind = (
-            None if motion is None else _Other(prefixes[id(motion)]) for motion in (state.best, state.behind)
-        )
-    apart = ("search", "best", "behind", "refined", "refinement", "second_order")
+    members: dict[str, Any] = members_of(replace(solution["trajectory"], scene_values={}))
+    apart = ("refined", "refinement", "second_order")
     given = {item.name: solution[item.name] for item in fields(_Plan) if item.name not in apart}
     refinement: Refinement | None = solution["refinement"]
     if refinement is not None:
@@ -145,9 +84,7 @@ def write(path: str | os.PathLike[str], solution: Mapping[str, Any]) -> Path:
         given["refinement"] = _Refinement(refinement.wish, int(refinement.met), refinement.chosen, refinement.reason)
     given |= {"status": solution["status"].name, "history": _rows(solution["history"])}
     exact = np.array([float(item.second_order) for item in solution["history"]])
-    members |= members_of(
-        _Plan(**given, search=search, best=best, behind=behind, second_order=exact if exact.any() else None)
-    )
+    members |= members_of(_Plan(**given, second_order=exact if exact.any() else None))
     members |= {name: getattr(problem, name) for name in _PROBLEM}
     members |= {"problem.integrator": repr(problem.integrator)} | _surroundings(problem)
     if problem.constraints:
@@ -163,13 +100,13 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
     sizes = {"decisions": problem.decisions, "controls": scene.controls, "states": 2 * scene.robot.dof}
 
     _require_problem(source, members, problem)
-    motions = {"": _motion(source, members, "", problem)}
+    motion = _motion(source, members, problem)
     # Only after the motion, whose masses give a clearer message for another robot.
     _require_surroundings(source, members, problem, "scene.")
     plan = record_of(_Plan, members, source, sizes=sizes)
     if plan.status not in Status.__members__:
         raise FileError(f"{source}: there is no status {plan.status!r}")
-    found = problem.cost_of(motions[""])
+    found = problem.cost_of(motion)
     if not abs(found - plan.cost) <= 1e-9 * max(abs(found), abs(plan.cost)):
         raise FileError(f"{source} is of a problem with another cost: {plan.cost:.9g}, and here {found:.9g}")
     history = _iterations(source, plan.history, plan.second_order)
@@ -179,12 +116,13 @@ def read(path: str | os.PathLike[str], problem: OptimalControlProblem) -> dict[s
         _require_rows(source, plan.multipliers, problem)
     if (problem.rate is not None or problem.linear) and plan.previous_gains is None:
         raise FileError(f"{source}: previous_gains is missing")
-    apart = ("best", "behind", "refined", "second_order")
+    apart = ("refined", "second_order")
     given = {item.name: getattr(plan, item.name) for item in fields(_Plan) if item.name not in apart}
     given["refinement"] = _refinement(source, plan)
     given |= {"status": Status[plan.status], "history": history}
-    given |= {"search": _search(source, members, plan, motions, history, problem)}
-    return given | {"problem": problem, "trajectory": motions[""]}
+    if plan.search is not None and not 0 <= plan.search.iterations <= len(history):
+        raise FileError(f"{source}: search.iterations is {plan.search.iterations}, where 0 to {len(history)} belongs")
+    return given | {"problem": problem, "trajectory": motion}
 
 
 def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalControlProblem) -> None:
@@ -198,19 +136,16 @@ def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalContro
     own = [problem.bound_constraints[i] for i in between.rows[:, 0]]
     if sum(len(item.rows) for item in own) != between.moments.size:
         raise FileError(f"{source}: multipliers.moments do not belong to multipliers.instants")
-    for told in (between, multipliers.begun_between):
-        inside = (told.moments == UNUSED) | ((told.moments >= 0.0) & (told.moments <= 1.0))
-        if not (inside.all() and (told.bends >= 0.0).all()):
-            raise FileError(f"{source}: multipliers.moments are not within steps, or multipliers.bends are negative")
-        if not all(rows.any(axis=1).all() for rows in in_force(problem, told)):
-            raise FileError(f"{source}: multipliers.moments enforce no row at an instant")
+    inside = (between.moments == UNUSED) | ((between.moments >= 0.0) & (between.moments <= 1.0))
+    if not (inside.all() and (between.bends >= 0.0).all()):
+        raise FileError(f"{source}: multipliers.moments are not within steps, or multipliers.bends are negative")
+    if not all(rows.any(axis=1).all() for rows in in_force(problem, between)):
+        raise FileError(f"{source}: multipliers.moments enforce no row at an instant")
     sizes = [item.size for item in enforced(problem, between).bound_constraints]
     at_nodes = sum(item.size for item in problem.bound_constraints)
     for name, found, expected in (
         ("values", multipliers.values, sum(sizes)),
-        ("weights", multipliers.weights, len(sizes)),
         ("added", multipliers.added, at_nodes),
-        ("active", multipliers.active, sum(sizes)),
     ):
         if found is not None and found.size != expected:
             raise FileError(f"{source}: multipliers.{name} has shape ({found.size},), where ({expected},) belongs")
@@ -233,41 +168,6 @@ def _refinement(source: Path, plan: _Plan) -> Refinement | None:
     return Refinement(refinement.wish, bool(refinement.met), tried, refinement.chosen, refinement.reason)
 
 
-def _search(
-    source: Path,
-    members: Members,
-    plan: _Plan,
-    motions: dict[str, Trajectory],
-    history: tuple[Iteration, ...],
-    problem: OptimalControlProblem,
-) -> SearchState | None:
-    """The state of the search; motions that are in ``motions`` already are not read again."""
-    state = plan.search
-    if state is None:
-        return None
-    best, behind = (None if other is None else other.motion for other in (plan.best, plan.behind))
-    for prefix in (state.motion, best, behind):
-        if prefix is not None and prefix not in motions:
-            motions[prefix] = _motion(source, members, prefix, problem)
-    if not 0 <= state.history <= len(history):
-        raise FileError(f"{source}: search.history is {state.history}, where 0 to {len(history)} belongs")
-    return SearchState(
-        trajectory=motions[state.motion],
-        best=None if best is None else motions[best],
-        behind=None if behind is None else motions[behind],
-        gains=tuple(state.gains.tolist()),
-        history=history[: state.history],
-        rows=state.rows,
-        watchdog=Watchdog() if state.watchdog is None else _watchdog(*state.watchdog.tolist()),
-        **{name: bool(getattr(state, name)) for name in _FLAGS},
-        **{name: getattr(state, name) for name in _NUMBERS},
-    )
-
-
-def _watchdog(away: float, failed: float, rest: float, regularization: float, growth: float) -> Watchdog:
-    return Watchdog(int(away), int(failed), int(rest), regularization, growth)
-
-
 def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None) -> Trajectory:
     """Read only the motion of a solution, without its problem.
 
@@ -278,9 +178,9 @@ def solution_trajectory(path: str | os.PathLike[str], robot: Robot | None = None
     return Trajectory.of_members(source, read_npz(source, _FORMAT), robot)
 
 
-def _motion(source: Path, members: Members, prefix: str, problem: OptimalControlProblem) -> Trajectory:
-    """The motion whose entries begin with ``prefix``, checked against the problem."""
-    motion, scene = Trajectory.of_members(source, members, problem.scene.robot, prefix), problem.scene
+def _motion(source: Path, members: Members, problem: OptimalControlProblem) -> Trajectory:
+    """The motion, checked against the problem."""
+    motion, scene = Trajectory.of_members(source, members, problem.scene.robot), problem.scene
     found = motion.steps, motion.u.shape[1], motion.dw.shape[1]
     if found != (problem.steps, scene.controls, scene.processes):
         raise FileError(

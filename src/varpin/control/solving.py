@@ -1,6 +1,242 @@
-"""The function ``solve``: S-DDP for problems with or without constraints."""
+"""The function ``solve``: options, the first motion, resumed plans and refinement of the step."""
 
-from varpin.control import unconstrained
-from varpin.control.augmented import within_constraints
+from __future__ import annotations
 
-solve = within_constraints(unconstrained.solve)
+import logging
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from varpin.control.commands import controls_along, first_commands
+from varpin.control.examination import foreseen, looked_at
+from varpin.control.history import ITERATIONS, Iteration, Status
+from varpin.control.line_search import ARMIJO, BACKTRACKING
+from varpin.control.problem import OptimalControlProblem
+from varpin.control.refinement import SUFFICIENT, refine
+from varpin.control.search import Report, Search
+from varpin.control.solution import Solution
+from varpin.control.starts import Path, commands_along, path_of
+from varpin.errors import InputError
+from varpin.finding import announce
+from varpin.signals.policy import LinearPolicy
+from varpin.support.checks import JointValues, count, flag, fraction, is_one_of, positive, real, takes, told_motion
+from varpin.support.one_thread import one_thread
+from varpin.trajectory import Trajectory
+
+Callback = Callable[[Iteration], None] | Callable[[Iteration, Trajectory], None]
+Progress = Callable[[int, int], None]
+
+logger = logging.getLogger(__name__)
+
+
+def solve(
+    problem: OptimalControlProblem,
+    controls: JointValues | LinearPolicy | Solution | None = None,
+    *,
+    tolerance: float = 1e-7,
+    max_iterations: int = ITERATIONS,
+    second_order: bool = False,
+    forward: Literal["closed", "open"] = "closed",
+    armijo: float = ARMIJO,
+    backtracking: float = BACKTRACKING,
+    regularization: float = 0.0,
+    time_limit: float = np.inf,
+    callback: Callback | None = None,
+    resume: Solution | None = None,
+    progress: Progress | None = None,
+    check: bool = True,
+    true_cost: float | None = None,
+    states: ArrayLike | tuple[ArrayLike, ArrayLike] | Trajectory | None = None,
+) -> Solution:
+    """Solve an optimal control problem by S-DDP (Algorithm 2 of the paper).
+
+    Each iteration linearizes along the motion, runs a backward pass through the quadratic model of the cost to go,
+    noise terms included, and searches along the new controls for a motion of lower expected cost. The expected cost is
+    the cost of the motion plus what noise adds to it under the model. Where limits or constraints are in reach, the
+    changes of the controls are those of one quadratic program over the horizon, and the search lowers the expected cost
+    plus a penalty of the violations.
+
+        robot = vp.load_robot("ur5")
+        cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, -1, 1, 0, 0.5, 0], 1e3) + vp.VelocityCost(10))
+        problem = vp.OptimalControlProblem(vp.Scene(robot), cost, q0=np.zeros(6), v0=np.zeros(6), dt=0.01, steps=100)
+        plan = vp.solve(problem, callback=print)  # a line for each iteration
+        print(plan.table())
+        print(plan.verify())
+
+    Ctrl-C ends the search once the first motion has been integrated, and returns the best motion so far with ``status``
+    INTERRUPTED. ``solve(problem, plan)`` continues from there.
+
+    Feedback is that of the costs and goals alone: limits and other constraints never enter it. The noise cost is that of
+    linear feedback, without controls that noise drives into their limits; ``monte_carlo`` includes them.
+
+    Main args:
+        problem: What to minimize.
+        controls: Initial controls: None to hold the robot at q0; an array (R, m) or (m,), R the number of
+            decisions; by joint name; a :class:`LinearPolicy`; or a :class:`Solution`, whose policy then runs on this
+            problem. Controls outside the problem's limits are clipped.
+        tolerance: Stop when the expected decrease is below this fraction of the cost at stake, (O9): the decrease of
+            the cost's own quadratic models along the motion if each state and control were free, and at most their
+            change over the motion's displacement. For squared distances it is about their value. Constants in the cost
+            and the noise cost do not count.
+        max_iterations: Greatest number of iterations.
+
+    Other Args:
+        second_order: Full differential dynamic programming: second derivatives of the dynamics too, wherever the
+            model stays convex. Converges quadratically; needs an integrator that has them (:class:`Midpoint`).
+        forward: ``"closed"``: the feedback gains act in the line search. ``"open"``: only the feed-forward part, as in
+            the paper; it diverges where the open loop is unstable over the horizon.
+        armijo: Least share of the expected decrease that a step must reach (the paper's alpha).
+        backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1). Where the parabola
+            through a trial's cost and the slope has its minimum far below the next length, that length is left out.
+        regularization: Initial value, relative to the diagonal of Quu; it increases and decreases as needed.
+        time_limit: No iteration begins after this time since the call [s]. The result then depends on the machine.
+        callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table`. The
+            log has them at level INFO, preceded by the robot and the horizon. A function of two arguments, such as a
+            :class:`varpin.LiveView`, is also given the motion after the iteration, a :class:`varpin.Trajectory`.
+        progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
+        resume: A solution of the same problem, as solve returned it or as read from a file: the search continues where
+            it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
+            as before; ``regularization`` is taken from the solution.
+        check: Check the finished plan: whether its cost in finer steps agrees, and whether its velocities alternate or
+            oscillate. ``Solution.warnings`` and the log have the result. It takes as long as a few motions of the
+            search.
+        true_cost: Greatest difference between the plan's cost and its cost with feedback on the continuous system,
+            relative to the former: 0.01 for a percent; and greatest excess of the latter over the optimum of finer
+            controls, as estimated from a few iterations with half the step, or with constraints from the plan of half
+            the step. Constraints must then hold on the continuous system to a thousandth of their range. The problem's
+            step is the coarsest; it is halved, each search starting from the plan before, until all that is so.
+            ``Solution.problem`` has the plan's step. ``Solution.refinement`` lists the steps tried, or why the accuracy
+            cannot be reached; a warning reports that, too. Controls that are held over several steps keep their period,
+            and their optimum is that of the period. ``max_iterations`` is for each step, ``time_limit`` for all;
+            ``tolerance`` is at least a hundredth of ``true_cost``. Ctrl-C keeps the best plan so far. Where dampers are
+            far faster than the step, ``controls="linear"`` in the problem reaches the accuracy at much larger steps.
+        states: Initial states, which need not be feasible: configurations at the nodes (N + 1, n), the first one q0; a
+            pair (q, v) of such arrays; or a :class:`varpin.Trajectory`. A straight line or the path of another planner
+            will do: the first motion is held on it by feedback, as far as controls can. ``controls`` are then those
+            along the states, by default the inverse dynamics' clipped to their limits.
+
+    Returns:
+        The best motion found, however the search ended. ``status`` and ``reason`` tell how it ended; ``warnings`` lists
+        what keeps a robot from following the plan.
+
+    Raises:
+        InputError: Controls of a wrong shape, or options out of their range.
+        NoiseFieldError: A custom noise field fails on the first motion.
+        ForceError: A :class:`varpin.CustomForce` fails on the first motion; a later failure rejects a trial.
+        StepFailure: The first motion cannot be integrated; the error holds the motion up to there.
+        CostError: The cost of the first motion is not finite, or a custom cost fails there.
+    """
+    if not isinstance(problem, OptimalControlProblem):
+        raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
+    if not is_one_of(forward, ("closed", "open")):
+        raise InputError(f"forward must be 'closed' or 'open', got {forward!r}")
+    if not 0.0 < real("backtracking", backtracking) < 1.0:
+        raise InputError(f"backtracking must be in (0, 1), got {backtracking}")
+    if not real("regularization", regularization) >= 0.0:
+        raise InputError(f"regularization must be >= 0, got {regularization}")
+    second_order, check = flag("second_order", second_order), flag("check", check)
+    report_all = require_reports(callback, progress)
+    positive("tolerance", tolerance, "1")
+    deadline = time.perf_counter() + checked_time(time_limit)
+    fraction("armijo", armijo)
+    most = count("max_iterations", max_iterations)
+    if resume is not None and true_cost is not None:
+        raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
+    if states is not None and resume is not None:
+        raise InputError("resume goes on from the solution's own states: leave out either states or resume")
+    path = None if states is None else path_of(problem, states)
+    # Before the search, which may take long where values are in wrong units.
+    before = foreseen(problem) if check else []
+    announce(logger, problem.scene.announced, problem.dt, before)
+
+    def searched(
+        problem: OptimalControlProblem,
+        controls: JointValues | LinearPolicy | Solution | None,
+        resume: Solution | None = None,
+        path: Path | None = None,
+        tolerance: float = tolerance,
+    ) -> Solution:
+        search = Search(
+            problem,
+            second_order=second_order,
+            closed=forward == "closed",
+            armijo=armijo,
+            backtracking=backtracking,
+            regularization=regularization,
+        )
+        if resume is not None:
+            _require_resumable(problem, controls, resume)
+            search.resume(resume)
+        elif path is not None:
+            search.begin(commands_along(problem, path, controls_along(problem, controls)))
+        else:
+            search.begin(first_commands(problem, controls))
+        known = len(search.history)
+
+        def report(item: Iteration, motion: Trajectory) -> None:
+            report_all(item, motion)
+            if progress is not None:
+                # A converged search reports once more after its last iteration.
+                progress(min(item.index + 1 - known, most), most)
+
+        try:
+            status = search.run(tolerance, most, deadline, report)
+        except KeyboardInterrupt:
+            status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
+        return search.solution(status)
+
+    with one_thread():
+        if true_cost is None:
+            solution = searched(problem, controls, resume, path)
+        else:
+            wish = positive("true_cost", true_cost, "1")
+
+            def once(finer: OptimalControlProblem, start: LinearPolicy | None) -> Solution:
+                given, on = (controls, path) if start is None else (start, None)
+                return searched(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
+
+            before = None
+            solution = refine(problem, once, wish, lambda: deadline - time.perf_counter())
+    return looked_at(solution, before)[0] if check else solution
+
+
+def _require_resumable(problem: OptimalControlProblem, controls: object, resume: Solution) -> None:
+    if not isinstance(resume, Solution):
+        raise InputError(f"resume must be a Solution, got {type(resume).__name__}")
+    if controls is not None:
+        raise InputError("resume goes on from the solution's own controls: leave out either controls or resume")
+    if resume.search is None:
+        raise InputError("resume: the solution does not hold the state of its search; give it as controls")
+    difference = problem.differs(resume.problem)
+    if difference:
+        raise InputError(f"resume: the solution is of another problem: {difference}; give it as controls")
+    found, known = problem.cost_of(resume.trajectory), resume.cost
+    if not abs(found - known) <= 1e-9 * max(abs(found), abs(known)):
+        raise InputError(f"resume: the solution is of another cost: {known:.9g}, and here {found:.9g}")
+
+
+def require_reports(callback: Any, progress: object) -> Report:
+    """The callback as a function of an iteration and its motion, whether or not it takes the motion.
+
+    Raises:
+        InputError: The callback or ``progress`` has the wrong number of arguments.
+    """
+    both = told_motion("callback", callback, "iteration", "motion")
+    if progress is not None and not (callable(progress) and takes(progress, 2)):
+        raise InputError(f"progress must be a function of (iterations done, max_iterations), got {progress!r}")
+
+    def report_all(item: Iteration, motion: Trajectory) -> None:
+        if both:
+            callback(item, motion)
+        elif callback is not None:
+            callback(item)
+
+    return report_all
+
+
+def checked_time(limit: object) -> float:
+    """A time limit [s] as a float > 0, infinite for none."""
+    return np.inf if isinstance(limit, float) and limit == np.inf else positive("time_limit", limit, "s")

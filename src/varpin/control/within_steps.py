@@ -120,18 +120,6 @@ def left_at_end(problem: OptimalControlProblem, Z: Floats, P: Floats) -> Floats:
     return found
 
 
-def left_at_end_slopes(problem: OptimalControlProblem, Z: Floats, P: Floats, pull: Floats) -> tuple[Floats, Floats]:
-    """Derivatives of tr(pull B) in Z and P, with B of :func:`left_at_end`, for symmetric P and ``pull`` (n, n)."""
-    method = problem.integrator
-    if not isinstance(method, Collocation) or method.stages == 1:
-        return np.zeros(Z.shape), np.zeros(Z.shape)
-    H = method.after_held(Z)
-    to_Z = _slopes_of_means(Z[None], P[None], pull[None], np.zeros((1, *pull.shape)))[0]
-    to_Z -= method.after_held_slopes(Z, 2.0 * P @ H @ pull)
-    late, early = _means_of_decay(Z.T[None], pull[None])
-    return to_Z, late[0] + early[0] - H @ pull @ H.T
-
-
 def mean_of_decay(Z: Floats, H: Floats) -> Floats:
     """The integral of (1 - s) exp(-Z s)' H exp(-Z s) over s from 0 to 1, for matrices (N, n, n)."""
     return _means_of_decay(Z, H)[0]
@@ -156,62 +144,3 @@ def _means_of_decay(Z: Floats, H: Floats) -> tuple[Floats, Floats]:
         total, first = total + later @ total @ flow, first + later @ (first + part * total) @ flow
         flow, part = flow @ flow, 2.0 * part
     return total - first, first
-
-
-def mean_of_decay_slopes(Z: Floats, H: Floats, pull: Floats) -> tuple[Floats, Floats]:
-    """Derivatives of tr(pull B) in Z and H, with B of :func:`mean_of_decay`, for symmetric H and ``pull`` (N, n, n)."""
-    return _slopes_of_means(Z, H, pull, -pull), mean_of_decay(np.swapaxes(Z, 1, 2), pull)
-
-
-def _slopes_of_means(Z: Floats, H: Floats, to_total: Floats, to_first: Floats) -> Floats:
-    """Derivatives in Z of the integrals of E' H E and of s E' H E over s, E(s) = exp(-Z s), each times a pull.
-
-    The doublings of the step are followed backward. Over its first part a, derivatives are integrals of
-    E(s - t)' R E(t)' over t < s, by Gauss's rule of order 10.
-    """
-    size = float(np.linalg.norm(Z, axis=(1, 2)).max())
-    doublings = max(0, math.ceil(math.log2(size / _SHORT))) if size > 0.0 else 0
-    short = 0.5**doublings
-    points, shares = np.polynomial.legendre.leggauss(5)
-    points, shares = 0.5 * (points + 1.0), 0.5 * short * shares
-    powers = [np.broadcast_to(np.eye(Z.shape[1]), Z.shape)]
-    for k in range(1, _TERMS):
-        powers.append(powers[-1] @ Z / -k)
-
-    def flows(s: Floats) -> Floats:
-        """E at short times s: (*s.shape, N, n, n)."""
-        found: Floats = np.tensordot(s[..., None] ** np.arange(_TERMS), np.stack(powers), axes=1)
-        return found
-
-    def turned(a: Floats) -> Floats:
-        return np.swapaxes(a, -1, -2)
-
-    def between(s: Floats, R: Floats) -> Floats:
-        """The integrals of E(s - t)' R E(t)' over t from 0 to s."""
-        # The points are symmetric in the interval: those of s - t are those of t in reverse.
-        inner = turned(flows(np.multiply.outer(s, points)))
-        found: Floats = np.einsum("s,p,spNab->sNab", s, shares / short, inner[:, ::-1] @ R[:, None] @ inner)
-        return found
-
-    times = short * points
-    at_times = flows(times)
-    decayed = turned(at_times) @ H @ at_times
-    total, first = (np.tensordot(weights, decayed, axes=1) for weights in (shares, shares * times))
-    E, part = flows(np.array(short)), short
-    levels = []
-    for _ in range(doublings):
-        levels.append((total, first, E, part))
-        later = turned(E)
-        total, first = total + later @ total @ E, first + later @ (first + part * total) @ E
-        E, part = E @ E, 2.0 * part
-    to_flow = np.zeros(Z.shape)
-    for total, first, E, part in reversed(levels):
-        later = turned(E)
-        to_flow = to_flow @ later + later @ to_flow
-        to_flow = to_flow + 2.0 * (total @ E @ to_total + (first + part * total) @ E @ to_first)
-        to_total = to_total + E @ (to_total + part * to_first) @ later
-        to_first = to_first + E @ to_first @ later
-    pulls = H @ at_times @ (to_total + times[:, None, None, None] * to_first)
-    found: Floats = -between(np.array([short]), to_flow[None])[0]
-    found -= 2.0 * np.tensordot(shares, between(times, pulls), axes=1)
-    return found
