@@ -6,7 +6,7 @@ R. Schwan, Y. Jiang, D. Kuhn and C. N. Jones, "PIQP: a proximal interior-point q
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import piqp
@@ -90,6 +90,11 @@ class Program:
         numbers = np.repeat(np.arange(count), width)
         return _matrix([(numbers, rows.at.ravel(), rows.slopes.ravel())], (count, size))
 
+    def _slacks(self, equal: Sequence[int], other: Sequence[int]) -> list[Floats]:
+        """Where the slacks of rows belong among the variables: the two of each equality, then those of other rows."""
+        last = [self.rows[i].at.max(axis=1).astype(float) for i in (*equal, *other)]
+        return [*last[: len(equal)], *last[: len(equal)], *last[len(equal) :]]
+
     def after_rows(self, z: Floats) -> list[Floats]:
         """Changes (P,) of the values of all rows at z."""
         return [block @ z for block in self._blocks]
@@ -127,29 +132,49 @@ class Program:
             A = sp.hstack([A, sp.vstack([none, both])], format="csc")
             if G is not None:
                 G = sp.hstack([G, sp.csc_matrix((of_other, 2 * of_equal)), -other_one], format="csc")
-        found = None
-        # Stage by stage is faster; the factors of the whole matrix are more accurate, and take slacks of their own.
-        kinds = (piqp.KKTSolver.sparse_multistage,) if weight is None else ()
-        for kind in (*kinds, piqp.KKTSolver.sparse_ldlt):
-            solver = piqp.SparseSolver()
-            settings = solver.settings
-            settings.kkt_solver = kind
-            settings.eps_abs, settings.eps_rel, settings.max_iter = _ABSOLUTE, _RELATIVE, _STEPS
-            solver.setup(P, c, A, b, G, None, h, lower, upper)
-            status, known = solver.solve(), solver.result.info
-            rounded = status == piqp.PIQP_MAX_ITER_REACHED and max(known.primal_res, known.dual_res) <= _ROUNDED
-            if status == piqp.PIQP_SOLVED or rounded:
-                found = solver.result
-                break
-            if status == piqp.PIQP_PRIMAL_INFEASIBLE:
-                break
+        # The solver factors stage by stage, if the slacks of rows are where their stages are.
+        order = np.argsort(
+            np.concatenate([np.arange(size), *self._slacks(equal, other)]) if weight is not None else np.arange(size),
+            kind="stable",
+        )
+        P, A, G = P[order][:, order], A[:, order], None if G is None else G[:, order]
+        found = _solved(P, c[order], A, b, G, h, lower[order], upper[order])
         if found is None:
             return None
+        z = np.empty(len(order))
+        z[order] = found.x
         y = self._scale * found.y
         own = iter(np.split(y[self._dynamics.shape[0] :], np.cumsum([len(values[i]) for i in equal])[:-1]))
         push = iter(np.split(self._scale * found.z_u, np.cumsum([len(values[i]) for i in other])[:-1]) if other else ())
         multipliers = tuple(next(own) if rows.equality else next(push) for rows in self.rows)
-        return Minimum(found.x[:size].copy(), multipliers, float(found.x[size:].sum()))
+        return Minimum(z[:size], multipliers, float(z[size:].sum()))
+
+
+def _solved(
+    P: sp.csc_matrix,
+    c: Floats,
+    A: sp.csc_matrix,
+    b: Floats,
+    G: sp.csc_matrix | None,
+    h: Floats | None,
+    lower: Floats,
+    upper: Floats,
+) -> Any:
+    """PIQP's result; None where there is no minimum or the solver fails."""
+    # Stage by stage is faster, the factors of the whole matrix are more accurate.
+    for kind in (piqp.KKTSolver.sparse_multistage, piqp.KKTSolver.sparse_ldlt):
+        solver = piqp.SparseSolver()
+        settings = solver.settings
+        settings.kkt_solver = kind
+        settings.eps_abs, settings.eps_rel, settings.max_iter = _ABSOLUTE, _RELATIVE, _STEPS
+        solver.setup(P, c, A, b, G, None, h, lower, upper)
+        status, known = solver.solve(), solver.result.info
+        rounded = status == piqp.PIQP_MAX_ITER_REACHED and max(known.primal_res, known.dual_res) <= _ROUNDED
+        if status == piqp.PIQP_SOLVED or rounded:
+            return solver.result
+        if status == piqp.PIQP_PRIMAL_INFEASIBLE:
+            return None
+    return None
 
 
 def _products(factors: Floats) -> Floats:

@@ -247,7 +247,7 @@ class Search:
                 self.reason = f"{self._expected()}, and rounding hides {taken.hidden:.1e} of the cost"
                 return Status.CONVERGED
             if not self._regularize():
-                if self.violation > FEASIBLE and self._elastic:
+                if self.violation > FEASIBLE:
                     return self._infeasible()
                 self.reason = f"no step lowers the cost, whatever the regularization; {self._numbers(tolerance)}"
                 return Status.STALLED
