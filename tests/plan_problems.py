@@ -3,7 +3,8 @@
     case = plan_problems.CASES["held, speeds"]
     plan = vp.solve(case.problem, **case.options)
 
-``SMALL`` are of two or three joints and a dozen decisions, for oracles that take many motions; ``ARMS`` are of robots.
+``SMALL`` are of two or three joints and a dozen decisions, for oracles that take many motions; ``ARMS`` are of robots,
+and ``HARD`` leave hardly any room.
 """
 
 from __future__ import annotations
@@ -162,11 +163,23 @@ SMALL: dict[str, Case] = {
         kkt=None,
         within=1e-4,
     ),
+    "linear, out of a sphere": Case(
+        lambda: reach(vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3), controls="linear"),
+        31.86263,
+        kkt=None,
+        within=1e-4,
+    ),
+    "linear, clear of a ball": Case(
+        lambda: reach(vp.KeepClear(TWO, [BALL], 0.05, capsules=CAPSULES), controls="linear"),
+        39.999934,
+        kkt=None,
+        within=1e-4,
+    ),
     "three links": Case(
         lambda: wave(control_limits=(-12.0, 12.0)), 9.6697064, options={"tolerance": 1e-10}, kkt=1e-4, scipy=True
     ),
     "three links, speeds": Case(lambda: wave(vp.WithinVelocityLimits(THREE, (-0.9, 0.9))), 2.6048773),
-    "servos at their limits": Case(served, 0.0035311108035311108, kkt=1e-4),
+    "servos at their limits": Case(served, 0.0035311108, kkt=1e-4),
     "closed loop": Case(loop, 5.2016894),
     "from states": Case(lambda: reach(speeds(1.8)), 3.5426741, options={"states": LINE}),
     "second order": Case(lambda: reach(integrator=vp.Midpoint(), **LIMITS), 3.0291445, options={"second_order": True}),
@@ -220,6 +233,38 @@ def pose(robot: vp.Robot, _: np.ndarray, end: np.ndarray) -> list[vp.PlanConstra
     return [vp.ReachFrame(robot, "tool0", tool.translation, turned)]
 
 
+def hasty(goal: Sequence[float], duration: float, steps: int, speed: float, torque: float) -> vp.OptimalControlProblem:
+    """Joints that move at their greatest speed with little torque to spare."""
+    cost = vp.ControlCost(1e-6) + vp.VelocityCost(1e-2) + vp.Terminal(vp.TrackingCost(goal, 1e2) + vp.VelocityCost(1.0))
+    given = {"dt": duration / steps, "steps": steps, "control_limits": (-torque, torque)}
+    return vp.OptimalControlProblem(vp.Scene(TWO, damping=0.1), cost, REST, REST, constraints=[speeds(speed)], **given)
+
+
+def panda_at_speed() -> vp.OptimalControlProblem:
+    """A goal of the tool that joints reach at their greatest speeds."""
+    robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.0})
+    cost = vp.ControlCost(0.1 / robot.effort_limit**2) + vp.VelocityCost(0.1) + vp.Terminal(vp.VelocityCost(10.0))
+    rules = [
+        vp.ReachFrame(robot, robot.end_effector, [-0.49, -0.19, 0.41]),
+        vp.WithinVelocityLimits(robot, (-1.0, 1.0)),
+    ]
+    begin = [-0.85, -0.88, -0.71, -1.45, -1.24, 0.85, 1.23]
+    given = {"dt": 1.0 / 60, "steps": 24, "integrator": vp.RungeKutta4(), "constraints": rules}
+    return vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, begin, np.zeros(7), **given)
+
+
+def kinova_near_speeds() -> vp.OptimalControlProblem:
+    """A joint keeps to its greatest speed for eight nodes, at most of them by a hair."""
+    robot = vp.load_robot("kinova")
+    begin = [-0.0711748649960309, 1.9930761174675944, 1.7271682700264162, 0.07818165024080687, 1.8578307798284002]
+    goal = [-0.3670625074091858, 1.691437829695649, 1.2497085561698789, 0.09824501637093636, 1.936600800564796]
+    cost = vp.ControlCost(0.1 / robot.effort_limit**2)
+    cost += vp.Terminal(vp.TrackingCost([*goal, 0.13025307794264052], 1e3) + vp.VelocityCost(10.0))
+    given = {"dt": 0.025, "steps": 40, "constraints": [vp.WithinVelocityLimits(robot, (-0.8, 0.8))]}
+    scene = vp.Scene(robot, damping=0.5)
+    return vp.OptimalControlProblem(scene, cost, [*begin, -0.09503175088201599], np.zeros(6), **given)
+
+
 ARMS: dict[str, Case] = {
     "UR5, speeds": Case(lambda: arm(*UR5, lambda r, *_: [vp.WithinVelocityLimits(r, (-0.8, 0.8))]), 0.45339862),
     "UR5, speeds and torques": Case(ur5_torques, 0.28243473),
@@ -258,4 +303,11 @@ ARMS: dict[str, Case] = {
         within=1e-4,
     ),
 }
-CASES = SMALL | ARMS
+# Those at the edge of what limits allow, where feedback has no room.
+HARD: dict[str, Case] = {
+    "two links in haste": Case(lambda: hasty([0.38, -1.25], 0.67, 16, 1.71, 43.0), 2.9835572),
+    "two links in more haste": Case(lambda: hasty([1.32, 1.05], 0.95, 19, 1.4, 29.0), 0.63806531),
+    "Panda, goal at greatest speeds": Case(panda_at_speed, 0.13662213),
+    "Kinova, speeds met by a hair": Case(kinova_near_speeds, 0.0023766076),
+}
+CASES = SMALL | ARMS | HARD

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from oracles import kkt, least_cost, lines, plan_rows, rollout, violation
-from plan_problems import CAPSULES, CASES, LIMITS, LINE, REST, SMALL, TWO, reach, speeds, tip
+from plan_problems import ARMS, CAPSULES, CASES, LIMITS, LINE, REST, SMALL, TWO, reach, speeds, tip
 from scipy.special import ndtr
 
 import varpin as vp
@@ -111,7 +111,7 @@ def tip_in_a_wide_box() -> vp.PlanConstraint:
 # --- feedback --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if name != "closed loop"])
+@pytest.mark.parametrize("name", [name for name in SMALL | ARMS if name != "closed loop"])
 def test_feedback_holds_a_disturbed_start(name: str) -> None:
     """From 0.02 rad beside the start no joint goes farther off than five times that, and none is so at the end."""
     problem, plan = CASES[name].problem, CASES[name].plan
@@ -235,7 +235,14 @@ def test_a_start_outside_that_one_step_mends_is_no_reason_to_end() -> None:
 
 # --- how searches begin, end and go on -------------------------------------------------------------------------------
 
-RESUMED = ("held, torques", "held, speeds and torques", "held, goal", "linear, speeds", "noise of the controls")
+RESUMED = (
+    "held, torques",
+    "held, speeds and torques",
+    "held, goal",
+    "held, between nodes",
+    "linear, speeds",
+    "noise of the controls",
+)
 
 
 @pytest.mark.parametrize("name", RESUMED)
