@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from refusals import refused
-from test_sddp import SAMPLINGS, run, samples_of_a_step, sliders, small
+from scipy.interpolate import CubicHermiteSpline
+from test_sddp import SAMPLINGS, run, sliders, small
 
 import varpin as vp
 from varpin.control.costs import Points
@@ -11,6 +12,19 @@ from varpin.control.costs import Points
 N, DOF, M = 6, 3, 2
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 FULL = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.2], [-0.1, 0.2, 0.5]])
+
+
+def samples_of_a_step(sampling, h):
+    """For each: its weight, its place in the step, and q and v there as sums over (q0, v0, q1, v1)."""
+    if sampling == "start":
+        return [(1.0, 0.0, [1, 0, 0, 0], [0, 1, 0, 0])]
+    if sampling == "midpoint":
+        return [(1.0, 0.5, [0.5, 0, 0.5, 0], [-1 / h, 0, 1 / h, 0])]
+    units = np.eye(4)
+    motion = CubicHermiteSpline([0.0, h], units[[0, 2]], units[[1, 3]])
+    places, weights = np.polynomial.legendre.leggauss(2)
+    places = 0.5 + 0.5 * places
+    return [(0.5 * w, s, motion(s * h), motion(s * h, 1)) for w, s in zip(weights, places, strict=True)]
 
 
 def points(times=None, steps=N):
@@ -151,17 +165,6 @@ def test_controls_of_a_solution_are_a_reference(sampling):
     controls = np.random.default_rng(0).normal(size=(20, 2))
     problem = small(vp.ControlCost(1.0, controls), sampling=sampling)
     assert problem.cost_of(run(problem, controls)) == 0.0
-
-
-@pytest.mark.parametrize("name", COSTS)
-def test_many_paths_at_once(name):
-    """Leading axes are paths."""
-    bound = COSTS[name].bind(points())
-    paths = [random_points(seed) for seed in range(4)]
-    q, v, u = (np.array([path[i] for path in paths]) for i in range(3))
-    together = bound.value(q, v, u)
-    assert together.shape == (4, N)
-    np.testing.assert_array_equal(together, [bound.value(*path) for path in paths])
 
 
 def test_sums():

@@ -13,8 +13,6 @@ from varpin.model.kinematics import frame_kinematics, links
 N = 5
 STEP = 1e-2
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-FULL = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.2], [-0.1, 0.2, 0.5]])
-FULL6 = np.diag([1.0, 2.0, 0.5, 0.1, 0.2, 0.3]) + 0.02
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
@@ -116,60 +114,6 @@ def turn(axis, angle):
     return pin.exp3(angle * np.asarray(axis) / np.linalg.norm(axis))
 
 
-TARGET = turn([1, 2, 3], 0.8)
-
-
-def residual(kind, robot, frame, q, v):
-    """What the costs below weigh, by Pinocchio, at one state."""
-    R, p, twist = pinocchio_frame(robot, frame, q, v)
-    if kind == "position":
-        return p - [0.3, 0.2, 0.1]
-    if kind == "orientation":
-        return pin.log3(TARGET.T @ R)
-    if kind == "velocity":
-        return twist - np.arange(6) * 0.1
-    return pin.centerOfMass(robot.free_model, robot.free_model.createData(), robot.free_positions(q)) - [0.1, 0.2, 0.3]
-
-
-MADE = {
-    "position": (lambda robot, frame: vp.FramePositionCost(robot, frame, [0.3, 0.2, 0.1], FULL), FULL),
-    "orientation": (lambda robot, frame: vp.FrameOrientationCost(robot, frame, TARGET, FULL), FULL),
-    "velocity": (lambda robot, frame: vp.FrameVelocityCost(robot, frame, np.arange(6) * 0.1, FULL6), FULL6),
-    "center": (lambda robot, frame: vp.CenterOfMassCost(robot, [0.1, 0.2, 0.3], FULL), FULL),
-}
-
-
-@pytest.mark.parametrize("kind", MADE)
-def test_values_gradients_and_gauss_newton_hessians(arm, kind):
-    robot, frame = arm
-    n = robot.dof
-    make, W = MADE[kind]
-    points = Points(np.linspace(0.0, 1.0, N), 1.0, N - 1, n, 1)
-    bound = make(robot, frame).bind(points)
-    q, v = state(robot, 1)
-    z = np.hstack([q, v, np.zeros((N, 1))])
-
-    def r(z):
-        return np.array([residual(kind, robot, frame, row[:n], row[n : 2 * n]) for row in z])
-
-    error, J = r(z), differences(r, z)
-    if kind == "orientation":  # far from half a turn, where the logarithm jumps
-        assert np.linalg.norm(error, axis=1).min() < 3.0
-        keep = np.linalg.norm(error, axis=1) < 2.8
-    else:
-        keep = np.ones(N, dtype=bool)
-    np.testing.assert_allclose(bound.value(q, v, z[:, 2 * n :]), np.einsum("Ni,ij,Nj->N", error, W, error), rtol=1e-11)
-    given = bound.expand(q, v, z[:, 2 * n :])
-    gradient = 2.0 * np.einsum("Nra,rs,Ns->Na", J, W, error)
-    hessian = 2.0 * np.einsum("Nra,rs,Nsb->Nab", J, W, J)
-    assert keep.sum() >= 2
-    np.testing.assert_allclose(given.gradient[keep], gradient[keep], atol=1e-8 * np.abs(gradient).max())
-    np.testing.assert_allclose(given.hessian[keep], hessian[keep], atol=1e-8 * np.abs(hessian).max())
-    if keep.all():
-        slopes = differences(lambda z: bound.value(z[:, :n], z[:, n : 2 * n], z[:, 2 * n :]), z)
-        np.testing.assert_allclose(given.gradient, slopes, atol=1e-8 * np.abs(slopes).max())
-
-
 @pytest.mark.parametrize("axis", [(2, -1, 2), (-9, 2, 6), (2, 9, -6), (0, 0, 1)])
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 9.9e-4, 1.01e-3, 0.5, 3.0, np.pi - 1e-5])
 def test_orientation_at_every_distance(load, angle, axis):
@@ -223,26 +167,6 @@ def test_targets_in_time(load):
     np.testing.assert_allclose(by_rows.value(q, v, u), expected, rtol=1e-10)
 
 
-def test_many_paths_at_once(load):
-    robot = load("ur5")
-    rng = np.random.default_rng(4)
-    points = Points(np.linspace(0, 1, N), 1.0, N - 1, 6, 6)
-    q, v, u = (rng.normal(size=(3, N, 6)) for _ in range(3))
-    rows = rng.normal(size=(N, 3))
-    for cost in (
-        vp.FramePositionCost(robot, "tool0", rows),
-        vp.FrameOrientationCost(robot, "tool0", TARGET),
-        vp.FrameVelocityCost(robot, "tool0"),
-        vp.CenterOfMassCost(robot, rows),
-        vp.ManipulabilityCost(robot, "tool0", 0.1),
-        vp.JointLimitBarrier(robot, limits=(-0.5, 0.5)),
-        vp.VelocityLimitBarrier(robot, limits=(-0.5, 0.5)),
-    ):
-        bound = cost.bind(points)
-        one_by_one = [bound.value(*path) for path in zip(q, v, u, strict=True)]
-        np.testing.assert_allclose(bound.value(q, v, u), one_by_one, rtol=1e-13, atol=1e-15)
-
-
 @pytest.mark.parametrize("directions", ["all", "linear", ("x", "z", "ry")])
 def test_manipulability(load, directions):
     """Yoshikawa's measure by Pinocchio's Jacobian; its slope by differences; nothing where there is enough of it."""
@@ -293,34 +217,6 @@ def test_manipulability_at_a_singular_configuration(load):
     np.testing.assert_allclose(np.abs(given.gradient[0, :6]), 0.1 * np.abs(slope), atol=1e-8)
 
 
-def test_barriers(load):
-    """By hand: nothing inside, the square of what is beyond limit less margin outside."""
-    robot = load("ur5")
-    points = Points(np.zeros(3), 1.0, 3, 6, 6)
-    q = np.zeros((3, 6))
-    q[0, 1], q[1, 2], q[2, 5] = 7.0, -3.1, 6.2
-    u = np.zeros((3, 6))
-    bound = vp.JointLimitBarrier(robot, [1, 2, 3, 4, 5, 6], margin=0.1).bind(points)
-    upper = 2 * np.pi - 0.1
-    np.testing.assert_allclose(
-        bound.value(q, u, u), [2 * (7.0 - upper) ** 2, 3 * (-3.1 + np.pi - 0.1) ** 2, 6 * (6.2 - upper) ** 2], rtol=1e-6
-    )
-    given = bound.expand(q, u, u)
-    np.testing.assert_allclose(
-        given.gradient[[0, 1, 2], [1, 2, 5]], [4 * (7.0 - upper), -6 * 0.05840735, 12 * 0.01681469], rtol=1e-6
-    )
-    assert np.count_nonzero(given.gradient) == 3
-    np.testing.assert_allclose(given.hessian[[0, 1, 2], [1, 2, 5], [1, 2, 5]], [4, 6, 12])
-    assert np.count_nonzero(given.hessian) == 3
-    bound = vp.VelocityLimitBarrier(robot, 2.0).bind(points)
-    v = np.zeros((3, 6))
-    v[0, 0], v[1, 3], v[2, 1] = -4.0, 3.3, 3.0
-    np.testing.assert_allclose(bound.value(q, v, u), [2 * 0.85**2, 2 * 0.1**2, 0.0], rtol=1e-6)
-    given = bound.expand(q, v, u)
-    np.testing.assert_allclose(given.gradient[[0, 1], [6, 9]], [-4 * 0.85, 4 * 0.1], rtol=1e-6)
-    assert np.count_nonzero(given.gradient) == np.count_nonzero(given.hessian) == 2
-
-
 def test_barriers_against_differences(load):
     """Of a finger whose limits are closer than two margins, too: the barriers meet in the middle."""
     robot = load("panda")
@@ -348,18 +244,6 @@ def test_barriers_against_differences(load):
 
     curvature = np.stack([(gradient(z + h * e) - gradient(z - h * e)) / (2 * h) for e in np.eye(2 * n)], axis=2)
     np.testing.assert_allclose(given.hessian[:, : 2 * n, : 2 * n], curvature, atol=1e-7 * np.abs(curvature).max())
-
-
-def test_as_terms_of_a_sum(load):
-    robot = load("ur5")
-    term = vp.FramePositionCost(robot, "tool0", [0.3, 0.2, 0.1], 2.0)
-    total = vp.Terminal(term) + 0.5 * term + vp.ControlCost(1e-3)
-    assert "FramePositionCost('tool0'" in repr(total)
-    points = Points(np.zeros(1), 1.0, 1, 6, 6)
-    q, v = state(robot, 7, 1)
-    u = np.zeros((1, 6))
-    first = term.bind(points).value(q, v, u)
-    np.testing.assert_allclose(total.bind(points).value(q, v, u), 1.5 * first)
 
 
 def test_what_is_refused(load):
