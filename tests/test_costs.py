@@ -111,31 +111,6 @@ def test_expansions(name):
     np.testing.assert_allclose(given, hessian, rtol=0, atol=1e-9 * np.abs(hessian).max())
 
 
-def quadratic(weight, error):
-    W = weight * np.eye(error.shape[1]) if np.ndim(weight) < 2 else np.asarray(weight)
-    return np.array([row @ W @ row for row in error])
-
-
-def test_values():
-    """By hand; a reference in rows is linear between the nodes."""
-    q, v, u = random_points(1)
-    t = points().t
-    middles = 0.5 * (ROWS[1:] + ROWS[:-1])
-    expected = {
-        "tracking, scalar, constant": quadratic(2.0, q - [0.1, 0.2, 0.3]),
-        "tracking, vector, one number": quadratic([1.0, 0.0, 3.0], q - 0.4),
-        "tracking, matrix, function": quadratic(FULL, q - np.column_stack([t, np.sin(t), np.ones(N)])),
-        "tracking, matrix, rows": quadratic(FULL, q - middles),
-        "velocity, vector, rows": quadratic([1.0, 2.0, 3.0], v - middles),
-        "control, matrix, function": quadratic([[2.0, 1.0], [1.0, 0.5]], u - np.column_stack([t, -t])),
-        "custom, with derivatives": smooth(t, q, v, u),
-        "control, held rows": quadratic([2.0, 0.5], u - HELD),
-        "scaled": 3.0 * quadratic(FULL, q - 0.1) + 1.5 * smooth(t, q, v, u),
-    }
-    for name, value in expected.items():
-        np.testing.assert_allclose(COSTS[name].bind(points()).value(q, v, u), value, rtol=1e-13, err_msg=name)
-
-
 def test_references_in_rows_at_nodes_and_at_the_end():
     q, v, u = np.zeros((N, DOF)), np.zeros((N, DOF)), np.zeros((N, M))
     cost = vp.TrackingCost(ROWS)
