@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 from scipy.integrate import solve_ivp
+from scipy.optimize import Bounds, lsq_linear, minimize
 
 import varpin as vp
 
@@ -310,3 +311,151 @@ def exact(
     y = np.array(rows)
     q, v = y[:, :n], y[:, n : 2 * n]
     return Motion(q, v, np.array([own.energy(*state) for state in zip(q, v, strict=True)]), y[:, -1])
+
+
+# --- plans: rows of constraints by NumPy and Pinocchio, and what holds at an optimum ----------------------------------
+
+
+def rollout(problem: vp.OptimalControlProblem, controls: np.ndarray) -> vp.Trajectory:
+    """The motion of a plan's decisions (R, m), without noise."""
+    held = np.repeat(controls, problem.hold, axis=0)
+    given = lines(problem, controls) if problem.controls == "linear" else held
+    grid = {"dt": problem.dt, "steps": problem.steps, "integrator": problem.integrator}
+    still = {"increments": 0} if problem.scene.processes else {}
+    return vp.simulate(problem.scene, problem.q0, problem.v0, controls=given, check=False, **grid, **still)
+
+
+def lines(problem: vp.OptimalControlProblem, controls: np.ndarray) -> vp.LinearPolicy:
+    """Controls (N + 1, m) at nodes, linear between them."""
+    (N, m), x = (len(controls) - 1, controls.shape[1]), 2 * problem.scene.robot.dof
+    on = "momentum" if problem.integrator.variational else "velocity"
+    return vp.LinearPolicy(
+        controls[1:], np.zeros((N, m, x)), np.zeros((N, x)), on=on, before=controls[0], linear=True,
+        previous_gains=np.zeros((N, m, m)), previous=np.zeros((N, m)), period=problem.dt,
+    )  # fmt: skip
+
+
+def plan_rows(
+    problem: vp.OptimalControlProblem, motion: vp.Trajectory, controls: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows c <= 0 and rows c = 0 of a problem's constraints at a motion's nodes, all but the first."""
+    robot, q, v, t = problem.scene.robot, motion.q[1:], motion.v[1:], motion.t[1:]
+    below, zero = [np.zeros(0)], [np.zeros(0)]
+    for own in problem.constraints:
+        match own:
+            case vp.WithinJointLimits() | vp.WithinVelocityLimits():
+                low, high = own.limits
+                y = q if isinstance(own, vp.WithinJointLimits) else v
+                below += [y - high, low - y]
+            case vp.WithinControlRate():
+                first = controls[:1] if own.before is None else np.broadcast_to(own.before, controls[:1].shape)
+                below.append(np.abs(np.diff(controls, axis=0, prepend=first)) / (problem.dt * problem.hold) - own.limit)
+            case vp.ReachFrame():
+                (place,) = placements(robot, q[-1:], own.frame)
+                zero += [] if own.position is None else [place.translation - own.position]
+                zero += [] if own.rotation is None else [pin.log3(own.rotation.T @ place.rotation)]
+            case vp.KeepInHalfSpace():
+                below.append(own.offset - robot.frame_positions(q, own.frame) @ own.normal)
+            case vp.KeepInBox():
+                x = robot.frame_positions(q, own.frame)
+                below += [x - own.limits[1], own.limits[0] - x]
+            case vp.KeepInSphere() | vp.KeepOutOfSphere():
+                center = np.array([own.center(s) for s in t]) if callable(own.center) else own.center
+                far = np.linalg.norm(robot.frame_positions(q, own.frame) - center, axis=1) - own.radius
+                below.append(far if isinstance(own, vp.KeepInSphere) else -far)
+            case vp.KeepClear():
+                below.append(np.array([own.distance - gap for gap in clearances(own, q)]))
+            case _:
+                raise TypeError(f"no rows for {own!r}")
+    flat = [np.concatenate([np.ravel(part) for part in parts]) for parts in (below, zero)]
+    return flat[0][np.isfinite(flat[0])], flat[1]
+
+
+def placements(robot: vp.Robot, q: np.ndarray, frame: str) -> list[pin.SE3]:
+    """The placement of a frame at configurations (K, n)."""
+    data, found = robot.model.createData(), []
+    for one in q:
+        pin.framesForwardKinematics(robot.model, data, robot.configuration(one))
+        found.append(data.oMf[robot.model.getFrameId(frame)].copy())
+    return found
+
+
+def clearances(own: vp.KeepClear, q: np.ndarray) -> np.ndarray:
+    """The least distance between capsules of links and balls at configurations (K, n)."""
+    gaps = []
+    for link, (begin, end, radius) in own.capsules.items():
+        for k, place in enumerate(placements(own.robot, q, link)):
+            a, b = (place.act(np.asarray(point, float)) for point in (begin, end))
+            for ball in own.obstacles:
+                assert ball.sides is None
+                share = np.clip((ball.begin - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
+                gaps.append((k, np.linalg.norm(a + share * (b - a) - ball.begin) - radius - ball.radius))
+    return np.array([min(gap for at, gap in gaps if at == k) for k in range(len(q))])
+
+
+def violation(problem: vp.OptimalControlProblem, motion: vp.Trajectory, controls: np.ndarray) -> float:
+    """The largest violation of constraints and control limits by a motion's nodes."""
+    below, zero = plan_rows(problem, motion, controls)
+    beyond = np.maximum(controls - problem.control_limits[1], problem.control_limits[0] - controls)
+    return max(0.0, *(float(part.max(initial=0.0)) for part in (below, np.abs(zero), beyond)))
+
+
+def kkt(plan: vp.Solution, near: float = 1e-5) -> float:
+    """What is left of the Lagrangian's gradient in the controls; 1 is the cost's gradient at controls a tenth smaller.
+
+    By central differences of motions. Multipliers are those of the least squares, of any sign for rows c = 0, not
+    negative for rows c <= 0 and control limits within ``near`` of being met, and 0 for all others.
+    """
+    problem, u = plan.problem, plan.controls
+
+    def values(w: np.ndarray) -> np.ndarray:
+        motion = rollout(problem, w)
+        below, zero = plan_rows(problem, motion, w)
+        return np.concatenate([[problem.cost_of(motion)], below, zero])
+
+    def slopes(at: np.ndarray) -> np.ndarray:
+        sizes = 1e-5 * np.maximum(np.abs(at).max(axis=0), 1e-2 * np.abs(at).max())
+        ways = [np.where(np.arange(at.size) == i, 1.0, 0.0).reshape(at.shape) * sizes for i in range(at.size)]
+        return np.array([(values(at + way) - values(at - way)) / (2.0 * way.max()) for way in ways]).T
+
+    below, _ = plan_rows(problem, plan.trajectory, u)
+    found, (low, high) = slopes(u), problem.control_limits
+    met = np.concatenate([below > -near, np.ones(len(found) - 1 - len(below), dtype=bool)])
+    free = np.concatenate([np.zeros(len(below), dtype=bool), np.ones(len(found) - 1 - len(below), dtype=bool)])[met]
+    ends = np.concatenate([np.eye(u.size)[(u >= high - near).ravel()], -np.eye(u.size)[(u <= low + near).ravel()]])
+    rows = np.concatenate([found[1:][met], ends])
+    least = np.where(np.concatenate([free, np.zeros(len(ends), dtype=bool)]), -np.inf, 0.0)
+    scale = np.abs(slopes(0.9 * u)[0]).max()
+    if not len(rows):
+        return float(np.abs(found[0]).max() / scale)
+    # Rows that no control moves, as that of a goal off the plane of a chain, are left out.
+    size = np.maximum(np.linalg.norm(rows, axis=1), 1e-12)
+    y = lsq_linear((rows / size[:, None]).T, -found[0], (least, np.full(len(rows), np.inf)), tol=1e-14).x
+    return float(np.abs(found[0] + y @ (rows / size[:, None])).max() / scale)
+
+
+def least_cost(problem: vp.OptimalControlProblem, start: np.ndarray) -> float:
+    """The least cost that SciPy's SLSQP finds within a problem's limits and constraints from controls (R, m)."""
+    known: dict[bytes, tuple[float, np.ndarray, np.ndarray]] = {}
+
+    def parts(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        if x.tobytes() not in known:
+            w = x.reshape(start.shape)
+            motion = rollout(problem, w)
+            known[x.tobytes()] = (problem.cost_of(motion), *plan_rows(problem, motion, w))
+        return known[x.tobytes()]
+
+    first = start.ravel()
+    # Rows that no control moves, as that of a goal off the plane of a chain, make equations singular.
+    moved = np.abs(parts(first)[2] - parts(1.01 * first + 0.01)[2]) > 1e-12
+    rules = [
+        {"type": "ineq", "fun": lambda x: -parts(x)[1]},
+        {"type": "eq", "fun": lambda x: parts(x)[2][moved]},
+    ]
+    sides = [np.broadcast_to(side, start.shape).ravel() for side in problem.control_limits]
+    found = minimize(
+        lambda x: parts(x)[0], first, method="SLSQP", bounds=Bounds(*sides),
+        constraints=rules if problem.constraints else (), options={"maxiter": 200, "ftol": 1e-8},
+    )  # fmt: skip
+    assert found.success, found.message
+    return float(found.fun)

@@ -102,63 +102,6 @@ def transcribed(problem):
     return g, H
 
 
-@pytest.mark.parametrize("hold", [1, 5])
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
-def test_linear_quadratic_problem_with_limits(integrator, hold):
-    """The whole problem at once is a quadratic program in a box: SciPy's solution of it, and its multipliers' signs."""
-    lower, upper = np.array([-3.0, -0.8]), np.array([2.0, np.inf])
-    problem = pushed((lower, upper), integrator=integrator, hold=hold, dt=0.2 / hold, steps=10 * hold)
-    sol = vp.solve(problem, tolerance=1e-15, max_iterations=300)
-    g, H = transcribed(problem)
-    L = np.linalg.cholesky(H)
-    R = problem.decisions
-    bounds = np.tile(lower, R), np.tile(np.where(np.isfinite(upper), upper, 1e9), R)
-    reference = lsq_linear(L.T, -np.linalg.solve(L, g), bounds, method="bvls", tol=1e-15, max_iter=1000).x
-    u = sol.controls
-    np.testing.assert_allclose(u.ravel(), reference, atol=2e-5)
-    at_lower, at_upper = u == lower, u == upper
-    assert at_upper.sum() >= 1
-    assert at_lower.sum() >= 1
-    assert not (at_lower | at_upper).all()
-    slope = (g + H @ u.ravel()).reshape(R, 2)
-    np.testing.assert_allclose(sol.gradient, slope, atol=1e-6)
-    assert (sol.gradient[at_lower] > 0.0).all()
-    assert (sol.gradient[at_upper] < 0.0).all()
-    assert np.abs(sol.gradient[~at_lower & ~at_upper]).max() < 1e-5
-    assert sol.history[-1].gradient == np.abs(sol.gradient[~at_lower & ~at_upper]).max()
-    assert not sol.gains[at_lower | at_upper].any()
-    assert np.abs(sol.gains[~at_lower & ~at_upper]).max(axis=1).min() > 1e-3
-    assert (sol.controls >= lower).all()
-    assert (sol.controls <= upper).all()
-    assert not sol.violations.any
-
-
-@pytest.mark.parametrize("roots", [False, True], ids=["plain", "square roots"])
-@pytest.mark.parametrize(("hold", "rate"), [(1, None), (5, None), (1, 2e-3), (5, 2e-3)])
-def test_one_plan_solves_a_linear_quadratic_problem_with_limits(hold, rate, roots, monkeypatch):
-    """Which controls meet their limits is found before anything moves: SciPy's solution after one step."""
-    if roots:
-        monkeypatch.setattr(passes, "TRUSTED", 0.0)
-    lower, upper = np.array([-3.0, -0.8]), np.array([2.0, 5.0])
-    problem = pushed((lower, upper), integrator=vp.Midpoint(), hold=hold, dt=0.2 / hold, steps=10 * hold)
-    if rate is not None:
-        problem = vp.OptimalControlProblem(
-            problem.scene, problem.cost + vp.ControlRateCost(rate), problem.q0, problem.v0, dt=problem.dt,
-            steps=problem.steps, hold=hold, integrator=vp.Midpoint(), control_limits=(lower, upper),
-        )  # fmt: skip
-    sol = vp.solve(problem, max_iterations=1)
-    g, H = transcribed(problem)
-    L = np.linalg.cholesky(H)
-    R = problem.decisions
-    bounds = np.tile(lower, R), np.tile(upper, R)
-    reference = lsq_linear(L.T, -np.linalg.solve(L, g), bounds, method="bvls", tol=1e-15, max_iter=1000).x
-    np.testing.assert_allclose(sol.controls.ravel(), reference, atol=2e-5)
-    assert ((sol.controls == lower) | (sol.controls == upper)).sum() >= 2
-    first = sol.history[0]
-    assert first.step == 1.0
-    np.testing.assert_allclose(first.decrease, first.expected_decrease, rtol=1e-9)
-
-
 @pytest.mark.parametrize(("effort", "speed"), [(1.0, 1.0), (0.1, 0.0)], ids=["on the way", "at the end alone"])
 def test_limits_that_the_optimum_does_not_touch(effort, speed):
     """From a cold start, with a stiff end."""
@@ -268,17 +211,6 @@ def terminal_hessian(scene, motion):
     inverse = np.linalg.inv(jet.Lvv)
     D = np.hstack([-inverse @ jet.Lvq, inverse])
     return np.diag([2e3] * 6 + [0.0] * 6) + 20.0 * D.T @ D
-
-
-def test_wide_limits_change_nothing():
-    """But rounding."""
-    free = vp.solve(pushed())
-    wide = vp.solve(pushed((-1e6, 1e6)))
-    np.testing.assert_allclose(wide.controls, free.controls, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(wide.gains, free.gains, rtol=1e-9, atol=1e-12)
-    assert wide.status.converged
-    assert free.problem.control_limits.shape == (2, 2)
-    assert not free.problem.limited
 
 
 @pytest.mark.parametrize("hold", [1, 5])
@@ -394,30 +326,6 @@ def test_penalties_and_limits_are_minimized_together(hold, way, monkeypatch):
     np.testing.assert_allclose(sol.controls.ravel(), found[: 2 * R], atol=2e-5)
     assert ((sol.controls == lower) | (sol.controls == upper)).sum() >= 2
     assert bool(calls) == (way == "interior points")
-
-
-def test_swing_with_most_torques_at_limits_converges():
-    """Torques too weak to hold the chain: the plan is a minimum by differences of its cost."""
-    robot = vp.planar_chain(2)
-    cost = vp.ControlCost(1e-3) + vp.VelocityCost(1e-2)
-    cost += vp.Terminal(vp.TrackingCost([1.5, -1.0], 100.0) + vp.VelocityCost(10.0))
-    limits = np.array([[-6.0, -2.0], [6.0, 2.0]])
-    problem = vp.OptimalControlProblem(
-        vp.Scene(robot, damping=0.05), cost, np.full(2, 0.1), np.zeros(2), dt=0.05, steps=24, control_limits=limits
-    )
-    plan = vp.solve(problem, max_iterations=60, check=False)
-    assert plan.status.converged
-    u = plan.controls
-    assert ((u <= limits[0]) | (u >= limits[1])).mean() > 0.4
-    gained = 0.0
-    for index in np.ndindex(*u.shape):
-        step = np.zeros(u.shape)
-        step[index] = 1e-5
-        ahead, back = (problem.cost_of(problem.simulate(u + sign * step)) for sign in (1.0, -1.0))
-        slope, stiffness = (ahead - back) / 2e-5, (ahead - 2.0 * plan.cost + back) / 1e-10
-        way = np.clip(u[index] - slope / max(stiffness, 1e-2), *limits[:, index[1]]) - u[index]
-        gained = max(gained, -0.5 * slope * way)
-    assert gained <= 1e-5 * plan.cost
 
 
 def test_control_that_is_fixed():

@@ -4,12 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-import scipy.optimize
 from refusals import refused
-from scipy.optimize import lsq_linear
-from test_control_limits import transcribed
-from test_sddp import SAMPLINGS, Plain, PlainCost, noise_columns, run, sliders, start_of, state_rows
-from test_solution_files import same
+from test_sddp import run, sliders
 
 import varpin as vp
 from varpin.control.along import Along
@@ -90,133 +86,6 @@ def test_it_means_the_same_at_every_step():
     # The changes are centred on the nodes 0 .. N - 1: half a period is missing at the end, half too much is before.
     assert abs(off[2]) < 0.02 * exact
     np.testing.assert_allclose(np.divide(off[:-1], off[1:]), 2.0, atol=0.1)
-
-
-def augmented_riccati(plain, problem, weight, before, noise):
-    """Gains on x and on the control before, and the value at the start, in absolute coordinates.
-
-    The value P is in (x, c, 1), where c is the control that acts, or acted last: a decision chooses u after c at the
-    price (u - c)' W (u - c) / T and eliminates it by a Schur complement; between decisions u is c.
-    """
-    n, m, h, hold = plain.n, problem.scene.controls, plain.dt, problem.hold
-    x, one = 2 * n, 4 * n + m
-    cost = PlainCost(plain, problem)
-    P = np.zeros((x + m + 1, x + m + 1))
-    end = [*range(x), x + m]
-    P[np.ix_(end, end)] = cost.end()
-    gains = []
-    for j in range(problem.steps - 1, -1, -1):
-        W = cost.step(j)
-        after = [*range(x, 2 * x), *range(2 * x, one), one]
-        W[np.ix_(after, after)] += P
-        T = np.zeros((one + 1, x + m + 1))  # (x, x', u, 1) in (x, u, 1)
-        T[:x, :x] = np.eye(x)
-        T[2 * x : one, x : x + m] = np.eye(m)
-        T[one, -1] = 1.0
-        T[x : 2 * x] = np.hstack([plain.A, plain.B, plain.c[:, None]])
-        P = T.T @ W @ T
-        S = W[x : 2 * x, x : 2 * x]
-        for a, Gx, Gu in noise(j):
-            g = np.hstack([Gx, Gu, a[:, None]])
-            P += h * g.T @ S @ g
-        if j % hold:
-            continue
-        R = 2.0 / (h * hold) * (np.zeros((m, m)) if j == 0 and before is None else np.asarray(weight))
-        Q = np.zeros((x + 2 * m + 1, x + 2 * m + 1))  # in (x, c, 1, u)
-        u, c = slice(x + m + 1, None), slice(x, x + m)
-        whole = [*range(x), *range(x + m + 1, x + 2 * m + 1), x + m]
-        Q[np.ix_(whole, whole)] = P
-        Q[u, u] += R
-        Q[c, c] += R
-        Q[u, c] -= R
-        Q[c, u] -= R
-        K = -np.linalg.solve(Q[u, u], Q[u, : x + m + 1])
-        P = Q[: x + m + 1, : x + m + 1] + Q[: x + m + 1, u] @ K
-        P = 0.5 * (P + P.T)
-        gains.append(K)
-    start = np.insert(start_of(plain, problem), x, np.zeros(m) if before is None else before)
-    return np.array(gains[::-1]), 0.5 * start @ P @ start
-
-
-@pytest.mark.parametrize("hold", [1, 3])
-@pytest.mark.parametrize("before", [None, BEFORE], ids=["free", "given"])
-@pytest.mark.parametrize(
-    ("integrator", "sampling"), [*((vp.Midpoint(), s) for s in SAMPLINGS), (vp.RungeKutta4(), "gauss")], ids=str
-)
-@pytest.mark.parametrize("roots", [False, True], ids=["plain", "square roots"])
-def test_riccati_on_the_augmented_state(integrator, sampling, before, hold, roots):
-    """Along any motion, under noise of every kind: both gains, the whole affine law, and the value."""
-    noise = vp.AdditiveNoise(0.2) + vp.ControlNoise(0.5) + vp.StateNoise(0.8, center=-0.1)
-    problem = linear(vp.ControlRateCost(MATRIX, before), integrator, sampling, noise, hold=hold)
-    motion = run(problem, np.random.default_rng(1).normal(size=(problem.decisions, 2)))
-    plan, _ = one_pass(Along(problem, motion), 0.0, False, None, None, roots=roots)
-    plain = Plain(problem.scene, problem.dt, integrator)
-    columns = noise_columns(plain, problem.scene, motion)(0.2, 0.5, 0.8, -0.1)
-    laws, value = augmented_riccati(plain, problem, MATRIX, before, columns)
-    found = np.concatenate([plan.feedback, plan.previous], axis=2)
-    np.testing.assert_allclose(found, laws[:, :, :-1], rtol=0, atol=1e-9 * np.abs(laws).max())
-    u = motion.u[::hold]
-    c = np.vstack([np.zeros(2) if before is None else before, u[:-1]])
-    y = np.hstack([state_rows(problem, motion)[:-1:hold], c])
-    law = u + plan.feedforward - np.einsum("Nij,Nj->Ni", found, y)
-    np.testing.assert_allclose(law, laws[:, :, -1], rtol=0, atol=1e-9 * np.abs(laws).max())
-    assert problem.cost_of(motion) + plan.noise + 0.5 * plan.slope == pytest.approx(value, rel=1e-9)
-    if before is None:
-        assert not plan.previous[0].any()
-
-
-@pytest.mark.parametrize("limits", [None, (np.array([-1.2, -0.8]), np.array([0.4, np.inf]))], ids=["free", "limited"])
-@pytest.mark.parametrize("hold", [1, 4])
-@pytest.mark.parametrize("before", [None, BEFORE], ids=["free start", "given start"])
-def test_the_minimum_over_all_controls_at_once(before, hold, limits):
-    """A quadratic program in a box, by SciPy; signs of the multipliers; no feedback on clamped controls."""
-    problem = linear(vp.ControlRateCost(MATRIX, before), steps=12 * hold, hold=hold, limits=limits).at(
-        dt=0.2 / hold, steps=12 * hold
-    )
-    sol = vp.solve(problem, tolerance=1e-15, max_iterations=300)
-    g, H = transcribed(problem)
-    L = np.linalg.cholesky(H)
-    R = problem.decisions
-    lower, upper = limits or (np.full(2, -np.inf), np.full(2, np.inf))
-    bounds = [np.tile(np.where(np.isfinite(limit), limit, sign * 1e9), R) for limit, sign in ((lower, -1), (upper, 1))]
-    method = {"method": "bvls", "tol": 1e-15, "max_iter": 1000}
-    reference = lsq_linear(L.T, -np.linalg.solve(L, g), bounds, **method).x
-    u = sol.controls
-    np.testing.assert_allclose(u.ravel(), reference, rtol=0, atol=1e-5)
-    slope = (g + H @ u.ravel()).reshape(R, 2)
-    np.testing.assert_allclose(sol.gradient, slope, rtol=0, atol=1e-6)
-    at_lower, at_upper = u <= lower, u >= upper
-    assert (sol.gradient[at_lower] > 0.0).all()
-    assert (sol.gradient[at_upper] < 0.0).all()
-    held = at_lower | at_upper
-    assert np.abs(sol.gradient[~held]).max() < 1e-5
-    if limits is not None:
-        assert at_lower.any()
-        assert at_upper.any()
-        assert not held.all()
-        assert not sol.gains[held].any()
-        assert not sol.previous_gains[held].any()
-    later = sol.previous_gains[1:][~held[1:]]
-    assert np.abs(later).max(axis=1).min() > 1e-3
-
-
-@pytest.mark.parametrize(
-    ("integrator", "second_order"), [(vp.Midpoint(), True), (vp.Gauss(2), False), (vp.SemiImplicitEuler(), False)]
-)
-def test_the_minimum_for_a_finger(integrator, second_order):
-    """Nonlinear: by BFGS over all controls at once, from the passive motion."""
-    problem = finger(vp.ControlRateCost(2e-3, before=[1e-3, 0.0, 0.0]), integrator, hold=3)
-    sol = vp.solve(problem, tolerance=1e-13, second_order=second_order)
-    assert sol.status.converged
-    scale, unit = sol.cost, np.abs(sol.controls).max()
-
-    def cost(u):
-        return problem.cost_of(run(problem, unit * u.reshape(4, 3))) / scale
-
-    found = scipy.optimize.minimize(cost, np.zeros(12), method="BFGS", options={"gtol": 1e-7})
-    assert sol.cost <= found.fun * scale * (1 + 1e-9)
-    assert found.fun == pytest.approx(1.0, rel=1e-6)
-    np.testing.assert_allclose(sol.controls, unit * found.x.reshape(4, 3), rtol=0, atol=2e-3 * unit)
 
 
 @pytest.mark.parametrize("roots", [False, True], ids=["plain", "square roots"])
@@ -328,24 +197,6 @@ def test_noise_of_ones_own_is_stepped_in_python_with_the_same_feedback():
         np.testing.assert_allclose(own.u, compiled.u, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("hold", [1, 3])
-def test_saved_and_resumed_bit_for_bit(tmp_path, hold):
-    problem = finger(vp.ControlRateCost(2e-3, [1e-3, 0.0, 0.0]), noise=vp.ControlNoise(0.05), hold=hold, steps=24)
-    whole = vp.solve(problem, max_iterations=6, tolerance=1e-14)
-    part = vp.solve(problem, max_iterations=2, tolerance=1e-14)
-    loaded = vp.Solution.load(part.save(tmp_path / "part.npz"), problem)
-    same(part, loaded)
-    np.testing.assert_array_equal(part.previous_gains, loaded.previous_gains)
-    done = len(loaded.search.history)
-    on = vp.solve(problem, resume=loaded, max_iterations=6 - done, tolerance=1e-14)
-    same(whole, on)
-    np.testing.assert_array_equal(whole.previous_gains, on.previous_gains)
-    with refused(vp.FileError, "cost"):
-        vp.Solution.load(tmp_path / "part.npz", problem.at(before=[0.0, 0.0, 2e-3]))
-    with refused(vp.InputError, "cost"):
-        vp.solve(problem.at(before=[0.0, 0.0, 2e-3]), resume=loaded)
-
-
 def test_the_rest_of_an_optimum_is_the_optimum_of_the_rest():
     """From the control that acted before, and from no other."""
     problem = linear(vp.ControlRateCost(MATRIX), hold=2)
@@ -377,22 +228,6 @@ def test_feedback_on_another_start_and_another_control_before():
     np.testing.assert_array_equal(own.previous[9:], own.u[8:-1])
 
 
-def test_the_torques_of_a_reach_become_smooth():
-    """From the best torques without that cost: jumps a ninth as large, for 3% of the rest of the cost."""
-    problem = vp.load_scene("ur5_reach").problem
-    start = problem.holding_controls()
-    rated = vp.OptimalControlProblem(
-        problem.scene, problem.cost + vp.ControlRateCost(1e-5, start), problem.q0, problem.v0, dt=problem.dt,
-        steps=problem.steps, control_limits=(problem.control_limits[0], problem.control_limits[1]),
-    )  # fmt: skip
-    rough = vp.solve(problem)
-    smooth = vp.solve(rated, rough)
-    assert smooth.status.converged
-    jumps = [np.abs(np.diff(sol.controls, axis=0, prepend=start[None])).max() for sol in (rough, smooth)]
-    assert jumps[1] < 0.12 * jumps[0]
-    assert problem.cost_of(smooth.trajectory) < 1.03 * rough.cost
-
-
 def test_mpc_joins_its_plans():
     """Each tick's plan begins at the control that acted; its jumps are those of the cost, not of replanning."""
 
@@ -414,16 +249,6 @@ def test_mpc_joins_its_plans():
     free, _ = largest(vp.ControlRateCost(0.1))
     assert free.plans[0].problem.rate.before is None
     np.testing.assert_array_equal(free.plans[1].problem.rate.before, free.motion.u[0])
-
-
-def test_late_plans_feed_the_control_before_back():
-    """With a budget that no plan meets the first plan acts on, as its own policy in a simulation."""
-    problem = linear(vp.ControlRateCost(MATRIX, BEFORE))
-    plant = vp.Scene(problem.scene.robot, gravity=False, damping=0.2, actuation=problem.scene.actuation)
-    ran = vp.Mpc(problem, budget=1e-9).run(vp.Plant(plant), duration=1.2)
-    policy = ran.plans[0].policy_on("velocity", substeps=10)
-    alone = vp.simulate(plant, problem.q0, problem.v0, dt=5e-3, steps=240, controls=policy, integrator=vp.RungeKutta4())
-    np.testing.assert_allclose(ran.motion.u, alone.u, rtol=0, atol=1e-9)
 
 
 def test_the_last_decision_of_a_late_plan_expects_itself_before():

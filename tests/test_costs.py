@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from refusals import refused
-from test_sddp import SAMPLINGS, run, samples_of_a_step, sliders, small
+from scipy.interpolate import CubicHermiteSpline
+from test_sddp import SAMPLINGS, run, sliders, small
 
 import varpin as vp
 from varpin.control.costs import Points
@@ -11,6 +12,19 @@ from varpin.control.costs import Points
 N, DOF, M = 6, 3, 2
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 FULL = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.2], [-0.1, 0.2, 0.5]])
+
+
+def samples_of_a_step(sampling, h):
+    """For each: its weight, its place in the step, and q and v there as sums over (q0, v0, q1, v1)."""
+    if sampling == "start":
+        return [(1.0, 0.0, [1, 0, 0, 0], [0, 1, 0, 0])]
+    if sampling == "midpoint":
+        return [(1.0, 0.5, [0.5, 0, 0.5, 0], [-1 / h, 0, 1 / h, 0])]
+    units = np.eye(4)
+    motion = CubicHermiteSpline([0.0, h], units[[0, 2]], units[[1, 3]])
+    places, weights = np.polynomial.legendre.leggauss(2)
+    places = 0.5 + 0.5 * places
+    return [(0.5 * w, s, motion(s * h), motion(s * h, 1)) for w, s in zip(weights, places, strict=True)]
 
 
 def points(times=None, steps=N):
@@ -97,31 +111,6 @@ def test_expansions(name):
     np.testing.assert_allclose(given, hessian, rtol=0, atol=1e-9 * np.abs(hessian).max())
 
 
-def quadratic(weight, error):
-    W = weight * np.eye(error.shape[1]) if np.ndim(weight) < 2 else np.asarray(weight)
-    return np.array([row @ W @ row for row in error])
-
-
-def test_values():
-    """By hand; a reference in rows is linear between the nodes."""
-    q, v, u = random_points(1)
-    t = points().t
-    middles = 0.5 * (ROWS[1:] + ROWS[:-1])
-    expected = {
-        "tracking, scalar, constant": quadratic(2.0, q - [0.1, 0.2, 0.3]),
-        "tracking, vector, one number": quadratic([1.0, 0.0, 3.0], q - 0.4),
-        "tracking, matrix, function": quadratic(FULL, q - np.column_stack([t, np.sin(t), np.ones(N)])),
-        "tracking, matrix, rows": quadratic(FULL, q - middles),
-        "velocity, vector, rows": quadratic([1.0, 2.0, 3.0], v - middles),
-        "control, matrix, function": quadratic([[2.0, 1.0], [1.0, 0.5]], u - np.column_stack([t, -t])),
-        "custom, with derivatives": smooth(t, q, v, u),
-        "control, held rows": quadratic([2.0, 0.5], u - HELD),
-        "scaled": 3.0 * quadratic(FULL, q - 0.1) + 1.5 * smooth(t, q, v, u),
-    }
-    for name, value in expected.items():
-        np.testing.assert_allclose(COSTS[name].bind(points()).value(q, v, u), value, rtol=1e-13, err_msg=name)
-
-
 def test_references_in_rows_at_nodes_and_at_the_end():
     q, v, u = np.zeros((N, DOF)), np.zeros((N, DOF)), np.zeros((N, M))
     cost = vp.TrackingCost(ROWS)
@@ -151,17 +140,6 @@ def test_controls_of_a_solution_are_a_reference(sampling):
     controls = np.random.default_rng(0).normal(size=(20, 2))
     problem = small(vp.ControlCost(1.0, controls), sampling=sampling)
     assert problem.cost_of(run(problem, controls)) == 0.0
-
-
-@pytest.mark.parametrize("name", COSTS)
-def test_many_paths_at_once(name):
-    """Leading axes are paths."""
-    bound = COSTS[name].bind(points())
-    paths = [random_points(seed) for seed in range(4)]
-    q, v, u = (np.array([path[i] for path in paths]) for i in range(3))
-    together = bound.value(q, v, u)
-    assert together.shape == (4, N)
-    np.testing.assert_array_equal(together, [bound.value(*path) for path in paths])
 
 
 def test_sums():

@@ -45,14 +45,6 @@ def test_speeds_hold_between_nodes_at_least_cost():
     assert abs(best.fun - plan.cost) <= 1e-4 * plan.cost
 
 
-def test_plans_within_constraints_between_nodes_are_those_at_nodes():
-    problem = reach(50.0)
-    plan, alone = vp.solve(problem), vp.solve(problem.at(between_nodes=False))
-    assert plan.controls.tobytes() == alone.controls.tobytes()
-    assert plan.reason == alone.reason
-    assert len(plan.history) == len(alone.history)
-
-
 def arm(name, load):
     """A reach of a robot whose motion at the nodes alone goes through what is in its way, or too fast."""
     if name == "decisions of two steps":
@@ -125,25 +117,6 @@ def test_steps_that_cannot_be_looked_at_are_said(monkeypatch):
     plan = vp.solve(reach(), check=False)
     assert plan.status is vp.Status.STALLED
     assert "between nodes is not known" in plan.reason
-
-
-def test_rounds_with_rows_between_nodes_go_on_where_they_stopped(tmp_path, rounds_alone):
-    problem = reach()
-    whole = vp.solve(problem, check=False)
-    cut = len(vp.solve(problem.at(between_nodes=False), check=False).history) + 3
-    assert cut < len(whole.history)
-
-    def stop(item, _motion):
-        if item.index == cut:
-            raise KeyboardInterrupt
-
-    part = vp.solve(problem, callback=stop, check=False)
-    assert part.status is vp.Status.INTERRUPTED
-    rest = vp.solve(problem, resume=vp.Solution.load(part.save(tmp_path / "plan.npz"), problem), check=False)
-    assert rest.controls.tobytes() == whole.controls.tobytes()
-    again = vp.solve(problem, resume=vp.Solution.load(whole.save(tmp_path / "whole.npz"), problem), check=False)
-    assert again.status is vp.Status.CONVERGED
-    assert again.cost == pytest.approx(whole.cost, rel=1e-4)
 
 
 def test_copies_and_files_know_the_option(tmp_path):

@@ -10,74 +10,7 @@ from findings import about
 import varpin as vp
 
 ROBOT = vp.planar_chain(2)
-ARM = {name: ([0, 0, 0], [1, 0, 0], 0.05) for name in ("joint1", "joint2")}
 LIMITS = {"control_limits": (-30.0, 30.0)}
-
-
-def reach(position):
-    return vp.ReachFrame(ROBOT, "tip", position=position)
-
-
-def clear(place, radius):
-    return vp.KeepClear(ROBOT, [vp.Obstacle.sphere(place, radius)], 0.02, capsules=ARM)
-
-
-def side(up, offset):
-    return vp.KeepInHalfSpace(ROBOT, "tip", [0, 0, up], offset)
-
-
-# The constraints, other options, and of which constraints one cannot be met.
-TASKS = {
-    "a goal out of reach": ([reach([2.5, 0.0, 0.0])], {}, ["ReachFrame"]),
-    "a goal off the plane that the arm moves in": ([reach([1.0, 0.5, -0.5])], {}, ["ReachFrame"]),
-    "two goals": ([reach([1.5, 0.0, -0.5]), reach([1.0, 0.0, 0.9])], {}, ["ReachFrame"]),
-    "a start in an obstacle": ([clear([1.5, 0.0, 0.0], 0.3)], LIMITS, ["KeepClear"]),
-    "an obstacle at the base": ([clear([0.0, 0.0, 0.0], 0.2)], {}, ["KeepClear"]),
-    "a goal too far for the speed": (
-        [vp.WithinVelocityLimits(ROBOT, (-0.3, 0.3)), reach([1.0, 0.0, -1.2])],
-        {},
-        ["ReachFrame", "WithinVelocityLimits"],
-    ),
-    "half-spaces that exclude each other": ([side(1, 0.5), side(-1, 0.5)], {}, ["KeepInHalfSpace"]),
-    "a start too fast to brake": (
-        [vp.WithinVelocityLimits(ROBOT, (-0.5, 0.5))],
-        {"v0": [3.0, 0.0], "control_limits": (-20.0, 20.0)},
-        ["WithinVelocityLimits"],
-    ),
-    "torques that do not carry the arm": (
-        [vp.WithinJointLimits(ROBOT, (-0.2, 0.2))],
-        {"control_limits": (-5.0, 5.0)},
-        ["WithinJointLimits"],
-    ),
-    "a box inside a sphere": (
-        [
-            vp.KeepInBox(ROBOT, "tip", [1.0, -1.0, -0.2], [2.2, 1.0, 0.2]),
-            vp.KeepOutOfSphere(ROBOT, "tip", [1.6, 0.0, 0.0], 1.0),
-        ],
-        {},
-        ["KeepInBox", "KeepOutOfSphere"],
-    ),
-    "torques that rise too slowly": (
-        [vp.WithinControlRate(5.0, before=[0.0, 0.0]), vp.WithinVelocityLimits(ROBOT, (-0.3, 0.3))],
-        {},
-        ["WithinControlRate", "WithinVelocityLimits"],
-    ),
-    "a start outside of limits": ([vp.WithinJointLimits(ROBOT, ([0.5, -1], [2.0, 1]))], LIMITS, ["WithinJointLimits"]),
-    "a sphere that the tip starts far from": (
-        [vp.KeepInSphere(ROBOT, "tip", [0.0, 0.0, 0.0], 1.0)],
-        LIMITS,
-        ["KeepInSphere"],
-    ),
-}
-# Those of them that the first node after the start cannot meet.
-AT_ONCE = (
-    "a start in an obstacle",
-    "an obstacle at the base",
-    "a start too fast to brake",
-    "torques that rise too slowly",
-    "a start outside of limits",
-    "a sphere that the tip starts far from",
-)
 
 
 def problem_of(constraints, **options):
@@ -85,21 +18,6 @@ def problem_of(constraints, **options):
     cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
     options = {"q0": [0.0, 0.0], "v0": [0.0, 0.0], "dt": 0.05, "steps": 20, **options}
     return vp.OptimalControlProblem(vp.Scene(ROBOT, damping=0.1), cost, constraints=constraints, **options)
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_no_plan(name):
-    constraints, options, labels = TASKS[name]
-    plan = vp.solve(problem_of(constraints, **options), check=False)
-    assert plan.status is vp.Status.INFEASIBLE
-    assert len(plan.history) <= 250
-    assert plan.reason.split("(")[0].split()[0] in labels
-    assert about(plan.reason, "unmet constraint")
-    worst = max(plan.constraints, key=lambda item: item.violation)
-    # It is the one that is violated most, if not the one that the first node cannot meet.
-    assert plan.reason.startswith(worst.label) or about(plan.reason, "unmet first node")
-    assert worst.violation > 1e-3
-    assert np.isfinite(plan.trajectory.q).all()
 
 
 def test_a_search_that_jumps_does_not_call_a_plan_infeasible():
@@ -128,26 +46,6 @@ def test_a_search_that_jumps_does_not_call_a_plan_infeasible():
     for fact in ("WithinVelocityLimits is violated", "divide other steps", "Radau"):
         assert fact in jumping.reason
     assert plan(vp.Radau(2)).status.converged
-
-
-@pytest.mark.parametrize("name", AT_ONCE)
-def test_no_plan_at_once(name):
-    """Where no control meets a constraint at the first node, its reason says so, and there is no long search."""
-    constraints, options, _ = TASKS[name]
-    plan = vp.solve(problem_of(constraints, **options), check=False)
-    assert len(plan.history) <= 6
-    assert about(plan.reason, "unmet first node")
-    # The constraint does stay violated there, by no less than said, unless rates of controls are.
-    told = {item.label: item for item in plan.constraints}
-    if "WithinControlRate" not in told:
-        worst = next(item for label, item in told.items() if plan.reason.startswith(label))
-        assert 0.0 < said(plan.reason) <= worst.excess[0].max() * (1.0 + 5e-3)
-    for option in (None, 0, 1):
-        few = {} if option is None else {"max_iterations": option}
-        assert vp.solve(plan.problem, check=False, **few).status is vp.Status.INFEASIBLE
-    again = vp.solve(plan.problem, resume=plan, check=False)
-    assert again.status is vp.Status.INFEASIBLE
-    assert again.reason == plan.reason
 
 
 def said(reason):
@@ -221,14 +119,6 @@ def excess(constraint, q, v):
     return max((y - high).max(), (low - y).max())
 
 
-def test_a_start_outside_that_one_step_can_mend():
-    """A start outside is no reason to end early where controls lead inside by the first node."""
-    for options in ({}, {"control_limits": (-2000.0, 2000.0)}):
-        plan = vp.solve(problem_of([vp.WithinJointLimits(ROBOT, ([0.05, -1], [2.0, 1]))], **options), check=False)
-        assert plan.status.converged
-        assert plan.violation <= 1e-9
-
-
 def test_two_constraints_that_the_first_node_cannot_meet_together():
     """Each can be met alone, and the reason has both."""
     joints, speeds = vp.WithinJointLimits(ROBOT, ([0.02, -1], [2.0, 1])), vp.WithinVelocityLimits(ROBOT, (-0.3, 0.3))
@@ -240,17 +130,3 @@ def test_two_constraints_that_the_first_node_cannot_meet_together():
     assert len(plan.history) <= 6
     assert about(plan.reason, "unmet first node")
     assert "WithinJointLimits and WithinVelocityLimits" in plan.reason
-
-
-def test_of_two_constraints_of_one_kind_the_reason_says_which():
-    robot = vp.planar_chain(2)
-    wide, narrow = (vp.WithinJointLimits(robot, (-limit, limit)) for limit in (3.0, 0.1))
-    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.5, 0.0], 10.0))
-    problem = vp.OptimalControlProblem(
-        vp.Scene(robot, damping=0.1), cost, [1.0, 0.0], [0.0, 0.0], dt=0.05, steps=8, constraints=[wide, narrow],
-        control_limits=(-1.0, 1.0),
-    )  # fmt: skip
-    plan = vp.solve(problem, check=False)
-    assert plan.status is vp.Status.INFEASIBLE
-    assert "WithinJointLimits (constraints[1])" in plan.reason
-    assert [report.label for report in plan.constraints] == [f"WithinJointLimits (constraints[{i}])" for i in (0, 1)]

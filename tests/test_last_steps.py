@@ -52,16 +52,6 @@ def test_last_steps_before_the_end_lead_to_the_plan_of_the_rounds(name, monkeypa
     assert "last steps after round" in plan.reason
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_plans_of_last_steps_can_be_resumed(name, tmp_path):
-    problem = PROBLEMS[name]()
-    plan = vp.solve(problem, check=False)
-    again = vp.solve(problem, resume=vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem), check=False)
-    assert again.status.converged, again.reason
-    assert again.violation <= 1e-9
-    assert again.cost == pytest.approx(plan.cost, rel=1e-7)
-
-
 @pytest.mark.parametrize("name", ["two links", "held", "held, also between nodes"])
 def test_last_steps_that_run_out_of_time_are_tried_again(name, monkeypatch, tmp_path):
     """A plan whose time is over within them goes on to the same plan, to the last bit."""

@@ -10,7 +10,6 @@ from varpin.control.backward import backward
 from varpin.control.passes import noise_shares, one_pass
 
 N = 8
-RNG = np.random.default_rng(3)
 
 
 def links(*, cost: vp.Cost | None = None, **options: object) -> vp.OptimalControlProblem:
@@ -20,11 +19,6 @@ def links(*, cost: vp.Cost | None = None, **options: object) -> vp.OptimalContro
         cost = vp.ControlCost(1e-2) + vp.VelocityCost(0.1) + vp.Terminal(end)
     given = {"dt": 0.1, "steps": N, "controls": "linear"} | options
     return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2), damping=0.1), cost, [0.1, 0.2], [0.0, 0.0], **given)
-
-
-def cost_under(problem: vp.OptimalControlProblem, u: np.ndarray) -> float:
-    """The cost of controls (N + 1, m) at the nodes, without any feedback."""
-    return problem.cost_of(problem.simulate(line(problem, u)))
 
 
 def line(problem: vp.OptimalControlProblem, u: np.ndarray) -> vp.LinearPolicy:
@@ -53,64 +47,6 @@ def test_the_optimum_of_a_double_integrator_is_the_continuous_one() -> None:
     assert plan.cost == pytest.approx(least, rel=1e-12)
     held = vp.solve(problem.at(controls="held"), check=False)
     assert held.cost > 1.01 * least
-
-
-@pytest.mark.parametrize("integrator", [vp.Gauss(2), vp.Midpoint(), vp.RungeKutta4(), vp.Radau(2)], ids=str)
-@pytest.mark.parametrize("rate", [None, vp.ControlRateCost(1e-3), vp.ControlRateCost(1e-3, before=[1.0, -1.0])])
-def test_the_gradient_is_that_of_the_cost(integrator: vp.Integrator, rate: vp.Cost | None) -> None:
-    base = links().cost
-    problem = links(cost=base if rate is None else base + rate, integrator=integrator)
-    start = 3.0 * np.random.default_rng(0).normal(size=(N + 1, 2))
-    plan = vp.solve(problem, start, max_iterations=0, check=False)
-    np.testing.assert_array_equal(plan.controls, start)
-    step, found = 1e-5, np.empty((N + 1, 2))
-    for index in np.ndindex(N + 1, 2):
-        away = np.zeros((N + 1, 2))
-        away[index] = step
-        found[index] = (cost_under(problem, start + away) - cost_under(problem, start - away)) / (2.0 * step)
-    np.testing.assert_allclose(plan.gradient, found, atol=2e-6 * np.abs(found).max())
-
-
-@pytest.mark.parametrize("limited", [False, True])
-def test_no_controls_cost_less_than_those_of_a_plan(limited: bool) -> None:
-    limits = {"control_limits": ([-4.0, -1.0], [4.0, 1.0])} if limited else {}
-    problem = links(**limits)
-    plan = vp.solve(problem, tolerance=1e-12, check=False)
-    assert plan.status.converged
-    u = plan.controls
-    lower, upper = problem.control_limits
-    at_limit = (u == lower) | (u == upper)
-    assert at_limit.any() == limited
-    assert ((u >= lower) & (u <= upper)).all()
-    # Where a control is free its gradient is zero, and at a limit it pushes outward.
-    scale = np.abs(vp.solve(problem, max_iterations=0, check=False).gradient).max()
-    assert np.abs(plan.gradient[~at_limit]).max() < 1e-5 * scale
-    assert (plan.gradient[u == lower] >= 0.0).all()
-    assert (plan.gradient[u == upper] <= 0.0).all()
-    for _ in range(5):
-        other = np.clip(u + 1e-2 * RNG.normal(size=u.shape), lower, upper)
-        assert cost_under(problem, other) > plan.cost
-
-
-def test_the_motion_of_a_plan_is_that_of_its_policy() -> None:
-    problem = links()
-    plan = vp.solve(problem, check=False)
-    assert plan.gains.shape == (N + 1, 2, 4)
-    assert plan.previous_gains.shape == (N + 1, 2, 2)
-    again = problem.simulate(plan.policy)
-    np.testing.assert_allclose(again.q, plan.trajectory.q, atol=1e-12)
-    np.testing.assert_allclose(again.u_nodes, plan.controls, atol=1e-10)
-    by_hand = vp.simulate(
-        problem.scene,
-        problem.q0,
-        problem.v0,
-        dt=problem.dt,
-        steps=N,
-        controls=vp.FirstOrderHold(plan.controls),
-        integrator=problem.integrator,
-    )
-    np.testing.assert_allclose(by_hand.q, plan.trajectory.q, atol=1e-12)
-    np.testing.assert_allclose(by_hand.u_stages, plan.trajectory.u_stages, atol=1e-10)
 
 
 def test_feedback_is_that_of_the_optimum_from_another_state() -> None:
@@ -164,20 +100,6 @@ def test_half_the_nodes_do() -> None:
         return 1000
 
     assert 2 * nodes("linear") <= nodes("held")
-
-
-def test_saved_and_read_again(tmp_path) -> None:
-    problem = links()
-    plan = vp.solve(problem, check=False)
-    again = vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem)
-    np.testing.assert_array_equal(again.controls, plan.controls)
-    np.testing.assert_array_equal(again.previous_gains, plan.previous_gains)
-    with refused(vp.FileError, "controls", "linear", "held"):
-        vp.Solution.load(tmp_path / "plan.npz", problem.at(controls="held"))
-    path = plan.trajectory.save(tmp_path / "motion.npz")
-    np.testing.assert_array_equal(vp.Trajectory.load(path).u_nodes, plan.controls)
-    more = vp.solve(problem, resume=again, max_iterations=2, check=False)
-    assert more.cost <= plan.cost
 
 
 def test_refusals() -> None:

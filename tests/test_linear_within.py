@@ -51,81 +51,6 @@ def values(problem: vp.OptimalControlProblem, motion: vp.Trajectory) -> list[np.
     return [bound.value(motion.q, motion.v, motion.u_nodes) for bound in problem.bound_constraints]
 
 
-def fixed(problem: vp.OptimalControlProblem) -> np.ndarray:
-    """Which controls (N + 1, m) are given."""
-    found = np.zeros((N + 1, 2), dtype=bool)
-    found[0] = False if problem.begin is None else ~np.isnan(problem.begin)
-    return found
-
-
-@pytest.fixture
-def nodes_alone(monkeypatch):
-    """Constraints hold at the nodes alone, where their derivatives are exact."""
-    monkeypatch.setattr("varpin.control.augmented.seen", lambda *_: None)
-
-
-@pytest.mark.parametrize("limited", [False, True])
-@pytest.mark.parametrize("name", CASES)
-def test_karush_kuhn_tucker(name, limited, nodes_alone):
-    """The Lagrangian's slopes by differences, and multipliers of the right signs."""
-    most = 20.0 if name == "given begin" else 16.0
-    options = {"control_limits": (-most, most)} if limited else {"integrator": vp.Midpoint()}
-    problem = links(name, **options)
-    plan = vp.solve(problem, check=False)
-    assert plan.status.converged, plan.reason
-    assert plan.violation <= 1e-9
-    u, (lower, upper) = plan.controls, problem.control_limits
-    assert (u >= lower).all()
-    assert (u <= upper).all()
-    assert (u[fixed(problem)] == BEFORE[:1]).all()
-
-    def parts(u):
-        motion = moved(problem, u)
-        pulls = zip(values(problem, motion), plan.constraints, strict=True)
-        return np.concatenate([problem.shares(motion), *((c * report.multipliers).ravel() for c, report in pulls)])
-
-    slopes, sizes = np.zeros(u.shape), np.zeros(u.shape)
-    for i in np.ndindex(*u.shape):
-        w = np.zeros(u.shape)
-        w[i] = 1e-4
-        found = (parts(u + w) - parts(u - w)) / 2e-4
-        slopes[i], sizes[i] = found.sum(), np.abs(found).sum()
-    held = ((u <= lower) & (slopes > 0.0)) | ((u >= upper) & (slopes < 0.0)) | fixed(problem)
-    # The search ends where the cost would fall by 1e-13 of itself: slopes are small as its root is.
-    assert np.abs(np.where(held, 0.0, slopes)).max() <= 1e-5 * sizes.max()
-    assert any(report.active.any() for report in plan.constraints)
-    for report in plan.constraints:
-        if not report.equality:
-            assert (report.multipliers >= 0.0).all()
-            assert np.abs(report.multipliers * report.values).max() <= 1e-8 * abs(plan.cost)
-
-
-@pytest.mark.parametrize("name", ["speeds", pytest.param("given begin", marks=pytest.mark.slow)])
-def test_scipy_finds_no_less(name, nodes_alone):
-    problem = links(name)
-    plan = vp.solve(problem, check=False)
-    given = fixed(problem)
-
-    def motion(x):
-        u = plan.controls.copy()
-        u[~given] = x
-        return moved(problem, u)
-
-    def rule(x, i):
-        return -values(problem, motion(x))[i].ravel()
-
-    rules = [{"type": "ineq", "fun": rule, "args": (i,)} for i in range(len(CASES[name]))]
-    free = plan.controls[~given]
-    start = free * (1.0 + 0.02 * np.random.default_rng(0).normal(size=free.size))
-    best = minimize(
-        lambda x: problem.cost_of(motion(x)), start, method="SLSQP", constraints=rules,
-        options={"maxiter": 200, "ftol": 1e-10},
-    )  # fmt: skip
-    assert best.success
-    assert plan.cost <= best.fun * (1.0 + 1e-6)
-    assert best.fun <= plan.cost * (1.0 + 1e-4)
-
-
 def test_slopes_are_those_of_the_lines():
     problem = links("slopes")
     plan = vp.solve(problem, check=False)
@@ -136,18 +61,6 @@ def test_slopes_are_those_of_the_lines():
     np.testing.assert_allclose(report.t, problem.dt * np.arange(1, N + 1), atol=1e-12)
     told = plan.verify()
     assert told.constraints[0].open_loop <= 1e-6
-
-
-def test_rounds_go_on_where_they_stopped(tmp_path):
-    """Cut, saved and read, the rounds end with the same bytes."""
-    problem = links("given begin")
-    whole = vp.solve(problem, check=False)
-    part = vp.solve(problem, max_iterations=whole.iterations - 1, check=False)
-    assert part.status is vp.Status.MAX_ITERATIONS
-    rest = vp.solve(problem, resume=vp.Solution.load(part.save(tmp_path / "plan.npz"), problem), check=False)
-    assert rest.controls.tobytes() == whole.controls.tobytes()
-    assert rest.gains.tobytes() == whole.gains.tobytes()
-    assert rest.multipliers.values.tobytes() == whole.multipliers.values.tobytes()
 
 
 def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
@@ -189,40 +102,6 @@ def fastest(problem, u, parts):
     h, steps = problem.dt / parts, problem.steps * parts
     given = {"dt": h, "steps": steps, "controls": lines, "integrator": vp.RungeKutta4(), "check": False}
     return np.abs(vp.simulate(problem.scene, problem.q0, problem.v0, **given).v)
-
-
-def test_motions_do_not_go_around_velocity_limits():
-    """At 50 ms a node linear torques would move a link at 5 rad/s between nodes, and at 0.3 at these."""
-    robot = vp.planar_chain(1)
-    cost = vp.ControlCost(1e-4) + vp.VelocityCost(1e-3) + vp.Terminal(vp.TrackingCost([0.9], 1e2))
-    options = {"dt": 0.05, "steps": N, "constraints": [vp.WithinVelocityLimits(robot, (-0.3, 0.3))]}
-    scene = vp.Scene(robot, gravity=False, damping=0.1)
-    costs = {}
-    for controls in ("linear", "held"):
-        problem = vp.OptimalControlProblem(scene, cost, [0.1], [0.0], controls=controls, **options)
-        plan = vp.solve(problem)
-        assert plan.status.converged
-        assert plan.violation <= 1e-6
-        assert not about(plan.warnings, "constraints between nodes")
-        costs[controls] = plan.cost
-        if controls == "linear":
-            assert fastest(problem, plan.controls, 64).max() <= 0.3 + 1e-6
-            (report,) = plan.constraints
-            assert len(report.t) > N
-            assert (np.diff(report.t) > 0.0).all()
-    assert costs["linear"] < costs["held"]
-
-
-@pytest.mark.parametrize("name", [pytest.param("ur5", marks=pytest.mark.slow), "two links"])
-def test_speeds_hold_between_nodes(name):
-    robot = vp.load_robot(name) if name == "ur5" else vp.planar_chain(2)
-    problem = reach(robot, 0.8) if name == "ur5" else reach(robot, 0.6, dt=0.1, steps=10)
-    plan = vp.solve(problem)
-    assert plan.status.converged, plan.reason
-    assert not about(plan.warnings, "constraints between nodes")
-    limit = problem.constraints[0].limits[1].max()
-    assert plan.violation <= 1e-6
-    assert fastest(problem, plan.controls, 32).max() <= limit * (1.0 + 1e-5)
 
 
 def test_karush_kuhn_tucker_with_rows_between_nodes():
@@ -364,44 +243,6 @@ def test_rows_follow_sliding_peaks():
         for bends in (instants.bends, np.zeros(instants.bends.shape))
     )
     assert sliding < 0.1 * fixed, (sliding, fixed)
-
-
-def test_rounds_with_rows_between_nodes_go_on_where_they_stopped(tmp_path):
-    problem = reach(vp.planar_chain(2), 0.6, dt=0.125, steps=N)
-    whole = vp.solve(problem, check=False)
-    saved = vp.Solution.load(whole.save(tmp_path / "whole.npz"), problem)
-    assert saved.violation == whole.violation
-    assert str(saved) == str(whole)
-    for cut in (3, len(whole.history) - 3):
-        part = vp.solve(problem, max_iterations=cut, check=False)
-        assert part.status is vp.Status.MAX_ITERATIONS
-        rest = vp.solve(problem, resume=vp.Solution.load(part.save(tmp_path / "plan.npz"), problem), check=False)
-        assert rest.controls.tobytes() == whole.controls.tobytes()
-        assert rest.multipliers.values.tobytes() == whole.multipliers.values.tobytes()
-
-
-@pytest.mark.parametrize("kind", ["region", pytest.param("clearance", marks=pytest.mark.slow)])
-def test_regions_and_clearance_hold_between_nodes(kind):
-    """To a thousandth of the range, 1e-3 m, in 32 parts of each step of 0.15 s."""
-    robot = vp.planar_chain(2)
-    if kind == "region":
-        within = vp.KeepOutOfSphere(robot, "tip", center=[1.3, 0.0, -1.5], radius=0.2)
-    else:
-        arm = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
-        ball = vp.Obstacle.sphere([1.4, 0.0, -1.35], 0.15, name="ball")
-        within = vp.KeepClear(robot, [ball], 0.02, capsules=arm)
-    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
-    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
-    given = {"dt": 0.15, "steps": N, "controls": "linear", "constraints": [within]}
-    problem = vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, [0.0, 0.0], [0.0, 0.0], **given)
-    plan = vp.solve(problem, check=False)
-    assert plan.status.converged, plan.reason
-    assert len(plan.constraints[0].t) > N
-    fine = problem.constraints_on(0.15 / 32, 32 * N, 1)[0]
-    lines = vp.FirstOrderHold(plan.controls).refined(32)
-    options = {"dt": 0.15 / 32, "steps": 32 * N, "controls": lines, "integrator": vp.RungeKutta4()}
-    motion = vp.simulate(problem.scene, problem.q0, problem.v0, **options, check=False)
-    assert fine.value(motion.q, motion.v, motion.u).max() <= 1e-3
 
 
 def test_files_with_other_rows_between_nodes_are_refused(tmp_path):
@@ -619,17 +460,3 @@ def test_trials_of_the_last_step_that_leave_are_given_up():
     step.ahead = np.full_like(step.ahead, 1e4)
     assert step.after(Counted(whole), 1.0) is None
     assert max(seen_parts) <= 4 * N
-
-
-def test_penalties_between_nodes_weigh_as_the_cost_of_the_plan_does():
-    """The first motion, an arm held where it is, costs thousands of times as much: under its weights 201 iterations."""
-    robot = vp.load_robot("z1")
-    begin = np.array([0.06, 0.1, -0.1, 0.05, -0.27, 0.18, -0.2])
-    goal = begin + 0.7 * np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-    scene = vp.Scene(robot, damping="robot")
-    problem = reach(robot, 0.8, scene, begin, goal, dt=0.04, steps=25)
-    plan = vp.solve(problem, check=False)
-    assert plan.status.converged
-    assert plan.violation <= 1e-9
-    assert plan.history[0].cost > 1e3 * plan.cost
-    assert plan.iterations <= 50

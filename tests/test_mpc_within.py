@@ -1,7 +1,6 @@
 """A controller within hard constraints: its ticks against plans from scratch, obstacles that move, what is told."""
 
 import numpy as np
-import pytest
 from refusals import naming, refused, unnamed
 
 import varpin as vp
@@ -47,30 +46,6 @@ FAMILIES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FAMILIES)
-def test_ticks_are_those_of_plans_from_scratch(name):
-    """Each against S-DDP with all rounds, from the same state, time and control before."""
-    problem = tracking(FAMILIES[name])
-    run = vp.Mpc(problem, iterations=4).run(duration=0.9)
-    assert run.infeasible == 0
-    (held,) = run.constraints
-    assert held.planned.max() <= held.tolerance
-    assert held.worst <= held.tolerance
-    active = 0
-    for plan in run.plans[3::6]:
-        # Around an obstacle there are other optima, on its other side: the rounds start on the tick's own.
-        alone = vp.solve(plan.problem, plan if "moving" in name else None, check=False)
-        assert alone.status.converged, alone.reason
-        active += int(alone.constraints[0].active.sum())
-        assert plan.cost == pytest.approx(alone.cost, rel=2e-3)
-        most = np.abs(alone.controls).max()
-        np.testing.assert_allclose(plan.controls[0], alone.controls[0], rtol=0, atol=2e-2 * most)
-    assert active > 0
-    free = vp.Mpc(tracking([])).run(duration=0.9)
-    outside = problem.constraints_on(free.motion.dt, free.motion.steps, 10)[0]
-    assert outside.value(free.motion.q, free.motion.v, free.motion.u).max() > 5.0 * held.tolerance
-
-
 def test_obstacles_are_where_they_are_at_each_time():
     """Bounds of an obstacle and a sphere that move are those of ones that stand there, at every node."""
     problem = tracking([*FAMILIES["a moving sphere"], *FAMILIES["a moving ball"]], t0=0.4)
@@ -102,13 +77,6 @@ def test_ways_of_obstacles_are_checked():
         tracking([vp.KeepClear(ROBOT, [moving], capsules=ARM)])
     with refused(vp.InputError, "center", "finite"):
         tracking([vp.KeepOutOfSphere(ROBOT, "tip", lambda t: [np.nan, 0.0, 0.0], 0.1)])
-
-
-def test_rates_go_on_from_tick_to_tick():
-    run = vp.Mpc(tracking(FAMILIES["rates"]), iterations=4).run(duration=0.6)
-    u = run.motion.u[::10]
-    assert np.abs(np.diff(u, axis=0)).max() <= 100.0 * 0.03 * (1.0 + 1e-3)
-    np.testing.assert_array_equal(run.plans[5].problem.before, u[4])
 
 
 def test_ticks_that_find_no_plan_are_told_of():

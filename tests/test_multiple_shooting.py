@@ -114,18 +114,6 @@ def test_around_an_obstacle():
         vp.solve(problem, resume=found, states=line([1.0, 0.5]))
 
 
-def test_resume_and_files(tmp_path):
-    problem = reach(scene=vp.Scene(vp.planar_chain(2), damping=0.1, actuation=["joint1"]))
-    path = line([1.0, 0.5])
-    whole = vp.solve(problem, states=path, check=False)
-    part = vp.solve(problem, states=path, check=False, max_iterations=whole.iterations - 3)
-    back = vp.Solution.load(part.save(tmp_path / "part.npz"), problem)
-    rest = vp.solve(problem, resume=back, check=False)
-    assert rest.iterations == whole.iterations
-    assert rest.trajectory.u.tobytes() == whole.trajectory.u.tobytes()
-    assert rest.gains.tobytes() == whole.gains.tobytes()
-
-
 def test_interrupted_while_gaps_are_closed():
     problem = reach(scene=vp.Scene(vp.planar_chain(2), damping=0.1, actuation=["joint1"]))
 
@@ -176,16 +164,6 @@ def test_states_in_degrees_are_told_of(caplog):
     assert naming(caplog.messages, "states", "'joint1'", "90", "degrees")
     with refused(vp.InputError, "q0", "degrees"):
         vp.solve(reach(), states=line([90.0, 45.0]) + 30.0)
-
-
-@pytest.mark.parametrize("given", [False, True])
-def test_linear_controls_end_at_their_optimum(given):
-    problem = linear(controls="linear", integrator=vp.Gauss(2))
-    u = np.linspace([1.0], [-1.0], STEPS + 1) if given else None
-    own, found = vp.solve(problem, tolerance=1e-12), vp.solve(problem, u, states=line([1.0, 0.3]), tolerance=1e-12)
-    assert found.status.converged
-    assert found.cost == pytest.approx(own.cost, rel=1e-10)
-    np.testing.assert_allclose(found.controls, own.controls, atol=1e-6)
 
 
 def test_linear_controls_within_rate_limits_and_a_first_control():

@@ -288,18 +288,6 @@ def test_wrong_derivatives_stall_and_say_so():
 
 
 @pytest.mark.parametrize("grid", GRIDS)
-@pytest.mark.parametrize("noise", [None, vp.AdditiveNoise(0.1), vp.ControlNoise(0.05)], ids=["quiet", "add", "control"])
-def test_warm_starts_have_little_left_to_do(noise, grid):
-    problem = reach(noise=noise, **GRIDS[grid])
-    sol = vp.solve(problem)
-    assert sol.status is vp.Status.CONVERGED
-    for start in (sol, sol.policy, sol.controls):
-        again = vp.solve(problem, start)
-        assert again.status is vp.Status.CONVERGED
-        assert again.iterations <= 1
-
-
-@pytest.mark.parametrize("grid", GRIDS)
 def test_a_search_ends_where_rounding_begins(grid):
     """No tolerance is too small."""
     problem = reach(**GRIDS[grid])
@@ -385,18 +373,6 @@ def test_what_was_given_up_is_tried_again_where_nothing_else_helps(steps, monkey
     assert bounded.trajectory.statistics.substeps.max() > 1
     assert bounded.cost <= 1.05 * free.cost
     assert not bounded.search.bounded
-
-
-def test_bounded_searches_go_on_as_if_not_interrupted():
-    """The bounds are those of the motion so far, which is all that a search holds."""
-    problem = tool_reach()
-    whole = vp.solve(problem, max_iterations=8)
-    parts = vp.solve(problem, max_iterations=3)
-    assert any(item.rollouts > 4 for item in whole.history)
-    parts = vp.solve(problem, resume=parts, max_iterations=5)
-    for name in ("gains", "feedforward", "controls"):
-        assert getattr(parts, name).tobytes() == getattr(whole, name).tobytes()
-    assert [item.rollouts for item in parts.history] == [item.rollouts for item in whole.history]
 
 
 ARRAYS = ("q", "v", "p", "u", "energy")

@@ -31,53 +31,6 @@ def same(a, b):
     assert without[0] == without[1]
 
 
-CASES = {
-    "plain": ({}, {}),
-    "noise": ({"noise": vp.StateNoise(0.3, center=0.0)}, {}),
-    "second order": ({"integrator": vp.Midpoint()}, {"second_order": True}),
-    "open": ({"integrator": vp.ExplicitEuler(), "dt": 0.01}, {"forward": "open", "regularization": 1.0}),
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("before", [0, 1, 3])
-def test_resumed_is_uninterrupted(case, before, tmp_path):
-    given, options = CASES[case]
-    problem = problem_of(**given)
-    whole = vp.solve(problem, max_iterations=7, tolerance=1e-13, **options)
-    assert len(whole.history) > before + 1  # there is something left to do
-    part = vp.solve(problem, max_iterations=before, tolerance=1e-13, **options)
-    path = part.save(tmp_path / "part.npz")
-    loaded = vp.Solution.load(path, problem_of(**given))
-    same(part, loaded)
-    same(whole, vp.solve(problem, resume=part, max_iterations=7 - before, tolerance=1e-13, **options))
-    same(whole, vp.solve(loaded.problem, resume=loaded, max_iterations=7 - before, tolerance=1e-13, **options))
-
-
-def test_interrupted_search_goes_on(tmp_path):
-    """Ctrl-C at any iteration leaves a solution that goes on to the same end."""
-    problem = problem_of()
-    whole = vp.solve(problem, max_iterations=6, tolerance=1e-13)
-
-    def stop(item):
-        if item.index == 2:
-            raise KeyboardInterrupt
-
-    part = vp.solve(problem, max_iterations=6, tolerance=1e-13, callback=stop)
-    assert part.status is vp.Status.INTERRUPTED
-    loaded = vp.Solution.load(part.save(tmp_path / "part.npz"), problem)
-    done = len(loaded.search.history)
-    same(whole, vp.solve(problem, resume=loaded, max_iterations=6 - done, tolerance=1e-13))
-
-
-def test_policy_of_a_loaded_solution_is_the_same(tmp_path):
-    problem = problem_of()
-    plan = vp.solve(problem, max_iterations=3)
-    loaded = vp.Solution.load(plan.save(tmp_path / "plan.npz"), problem)
-    np.testing.assert_array_equal(plan.policy.gains, loaded.policy.gains)
-    assert plan.verify(tolerance=1e-3) == loaded.verify(tolerance=1e-3)
-
-
 @pytest.mark.parametrize(
     ("other", "facts"),
     [

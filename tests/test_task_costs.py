@@ -13,8 +13,6 @@ from varpin.model.kinematics import frame_kinematics, links
 N = 5
 STEP = 1e-2
 WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-FULL = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.2], [-0.1, 0.2, 0.5]])
-FULL6 = np.diag([1.0, 2.0, 0.5, 0.1, 0.2, 0.3]) + 0.02
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
@@ -88,24 +86,6 @@ def test_frames(arm):
         np.testing.assert_array_equal(placed, once_more)
 
 
-def test_center_of_mass(arm):
-    robot, _ = arm
-    n = robot.dof
-    q, v = state(robot)
-    gear, u = robot.free_velocities(np.eye(n)).T, np.zeros((1, 1))
-    for k in range(N):
-        data, free = robot.free_model.createData(), robot.free_positions(q[k])
-        center = pin.centerOfMass(robot.free_model, data, free)
-        J = pin.jacobianCenterOfMass(robot.free_model, data, free) @ gear
-        for axis in np.eye(3):
-            # The centre is 1 m from the target along an axis: the gradient is twice a row of the Jacobian.
-            bound = vp.CenterOfMassCost(robot, center - axis).bind(Points(np.zeros(1), 1.0, 1, n, 1))
-            assert bound.value(q[k : k + 1], v[:1], u)[0] == pytest.approx(1.0, abs=1e-12)
-            given = bound.expand(q[k : k + 1], v[:1], u)
-            np.testing.assert_allclose(given.gradient[0, :n], 2.0 * axis @ J, atol=1e-12)
-        np.testing.assert_allclose(given.hessian[0, :n, :n], 2.0 * J.T @ J, atol=1e-12)
-
-
 def test_only_what_carries_a_frame_is_placed(load):
     robot = load("panda")
     assert len(links(robot.tree, 3).parent) == 4
@@ -114,60 +94,6 @@ def test_only_what_carries_a_frame_is_placed(load):
 
 def turn(axis, angle):
     return pin.exp3(angle * np.asarray(axis) / np.linalg.norm(axis))
-
-
-TARGET = turn([1, 2, 3], 0.8)
-
-
-def residual(kind, robot, frame, q, v):
-    """What the costs below weigh, by Pinocchio, at one state."""
-    R, p, twist = pinocchio_frame(robot, frame, q, v)
-    if kind == "position":
-        return p - [0.3, 0.2, 0.1]
-    if kind == "orientation":
-        return pin.log3(TARGET.T @ R)
-    if kind == "velocity":
-        return twist - np.arange(6) * 0.1
-    return pin.centerOfMass(robot.free_model, robot.free_model.createData(), robot.free_positions(q)) - [0.1, 0.2, 0.3]
-
-
-MADE = {
-    "position": (lambda robot, frame: vp.FramePositionCost(robot, frame, [0.3, 0.2, 0.1], FULL), FULL),
-    "orientation": (lambda robot, frame: vp.FrameOrientationCost(robot, frame, TARGET, FULL), FULL),
-    "velocity": (lambda robot, frame: vp.FrameVelocityCost(robot, frame, np.arange(6) * 0.1, FULL6), FULL6),
-    "center": (lambda robot, frame: vp.CenterOfMassCost(robot, [0.1, 0.2, 0.3], FULL), FULL),
-}
-
-
-@pytest.mark.parametrize("kind", MADE)
-def test_values_gradients_and_gauss_newton_hessians(arm, kind):
-    robot, frame = arm
-    n = robot.dof
-    make, W = MADE[kind]
-    points = Points(np.linspace(0.0, 1.0, N), 1.0, N - 1, n, 1)
-    bound = make(robot, frame).bind(points)
-    q, v = state(robot, 1)
-    z = np.hstack([q, v, np.zeros((N, 1))])
-
-    def r(z):
-        return np.array([residual(kind, robot, frame, row[:n], row[n : 2 * n]) for row in z])
-
-    error, J = r(z), differences(r, z)
-    if kind == "orientation":  # far from half a turn, where the logarithm jumps
-        assert np.linalg.norm(error, axis=1).min() < 3.0
-        keep = np.linalg.norm(error, axis=1) < 2.8
-    else:
-        keep = np.ones(N, dtype=bool)
-    np.testing.assert_allclose(bound.value(q, v, z[:, 2 * n :]), np.einsum("Ni,ij,Nj->N", error, W, error), rtol=1e-11)
-    given = bound.expand(q, v, z[:, 2 * n :])
-    gradient = 2.0 * np.einsum("Nra,rs,Ns->Na", J, W, error)
-    hessian = 2.0 * np.einsum("Nra,rs,Nsb->Nab", J, W, J)
-    assert keep.sum() >= 2
-    np.testing.assert_allclose(given.gradient[keep], gradient[keep], atol=1e-8 * np.abs(gradient).max())
-    np.testing.assert_allclose(given.hessian[keep], hessian[keep], atol=1e-8 * np.abs(hessian).max())
-    if keep.all():
-        slopes = differences(lambda z: bound.value(z[:, :n], z[:, n : 2 * n], z[:, 2 * n :]), z)
-        np.testing.assert_allclose(given.gradient, slopes, atol=1e-8 * np.abs(slopes).max())
 
 
 @pytest.mark.parametrize("axis", [(2, -1, 2), (-9, 2, 6), (2, 9, -6), (0, 0, 1)])
@@ -223,26 +149,6 @@ def test_targets_in_time(load):
     np.testing.assert_allclose(by_rows.value(q, v, u), expected, rtol=1e-10)
 
 
-def test_many_paths_at_once(load):
-    robot = load("ur5")
-    rng = np.random.default_rng(4)
-    points = Points(np.linspace(0, 1, N), 1.0, N - 1, 6, 6)
-    q, v, u = (rng.normal(size=(3, N, 6)) for _ in range(3))
-    rows = rng.normal(size=(N, 3))
-    for cost in (
-        vp.FramePositionCost(robot, "tool0", rows),
-        vp.FrameOrientationCost(robot, "tool0", TARGET),
-        vp.FrameVelocityCost(robot, "tool0"),
-        vp.CenterOfMassCost(robot, rows),
-        vp.ManipulabilityCost(robot, "tool0", 0.1),
-        vp.JointLimitBarrier(robot, limits=(-0.5, 0.5)),
-        vp.VelocityLimitBarrier(robot, limits=(-0.5, 0.5)),
-    ):
-        bound = cost.bind(points)
-        one_by_one = [bound.value(*path) for path in zip(q, v, u, strict=True)]
-        np.testing.assert_allclose(bound.value(q, v, u), one_by_one, rtol=1e-13, atol=1e-15)
-
-
 @pytest.mark.parametrize("directions", ["all", "linear", ("x", "z", "ry")])
 def test_manipulability(load, directions):
     """Yoshikawa's measure by Pinocchio's Jacobian; its slope by differences; nothing where there is enough of it."""
@@ -276,23 +182,6 @@ def test_manipulability(load, directions):
     assert not given.hessian[measured > least * (1 + 1e-9)].any()
 
 
-def test_manipulability_at_a_singular_configuration(load):
-    """A stretched arm has none, and the derivative of a determinant there: of w = |J| for six joints, to both sides."""
-    robot = load("ur5")
-    q = np.array([[0.3, -1.0, 0.0, 0.4, 0.9, 0.2]])
-    bound = vp.ManipulabilityCost(robot, "tool0", 0.05).bind(Points(np.zeros(1), 1.0, 1, 6, 6))
-    u = np.zeros((1, 6))
-    assert bound.value(q, q, u)[0] == pytest.approx(0.05**2, rel=1e-6)
-    given = bound.expand(q, q, u)
-
-    def determinant(q):
-        return np.linalg.det(frame_kinematics(robot, "tool0").jacobians(q)[2])
-
-    slope = differences(determinant, q)[0]
-    assert np.abs(slope).max() > 1e-2
-    np.testing.assert_allclose(np.abs(given.gradient[0, :6]), 0.1 * np.abs(slope), atol=1e-8)
-
-
 def test_barriers(load):
     """By hand: nothing inside, the square of what is beyond limit less margin outside."""
     robot = load("ur5")
@@ -319,47 +208,6 @@ def test_barriers(load):
     given = bound.expand(q, v, u)
     np.testing.assert_allclose(given.gradient[[0, 1], [6, 9]], [-4 * 0.85, 4 * 0.1], rtol=1e-6)
     assert np.count_nonzero(given.gradient) == np.count_nonzero(given.hessian) == 2
-
-
-def test_barriers_against_differences(load):
-    """Of a finger whose limits are closer than two margins, too: the barriers meet in the middle."""
-    robot = load("panda")
-    n = robot.dof
-    q, v = (1.5 * part for part in state(robot, 6))
-    points = Points(np.linspace(0, 1, N), 1.0, N - 1, n, 1)
-    W = np.diag(np.arange(1.0, n + 1)) + 0.1
-    cost = vp.JointLimitBarrier(robot, W, 0.2) + vp.VelocityLimitBarrier(robot, 0.5, limits=(-1.0, 0.7))
-    bound = cost.bind(points)
-    z = np.hstack([q, v])
-    u = np.zeros((N, 1))
-    # Second differences of a function with kinks in its slope hold where no kink is within their reach.
-    given = bound.expand(q, v, u)
-    h = 1e-6
-
-    def value(z):
-        return bound.value(z[:, :n], z[:, n:], u)
-
-    slopes = np.stack([(value(z + h * e) - value(z - h * e)) / (2 * h) for e in np.eye(2 * n)], axis=1)
-    assert np.count_nonzero(np.abs(slopes) > 1e-3) > 10
-    np.testing.assert_allclose(given.gradient[:, : 2 * n], slopes, atol=1e-7 * np.abs(slopes).max())
-
-    def gradient(z):
-        return bound.expand(z[:, :n], z[:, n:], u).gradient[:, : 2 * n]
-
-    curvature = np.stack([(gradient(z + h * e) - gradient(z - h * e)) / (2 * h) for e in np.eye(2 * n)], axis=2)
-    np.testing.assert_allclose(given.hessian[:, : 2 * n, : 2 * n], curvature, atol=1e-7 * np.abs(curvature).max())
-
-
-def test_as_terms_of_a_sum(load):
-    robot = load("ur5")
-    term = vp.FramePositionCost(robot, "tool0", [0.3, 0.2, 0.1], 2.0)
-    total = vp.Terminal(term) + 0.5 * term + vp.ControlCost(1e-3)
-    assert "FramePositionCost('tool0'" in repr(total)
-    points = Points(np.zeros(1), 1.0, 1, 6, 6)
-    q, v = state(robot, 7, 1)
-    u = np.zeros((1, 6))
-    first = term.bind(points).value(q, v, u)
-    np.testing.assert_allclose(total.bind(points).value(q, v, u), 1.5 * first)
 
 
 def test_what_is_refused(load):

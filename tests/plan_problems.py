@@ -1,0 +1,313 @@
+"""Named problems of plans, each with the least cost that is known: what any search has to reach.
+
+    case = plan_problems.CASES["held, speeds"]
+    plan = vp.solve(case.problem, **case.options)
+
+``SMALL`` are of two or three joints and a dozen decisions, for oracles that take many motions; ``ARMS`` are of robots,
+and ``HARD`` leave hardly any room.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from oracles import placements
+
+import varpin as vp
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A problem, and what holds of its plan.
+
+    Attributes:
+        build: Makes the problem.
+        cost: The least cost known, noise included.
+        options: Of :func:`varpin.solve`.
+        kkt: What may be left of the Lagrangian's gradient (:func:`oracles.kkt`); None where that is not looked at.
+        scipy: Whether SciPy's SLSQP is to find the same least cost from the first controls.
+        within: The largest violation within steps; None where constraints hold at nodes alone.
+    """
+
+    build: Callable[[], vp.OptimalControlProblem]
+    cost: float
+    options: dict[str, object] = field(default_factory=dict)
+    kkt: float | None = 1e-5
+    scipy: bool = False
+    within: float | None = None
+
+    @functools.cached_property
+    def problem(self) -> vp.OptimalControlProblem:
+        return self.build()
+
+    @functools.cached_property
+    def plan(self) -> vp.Solution:
+        return vp.solve(self.problem, check=False, **self.options)
+
+
+TWO, THREE = vp.planar_chain(2), vp.planar_chain(3)
+CAPSULES = {f"joint{k}": ([0, 0, 0], [1, 0, 0], 0.05) for k in (1, 2)}
+REST = np.zeros(2)
+
+
+def reach(
+    *constraints: vp.PlanConstraint, more: vp.Cost | None = None, scene: vp.Scene | None = None, **options: object
+) -> vp.OptimalControlProblem:
+    """Two links that are to swing up a little, in 0.72 s and 12 steps."""
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
+    cost += vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0) + vp.VelocityCost(10.0))
+    given = {"dt": 0.06, "steps": 12, "constraints": constraints, **options}
+    return vp.OptimalControlProblem(
+        scene or vp.Scene(TWO, damping=0.1), cost if more is None else cost + more, REST, REST, **given
+    )
+
+
+def tip(z: float = -0.9) -> vp.ReachFrame:
+    return vp.ReachFrame(TWO, "tip", position=[1.2, 0.0, z])
+
+
+def speeds(most: float) -> vp.WithinVelocityLimits:
+    return vp.WithinVelocityLimits(TWO, (-most, most))
+
+
+def noisy(noise: vp.Noise) -> vp.Scene:
+    return vp.Scene(TWO, damping=0.5, noise=noise)
+
+
+def tracking(t: object) -> np.ndarray:
+    return 0.3 * np.sin(4.0 * np.asarray(t)[..., None] + np.arange(3))
+
+
+def wave(*constraints: vp.PlanConstraint, **options: object) -> vp.OptimalControlProblem:
+    """Three links that follow a wave."""
+    cost = vp.TrackingCost(tracking, 50.0) + vp.ControlCost(1e-3)
+    return vp.OptimalControlProblem(
+        vp.Scene(THREE, damping=0.2), cost, tracking(0.0), np.zeros(3), dt=0.08, steps=10,
+        constraints=constraints, **options,
+    )  # fmt: skip
+
+
+def served() -> vp.OptimalControlProblem:
+    """Servos whose drives are too weak for the first moments of a reach."""
+    scene = vp.Scene(TWO, forces=[vp.PositionServo(200.0, 20.0, [30.0, 12.0])])
+    cost = vp.ControlCost(1e-1, reference=[0.6, 0.3]) + vp.Terminal(
+        vp.TrackingCost([0.6, 0.3], 1e2) + vp.VelocityCost(1.0)
+    )
+    return vp.OptimalControlProblem(scene, cost, REST, REST, dt=0.06, steps=12, constraints=[speeds(1.6)])
+
+
+def loop() -> vp.OptimalControlProblem:
+    """A closed loop of three links, driven by its crank within speeds."""
+    tied = vp.PointOnPoint("tip", (1.8, 0.0, -0.5), "xz")
+    scene = vp.Scene(THREE, damping=0.1, constraints=tied, actuation=["joint1"])
+    begin = vp.assemble(scene, [-0.9, 1.6, 0.9])
+    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost(begin + np.array([0.6, 0.0, 0.0]), [50.0, 0.0, 0.0]))
+    cost += vp.Terminal(vp.VelocityCost(1.0))
+    within = vp.WithinVelocityLimits(THREE, ([-1.2, -9.0, -9.0], [1.2, 9.0, 9.0]))
+    return vp.OptimalControlProblem(scene, cost, begin, np.zeros(3), dt=0.06, steps=12, constraints=[within])
+
+
+LIMITS = {"control_limits": ([-20.0, -6.0], [20.0, 6.0])}
+BALL = vp.Obstacle.sphere([1.5, 0.0, -1.25], 0.15)
+LINE = np.linspace(0.0, 1.0, 13)[:, None] * np.array([1.0, 0.5])
+
+SMALL: dict[str, Case] = {
+    "held": Case(reach, 2.1247274, scipy=True),
+    "held, torques": Case(lambda: reach(**LIMITS), 2.8690354, scipy=True),
+    "held, joints": Case(lambda: reach(vp.WithinJointLimits(TWO, (-0.05, [0.9, 2.0]))), 3.6725869, scipy=True),
+    "held, speeds": Case(lambda: reach(speeds(1.8)), 3.5426741, scipy=True),
+    "held, speeds and torques": Case(lambda: reach(speeds(2.2), **LIMITS), 9.1687277, scipy=True),
+    "held, rates": Case(lambda: reach(vp.WithinControlRate(150.0, before=[14.0, 4.0])), 2.2275035),
+    "held, goal": Case(lambda: reach(tip()), 208.03691, scipy=True),
+    "held, goal and rates": Case(lambda: reach(tip(), vp.WithinControlRate(90.0)), 208.03742),
+    "held, half-space": Case(lambda: reach(vp.KeepInHalfSpace(TWO, "tip", [0, 0, 2], -3.0)), 14.163062),
+    "held, box": Case(lambda: reach(vp.KeepInBox(TWO, "tip", [0.0, -np.inf, -1.6], [2.5, np.inf, np.inf])), 9.3523701),
+    "held, in a sphere": Case(lambda: reach(vp.KeepInSphere(TWO, "tip", [1.5, 0.0, -0.5], 1.4)), 3.8353273),
+    "held, out of a sphere": Case(
+        lambda: reach(vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3)), 31.868422, scipy=True
+    ),
+    "held, out of a moving sphere": Case(
+        lambda: reach(vp.KeepOutOfSphere(TWO, "tip", lambda t: [1.0 + 0.4 * t, 0.0, -1.4], 0.3)), 28.956314
+    ),
+    "held, clear of a ball": Case(lambda: reach(vp.KeepClear(TWO, [BALL], 0.05, capsules=CAPSULES)), 40.007551),
+    "held, change of controls": Case(
+        lambda: reach(speeds(2.2), more=vp.ControlRateCost(1e-4, before=[14.0, 4.0])), 3.7537843
+    ),
+    "held over 3 steps": Case(lambda: reach(speeds(2.2), dt=0.03, steps=24, hold=3, **LIMITS), 9.465277, scipy=True),
+    "held over 2 steps, rates": Case(lambda: reach(vp.WithinControlRate(110.0), dt=0.03, steps=24, hold=2), 2.1258071),
+    "held, between nodes": Case(
+        lambda: reach(speeds(1.8), between_nodes=True, dt=0.09, steps=8), 3.5974214, kkt=None, within=1e-4
+    ),
+    "held, sphere between nodes": Case(
+        lambda: reach(vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3), between_nodes=True, dt=0.09, steps=8),
+        31.882135,
+        kkt=None,
+        within=1e-4,
+    ),
+    "linear": Case(lambda: reach(controls="linear"), 2.1082305, scipy=True),
+    "linear, torques": Case(lambda: reach(controls="linear", **LIMITS), 2.7921344, scipy=True),
+    "linear, rates and goal": Case(lambda: reach(tip(), vp.WithinControlRate(120.0), controls="linear"), 208.02676),
+    "linear, change of controls": Case(
+        lambda: reach(more=vp.ControlRateCost(1e-4, before=[14.0, 4.0]), controls="linear", **LIMITS), 4.2462364
+    ),
+    "linear, speeds": Case(lambda: reach(speeds(1.8), controls="linear"), 3.5263477, kkt=None, within=1e-4),
+    "linear, speeds and torques": Case(
+        lambda: reach(speeds(2.2), controls="linear", **LIMITS), 9.1274867, kkt=None, within=1e-4
+    ),
+    "linear, joints": Case(
+        lambda: reach(vp.WithinJointLimits(TWO, (-0.05, [0.9, 2.0])), controls="linear"),
+        3.6565019,
+        kkt=None,
+        within=1e-4,
+    ),
+    "linear, out of a sphere": Case(
+        lambda: reach(vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3), controls="linear"),
+        31.86263,
+        kkt=None,
+        within=1e-4,
+    ),
+    "linear, clear of a ball": Case(
+        lambda: reach(vp.KeepClear(TWO, [BALL], 0.05, capsules=CAPSULES), controls="linear"),
+        39.999934,
+        kkt=None,
+        within=1e-4,
+    ),
+    "three links": Case(
+        lambda: wave(control_limits=(-12.0, 12.0)), 9.6697064, options={"tolerance": 1e-10}, kkt=1e-4, scipy=True
+    ),
+    "three links, speeds": Case(lambda: wave(vp.WithinVelocityLimits(THREE, (-0.9, 0.9))), 2.6048773),
+    "servos at their limits": Case(served, 0.0035311108, kkt=1e-4),
+    "closed loop": Case(loop, 5.2016894),
+    "from states": Case(lambda: reach(speeds(1.8)), 3.5426741, options={"states": LINE}),
+    "second order": Case(lambda: reach(integrator=vp.Midpoint(), **LIMITS), 3.0291445, options={"second_order": True}),
+    "explicit steps": Case(lambda: reach(speeds(1.8), integrator=vp.RungeKutta4()), 3.5426051, scipy=True),
+    "midpoint rule": Case(
+        lambda: reach(speeds(1.8), integrator=vp.SemiImplicitEuler(), sampling="midpoint"), 3.5644662
+    ),
+    "noise of constant strength": Case(lambda: reach(scene=noisy(vp.AdditiveNoise(0.3))), 6.1839502),
+    "noise of the controls, torques": Case(
+        lambda: reach(scene=noisy(vp.ControlNoise(0.1)), **LIMITS), 13.851085, kkt=None
+    ),
+    "noise of the controls": Case(lambda: reach(scene=noisy(vp.ControlNoise(0.1))), 5.4958273, kkt=None),
+}
+
+
+def arm(
+    name: str,
+    begin: Sequence[float],
+    move: Sequence[float],
+    constraints: Callable[[vp.Robot, np.ndarray, np.ndarray], Sequence[vp.PlanConstraint]],
+    **options: object,
+) -> vp.OptimalControlProblem:
+    """A reach of an arm from rest in 1.2 s; ``constraints`` are of the robot, its begin and its goal."""
+    robot = vp.load_robot(name, lock={"panda": {"panda_finger_joint1": 0.02}, "z1": {"jointGripper": 0.0}}.get(name))
+    start, end = np.array(begin), np.array(begin) + move
+    cost = vp.ControlCost(1.0 / robot.effort_limit**2) + vp.VelocityCost(0.1)
+    cost += vp.Terminal(vp.TrackingCost(end, 50.0) + vp.VelocityCost(10.0))
+    given = {"dt": 0.04, "steps": 30, "constraints": constraints(robot, start, end), **options}
+    return vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, start, np.zeros(robot.dof), **given)
+
+
+def at(robot: vp.Robot, q: np.ndarray, frame: str | None = None) -> np.ndarray:
+    return robot.frame_positions(q, frame or robot.end_effector)
+
+
+UR5 = ("ur5", [0.0, -1.2, 1.4, -1.8, -1.57, 0.0], [1.0, 0.2, -0.3, 0.2, 0.3, 0.4])
+PANDA = ("panda", [0.0, -0.6, 0.0, -2.2, 0.0, 1.8, 0.7], [0.9, 0.4, 0.2, 0.4, -0.2, 0.3, 0.4])
+KINOVA = ("kinova", [0.3, 2.6, 1.6, 0.5, 1.0, 0.5], [0.7, -0.2, 0.3, 0.4, 0.3, 0.2])
+Z1 = ("z1", [0.0, 1.5, -1.5, 0.0, 0.0, 0.0], [0.6, 0.4, -0.3, 0.3, 0.2, 0.4])
+
+
+def ur5_torques() -> vp.OptimalControlProblem:
+    most = np.array([20.0, 60.0, 25.0, 8.0, 1.0, 0.5])
+    return arm(*UR5, lambda robot, _, __: [vp.WithinVelocityLimits(robot, (-0.85, 0.85))], control_limits=(-most, most))
+
+
+def pose(robot: vp.Robot, _: np.ndarray, end: np.ndarray) -> list[vp.PlanConstraint]:
+    c, s = np.cos(0.3), np.sin(0.3)
+    (tool,) = placements(robot, end[None], "tool0")
+    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ tool.rotation
+    return [vp.ReachFrame(robot, "tool0", tool.translation, turned)]
+
+
+def hasty(goal: Sequence[float], duration: float, steps: int, speed: float, torque: float) -> vp.OptimalControlProblem:
+    """Joints that move at their greatest speed with little torque to spare."""
+    cost = vp.ControlCost(1e-6) + vp.VelocityCost(1e-2) + vp.Terminal(vp.TrackingCost(goal, 1e2) + vp.VelocityCost(1.0))
+    given = {"dt": duration / steps, "steps": steps, "control_limits": (-torque, torque)}
+    return vp.OptimalControlProblem(vp.Scene(TWO, damping=0.1), cost, REST, REST, constraints=[speeds(speed)], **given)
+
+
+def panda_at_speed() -> vp.OptimalControlProblem:
+    """A goal of the tool that joints reach at their greatest speeds."""
+    robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.0})
+    cost = vp.ControlCost(0.1 / robot.effort_limit**2) + vp.VelocityCost(0.1) + vp.Terminal(vp.VelocityCost(10.0))
+    rules = [
+        vp.ReachFrame(robot, robot.end_effector, [-0.49, -0.19, 0.41]),
+        vp.WithinVelocityLimits(robot, (-1.0, 1.0)),
+    ]
+    begin = [-0.85, -0.88, -0.71, -1.45, -1.24, 0.85, 1.23]
+    given = {"dt": 1.0 / 60, "steps": 24, "integrator": vp.RungeKutta4(), "constraints": rules}
+    return vp.OptimalControlProblem(vp.Scene(robot, damping=0.1), cost, begin, np.zeros(7), **given)
+
+
+def kinova_near_speeds() -> vp.OptimalControlProblem:
+    """A joint keeps to its greatest speed for eight nodes, at most of them by a hair."""
+    robot = vp.load_robot("kinova")
+    begin = [-0.0711748649960309, 1.9930761174675944, 1.7271682700264162, 0.07818165024080687, 1.8578307798284002]
+    goal = [-0.3670625074091858, 1.691437829695649, 1.2497085561698789, 0.09824501637093636, 1.936600800564796]
+    cost = vp.ControlCost(0.1 / robot.effort_limit**2)
+    cost += vp.Terminal(vp.TrackingCost([*goal, 0.13025307794264052], 1e3) + vp.VelocityCost(10.0))
+    given = {"dt": 0.025, "steps": 40, "constraints": [vp.WithinVelocityLimits(robot, (-0.8, 0.8))]}
+    scene = vp.Scene(robot, damping=0.5)
+    return vp.OptimalControlProblem(scene, cost, [*begin, -0.09503175088201599], np.zeros(6), **given)
+
+
+ARMS: dict[str, Case] = {
+    "UR5, speeds": Case(lambda: arm(*UR5, lambda r, *_: [vp.WithinVelocityLimits(r, (-0.8, 0.8))]), 0.45339862),
+    "UR5, speeds and torques": Case(ur5_torques, 0.28243473),
+    "UR5, pose of the tool": Case(lambda: arm(*UR5, pose), 5.8381014),
+    "UR5, rates and goal, linear": Case(
+        lambda: arm(
+            *UR5,
+            lambda r, _, end: [vp.WithinControlRate(400.0), vp.ReachFrame(r, "tool0", at(r, end))],
+            controls="linear",
+        ),
+        0.20467992,
+    ),
+    "Panda, speeds": Case(lambda: arm(*PANDA, lambda r, *_: [vp.WithinVelocityLimits(r, (-0.7, 0.7))]), 0.69038677),
+    "Panda, goal and joints": Case(
+        lambda: arm(
+            *PANDA,
+            lambda r, begin, end: [
+                vp.ReachFrame(r, r.end_effector, at(r, end)),
+                vp.WithinJointLimits(r, ([-0.1, *[-np.inf] * 6], [end[0] - 0.05, *[np.inf] * 6])),
+            ],
+        ),
+        0.53737641,
+    ),
+    "Kinova, sphere": Case(
+        lambda: arm(
+            *KINOVA,
+            lambda r, begin, end: [
+                vp.KeepOutOfSphere(r, r.end_effector, at(r, 0.5 * (begin + end)) + np.array([0, 0, 0.02]), 0.06)
+            ],
+        ),
+        0.10137364,
+    ),
+    "Z1, speeds, linear": Case(
+        lambda: arm(*Z1, lambda r, *_: [vp.WithinVelocityLimits(r, (-0.45, 0.45))], controls="linear"),
+        0.45452603,
+        within=1e-4,
+    ),
+}
+# Those at the edge of what limits allow, where feedback has no room.
+HARD: dict[str, Case] = {
+    "two links in haste": Case(lambda: hasty([0.38, -1.25], 0.67, 16, 1.71, 43.0), 2.9835572),
+    "two links in more haste": Case(lambda: hasty([1.32, 1.05], 0.95, 19, 1.4, 29.0), 0.63806531),
+    "Panda, goal at greatest speeds": Case(panda_at_speed, 0.13662213),
+    "Kinova, speeds met by a hair": Case(kinova_near_speeds, 0.0023766076),
+}
+CASES = SMALL | ARMS | HARD

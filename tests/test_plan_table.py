@@ -1,0 +1,454 @@
+"""What any search for plans has to do, at public names: a table of problems against oracles, and how searches end."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from oracles import kkt, least_cost, lines, plan_rows, rollout, violation
+from plan_problems import ARMS, CAPSULES, CASES, LIMITS, LINE, REST, SMALL, TWO, reach, speeds, tip
+from scipy.special import ndtr
+
+import varpin as vp
+
+# A plan may cost as much more than the least cost known.
+ABOVE = 1e-3
+# Violation of constraints at nodes, in their own units.
+MET = 1e-6
+PATHS = 10_000
+
+
+# --- the table -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_plan(name: str) -> None:
+    """It converges to the least cost known, and holds to its constraints, by rows that are not the library's."""
+    case = CASES[name]
+    problem, plan = case.problem, case.plan
+    assert plan.status is vp.Status.CONVERGED, plan.reason
+    assert plan.expected_cost <= (1.0 + ABOVE) * case.cost
+    assert plan.cost == pytest.approx(problem.cost_of(plan.trajectory), rel=1e-12)
+    assert ((problem.control_limits[0] <= plan.controls) & (plan.controls <= problem.control_limits[1])).all()
+    assert violation(problem, plan.trajectory, plan.controls) <= MET
+    assert plan.violation <= MET
+    # The motion is that of its policy, and for arms that do not fall over without feedback, of its controls.
+    np.testing.assert_allclose(problem.simulate(plan.policy).q, plan.trajectory.q, rtol=0, atol=1e-9)
+    if name in SMALL and not problem.scene.constraints:
+        np.testing.assert_allclose(rollout(problem, plan.controls).q, plan.trajectory.q, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name, case in SMALL.items() if case.kkt])
+def test_karush_kuhn_tucker(name: str) -> None:
+    assert kkt(SMALL[name].plan) <= SMALL[name].kkt
+
+
+@pytest.mark.parametrize("name", [name for name, case in SMALL.items() if case.scipy])
+def test_scipy_finds_no_less(name: str) -> None:
+    case = SMALL[name]
+    u = case.plan.controls
+    disturbed = u * (1.0 + 0.02 * np.random.default_rng(0).normal(size=u.shape))
+    assert case.plan.cost == pytest.approx(least_cost(case.problem, disturbed), rel=1e-5)
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.within])
+def test_within_steps(name: str) -> None:
+    """The constraints hold in sixteenths of the steps, too."""
+    case = CASES[name]
+    problem, plan, finer = case.problem, case.plan, 16
+    fine = problem.at(dt=problem.dt / finer, between_nodes=False)
+    if problem.controls == "linear":
+        nodes = np.arange(fine.steps + 1) / finer
+        controls = np.stack([np.interp(nodes, np.arange(len(plan.controls)), u) for u in plan.controls.T], axis=1)
+        given = lines(fine, controls)
+    else:
+        given = controls = np.repeat(plan.controls, finer, axis=0)
+    # Arms fall over without feedback: each step begins at the plan's node.
+    worst = 0.0
+    for k in range(problem.steps):
+        part = vp.simulate(
+            problem.scene, plan.trajectory.q[k], plan.trajectory.v[k], dt=fine.dt, steps=finer, check=False,
+            integrator=fine.integrator,
+            controls=vp.FirstOrderHold(controls[finer * k : finer * (k + 1) + 1]) if given is not controls
+            else controls[finer * k : finer * (k + 1)],
+        )  # fmt: skip
+        below, _ = plan_rows(problem, part, np.zeros((2, problem.scene.controls)))
+        worst = max(worst, float(below.max()))
+    assert worst <= case.within
+
+
+@pytest.mark.parametrize(
+    "name", ["held, speeds", "held, out of a sphere", "linear, rates and goal", "held over 3 steps"]
+)
+def test_multipliers_are_slopes_of_the_least_cost(name: str) -> None:
+    """Of the first constraint's bound: how the least cost falls as it is relaxed."""
+    change = 1e-3
+    relaxed = {
+        "held, speeds": lambda d: reach(speeds(1.8 + d)),
+        "held, out of a sphere": lambda d: reach(vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3 - d)),
+        "linear, rates and goal": lambda d: reach(tip(-0.9 + d), vp.WithinControlRate(120.0), controls="linear"),
+        "held over 3 steps": lambda d: reach(speeds(2.2 + d), dt=0.03, steps=24, hold=3, **LIMITS),
+    }[name]
+    more, less = (vp.solve(relaxed(d), check=False, tolerance=1e-10).cost for d in (change, -change))
+    report = SMALL[name].plan.constraints[0]
+    pull = report.multipliers[-1, 2] if report.equality else report.multipliers.sum()
+    assert (less - more) / (2.0 * change) == pytest.approx(pull, rel=1e-3)
+
+
+def test_constraints_that_nothing_meets_change_nothing() -> None:
+    free, within = SMALL["held"].plan, vp.solve(reach(speeds(50.0), tip_in_a_wide_box()), check=False)
+    assert within.cost == pytest.approx(free.cost, rel=1e-6)
+    assert not any(report.active.any() for report in within.constraints)
+
+
+def tip_in_a_wide_box() -> vp.PlanConstraint:
+    return vp.KeepInBox(TWO, "tip", [-5.0] * 3, [5.0] * 3)
+
+
+# --- feedback --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in SMALL | ARMS if name != "closed loop"])
+def test_feedback_holds_a_disturbed_start(name: str) -> None:
+    """From 0.02 rad beside the start no joint goes farther off than five times that, and none is so at the end."""
+    problem, plan = CASES[name].problem, CASES[name].plan
+    away = 0.02 * np.random.default_rng(0).choice([-1, 1], problem.scene.robot.dof)
+    grid = {"dt": problem.dt, "steps": problem.steps, "integrator": problem.integrator, "check": False}
+    still = {"increments": 0} if problem.scene.processes else {}
+    motion = vp.simulate(problem.scene, problem.q0 + away, problem.v0, controls=plan.policy, **grid, **still)
+    off = np.abs(motion.q - plan.trajectory.q)
+    assert off.max() <= 5 * 0.02
+    assert off[-1].max() <= 1.05 * 0.02
+    low, high = problem.control_limits
+    rows = motion.u_nodes if problem.controls == "linear" else motion.u
+    assert ((low <= rows) & (rows <= high)).all()
+    assert np.isfinite(plan.gains).all()
+
+
+@pytest.mark.parametrize("name", ["noise of constant strength", "noise of the controls"])
+def test_noise_costs_what_motions_under_noise_cost(name: str) -> None:
+    plan = SMALL[name].plan
+    found = plan.monte_carlo(4000, rng=0)
+    assert plan.noise_cost > 0.1 * plan.cost
+    # The model is of second order in the noise.
+    assert abs(found.cost - plan.expected_cost) <= 4.0 * found.standard_error + 0.05 * plan.noise_cost
+
+
+# --- chance constraints ----------------------------------------------------------------------------------------------
+
+
+def beside_a_limit(noise: vp.Noise, **options: object) -> vp.OptimalControlProblem:
+    within = vp.WithinJointLimits(TWO, (-0.2, [0.9, 0.6]), margin=2.0)
+    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1.0) + vp.Terminal(vp.TrackingCost([1.0, 0.5], 100.0))
+    scene = vp.Scene(TWO, damping=0.3, noise=noise)
+    return vp.OptimalControlProblem(scene, cost, REST, REST, dt=0.03, steps=40, constraints=[within], **options)
+
+
+@pytest.mark.parametrize(
+    ("noise", "options"),
+    [
+        (vp.AdditiveNoise(0.05), {}),
+        (vp.AdditiveNoise(0.05), {"controls": "linear"}),
+        (vp.AdditiveNoise(0.05), {"control_limits": ([-32.0, -12.0], [32.0, 12.0])}),
+        (vp.ControlNoise(0.03), {}),
+    ],
+    ids=["held", "linear", "torques", "of the controls"],
+)
+def test_margins_in_standard_deviations(noise: vp.Noise, options: dict[str, object]) -> None:
+    """At margin 2 each bound at each node is violated by at most 2.3 % of motions, and at an active one by many."""
+    problem = beside_a_limit(noise, **options)
+    plan = vp.solve(problem, check=False)
+    assert plan.status is vp.Status.CONVERGED, plan.reason
+    grid = {"dt": problem.dt, "steps": problem.steps, "integrator": problem.integrator}
+    paths = vp.simulate_ensemble(problem.scene, REST, REST, paths=PATHS, rng=1, controls=plan.policy, **grid)
+    low, high = problem.constraints[0].limits
+    share = np.maximum((paths.q > high).mean(axis=0), (paths.q < low).mean(axis=0)).max()
+    promised = ndtr(-2.0)
+    assert share <= promised + 3.0 * np.sqrt(promised * (1.0 - promised) / PATHS)
+    assert share >= 0.5 * promised
+    # Without noise the plan keeps away from the bound.
+    assert (high - plan.trajectory.q).min() > 1e-3
+
+
+# --- what cannot be --------------------------------------------------------------------------------------------------
+
+
+def joints(low: object, high: object) -> vp.PlanConstraint:
+    return vp.WithinJointLimits(TWO, (low, high))
+
+
+def clear(place: list[float], radius: float) -> vp.PlanConstraint:
+    return vp.KeepClear(TWO, [vp.Obstacle.sphere(place, radius)], 0.02, capsules=CAPSULES)
+
+
+STRONG = {"control_limits": (-30.0, 30.0)}
+# Constraints, options, the most iterations.
+IMPOSSIBLE = {
+    "a goal out of reach": ([vp.ReachFrame(TWO, "tip", position=[2.5, 0.0, 0.0])], {}, 250),
+    "a goal off the plane": ([vp.ReachFrame(TWO, "tip", position=[1.0, 0.5, -0.5])], {}, 250),
+    "two goals": ([vp.ReachFrame(TWO, "tip", position=[1.5, 0.0, z]) for z in (-0.5, 0.9)], {}, 250),
+    "a goal too far for the speed": ([speeds(0.3), tip(-1.2)], {}, 250),
+    "a start in an obstacle": ([clear([1.5, 0.0, 0.0], 0.3)], STRONG, 6),
+    "half-spaces that exclude each other": (
+        [vp.KeepInHalfSpace(TWO, "tip", [0, 0, up], 0.5) for up in (1.0, -1.0)], {}, 250
+    ),
+    "a start too fast to brake": ([speeds(0.5)], {"v0": [3.0, 0.0], "control_limits": (-20.0, 20.0)}, 6),
+    "torques that do not carry the arm": ([joints(-0.2, 0.2)], {"control_limits": (-5.0, 5.0)}, 250),
+    "a start outside of limits": ([joints([0.5, -1], [2.0, 1])], STRONG, 6),
+    "linear, a start outside": ([joints([0.5, -1], [2.0, 1])], {"controls": "linear", **STRONG}, 6),
+    "a sphere around the goal": ([tip(), vp.KeepOutOfSphere(TWO, "tip", [1.2, 0.0, -0.9], 0.1)], {}, 250),
+    "of two alike": ([joints(-3.0, 3.0), joints(-0.1, 0.1)], {"q0": [1.0, 0.0], "control_limits": (-1.0, 1.0)}, 250),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+def test_what_cannot_be_is_infeasible_and_named(name: str) -> None:
+    """The reason has a constraint, one of its rows, a node and an amount, all of which are so of the plan's motion."""
+    constraints, options, most = IMPOSSIBLE[name]
+    given = {"q0": REST, "v0": REST, "dt": 0.05, "steps": 20, "constraints": constraints, **options}
+    problem = vp.OptimalControlProblem(reach().scene, reach().cost, **given)
+    plan = vp.solve(problem, check=False)
+    assert plan.status is vp.Status.INFEASIBLE
+    assert plan.iterations <= most
+    assert np.isfinite(plan.trajectory.q).all()
+    assert violation(problem, plan.trajectory, plan.controls) > 1e-3
+    (report,) = [item for item in plan.constraints if plan.reason.startswith(item.label)]
+    (row,) = [j for j, words in enumerate(report.rows) if f"{words} at" in plan.reason]
+    when = float(re.search(r"t = ([0-9.e-]+) s", plan.reason)[1])
+    amount = float(re.search(r"violated by ([0-9.e+-]+)", plan.reason)[1])
+    place = int(np.abs(report.t - when).argmin())
+    assert report.t[place] == pytest.approx(when, abs=1e-3)
+    assert report.excess[place, row] > 1e-4
+    assert report.excess[place].max() >= 0.99 * amount
+
+
+def test_a_start_outside_that_one_step_mends_is_no_reason_to_end() -> None:
+    mends = vp.WithinJointLimits(TWO, ([0.05, -1], [2.0, 1]))
+    for options in ({}, {"control_limits": (-2000.0, 2000.0)}):
+        plan = vp.solve(reach(mends, **options), check=False)
+        assert plan.status is vp.Status.CONVERGED
+        assert violation(plan.problem, plan.trajectory, plan.controls) <= MET
+
+
+# --- how searches begin, end and go on -------------------------------------------------------------------------------
+
+RESUMED = (
+    "held, torques",
+    "held, speeds and torques",
+    "held, goal",
+    "held, between nodes",
+    "linear, speeds",
+    "noise of the controls",
+)
+
+
+@pytest.mark.parametrize("name", RESUMED)
+def test_a_plan_that_is_cut_saved_and_resumed_is_the_same_to_the_bit(name: str, tmp_path) -> None:
+    case = SMALL[name]
+    for most in (1, 3):
+        part = vp.solve(case.problem, max_iterations=most, check=False)
+        assert part.iterations <= most
+        path = part.save(tmp_path / "part.npz")
+        rest = vp.solve(case.problem, resume=vp.Solution.load(path, case.problem), check=False)
+        assert rest.status is vp.Status.CONVERGED
+        np.testing.assert_array_equal(rest.controls, case.plan.controls)
+        np.testing.assert_array_equal(rest.gains, case.plan.gains)
+        assert rest.cost == case.plan.cost
+
+
+def test_a_file_holds_the_whole_plan(tmp_path) -> None:
+    plan = SMALL["held, goal and rates"].plan
+    known = vp.Solution.load(plan.save(tmp_path / "plan.npz"), plan.problem)
+    for one, other in zip(plan.constraints, known.constraints, strict=True):
+        np.testing.assert_array_equal(one.values, other.values)
+        np.testing.assert_array_equal(one.multipliers, other.multipliers)
+    np.testing.assert_array_equal(known.trajectory.q, plan.trajectory.q)
+    assert (known.status, known.reason, known.history) == (plan.status, plan.reason, plan.history)
+    with pytest.raises(vp.FileError):
+        vp.Solution.load(tmp_path / "plan.npz", reach(tip()))
+
+
+@pytest.mark.parametrize("name", RESUMED)
+def test_interrupted(name: str) -> None:
+    """The best motion so far, from which the search goes on."""
+    case, seen = SMALL[name], []
+
+    def stop(iteration: vp.Iteration) -> None:
+        seen.append(iteration)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    part = vp.solve(case.problem, check=False, callback=stop)
+    assert part.status is vp.Status.INTERRUPTED
+    assert len(part.history) <= 3
+    first = vp.solve(case.problem, check=False, max_iterations=0)
+    if not case.problem.constraints:
+        assert part.expected_cost <= first.expected_cost
+    assert vp.solve(case.problem, resume=part, check=False).cost == pytest.approx(case.plan.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", RESUMED)
+def test_the_time_limit_ends_a_search(name: str) -> None:
+    case = SMALL[name]
+    none = vp.solve(case.problem, check=False, time_limit=1e-9)
+    assert none.status is vp.Status.OUT_OF_TIME
+    assert none.iterations == 0
+    some = vp.solve(case.problem, check=False, time_limit=0.15, callback=lambda _: time.sleep(0.1))
+    assert some.status is vp.Status.OUT_OF_TIME
+    assert 1 <= some.iterations < case.plan.iterations
+    assert vp.solve(case.problem, resume=some, check=False).cost == pytest.approx(case.plan.cost, rel=1e-6)
+
+
+def test_reports_of_each_iteration() -> None:
+    """To callbacks of one and of two arguments, and to ``progress``; they are those of the plan's history."""
+    case = SMALL["held, speeds"]
+    rows, motions, counts = [], [], []
+    plan = vp.solve(case.problem, check=False, callback=rows.append, progress=lambda *count: counts.append(count))
+    vp.solve(case.problem, check=False, callback=lambda _, motion: motions.append(motion))
+    assert [row.index for row in rows] == list(range(len(rows)))
+    assert [replace(row, seconds=0.0) for row in rows] == [replace(row, seconds=0.0) for row in plan.history]
+    assert len(motions) == len(rows)
+    assert all(isinstance(motion, vp.Trajectory) for motion in motions)
+    done, most = zip(*counts, strict=True)
+    assert list(done) == sorted(done)
+    assert set(most) == {500}
+    assert all(str(row) in plan.table() for row in plan.history)
+    assert plan.reason in plan.table()
+
+
+def test_repeated_searches_are_the_same_to_the_bit() -> None:
+    case = SMALL["held, speeds and torques"]
+    np.testing.assert_array_equal(vp.solve(case.problem, check=False).controls, case.plan.controls)
+
+
+@pytest.mark.parametrize(
+    ("name", "alone"),
+    [
+        ("held, joints", True),
+        ("held, speeds", True),
+        ("linear, speeds", True),
+        ("held, torques", False),
+        ("held, goal", False),
+    ],
+)
+def test_any_start_leads_to_a_plan(name: str, alone: bool) -> None:
+    """Zero controls, a constant, a plan, a policy, and states that no controls follow; to one minimum if ``alone``."""
+    case = SMALL[name]
+    starts = {
+        "zero": {"controls": np.zeros(2)},
+        "rows": {"controls": np.tile([20.0, 5.0], (case.problem.decisions, 1))},
+        "a plan": {"controls": case.plan},
+        "a policy": {"controls": case.plan.policy},
+        "states": {"states": LINE},
+        "states and velocities": {"states": (LINE, np.gradient(LINE, 0.06, axis=0))},
+    }
+    for start, options in starts.items():
+        plan = vp.solve(case.problem, check=False, **options)
+        assert plan.status is vp.Status.CONVERGED, start
+        assert violation(case.problem, plan.trajectory, plan.controls) <= MET
+        if alone or start not in ("zero", "rows"):
+            assert plan.cost <= (1.0 + ABOVE) * case.cost, start
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"constraints": [speeds(1.8)]}, {"controls": "linear", "constraints": [speeds(1.8)]}],
+    ids=["free", "within speeds", "linear within speeds"],
+)  # fmt: skip
+def test_a_wished_true_cost(options: dict[str, object]) -> None:
+    """The step is halved until the continuous robot pays no more than that beside the plan."""
+    problem = reach(*options.get("constraints", ()), dt=0.12, steps=6, controls=options.get("controls", "held"))
+    plan = vp.solve(problem, check=False, true_cost=5e-3)
+    assert plan.refinement.met
+    assert plan.status is vp.Status.CONVERGED
+    assert abs(plan.verify().closed_loop_loss) <= 5e-3
+    best = vp.solve(problem.at(dt=problem.dt / 16), check=False).cost
+    assert plan.verify().closed_loop_cost <= (1.0 + 2 * 5e-3) * best
+    assert all(told.closed_loop <= 1e-2 for told in plan.verify().constraints)
+
+
+# --- controllers -----------------------------------------------------------------------------------------------------
+
+
+def swing(
+    *constraints: vp.PlanConstraint, scene: vp.Scene | None = None, **options: object
+) -> vp.OptimalControlProblem:
+    """Two links that are to follow a wave faster than their limits allow."""
+    cost = vp.TrackingCost(lambda t: [0.5 * np.sin(3.0 * t), 0.3 * np.sin(4.0 * t)], 100.0)
+    cost += vp.ControlCost(1e-4) + vp.VelocityCost(1e-2)
+    given = {"dt": 0.03, "steps": 15, "constraints": constraints, **options}
+    return vp.OptimalControlProblem(scene or vp.Scene(TWO, damping=0.3), cost, REST, REST, **given)
+
+
+@pytest.mark.parametrize("controls", ["held", "linear"])
+def test_a_controller_within_limits_and_constraints(controls: str) -> None:
+    problem = swing(speeds(1.0), controls=controls, control_limits=([-20.0, -6.0], [20.0, 6.0]))
+    run = vp.Mpc(problem).run(duration=0.9)
+    assert not run.failures
+    assert not run.infeasible
+    u = run.motion.u
+    assert (np.abs(u) <= [20.0, 6.0]).all()
+    assert (np.abs(u) > [19.9, 5.9]).any()
+    substeps = run.motion.steps // len(run.plans)
+    assert np.abs(run.motion.v[::substeps]).max() <= 1.0 + 5e-3
+    assert np.abs(run.motion.v).max() > 0.98
+    assert (run.iterations[1:] <= 2).all()
+
+
+def test_a_controllers_rates() -> None:
+    """Controls change by no more than the limit from tick to tick, beginning with the one before the run."""
+    problem = swing(vp.WithinControlRate(100.0, before=[14.0, 4.0]))
+    run = vp.Mpc(problem).run(duration=0.6)
+    substeps = run.motion.steps // len(run.plans)
+    applied = np.vstack([[14.0, 4.0], run.motion.u[::substeps]])
+    # The feedback acts within a tick about the plan made at its beginning: its first control is the plan's.
+    assert np.abs(np.diff(applied, axis=0)).max() <= 100.0 * 0.03 + 1e-4
+    assert not run.failures
+
+
+def test_what_a_controller_plans_converges_to_what_solve_finds() -> None:
+    problem = swing(speeds(1.0))
+    mpc = vp.Mpc(problem, iterations=20, tolerance=1e-9)
+    run = mpc.run(duration=0.3)
+    last = run.plans[-1]
+    own = vp.solve(last.problem, check=False)
+    assert last.cost == pytest.approx(own.cost, rel=1e-3)
+    np.testing.assert_allclose(last.trajectory.q, own.trajectory.q, rtol=0, atol=1e-2)
+
+
+def test_a_deadline() -> None:
+    """No plan comes within a nanosecond: the first one acts on with its feedback, and all ticks are late."""
+    mpc = vp.Mpc(swing(speeds(1.0)), budget=1e-9)
+    run = mpc.run(duration=0.3)
+    assert run.late[1:].all()
+    assert run.misses == len(run.plans) - 1
+    assert all(plan is run.plans[0] for plan in run.plans)
+    usual = vp.Mpc(swing(speeds(1.0)), budget=5.0).run(duration=0.3)
+    assert not usual.misses
+    # Nothing disturbs the plant: the first plan is almost as good.
+    assert np.abs(run.motion.q - usual.motion.q).max() < 2e-2
+
+
+def test_failed_ticks() -> None:
+    """A noise that cannot be had in two ticks of ten: the plan before acts on, and a warning says so."""
+    tick = 0
+
+    def field(q, v, u) -> np.ndarray:
+        if tick in (3, 4):
+            raise ValueError("no such noise")
+        return 1e-3 * np.eye(2)
+
+    def count(done: int, _: int) -> None:
+        nonlocal tick
+        tick = done
+
+    uncertain = vp.Scene(TWO, damping=0.3, noise=vp.CustomNoise(field, 2))
+    plant = vp.Plant(swing().scene)
+    run = vp.Mpc(swing(scene=uncertain)).run(plant, duration=0.3, progress=count)
+    assert run.failed.tolist() == [k in (3, 4) for k in range(10)]
+    assert run.plans[2] is run.plans[3] is run.plans[4] is not run.plans[5]
+    assert any("2 of 9 ticks" in told for told in map(str, run.warnings))
+    whole = vp.Mpc(swing()).run(plant, duration=0.3)
+    assert 0.0 < np.abs(run.motion.q - whole.motion.q).max() < 2e-2
