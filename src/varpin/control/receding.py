@@ -1,4 +1,4 @@
-"""Replanning at a controller's ticks: the same search from the plan before, shifted, and how well runs keep constraints."""
+"""Replanning at a controller's ticks, by the same search, and how well runs keep constraints."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -33,12 +34,14 @@ from varpin.control.problem import OptimalControlProblem
 from varpin.control.qp import Minimum, Program
 from varpin.control.second_order import curvature_along
 from varpin.control.solution import Solution
-from varpin.control.spread import Feedback, deviations
+from varpin.control.spread import Feedback, deviations, state_slopes
 from varpin.control.stages import Stages
+from varpin.control.starts import joint_forces, states_on
 from varpin.control.trials import Attempt, Trials
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, VarpinError
 from varpin.mechanics.custom import CustomForceError
+from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.simulation.failures import StepFailure, named
 from varpin.simulation.record import located
@@ -81,6 +84,9 @@ _GOAL = 1.0
 _POOR = 0.3
 # A full step is extended by this factor where it brings this share of what its slope gives: at a minimum it is half.
 _EARLY, _EXTENSION = 0.85, 4.0
+# Share of the foreseen decrease from which on a full step is as foreseen; else a trial follows the foreseen states, by
+# one of these lengths, if no joint moves by more than _FAR [rad or m].
+_AS_FORESEEN, _LENGTHS, _FAR = 0.7, (1.0, 0.75, 0.5), 2.0
 # Greatest number of substeps of a trial, relative to the motion.
 _SUBSTEPS = 4.0
 # Relative rounding error of Quu above which the gains are reported as unreliable.
@@ -105,6 +111,13 @@ class Taken(NamedTuple):
     hidden: float = 0.0  # rounding error of a difference of costs; 0 if a step was taken
     attempt: Attempt | None = None
     shares: Floats | None = None
+
+
+class Here(NamedTuple):
+    """The motion that trials are compared with."""
+
+    noise: Floats  # noise cost of each step
+    bad: float  # sum of its violations, in tenths of ranges
 
 
 class Trial(NamedTuple):
@@ -163,7 +176,7 @@ class Search:
         self.step: Step | None = None
         robot = problem.scene.robot.name
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
-        self._around: Along | None = None
+        self._expansions: Along | None = None
         self._enforce(NOWHERE)
 
     def begin(self, commands: Commands) -> None:
@@ -255,9 +268,9 @@ class Search:
     @property
     def along(self) -> Along:
         """The expansions along the motion."""
-        if self._around is None or self._around.trajectory is not self.trajectory:
-            self._around = Along(self.problem, self.trajectory)
-        return self._around
+        if self._expansions is None or self._expansions.trajectory is not self.trajectory:
+            self._expansions = Along(self.problem, self.trajectory)
+        return self._expansions
 
     @property
     def violation(self) -> float:
@@ -286,7 +299,7 @@ class Search:
         return SearchState(self.weight, self.regularization, self.growth, self.first, self.counts, len(self.history))
 
     def _next_step(self) -> bool:
-        """Make the step of the motion, with more regularization where the model has no minimum; whether there is one."""
+        """Make the step of the motion, with more regularization where there is none; whether there is one."""
         while not self._made():
             if not self._stiffen():
                 return False
@@ -386,6 +399,19 @@ class Search:
         vars(made)["terminal"] = end._replace(hessian=hessian)
         return made
 
+    def _foreseen_states(self) -> Floats | None:
+        """The changes of q and v at the nodes (N + 1, 2n) with a full step, by the linear model."""
+        problem, along, plan = self.problem, self.along, self.plan
+        n = problem.scene.robot.dof
+        if self._known.minimum is not None or len(along.blocks) > 1 or plan is None:
+            return None
+        change = np.zeros((problem.steps + 1, 2 * n))
+        foreseen(along, plan, after=change[1:])
+        if problem.integrator.variational:
+            slopes = state_slopes(problem, self.trajectory)
+            change = (slopes @ change[:, :, None])[:, :, 0]
+        return change
+
     def _is_free(self, plan: Plan) -> bool:
         """Whether the full step of a backward pass keeps to all limits and rows, by the linear model."""
         along, problem = self.along, self.problem
@@ -454,9 +480,7 @@ class Search:
             for item in self.bound
         ]
         if self.added is not None:
-            count = len(problem.bound_constraints)
             more = [*self.added, *(self.added[i][self.between.of(i)[:, 0]] for i in self.between.constraints)]
-            assert len(more) == len(own) and count
             own = [part + extra for part, extra in zip(own, more, strict=True)]
         self.backoff = [
             np.where(item.in_force, part, 0.0) if isinstance(item, BoundBetween) else part
@@ -570,6 +594,13 @@ class Search:
                     break
                 trial = other
             lengths.learn(a, trial.merit, step.slope)
+            if a == 1.0 and -trial.merit < _AS_FORESEEN * step.decrease and (path := self._foreseen_path()) is not None:
+                following, along_path = path
+                other = self._run(following, here)
+                trials += 1
+                if other.merit < trial.merit and other.merit <= self.armijo * along_path * step.slope:
+                    best, length = other, along_path
+                    break
             if trial.shares is not None:
                 tried = trial.shares
             if trial.merit <= self.armijo * a * step.slope and trial.merit < best.merit:
@@ -591,26 +622,33 @@ class Search:
             if tried is not None:
                 hidden = rounding(self.problem, self.trajectory, self.shares, tried, self.along.model)
             return Taken(trials=trials, hidden=hidden)
-        assert best.attempt is not None and best.shares is not None
+        assert best.attempt is not None
+        assert best.shares is not None
         self._move(best.attempt.trajectory(), best.shares)
         return Taken(length, trials, -best.merit, 0.0, best.attempt, best.shares)
 
-    def _merit_here(self) -> tuple[Floats, float]:
-        """Noise cost of each step, and the sum of violations of the motion."""
+    def _merit_here(self) -> Here:
         assert self.noise is not None
-        return noise_shares(self.problem, self.trajectory, self.noise), self._badness
+        return Here(noise_shares(self.problem, self.trajectory, self.noise), self._badness)
 
-    def _try(self, length: float, feedforward: Floats, here: tuple[Floats, float]) -> Trial:
+    def _try(self, length: float, feedforward: Floats, here: Here) -> Trial:
         """A trial of a length along the step."""
-        problem, plan = self.problem, self.plan
-        assert plan is not None and self.noise is not None
+        problem = self.problem
         u = problem.decided(self.trajectory)
-        if self.closed:
-            x = states(problem, self.trajectory)[: -1 : problem.hold]
-            commands = around(problem, u, x, plan.feedback, plan.previous)
-            commands = commands._replace(u=u + length * feedforward)
-        else:
-            commands = held(u, problem)._replace(u=u + length * feedforward)
+        if not self.closed:
+            return self._run(held(u, problem)._replace(u=u + length * feedforward), here)
+        commands = self._around(u, states(problem, self.trajectory)[: -1 : problem.hold])
+        return self._run(commands._replace(u=u + length * feedforward), here)
+
+    def _around(self, u: Floats, x: Floats) -> Commands:
+        """Controls with the plan's feedback around states."""
+        assert self.plan is not None
+        return around(self.problem, u, x, self.plan.feedback, self.plan.previous)
+
+    def _run(self, commands: Commands, here: Here) -> Trial:
+        """A trial under commands."""
+        problem = self.problem
+        assert self.noise is not None
         if problem.linear:
             # The first control has no feedback: its state is given.
             first = problem.begun(np.clip(commands.u[:1], *problem.control_limits))
@@ -623,14 +661,52 @@ class Search:
             shares, noise, bad = attempt.shares(), 0.0, 0.0
             motion = attempt.trajectory()
             if problem.processes:
-                noise = float((noise_shares(problem, motion, self.noise) - here[0]).sum())
+                noise = float((noise_shares(problem, motion, self.noise) - here.noise).sum())
             if self.bound:
-                bad = sum(float(part.sum()) for part in self._violations(motion)) - here[1]
+                bad = sum(float(part.sum()) for part in self._violations(motion)) - here.bad
         except TRIAL_ERRORS as error:
-            logger.info("%s: trial of length %g: %s", self.label, length, error)
+            logger.info("%s: trial: %s", self.label, error)
             return Trial()
         merit = float((shares - self.shares).sum()) + noise + (self.weight * bad if bad else 0.0)
         return Trial(merit, attempt, shares) if np.isfinite(merit) else Trial()
+
+    @cached_property
+    def _follows(self) -> bool:
+        """Whether there are controls, just one for each motion, that give all joints the forces it needs."""
+        problem, scene = self.problem, self.problem.scene
+        if problem.linear or self.tick or not self.closed:
+            return False
+        if scene.inputs or scene.constraints or scene.custom is not None or limited_servos(scene.elements):
+            return False
+        n = scene.robot.dof
+        return scene.direct or (scene.controls == n and int(np.linalg.matrix_rank(scene.actuation)) == n)
+
+    def _foreseen_path(self) -> tuple[Commands, float] | None:
+        """Commands along the states that the step foresees, in the place of its controls, and the step's length.
+
+        The controls are those of the inverse dynamics: what it is off by on the motion itself cancels. None where the
+        states cost no less than the motion, or far from it.
+        """
+        problem, motion, n = self.problem, self.trajectory, self.problem.scene.robot.dof
+        if not self._follows or self.bound:
+            return None
+        change = self._foreseen_states()
+        if change is None:
+            return None
+        far = float(np.abs(change[:, :n]).max())
+        lengths = [length for length in _LENGTHS if length * far <= _FAR]
+        if not lengths:
+            return None
+        parts = np.array([0.0, *lengths])[:, None, None]
+        q, v = motion.q + parts * change[:, :n], motion.v + parts * change[:, n:]
+        force = joint_forces(problem, q, v)
+        u = problem.decided(motion) + (force[1:] - force[:1]) @ problem.scene.allocation.T
+        u = np.clip(u, *problem.control_limits)
+        costs = problem.costs(q[1:], v[1:], np.repeat(u, problem.hold, axis=1)) - self.cost
+        best = int(np.argmin(costs))
+        if not costs[best] < 0.0:
+            return None
+        return self._around(u[best], states_on(problem, q[1 + best], v[1 + best])), lengths[best]
 
     def _values(self, motion: Trajectory) -> list[Floats]:
         """Values (P,) of all rows on a motion, margins included, in tenths of ranges."""

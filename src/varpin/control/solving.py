@@ -69,8 +69,8 @@ def solve(
     Ctrl-C ends the search once the first motion has been integrated, and returns the best motion so far with ``status``
     INTERRUPTED. ``solve(problem, plan)`` continues from there.
 
-    Feedback is that of the costs and goals alone: limits and other constraints never enter it. The noise cost is that of
-    linear feedback, without controls that noise drives into their limits; ``monte_carlo`` includes them.
+    Feedback is that of the costs and goals alone: limits and other constraints never enter it. The noise cost is that
+    of linear feedback, without controls that noise drives into their limits; ``monte_carlo`` includes them.
 
     Main args:
         problem: What to minimize.

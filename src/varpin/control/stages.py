@@ -74,7 +74,7 @@ class Layout(NamedTuple):
             feedback: K (R, m, 2n).
             previous: G (R, m, m), or None.
         """
-        R, m, x = feedback.shape
+        R, m, _ = feedback.shape
         k = np.arange(R)
         w = np.zeros((R, m, m)) if previous is None else previous
         at = np.concatenate([self.state(k - self.linear), self.control(k - 1), self.control(k)], axis=1)

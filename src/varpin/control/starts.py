@@ -1,4 +1,4 @@
-"""Searches that start from given states: the controls of the inverse dynamics, and feedback that holds the motion there."""
+"""Starts from given states: the controls of the inverse dynamics, and feedback that holds the motion there."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
     n, m = scene.robot.dof, scene.controls
     u = controls
     if u is None:
-        needed = _demand(problem, path.q, path.v)
+        needed = joint_forces(problem, path.q, path.v)
         u = as_moved(scene, path.q[hold::hold], path.v[hold::hold], needed @ scene.allocation.T)
         u = np.clip(u, *problem.control_limits)
     M = lagrangian_jet(scene, problem.q0, np.zeros(n)).Lvv
@@ -137,6 +137,14 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
     return min(tries, key=lambda commands: _cost_under(problem, commands))
 
 
+def states_on(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
+    """The states (R, 2n) before each decision, (q, p) or (q, v), of q and v (N + 1, n) at the nodes."""
+    q, v = q[: -1 : problem.hold], v[: -1 : problem.hold]
+    if problem.integrator.variational:
+        v = (node_jets(problem.scene, q, v)[0] @ v[:, :, None])[:, :, 0]
+    return np.hstack([q, v])
+
+
 def _cost_under(problem: OptimalControlProblem, commands: Commands) -> float:
     """The cost of the motion under commands; infinite where it fails."""
     try:
@@ -146,7 +154,7 @@ def _cost_under(problem: OptimalControlProblem, commands: Commands) -> float:
         return np.inf
 
 
-def _demand(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
+def joint_forces(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
     """The joint forces (..., R, n) that controls have to give over each decision, on q and v (..., N + 1, n)."""
     scene, period = problem.scene, problem.period
     q, v = q[..., :: problem.hold, :], v[..., :: problem.hold, :]
