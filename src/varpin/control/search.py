@@ -36,7 +36,7 @@ from varpin.control.second_order import curvature_along
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, deviations, state_slopes
 from varpin.control.stages import Stages
-from varpin.control.starts import joint_forces, states_on
+from varpin.control.starts import holding_gains, joint_forces, states_on
 from varpin.control.trials import Attempt, Trials
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, VarpinError
@@ -56,7 +56,7 @@ TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it falls after
 # long steps and rises after a very short one, or after two short ones in a row.
 _GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
-_LONG, _SHORT, _VERY_SHORT = 0.5, 0.1, 0.01
+_LONG, _SHORT, _VERY_SHORT = 0.25, 0.1, 0.01
 # Greatest regularization with which a search may converge. Controls without effect or cost need some.
 _LITTLE = 1e-4
 # Iterations that together gain no more than the tolerance before the search stalls.
@@ -74,6 +74,8 @@ _CORRECTIONS = 2
 _CLOSE = 1e-3
 # Violation between nodes from which a row is added where the problem asks for them.
 _BETWEEN = 1e-6
+# Share of the violation between nodes at which rows begin that is left in the end.
+_CLOSER = 0.1
 # How often margins are widened by counting motions.
 _COUNTS = 3
 # How often rows between nodes may follow the motion at its end.
@@ -85,8 +87,8 @@ _POOR = 0.3
 # A full step is extended by this factor where it brings this share of what its slope gives: at a minimum it is half.
 _EARLY, _EXTENSION = 0.85, 4.0
 # Share of the foreseen decrease from which on a full step is as foreseen; else a trial follows the foreseen states, by
-# one of these lengths, if no joint moves by more than _FAR [rad or m].
-_AS_FORESEEN, _LENGTHS, _FAR = 0.7, (1.0, 0.75, 0.5), 2.0
+# one of these lengths, if no joint moves by more than _FAR [rad or m]. It follows them with this share of their gain.
+_AS_FORESEEN, _LENGTHS, _FAR, _FOLLOWS = 0.7, (1.0, 0.75, 0.5), 2.0, 0.8
 # Greatest number of substeps of a trial, relative to the motion.
 _SUBSTEPS = 4.0
 # Relative rounding error of Quu above which the gains are reported as unreliable.
@@ -539,8 +541,9 @@ class Search:
         count = len(problem.bound_constraints)
         backoff = self.backoff[:count]
         left = beyond(looked, backoff)
+        share = REPORTED * (_CLOSER if len(self.between.rows) else 1.0)
         bounds = np.array(
-            [_BETWEEN if problem.between_nodes else REPORTED * item.scale for item in problem.bound_constraints]
+            [_BETWEEN if problem.between_nodes else share * item.scale for item in problem.bound_constraints]
         )
         if not (left > bounds).any():
             return False
@@ -595,9 +598,8 @@ class Search:
                 trial = other
             lengths.learn(a, trial.merit, step.slope)
             if a == 1.0 and -trial.merit < _AS_FORESEEN * step.decrease and (path := self._foreseen_path()) is not None:
-                following, along_path = path
-                other = self._run(following, here)
-                trials += 1
+                other, along_path, more = self._follow(*path, here)
+                trials += more
                 if other.merit < trial.merit and other.merit <= self.armijo * along_path * step.slope:
                     best, length = other, along_path
                     break
@@ -681,8 +683,17 @@ class Search:
         n = scene.robot.dof
         return scene.direct or (scene.controls == n and int(np.linalg.matrix_rank(scene.actuation)) == n)
 
-    def _foreseen_path(self) -> tuple[Commands, float] | None:
-        """Commands along the states that the step foresees, in the place of its controls, and the step's length.
+    def _follow(self, commands: Commands, length: float, cost: float, here: Here) -> tuple[Trial, float, int]:
+        """The better motion along foreseen states: under feedback that holds it there, or the plan's."""
+        gains = np.tile(holding_gains(self.problem), (len(commands.u), 1, 1))
+        x = commands.reference[:, : gains.shape[2]]
+        best = self._run(commands._replace(gains=gains, reference=np.ascontiguousarray(x)), here)
+        if best.merit <= _FOLLOWS * cost:
+            return best, length, 1
+        return min(best, self._run(commands, here), key=lambda trial: trial.merit), length, 2
+
+    def _foreseen_path(self) -> tuple[Commands, float, float] | None:
+        """Commands along the states that the step foresees, its length and the foreseen change of the cost.
 
         The controls are those of the inverse dynamics: what it is off by on the motion itself cancels. None where the
         states cost no less than the motion, or far from it.
@@ -706,7 +717,8 @@ class Search:
         best = int(np.argmin(costs))
         if not costs[best] < 0.0:
             return None
-        return self._around(u[best], states_on(problem, q[1 + best], v[1 + best])), lengths[best]
+        commands = self._around(u[best], states_on(problem, q[1 + best], v[1 + best]))
+        return commands, lengths[best], float(costs[best])
 
     def _values(self, motion: Trajectory) -> list[Floats]:
         """Values (P,) of all rows on a motion, margins included, in tenths of ranges."""

@@ -108,16 +108,13 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
         controls: Controls (R, m) along them; by default those of the inverse dynamics, clipped to their limits.
     """
     scene, hold = problem.scene, problem.hold
-    n, m = scene.robot.dof, scene.controls
+    m = scene.controls
     u = controls
     if u is None:
         needed = joint_forces(problem, path.q, path.v)
         u = as_moved(scene, path.q[hold::hold], path.v[hold::hold], needed @ scene.allocation.T)
         u = np.clip(u, *problem.control_limits)
-    M = lagrangian_jet(scene, problem.q0, np.zeros(n)).Lvv
-    omega = _HOLDING_FREQUENCY / problem.period
-    on_speed = np.eye(n) if problem.integrator.variational else M
-    gains = scene.allocation @ -np.hstack([omega**2 * M, 2.0 * omega * on_speed])
+    gains = holding_gains(problem)
     gains[scene.prescribed] = 0.0
     q, v = path.q[:-1:hold], path.v[:-1:hold]
     if problem.integrator.variational:
@@ -135,6 +132,16 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
         around(problem, u, x, np.tile(share * gains, (len(u), 1, 1)), np.zeros((len(u), m, m))) for share in (1.0, 0.0)
     ]
     return min(tries, key=lambda commands: _cost_under(problem, commands))
+
+
+def holding_gains(problem: OptimalControlProblem) -> Floats:
+    """Gains (m, 2n) of the controls that hold a motion on states, (q, p) or (q, v)."""
+    scene, n = problem.scene, problem.scene.robot.dof
+    M = lagrangian_jet(scene, problem.q0, np.zeros(n)).Lvv
+    omega = _HOLDING_FREQUENCY / problem.period
+    on_speed = np.eye(n) if problem.integrator.variational else M
+    found: Floats = scene.allocation @ -np.hstack([omega**2 * M, 2.0 * omega * on_speed])
+    return found
 
 
 def states_on(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
