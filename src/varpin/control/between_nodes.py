@@ -1,9 +1,9 @@
 """Constraints of a plan between its nodes: where the motion violates them, and rows that forbid it there.
 
-A row follows a peak of its constraint within a step, from one motion to the next: the value there, and its derivatives
-in the state before the step and the controls over it, are those of the motion integrated in a few equal parts, on the
-parabola through the ends of parts next to the peak. A controller's ticks have rows on the cubics through the steps
-instead, which take hardly any time.
+Rows are added at the peaks of a motion within its steps, and stay (exchange, as of semi-infinite programs): the value
+there, and its derivatives in the state before the step and the controls over it, are those of the motion integrated in
+a few equal parts, on the parabola through the ends of parts next to the instant. A controller's ticks have rows on the
+cubics through the steps instead, which take hardly any time.
 """
 
 from __future__ import annotations
@@ -30,10 +30,8 @@ MOST_INSTANTS = _PARTS - 1
 _MIDDLE = 0.5
 # Violation of the start from which on a row cannot hold in the first step.
 _OUTSIDE = 1e-6
-# How far a row follows its peak from one motion to the next, in steps; farther away there is another row.
-_REACH = 1.5 / _PARTS
-# How far the parabola of a peak goes on as it slides, in parts of a step; beyond, values are linear.
-_SLIDE = 2.0
+# Distance in steps within which an instant is that of a peak: what it misses of it is of second order.
+_SAME = 1e-3
 # Distance of a peak from its bound up to which it gets a row, too, relative to the constraint's scale.
 _NEAR = 1e-3
 # Marks a row that is not enforced, in the place of its moment.
@@ -48,18 +46,15 @@ class Instants(Frozen):
         rows: Constraint, step and number of the instant in the step (I, 3), each from 0, in ascending order.
         moments: Where all rows of each of them are in a step of unit length (O,), one instant after another; negative
             for rows that are not enforced.
-        bends: How sharp their peaks are (O,): minus the second derivative in time, in parts of a step; zero for rows
-            that do not follow a peak.
         cubic: Whether rows are on the cubics through the steps, at their middles, not of steps integrated in parts.
     """
 
     rows: Integers
     moments: Floats
-    bends: Floats
     cubic: bool = False
 
     def __post_init__(self) -> None:
-        for array in (self.rows, self.moments, self.bends):
+        for array in (self.rows, self.moments):
             array.setflags(write=False)
 
     @property
@@ -72,7 +67,7 @@ class Instants(Frozen):
         return self.rows[self.rows[:, 0] == constraint, 1:]
 
 
-NOWHERE = Instants(np.zeros((0, 3), dtype=np.int64), np.zeros(0), np.zeros(0))
+NOWHERE = Instants(np.zeros((0, 3), dtype=np.int64), np.zeros(0))
 
 
 def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalControlProblem:
@@ -81,9 +76,9 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
         return problem
     made = object.__new__(type(problem))
     found: list[BoundConstraint] = list(problem.bound_constraints)
-    for i, (moments, bends) in _of_constraints(problem, instants).items():
+    for i, moments in _of_constraints(problem, instants).items():
         steps = instants.of(i)[:, 0]
-        found.append(_on_cubics(problem, i, steps) if instants.cubic else _bound(problem, i, steps, moments, bends))
+        found.append(_on_cubics(problem, i, steps) if instants.cubic else _bound(problem, i, steps, moments))
     # The dataclass is frozen: attributes are set in its dictionary.
     vars(made).update(vars(problem) | {"bound_constraints": tuple(found)})
     return made
@@ -91,22 +86,20 @@ def enforced(problem: OptimalControlProblem, instants: Instants) -> OptimalContr
 
 def in_force(problem: OptimalControlProblem, instants: Instants) -> list[Mask]:
     """Which rows at ``instants`` are enforced (K, rows), for each constraint with such rows."""
-    return [moments >= 0.0 for moments, _ in _of_constraints(problem, instants).values()]
+    return [moments >= 0.0 for moments in _of_constraints(problem, instants).values()]
 
 
-def _of_constraints(problem: OptimalControlProblem, instants: Instants) -> dict[int, tuple[Floats, Floats]]:
-    """The moments and bends, each (K, rows), of each constraint with rows at ``instants``."""
+def _of_constraints(problem: OptimalControlProblem, instants: Instants) -> dict[int, Floats]:
+    """The moments (K, rows) of each constraint with rows at ``instants``."""
     found, begin = {}, 0
     for i in instants.constraints:
         shape = len(instants.of(i)), len(problem.bound_constraints[i].rows)
         own = slice(begin, begin + shape[0] * shape[1])
-        found[i], begin = (instants.moments[own].reshape(shape), instants.bends[own].reshape(shape)), own.stop
+        found[i], begin = instants.moments[own].reshape(shape), own.stop
     return found
 
 
-def _bound(
-    problem: OptimalControlProblem, constraint: int, steps: Integers, moments: Floats, bends: Floats
-) -> BoundBetween:
+def _bound(problem: OptimalControlProblem, constraint: int, steps: Integers, moments: Floats) -> BoundBetween:
     """A constraint at the ``moments`` (K, rows) of ``steps`` (K,), several of which may be the same."""
     of_nodes = problem.bound_constraints[constraint]
     own, index = np.unique(steps, return_inverse=True)
@@ -115,7 +108,7 @@ def _bound(
     times = problem.t0 + problem.dt * (steps + mean)
     share = _PARTS * moments
     middle = np.clip(np.rint(share), 1, _PARTS - 1)
-    weights, rates = _on_parabolas(middle, share - middle, used)
+    weights = _on_parabolas(middle, share - middle, used)
     # The states at which any row of a step needs the constraint.
     needed = np.zeros((len(own), _PARTS + 1), dtype=bool)
     np.logical_or.at(needed, index, weights.any(axis=1))
@@ -124,22 +117,19 @@ def _bound(
     number[needed] = np.arange(len(samples))
     inner = at_times(problem, of_nodes.source, _times(problem, own[samples[:, 0]], samples[:, 1]))
     given = of_nodes.source, steps + 1, times, of_nodes.rows, of_nodes.unit, of_nodes.scale
-    parts = _parts(problem)
-    return BoundBetween(*given, of_nodes, parts, own, samples, inner, number[index], weights, rates, bends, _SLIDE)
+    return BoundBetween(*given, of_nodes, _parts(problem), own, samples, inner, number[index], weights)
 
 
-def _on_parabolas(middle: Floats, x: Floats, used: Mask) -> tuple[Floats, Floats]:
-    """Weights (K, rows, parts + 1) of the ends of parts in values on parabolas, and in their derivatives in x.
+def _on_parabolas(middle: Floats, x: Floats, used: Mask) -> Floats:
+    """Weights (K, rows, parts + 1) of the ends of parts in values on parabolas.
 
     The parabolas go through the ends next to ``middle`` ones, from which ``x`` is counted in parts, each (K, rows).
     """
-    found = np.zeros((2, *x.shape, _PARTS + 1))
-    values = 0.5 * x * (x - 1.0), 1.0 - x * x, 0.5 * x * (x + 1.0)
-    for into, weights in zip(found, (values, (x - 0.5, -2.0 * x, x + 0.5)), strict=True):
-        for k, weight in enumerate(weights):
-            place = (middle + k - 1).astype(np.int64)
-            np.put_along_axis(into, place[:, :, None], np.where(used, weight, 0.0)[:, :, None], axis=2)
-    return found[0], found[1]
+    found = np.zeros((*x.shape, _PARTS + 1))
+    for k, weight in enumerate((0.5 * x * (x - 1.0), 1.0 - x * x, 0.5 * x * (x + 1.0))):
+        place = (middle + k - 1).astype(np.int64)
+        np.put_along_axis(found, place[:, :, None], np.where(used, weight, 0.0)[:, :, None], axis=2)
+    return found
 
 
 def _times(problem: OptimalControlProblem, steps: Integers, samples: Integers) -> Floats:
@@ -186,7 +176,7 @@ def middles(problem: OptimalControlProblem) -> Instants:
         return NOWHERE
     rows = np.array([(i, step, 0) for i in of for step in range(problem.steps)])
     entries = problem.steps * sum(len(problem.bound_constraints[i].rows) for i in of)
-    return Instants(rows, np.full(entries, _MIDDLE), np.zeros(entries), cubic=True)
+    return Instants(rows, np.full(entries, _MIDDLE), cubic=True)
 
 
 def seen(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats | None] | None:
@@ -215,70 +205,55 @@ def seen(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats | No
     return found
 
 
-def updated(
-    problem: OptimalControlProblem,
-    instants: Instants,
-    values: list[Floats | None],
-    backoff: list[Floats],
-    *,
-    anew: bool = True,
+def extended(
+    problem: OptimalControlProblem, instants: Instants, values: list[Floats | None], backoff: list[Floats]
 ) -> Instants:
-    """The instants at the peaks of a motion, and further ones where a constraint is violated or close to its bound.
+    """The instants and further ones at peaks where a motion violates a constraint or is close to its bound.
 
     Args:
         problem: The problem, without rows between nodes.
         instants: Those so far.
         values: Values of the motion of :func:`seen`.
         backoff: Margins of all constraints at the nodes (K, rows).
-        anew: Whether there may be further ones.
     """
-    rows, moments, bends = [], [], []
+    rows, moments = [], []
     former = _of_constraints(problem, instants)
     for i, (near, margin) in enumerate(zip(values, backoff, strict=True)):
         if near is None:
             continue
         peaks = _peaks(near)
         close = -_NEAR * problem.bound_constraints[i].scale
-        wanted = peaks.there & (peaks.values + margin[:, None] > close) & anew
+        wanted = peaks.there & (peaks.values + margin[:, None] > close)
         known = instants.of(i)
-        old = former[i][0] if i in former else np.zeros((0, near.shape[2]))
+        old = former.get(i, np.zeros((0, near.shape[2])))
         for step in np.union1d(np.flatnonzero(wanted.any(axis=(1, 2))), known[:, 0]):
-            of_step = _Peaks(*(array[step] for array in peaks))
-            new = _followed(old[known[:, 0] == step], of_step, wanted[step])
-            rows += [(i, int(step), number) for number in range(len(new[0]))]
-            moments.append(new[0].ravel())
-            bends.append(new[1].ravel())
-    if not rows:
-        return NOWHERE
-    return Instants(np.array(rows), np.concatenate(moments), np.concatenate(bends))
+            places = np.where(wanted[step], peaks.places[step], UNUSED)
+            new = _with_places(old[known[:, 0] == step], places, peaks.values[step])
+            rows += [(i, int(step), number) for number in range(len(new))]
+            moments.append(new.ravel())
+    return Instants(np.array(rows), np.concatenate(moments)) if rows else NOWHERE
 
 
-def _followed(moments: Floats, peaks: _Peaks, wanted: Mask) -> tuple[Floats, Floats]:
-    """The moments and bends (S, rows) of one step's instants, of which the first were at ``moments`` (s, rows).
+def _with_places(moments: Floats, places: Floats, values: Floats) -> Floats:
+    """The moments (s, rows) of one step's instants, and new ones at places (parts - 1, rows), negative for none.
 
-    Each row of an instant follows the nearest peak within reach. Peaks that are ``wanted`` (parts - 1, rows) and not
-    followed get the first instants whose row is not enforced.
+    Where there are as many as there may be, a new one, the highest first, takes the place of the nearest.
     """
-    found = [*np.stack([moments, np.zeros(moments.shape)], axis=2)]
-    for row in np.flatnonzero(wanted.any(axis=0) | (moments >= 0.0).any(axis=0)):
-        places, sharp, left = peaks.places[:, row], peaks.bends[:, row], [*np.flatnonzero(peaks.there[:, row])]
-        used = [own[row] for own in found if own[row, 0] >= 0.0]
-        pairs = sorted((abs(places[k] - own[0]), s, k) for s, own in enumerate(used) for k in left)
-        moved: set[int] = set()
-        for distance, s, k in pairs:
-            if distance <= _REACH and s not in moved and k in left:
-                used[s][:] = places[k], sharp[k]
-                moved.add(s)
-                left.remove(k)
-        for k in sorted((k for k in left if wanted[k, row]), key=lambda k: -float(peaks.values[k, row])):
-            free = next((own for own in found if own[row, 0] < 0.0), None)
+    found = [*moments.copy()]
+    for row in range(places.shape[1]):
+        for k in np.argsort(-values[:, row]):
+            place = places[k, row]
+            used = [own for own in found if own[row] >= 0.0]
+            if place < 0.0 or any(abs(own[row] - place) <= _SAME for own in used):
+                continue
+            free = next((own for own in found if own[row] < 0.0), None)
             if free is None and len(found) < MOST_INSTANTS:
-                free = np.tile([UNUSED, 0.0], (wanted.shape[1], 1))
+                free = np.full(places.shape[1], UNUSED)
                 found.append(free)
-            if free is not None:
-                free[row] = places[k], sharp[k]
-    made = np.array(found)
-    return made[:, :, 0], made[:, :, 1]
+            if free is None:
+                free = min(used, key=lambda own: abs(own[row] - place))
+            free[row] = place
+    return np.array(found)
 
 
 def beyond(values: list[Floats | None], backoff: list[Floats]) -> Floats:
@@ -301,7 +276,6 @@ class _Peaks(NamedTuple):
 
     places: Floats  # (N, parts - 1, rows) in a step of unit length
     values: Floats
-    bends: Floats  # minus the second derivative, in parts of a step
     there: Mask  # which of the parabolas have one within the step, no closer to another's middle
 
 
@@ -315,33 +289,7 @@ def _peaks(near: Floats) -> _Peaks:
         bends = 2.0 * here - before - after
         x = 0.5 * (after - before) / bends
         there = np.isfinite(here) & (bends > 0.0) & (-reach[0] <= x) & (x < reach[1])
-        x, bends = np.where(there, x, 0.0), np.where(there, bends, 0.0)
+        x = np.where(there, x, 0.0)
         values = np.where(there, here + 0.25 * x * (after - before), here)
     places = (np.arange(1, _PARTS)[:, None] + x) / _PARTS
-    return _Peaks(places, values, bends, there)
-
-
-def carried(
-    problem: OptimalControlProblem, old: Instants, new: Instants, parts: list[Floats], least: float = 0.0
-) -> list[Floats]:
-    """Values (K, rows) of all constraints and their rows at instants ``old``, for those at ``new``.
-
-    Rows that are not in ``old`` have ``least``.
-    """
-    count = len(problem.bound_constraints)
-    found, before = list(parts[:count]), dict(zip(old.constraints, parts[count:], strict=True))
-    for i in new.constraints:
-        rows = new.of(i)
-        values = np.full((len(rows), len(problem.bound_constraints[i].rows)), least)
-        if i in before:
-            number, numbers = _numbers(old.of(i)), _numbers(rows)
-            known = np.isin(numbers, number)
-            values[known] = before[i][np.searchsorted(number, numbers[known])]
-        found.append(values)
-    return found
-
-
-def _numbers(rows: Integers) -> Integers:
-    """Ascending numbers (K,) of the step and number of instants (K, 2)."""
-    found: Integers = rows[:, 0] * MOST_INSTANTS + rows[:, 1]
-    return found
+    return _Peaks(places, values, there)

@@ -36,7 +36,6 @@ class Multipliers(Frozen):
         instants: Constraint, step and number (I, 3) of each instant between nodes at which a constraint has rows; None
             where all hold there without.
         moments: Where these rows are in a step of unit length (O,); negative for rows that are not enforced.
-        bends: Minus the second derivatives of their values in time where they follow peaks (O,), else zero.
         cubic: Whether these rows are on the cubics through the steps, as in a controller's ticks, not of steps
             integrated in parts.
         added: What is added to margins of the rows at nodes, as motions under noise were counted; None where margins of
@@ -47,21 +46,20 @@ class Multipliers(Frozen):
     backoff: Annotated[Floats, Axes("rows", finite=True)]
     instants: Annotated[Integers, Axes("instants", 3)] | None = None
     moments: Annotated[Floats, Axes("moments", finite=True)] | None = None
-    bends: Annotated[Floats, Axes("moments", finite=True)] | None = None
     cubic: bool = False
     added: Annotated[Floats, Axes("node_rows", finite=True)] | None = None
 
     def __post_init__(self) -> None:
-        for array in (self.values, self.backoff, self.instants, self.moments, self.bends, self.added):
+        for array in (self.values, self.backoff, self.instants, self.moments, self.added):
             if array is not None:
                 array.setflags(write=False)
 
     @property
     def between(self) -> Instants:
         """The rows between nodes."""
-        if self.instants is None or self.moments is None or self.bends is None:
+        if self.instants is None or self.moments is None:
             return NOWHERE
-        return Instants(self.instants, self.moments, self.bends, self.cubic)
+        return Instants(self.instants, self.moments, self.cubic)
 
 
 @dataclass(frozen=True, eq=False)

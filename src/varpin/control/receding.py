@@ -69,7 +69,6 @@ def _margins(problem: OptimalControlProblem, previous: Solution, known: Multipli
         backoff=flat(backoff),
         instants=instants.rows if some else None,
         moments=instants.moments if some else None,
-        bends=instants.bends if some else None,
         cubic=instants.cubic,
     )
 

@@ -11,7 +11,6 @@ import logging
 import time
 from collections.abc import Callable
 from copy import copy
-from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -19,7 +18,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.along import Along, states
-from varpin.control.between_nodes import NOWHERE, Instants, beyond, enforced, seen, updated, watched
+from varpin.control.between_nodes import NOWHERE, Instants, beyond, enforced, extended, seen, watched
 from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.costs import CostError
 from varpin.control.descent import rounding
@@ -243,7 +242,6 @@ class Search:
             if ended is Status.CONVERGED and self._goes_on():
                 continue
             if ended is None and self._near and self._looks_between():
-                self._near = False
                 continue
             if ended is None and len(self.history) >= last:
                 ended = Status.MAX_ITERATIONS
@@ -547,11 +545,10 @@ class Search:
         )
         if not (left > bounds).any():
             return False
-        made = updated(problem, self.between, looked, backoff)
-        made = replace(made, bends=np.zeros(made.bends.shape))
+        made = extended(problem, self.between, looked, backoff)
         if self._looks >= _LOOKS:
             return False
-        self._looks += 1
+        self._looks, self._near = self._looks + 1, False
         if len(made.rows):
             kept = self.multipliers[:count]
             self._enforce(made)
@@ -837,7 +834,6 @@ class Search:
                 backoff=flat(self.backoff),
                 instants=self.between.rows if len(self.between.rows) else None,
                 moments=self.between.moments if len(self.between.rows) else None,
-                bends=self.between.bends if len(self.between.rows) else None,
                 cubic=self.between.cubic,
                 added=None if self.added is None else flat(self.added),
             )

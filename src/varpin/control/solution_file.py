@@ -137,8 +137,8 @@ def _require_rows(source: Path, multipliers: Multipliers, problem: OptimalContro
     if sum(len(item.rows) for item in own) != between.moments.size:
         raise FileError(f"{source}: multipliers.moments do not belong to multipliers.instants")
     inside = (between.moments == UNUSED) | ((between.moments >= 0.0) & (between.moments <= 1.0))
-    if not (inside.all() and (between.bends >= 0.0).all()):
-        raise FileError(f"{source}: multipliers.moments are not within steps, or multipliers.bends are negative")
+    if not inside.all():
+        raise FileError(f"{source}: multipliers.moments are not within steps")
     if not all(rows.any(axis=1).all() for rows in in_force(problem, between)):
         raise FileError(f"{source}: multipliers.moments enforce no row at an instant")
     sizes = [item.size for item in enforced(problem, between).bound_constraints]

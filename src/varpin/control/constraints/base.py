@@ -53,12 +53,6 @@ class Slopes(NamedTuple):
     nodes: Integers  # (K,)
     by_state: Floats  # (K, rows, 2n) in (q, v) at the node
     by_controls: Floats  # (K, rows, c) in the step's control, c = m, or in those at its ends, 2m; c = 0 for neither
-    # (K, rows, 2n + c) whose squares are second derivatives of the rows; None where those are left out
-    curved: Floats | None = None
-
-    def in_step(self) -> Floats:
-        """The derivatives (K, rows, 2n + c) in (q, v) and the controls."""
-        return np.concatenate([self.by_state, self.by_controls], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,10 +15,8 @@ from varpin.control.parts import Parts
 class BoundBetween(BoundConstraint):
     """A constraint at instants within steps, each integrated in parts from the node at its begin.
 
-    The value at an instant is that of the parabola through the ends of parts next to it. A row that follows a peak has
-    the value at the peak of that parabola, which has the second derivative of an earlier motion, (P6) of
-    docs/plan-constraints.md: it goes on without a kink as the peak slides. The places are the nodes at the ends of the
-    steps; several instants may be in one step. The times are means of those of the rows.
+    The value at an instant is that of the parabola through the ends of parts next to it. The places are the nodes at
+    the ends of the steps; several instants may be in one step. The times are means of those of the rows.
 
     Attributes:
         of_nodes: The constraint at the nodes, all after the first.
@@ -28,9 +26,6 @@ class BoundBetween(BoundConstraint):
         inner: The constraint, bound to a grid whose nodes after the first are these states.
         near: Which of them are the ends of parts of an instant's step (K, parts + 1); any where the weights are zero.
         weights: Their weights in each row (K, rows, parts + 1); all zero in rows that are not enforced.
-        rates: Their weights in the row's derivative in time, in parts of a step (K, rows, parts + 1).
-        bends: Minus the second derivatives of peaks (K, rows); zero where a row does not follow one.
-        slide: How far from an instant its peak may be, in parts of a step; beyond, values grow linearly.
     """
 
     of_nodes: BoundConstraint
@@ -40,9 +35,6 @@ class BoundBetween(BoundConstraint):
     inner: BoundConstraint
     near: Integers
     weights: Floats
-    rates: Floats
-    bends: Floats
-    slide: float
 
     @property
     def in_force(self) -> Mask:
@@ -66,15 +58,7 @@ class BoundBetween(BoundConstraint):
         q, v = (_after_first(x[tuple(self.samples.T)]) for x in within)
         c = self.inner.value(q, v, u)[self.near]
         found = np.einsum("krs,ksr->kr", self.weights, c)
-        slide = self._slide(c)
-        found += slide * (np.einsum("krs,ksr->kr", self.rates, c) - 0.5 * self.bends * slide)
         return np.where(self.in_force, found, -self.scale)
-
-    def _slide(self, c: Floats) -> Floats:
-        """How far peaks of values ``c`` (K, parts + 1, rows) are from the instants (K, rows), in parts of a step."""
-        bends = np.where(self.bends > 0.0, self.bends, np.inf)
-        found: Floats = np.clip(np.einsum("krs,ksr->kr", self.rates, c) / bends, -self.slide, self.slide)
-        return found
 
     def jacobian(self, q: Floats, v: Floats) -> Floats:
         """dc/d(q, v) (K, rows, 2n) as at the ends of the steps."""
@@ -88,14 +72,10 @@ class BoundBetween(BoundConstraint):
         """
         within, D = self.parts.slopes(*self._within(q, v, u))
         q, v = (_after_first(x[tuple(self.samples.T)]) for x in within)
-        slide = self._slide(self.inner.value(q, v, u)[self.near])
         J = (self.inner.jacobian(q, v) @ D[tuple(self.samples.T)])[self.near]
-        sliding = np.einsum("krs,ksrz->krz", self.rates, J)
-        found = np.einsum("krs,ksrz->krz", self.weights, J) + slide[:, :, None] * sliding
-        inside = (self.bends > 0.0) & (np.abs(slide) < self.slide)
-        bends = np.where(inside, self.bends, np.inf)
+        found = np.einsum("krs,ksrz->krz", self.weights, J)
         x = D.shape[2]
-        return Slopes(self.begins, found[:, :, :x], found[:, :, x:], sliding / np.sqrt(bends)[:, :, None])
+        return Slopes(self.begins, found[:, :, :x], found[:, :, x:])
 
 
 @dataclass(frozen=True, eq=False)
