@@ -8,8 +8,6 @@ from refusals import refused
 from test_sddp import run, sliders
 
 import varpin as vp
-from varpin.control.along import Along
-from varpin.control.passes import one_pass
 
 MATRIX = np.array([[2e-2, 5e-3], [5e-3, 1e-2]])
 BEFORE = np.array([0.7, -0.3])
@@ -86,22 +84,6 @@ def test_it_means_the_same_at_every_step():
     # The changes are centred on the nodes 0 .. N - 1: half a period is missing at the end, half too much is before.
     assert abs(off[2]) < 0.02 * exact
     np.testing.assert_allclose(np.divide(off[:-1], off[1:]), 2.0, atol=0.1)
-
-
-@pytest.mark.parametrize("roots", [False, True], ids=["plain", "square roots"])
-@pytest.mark.parametrize("before", [None, [1e-3, 0.0, 0.0]], ids=["free", "given"])
-def test_gradient_far_from_an_optimum(before, roots):
-    """Of a nonlinear motion's cost, against differences."""
-    problem = finger(vp.ControlRateCost(2e-3, before), steps=6, hold=2)
-    u = 1e-3 * np.random.default_rng(3).normal(size=(3, 3))
-    plan, _ = one_pass(Along(problem, run(problem, u)), 0.0, False, None, None, roots=roots)
-    for r in range(3):
-        for i in range(3):
-            e = np.zeros((3, 3))
-            e[r, i] = 1e-5
-            costs = [problem.cost_of(run(problem, u + k * e)) for k in (-2, -1, 1, 2)]
-            slope = np.dot([1, -8, 8, -1], costs) / 1.2e-4
-            assert plan.gradient[r, i] == pytest.approx(slope, rel=1e-6, abs=1e-8 * np.abs(plan.gradient).max())
 
 
 def test_noise_is_known_to_the_law():

@@ -6,7 +6,6 @@ from findings import about
 from scipy.optimize import minimize
 
 import varpin as vp
-from varpin.control import augmented
 
 ROBOT = vp.planar_chain(2)
 N, DT, LIMIT = 6, 0.1, 0.6
@@ -94,29 +93,6 @@ def most(plan, parts=32):
     )  # fmt: skip
     fine = problem.constraints_on(problem.dt / parts, problem.steps * parts, problem.hold * parts)
     return max(bound.value(motion.q, motion.v, motion.u).max() for bound in fine)
-
-
-@pytest.fixture
-def rounds_alone(monkeypatch):
-    """Rounds that go on to their end, without last steps before."""
-    monkeypatch.setattr(augmented, "_REACHED", -1.0)
-
-
-@pytest.mark.parametrize("iterations", [3, 9])
-def test_a_plan_that_does_not_hold_between_nodes_says_so(iterations, rounds_alone):
-    """With too few iterations for it: before there are rows between nodes, and after."""
-    problem = reach()
-    plan = vp.solve(problem, max_iterations=iterations, check=False)
-    assert most(plan) > 1e-4
-    assert not plan.status.converged
-    assert "between nodes WithinVelocityLimits is violated by" in plan.reason
-
-
-def test_steps_that_cannot_be_looked_at_are_said(monkeypatch):
-    monkeypatch.setattr("varpin.control.augmented.seen", lambda *_: None)
-    plan = vp.solve(reach(), check=False)
-    assert plan.status is vp.Status.STALLED
-    assert "between nodes is not known" in plan.reason
 
 
 def test_copies_and_files_know_the_option(tmp_path):

@@ -5,9 +5,6 @@ import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin.control.along import Along
-from varpin.control.backward import backward
-from varpin.control.passes import noise_shares, one_pass
 
 N = 8
 
@@ -19,12 +16,6 @@ def links(*, cost: vp.Cost | None = None, **options: object) -> vp.OptimalContro
         cost = vp.ControlCost(1e-2) + vp.VelocityCost(0.1) + vp.Terminal(end)
     given = {"dt": 0.1, "steps": N, "controls": "linear"} | options
     return vp.OptimalControlProblem(vp.Scene(vp.planar_chain(2), damping=0.1), cost, [0.1, 0.2], [0.0, 0.0], **given)
-
-
-def line(problem: vp.OptimalControlProblem, u: np.ndarray) -> vp.LinearPolicy:
-    n, m = problem.scene.robot.dof, problem.scene.controls
-    steps = problem.steps
-    return vp.LinearPolicy(u[1:], np.zeros((steps, m, 2 * n)), np.zeros((steps, 2 * n)), before=u[0], linear=True)
 
 
 def test_the_optimum_of_a_double_integrator_is_the_continuous_one() -> None:
@@ -121,21 +112,6 @@ def test_refusals() -> None:
         vp.LinearPolicy(np.zeros((2, 1)), np.zeros((2, 1, 2)), np.zeros((2, 2)), linear=True)
 
 
-@pytest.mark.parametrize("joints", [1, 2])
-def test_the_pass_on_square_roots_is_the_plain_one(joints) -> None:
-    """One joint has a state of odd size, which the core takes with a zero beside it."""
-    end = vp.TrackingCost(np.full(joints, 0.6), 1e3) + vp.VelocityCost(1e2)
-    cost = vp.ControlCost(1e-2) + vp.ControlRateCost(1e-4) + vp.VelocityCost(0.1) + vp.Terminal(end)
-    scene = vp.Scene(vp.planar_chain(joints), damping=0.1)
-    still = np.zeros(joints)
-    problem = vp.OptimalControlProblem(scene, cost, still, still, dt=0.1, steps=N, controls="linear")
-    along = Along(problem, problem.simulate(problem.holding_policy()))
-    plain, roots = (one_pass(along, 0.0, False, None, None, roots=way)[0] for way in (False, True))
-    for name in ("feedforward", "feedback", "previous", "gradient", "slope", "curvature"):
-        one, other = getattr(plain, name), getattr(roots, name)
-        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9 * np.abs(one).max(), err_msg=name)
-
-
 def test_links_too_light_for_the_plain_pass() -> None:
     """A finger of some grams: the plain pass has lost its digits, and squares take over."""
     scene = vp.Scene(vp.load_robot("finger"))
@@ -153,53 +129,6 @@ def test_advice_is_one_that_such_problems_take() -> None:
     (advice,) = [sentence for sentence in plan.warnings if "problem.at(" in sentence]
     assert "problem.at(dt=0.025) " in advice
     assert plan.problem.at(dt=0.025).linear
-
-
-@pytest.mark.parametrize(
-    ("noise", "options"),
-    [
-        (None, {"integrator": vp.Gauss(3)}),
-        (None, {"integrator": vp.Midpoint()}),
-        (vp.StateNoise(0.5, center=[0.0, 0.0]), {"integrator": vp.Gauss(2)}),
-    ],
-    ids=["gauss", "midpoint", "noise"],
-)
-def test_second_order_has_the_hessian_of_the_cost(noise: vp.Noise | None, options: dict) -> None:
-    """One line, so that the pass without feedback is the Hessian in both controls, and that is by differences."""
-    scene = vp.Scene(vp.planar_chain(2), damping=0.1, noise=noise)
-    end = vp.TrackingCost([0.6, -0.4], 1e2) + vp.VelocityCost(1.0)
-    cost = vp.ControlCost(1.0) + vp.VelocityCost(0.1) + vp.Terminal(end)
-    problem = vp.OptimalControlProblem(
-        scene, cost, [0.1, 0.2], [1.0, -2.0], dt=0.1, steps=1, controls="linear", **options
-    )
-    u = np.array([[1.0, -2.0], [3.0, 0.5]])
-    along = Along(problem, problem.simulate(line(problem, u)))
-    plan = backward(problem, along.trajectory, 0.0, second_order=True, along=along)
-    assert plan is not None
-
-    def gradient(changed: np.ndarray) -> np.ndarray:
-        """Of the cost in both controls, with the noise's S held."""
-        motion = problem.simulate(line(problem, changed.reshape(2, 2)))
-        found = np.zeros(4)
-        for c, away in enumerate(1e-4 * np.eye(4)):
-            values = []
-            for sign in (1.0, -1.0):
-                moved = problem.simulate(line(problem, (changed + sign * away).reshape(2, 2)))
-                values.append(problem.cost_of(moved) + noise_shares(problem, moved, plan).sum())
-            found[c] = (values[0] - values[1]) / 2e-4
-        assert motion.steps == 1
-        return found
-
-    at, step = u.ravel(), 1e-3
-    H = np.array([(gradient(at + e) - gradient(at - e)) / (2.0 * step) for e in step * np.eye(4)])
-    # The second decision's gain on the first control, and the value that is left.
-    np.testing.assert_allclose(plan.previous[1], -np.linalg.solve(H[2:, 2:], H[2:, :2]), rtol=2e-5, atol=2e-5)
-    left = H[:2, :2] - H[:2, 2:] @ np.linalg.solve(H[2:, 2:], H[2:, :2])
-    g = gradient(at)
-    ahead = -np.linalg.solve(left, g[:2] - H[:2, 2:] @ np.linalg.solve(H[2:, 2:], g[2:]))
-    np.testing.assert_allclose(plan.feedforward[0], ahead, rtol=2e-5, atol=1e-5)
-    first = backward(problem, along.trajectory, 0.0)
-    assert np.abs(first.previous[1] - plan.previous[1]).max() > 1e-3 * np.abs(plan.previous[1]).max()
 
 
 def test_second_order_converges_in_fewer_iterations() -> None:

@@ -10,7 +10,6 @@ from refusals import refused, unnamed
 
 import varpin as vp
 import varpin.control.mpc
-from varpin.control import passes
 
 
 def cart(steps=40, **options):
@@ -175,31 +174,6 @@ def test_ctrl_c_ends_a_run_while_it_plans(within):
     assert caught.value.trajectory.t[-1] == pytest.approx(3 * 0.05)
 
 
-@pytest.mark.parametrize("iterations", [1, 3])
-def test_a_tick_takes_a_backward_pass_for_each_iteration(iterations, monkeypatch):
-    """And no more: its gains are those that its last step followed, and near those made anew for its motion."""
-    mpc = vp.Mpc(tracking(), iterations=iterations, tolerance=1e-15)
-    first = mpc.plan(0.0, mpc.problem.q0, mpc.problem.v0)
-    calls, real = [], passes.one_pass
-
-    def counted(*given, **options):
-        calls.append(given)
-        return real(*given, **options)
-
-    q, v = first.trajectory.q[1] + 1e-3, first.trajectory.v[1]
-    monkeypatch.setattr(passes, "one_pass", counted)
-    plan = mpc.plan(mpc.period, q, v, first)
-    assert len(calls) == plan.iterations == iterations
-    whole = vp.solve(plan.problem, first.shifted(1), tolerance=1e-15, max_iterations=iterations, check=False)
-    assert len(calls) == 2 * iterations + 1
-    np.testing.assert_array_equal(plan.trajectory.u, whole.trajectory.u)
-    assert plan.cost == whole.cost
-    assert 0.0 < np.abs(plan.gains - whole.gains).max() < 0.05 * np.abs(whole.gains).max()
-    # The whole step was taken, so nothing is left of it.
-    assert plan.history[-1].step == 1.0
-    assert not plan.feedforward.any()
-
-
 def test_a_plant_that_fails_keeps_the_motion():
     mpc = vp.Mpc(tracking(), iterations=1)
     plant = vp.Plant(
@@ -289,33 +263,6 @@ def test_a_controller_that_cannot_keep_up_says_so(slow, told, monkeypatch):
     said = [sentence for sentence in run.warnings if "longer than the period of 50 ms" in sentence]
     assert bool(said) == told
     assert not told or f"in {slow} of 20 ticks ({1e3 * run.seconds[1:].mean():.3g} ms in the mean)" in said[0]
-
-
-@pytest.mark.parametrize(
-    ("budget", "iterations", "late"), [(0.0285, 5, 0), (0.0125, 2, 0), (0.0075, 1, 0), (0.0035, 1, 20), (0.0015, 0, 20)]
-)
-def test_a_tick_ends_within_its_budget_or_the_plan_before_acts_on(budget, iterations, late, monkeypatch):
-    """On a clock of 1 ms a look: an iteration takes five looks at it, and what is around them two or three."""
-    now = [0.0]
-
-    def clock():
-        now[0] += 1e-3
-        return now[0]
-
-    class Clock:
-        perf_counter = staticmethod(clock)
-
-    for module in (varpin.control.mpc, varpin.control.search):
-        monkeypatch.setattr(module, "time", Clock)
-    mpc = vp.Mpc(tracking(), iterations=5, tolerance=1e-300, budget=budget)
-    run = mpc.run(duration=21 * mpc.period)
-    assert run.misses == late
-    assert run.iterations[1:].max() == iterations
-    assert (run.seconds <= budget).all() == (late == 0)
-    told = [sentence for sentence in run.warnings if f"came later than the budget of {1e3 * budget:.3g} ms" in sentence]
-    assert len(told) == (late > 0)
-    assert not told or told[0].startswith("20 of 20 plans")
-    assert late == 0 or all(plan is run.plans[0] for plan in run.plans)
 
 
 def test_what_is_told_of_an_early_end_is_in_the_time_of_the_run():

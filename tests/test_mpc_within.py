@@ -4,9 +4,6 @@ import numpy as np
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control import box
-from varpin.control.backward import backward
-from varpin.control.penalties import penalized
 
 ROBOT = vp.planar_chain(2)
 ARM = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
@@ -111,30 +108,3 @@ def test_no_bound_is_to_be_narrower_than_nothing():
     assert not unnamed(str(report), "4 ticks an older plan", "rad/s")
     first, bound = run.plans[0], run.plans[0].constraints[0].violation
     assert first.violation == bound == report.planned.max()
-
-
-def test_passes_that_look_for_active_bounds_end_with_the_time(monkeypatch):
-    """The plan of a tick whose time for them is over: one pass, and a step that lowers the augmented cost."""
-    problem = tracking([*FAMILIES["speeds"], *FAMILIES["a moving sphere"]])
-    first = vp.Mpc(problem).plan(0.0, problem.q0, problem.v0)
-    made = []
-
-    def counted(*args, **options):
-        made.append(None)
-        return plain(*args, **options)
-
-    plain = box.single_pass
-    monkeypatch.setattr(box, "single_pass", counted)
-    moved = problem.at(t0=0.1, q0=first.trajectory.q[5], v0=first.trajectory.v[5])
-    zeros = [np.zeros(item.shape) for item in moved.bound_constraints]
-    weights = np.full(len(zeros), 100.0)
-    motion = moved.simulate(moved.holding_policy())
-    passes, changes = [], []
-    for until in (0.0, np.inf):
-        made.clear()
-        goal = penalized(moved, zeros, weights, zeros, until=until)
-        plan = backward(goal, motion, 0.0)
-        passes.append(len(made))
-        changes.append(plan.expected_decrease)
-    assert passes[0] <= 2 < passes[1]
-    assert 0.0 < changes[0] <= changes[1]

@@ -4,13 +4,10 @@ import numpy as np
 import pytest
 from expected_cost import expected_cost_slopes
 from refusals import refused
+from varpin.control.backward import backward
 
 import varpin as vp
-from varpin.control import search
-from varpin.control.along import Along
-from varpin.control.backward import backward
 from varpin.control.moments import noise_cost
-from varpin.control.passes import Plan, noise_shares
 from varpin.control.spread import Feedback
 from varpin.control.within_steps import mean_of_decay, mean_of_decay_slopes
 
@@ -132,94 +129,6 @@ def test_light_joints_in_long_steps_end_converged() -> None:
     plan = vp.solve(vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=0.05, steps=12), check=False)
     assert plan.status is vp.Status.CONVERGED
     assert plan.iterations <= 60
-
-
-@pytest.mark.parametrize("controls", ["held", "linear"])
-@pytest.mark.parametrize("noise", [CONTROL, CONTROL + STATE + vp.AdditiveNoise(0.2)])
-def test_a_fixed_cost_in_place_of_the_noise(controls: str, noise: object) -> None:
-    """That with the value function of the pass itself leads to the same plan; under regularization it stays."""
-    problem = reach(noise, steps=10, dt=0.05, rate=1e-2, controls=controls, integrator=vp.Gauss(2))
-    motion = problem.simulate(problem.holding_policy())
-    along = Along(problem, motion)
-    plan = backward(problem, motion, 0.0, along=along)
-    held = along.with_noise_held(plan.spread)
-    again, away = (backward(problem, motion, regularization, along=held) for regularization in (0.0, 1e6))
-    for name in ("feedforward", "feedback", "previous", "gradient"):
-        expected = getattr(plan, name)
-        np.testing.assert_allclose(getattr(again, name), expected, atol=1e-9 * np.abs(expected).max(), rtol=0.0)
-    assert again.slope == pytest.approx(plan.slope, rel=1e-9)
-    if controls == "held":
-        # Large regularization leaves no gains, and the gradient is that of the controls alone.
-        slopes = slopes_of(problem, plan, problem.decided(motion))
-        np.testing.assert_allclose(away.gradient, slopes, atol=1e-5 * np.abs(slopes).max())
-
-
-def slopes_of(problem: vp.OptimalControlProblem, plan: Plan, u: np.ndarray) -> np.ndarray:
-    """The gradient of the cost, and of the noise cost with S held, by differences."""
-
-    def total(controls: np.ndarray) -> float:
-        motion = problem.simulate(controls)
-        return problem.cost_of(motion) + float(noise_shares(problem, motion, plan).sum())
-
-    found = np.empty_like(u)
-    for index in np.ndindex(u.shape):
-        away = np.zeros_like(u)
-        away[index] = 1e-5
-        found[index] = (total(u + away) - total(u - away)) / 2e-5
-    return found
-
-
-def bump(height: float) -> vp.CustomCost:
-    """A hill between the begin and the goal, on whose top the model has no minimum."""
-    top, width = np.array([0.35, 0.05]), 0.05
-
-    def value(t, q, v, u):
-        return height * np.exp(-((q - top) ** 2).sum(axis=1) / width)
-
-    def derivatives(t, q, v, u):
-        (N, n), m, away, e = q.shape, u.shape[1], q - top, value(t, q, v, u)
-        gradient, hessian = np.zeros((N, 2 * n + m)), np.zeros((N, 2 * n + m, 2 * n + m))
-        gradient[:, :n] = -2.0 / width * away * e[:, None]
-        curved = 4.0 / width**2 * away[:, :, None] * away[:, None] - 2.0 / width * np.eye(n)
-        hessian[:, :n, :n] = e[:, None, None] * curved
-        return gradient, hessian
-
-    return vp.CustomCost(value, derivatives)
-
-
-@pytest.mark.slow
-def test_motions_that_need_regularization_do_not_change_how_others_are_rated() -> None:
-    """A search over a hill, and the same one resumed."""
-    cost = vp.ControlCost(0.1) + bump(50.0) + vp.Terminal(vp.TrackingCost([0.5, -0.5], 20.0) + vp.VelocityCost(1.0))
-    scene = vp.Scene(vp.planar_chain(2), damping=0.2, noise=vp.ControlNoise(0.05))
-    problem = vp.OptimalControlProblem(scene, cost, [0.2, 0.2], [0.0, 0.0], dt=0.03, steps=20)
-    plan = vp.solve(problem, check=False)
-    assert plan.status is vp.Status.CONVERGED
-    assert plan.iterations <= 30
-    assert max(item.regularization for item in plan.history) > 1.0
-    for cut in (plan.iterations // 3, plan.iterations // 2):
-        part = vp.solve(problem, max_iterations=cut, check=False)
-        np.testing.assert_array_equal(vp.solve(problem, resume=part, check=False).controls, plan.controls)
-
-
-def test_it_is_turned_to_after_two_iterations_that_raise_the_expected_cost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Here the first steps do; what the first motion costs is no gain."""
-    turns, take = [], search.Search._take_whole
-
-    def watched(one: search.Search) -> None:
-        turns.append((len(one.history), tuple(one.gains)))
-        take(one)
-
-    monkeypatch.setattr(search.Search, "_take_whole", watched)
-    goal = np.array([0.4, 2.6, 1.0, -1.9, 1.2, 0.3])
-    scene = vp.Scene(vp.load_robot("kinova"), damping=0.1, noise=vp.ControlNoise(0.5))
-    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
-    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost(1.0))
-    begin = np.array([0.0, 2.9, 1.3, -2.1, 1.4, 0.0])
-    vp.solve(
-        vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=0.02, steps=30), max_iterations=4, check=False
-    )
-    assert turns == [(2, (0.0, 0.0, 0.0))]
 
 
 def test_the_prediction_is_that_of_paths_where_noise_is_small() -> None:

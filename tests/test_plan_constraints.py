@@ -1,6 +1,5 @@
 """Hard constraints of plans: against SciPy on the same grid, KKT conditions by differences, what is refused."""
 
-import functools
 from contextlib import ExitStack
 from dataclasses import replace
 
@@ -10,18 +9,12 @@ import pytest
 from findings import about
 from refusals import naming, refused, unnamed
 from scipy.integrate import solve_ivp
-from scipy.optimize import lsq_linear, nnls
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import varpin as vp
-from varpin.control import ViolationOnRobot, polish, unconstrained
-from varpin.control.augmented import within_constraints
-from varpin.control.backward import backward
+from varpin.control import ViolationOnRobot
 from varpin.control.hints import hints
 from varpin.control.hints import reach as hints_reach
-from varpin.control.penalties import _by_step, penalized, split
-from varpin.control.spread import Feedback, deviations
-from varpin.control.trials import Trials
 from varpin.model.clearance import capsule_around, clearance
 from varpin.model.kinematics import frame_kinematics
 from varpin.support.one_thread import one_thread
@@ -60,87 +53,6 @@ def test_a_half_space_is_what_its_formula_says(length):
     np.testing.assert_allclose(plane.distances(p)[:, 0], (offset - p @ normal) / length, atol=1e-15)
 
 
-def test_multipliers_of_more_rows_than_controls():
-    """The conditions of the least of a quadratic form, where rows depend on each other and most are met."""
-    rng = np.random.default_rng(0)
-    ways = rng.normal(size=(120, 30))
-    equal = np.arange(120) % 40 == 0
-    S, d = ways @ ways.T, ways @ rng.normal(size=30) - 1e-3 * rng.uniform(size=120)
-    x = polish._least(S.copy(), d.copy(), equal, np.ones(120, dtype=bool))
-    slope = S @ x - d
-    assert (x[~equal] >= 0.0).all()
-    assert np.abs(slope[equal | (x > 0.0)]).max() <= 1e-8
-    assert slope.min() >= -1e-8
-    assert 0 < (x[~equal] > 0.0).sum() < 30
-
-
-def test_a_search_that_ends_off_the_optimum_is_not_believed(monkeypatch):
-    """Where the conditions of an optimum do not hold, no plan is converged, whatever its last search says."""
-
-    @functools.wraps(unconstrained.solve)
-    def careless(problem, controls=None, *, tolerance=1e-7, **options):
-        return unconstrained.solve(problem, controls, tolerance=max(tolerance, 1e-3), **options)
-
-    monkeypatch.setattr(polish, "_STEPS", 0)
-    wide = two_links([vp.WithinVelocityLimits(ROBOT, (-50.0, 50.0))])
-    plan = within_constraints(careless)(wide, check=False)
-    assert plan.violation == 0.0
-    assert plan.status is vp.Status.STALLED
-    assert "would fall by" in plan.reason
-
-
-def test_dual_problems_are_those_of_scipy():
-    """With dependent rows, equalities, and guesses of the active rows that are all wrong."""
-    rng = np.random.default_rng(0)
-    for rows, rank in ((1, 1), (6, 6), (20, 12), (40, 7)):
-        B, d = rng.normal(size=(rank, rows)), rng.normal(size=rows)
-        # Bounded below: d is in the range of S.
-        S, d = B.T @ B, B.T @ (B @ d)
-        equal = rng.random(rows) < 0.2
-        best = lsq_linear(B, B @ np.linalg.lstsq(S, d)[0], (np.where(equal, -np.inf, 0.0), np.inf), tol=1e-14)
-        found = polish._least(S, d, equal, rng.random(rows) < 0.5)
-        assert (found[~equal] >= 0.0).all()
-        values = [0.5 * x @ S @ x - d @ x for x in (found, best.x)]
-        assert values[0] <= values[1] + 1e-9 * abs(values[1])
-
-
-@pytest.mark.parametrize("pivots", [10, 0])
-def test_dual_problem_whose_matrix_rounding_has_made_indefinite(monkeypatch, pivots):
-    """The residual of SciPy's nonnegative least squares for a matrix without a Cholesky factor; without pivots, too."""
-    monkeypatch.setattr(polish, "_PIVOTS", pivots)
-    rng = np.random.default_rng(1)
-    B, b = rng.normal(size=(3, 10)), rng.normal(size=3)
-    S = B.T @ B - 1e-12 * np.eye(10)
-    with pytest.raises(np.linalg.LinAlgError):
-        np.linalg.cholesky(S)
-    x = polish._nonnegative(S, B.T @ b, np.zeros(10, dtype=bool))
-    assert x.min() >= 0.0
-    assert np.linalg.norm(B @ x - b) <= nnls(B, b)[1] + 1e-6
-
-
-def test_first_penalties_on_given_states_are_light():
-    """They are those of a motion that stays on its states, and not of one that falls, as its weak drives let it."""
-    scene = vp.Scene(ROBOT)
-    held = np.clip(scene.holding_torque(np.zeros(2)), -4.0, 4.0)
-    assert (np.abs(held) == 4.0).any()
-    problem = vp.OptimalControlProblem(
-        scene,
-        vp.ControlCost(1e-3) + vp.TrackingCost([0.0, 0.0], 10.0),
-        [0, 0],
-        [0, 0],
-        dt=0.05,
-        steps=16,
-        control_limits=(-4.0, 4.0),
-        integrator=vp.Midpoint(),
-        constraints=[vp.WithinVelocityLimits(ROBOT, (-20.0, 20.0))],
-    )
-    plan = vp.solve(problem, states=np.zeros((17, 2)), max_iterations=0, check=False)
-    scale = problem.bound_constraints[0].scale
-    told = plan.multipliers.first_weights[0] * scale**2 * np.sqrt(16)
-    assert told == pytest.approx(0.8 * 1e-3 * held @ held, rel=1e-6)
-    assert told < 1e-2 * plan.cost
-
-
 def falling_at_first():
     robot, rest = vp.load_robot("kinova"), np.zeros(6)
     cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(rest + 0.3, 100.0) + vp.VelocityCost(1.0))
@@ -158,18 +70,6 @@ def test_penalties_that_a_first_motion_made_stiff():
     # Other first motions end at the same cost.
     held = np.tile(problem.scene.holding_torque(problem.q0), (10, 1))
     assert vp.solve(problem, held, check=False).cost == pytest.approx(plan.cost, rel=1e-6)
-
-
-@pytest.mark.parametrize("cut", [5, 20])
-def test_stiff_penalties_are_resumed_to_the_bit(cut, tmp_path):
-    """In the first round, and after it."""
-    problem = falling_at_first()
-    whole, begun = vp.solve(problem, check=False), vp.solve(problem, max_iterations=cut, check=False)
-    begun.save(tmp_path / "begun.npz")
-    resumed = vp.solve(problem, resume=vp.Solution.load(tmp_path / "begun.npz", problem), check=False)
-    assert len(resumed.history) == len(whole.history)
-    np.testing.assert_array_equal(resumed.controls, whole.controls)
-    np.testing.assert_array_equal(resumed.multipliers.weights, whole.multipliers.weights)
 
 
 @pytest.mark.parametrize("weight", [1e-7, 1e-3, 1e-2])
@@ -207,101 +107,6 @@ def test_given_limits_that_are_all_infinite():
     for made in (vp.WithinJointLimits, vp.WithinVelocityLimits):
         with pytest.raises(vp.InputError, match="all limits given are infinite"):
             made(robot, (-np.inf, np.inf))
-
-
-def hasty(goal, duration, steps, speed, torque):
-    """Joints that move at their greatest speed with little torque to spare."""
-    cost = vp.ControlCost(1e-6) + vp.VelocityCost(1e-2) + vp.Terminal(vp.TrackingCost(goal, 1e2) + vp.VelocityCost(1.0))
-    return vp.OptimalControlProblem(
-        vp.Scene(ROBOT, damping=0.1),
-        cost,
-        np.zeros(2),
-        np.zeros(2),
-        dt=duration / steps,
-        steps=steps,
-        constraints=[vp.WithinVelocityLimits(ROBOT, (-speed, speed))],
-        control_limits=(-torque, torque),
-    )
-
-
-HASTY = [([0.38, -1.25], 0.67, 16, 1.71, 43.0), ([1.32, 1.05], 0.95, 19, 1.4, 29.0)]
-
-
-@pytest.mark.parametrize("numbers", HASTY)
-def test_steps_of_any_length_lead_onto_the_constraints(numbers):
-    """From motions off the optimum, at torques that are brought to their limits or come from them."""
-    problem, torque, rng = hasty(*numbers), numbers[-1], np.random.default_rng(3)
-    plan = vp.solve(problem, check=False)
-    multipliers = [report.multipliers for report in plan.constraints]
-    nothing = [np.zeros(item.shape) for item in problem.bound_constraints]
-    weights, trials, reached = np.array([1e3]), Trials(problem), 0
-    for _ in range(8):
-        u = np.clip(0.99 * plan.controls + 1e-2 * rng.normal(size=plan.controls.shape), -torque, torque)
-        step = polish._Step(problem, problem.simulate(u), multipliers, weights, nothing)
-        assert step.found.violation > 1e-3
-        step.solve(np.inf)
-        low, high = step.pressing
-        assert not (low & high).any()
-        reached += int((low | high).sum())
-        for length in (1.0, 0.5, 0.25, 0.0):
-            after = step.after(trials, length)
-            # A whole one moves the controls by newtons, and the model knows no curvature of the constraints.
-            assert after.found.violation <= (1.5 if length == 1.0 else 0.01) * step.found.violation
-            if length == 1.0:
-                np.testing.assert_array_equal(after.motion.u[low], -torque)
-                np.testing.assert_array_equal(after.motion.u[high], torque)
-    assert reached > 8
-
-
-RATE, GOAL = 1000.0, [2.5, 0.0, -2.2]
-
-
-def goal_within_rates():
-    """The rounds end a little beyond a goal and limits of rates; there is a motion within them."""
-    robot = vp.planar_chain(4)
-    return vp.OptimalControlProblem(
-        vp.Scene(robot, damping=0.3),
-        vp.ControlCost(1e-3) + vp.Terminal(vp.VelocityCost(5.0)),
-        [1.2, 0.1, 0.1, 0.1],
-        np.zeros(4),
-        dt=0.03,
-        steps=32,
-        control_limits=(-50.0, 50.0),
-        integrator=vp.Midpoint(),
-        constraints=[vp.ReachFrame(robot, "tip", position=GOAL), vp.WithinControlRate(RATE)],
-    )
-
-
-def test_what_is_left_of_a_violation_does_not_show_that_there_is_no_plan(monkeypatch):
-    """There is one, but a last step does not find it, and the rounds end a hair beyond the limits."""
-
-    def failed(*_):
-        raise vp.LinearizationError(0, 0.0, "no derivative")
-
-    monkeypatch.setattr("varpin.control.augmented.polished", failed)
-    monkeypatch.setattr("varpin.control.augmented._ROUNDS", 5)
-    plan = vp.solve(goal_within_rates(), check=False)
-    bound = plan.problem.bound_constraints
-    assert plan.violation > 1e-6
-    assert all(told.violation <= 1e-3 * item.scale for told, item in zip(plan.constraints, bound, strict=True))
-    assert plan.status is vp.Status.STALLED
-    assert naming([plan.reason], "stays violated", f"{plan.violation:.1e}")
-
-
-def test_a_last_step_ends_with_the_time(monkeypatch):
-    """With many rows between nodes it took longer than the search."""
-    problem, solved = two_links(FAMILIES["velocities"]), []
-    plan = vp.solve(problem, tolerance=1e-3, check=False)
-    solve = polish._Step.solve
-    monkeypatch.setattr(polish._Step, "solve", lambda step, until: solved.append(step) or solve(step, until))
-    bound = problem.bound_constraints
-    zeros, weights = [np.zeros(item.shape) for item in bound], plan.multipliers.weights
-    motion = problem.simulate(plan.controls * 1.01)
-    for until, ends in ((0.0, True), (np.inf, False)):
-        solved.clear()
-        found = polish.polished(problem, motion, split(bound, plan.multipliers.values), weights, zeros, until)
-        assert (len(solved) == 0) is ends
-        assert (found.motion is motion) is ends
 
 
 @pytest.mark.parametrize("torque", [1e-6, 1e-3])
@@ -353,16 +158,6 @@ def test_a_file_of_other_constraints_is_refused_in_few_words(tmp_path):
     assert len(str(error.value)) < 600
 
 
-def test_a_round_that_was_cut_is_as_long_as_one_that_was_not(monkeypatch):
-    """A round ends after so many iterations, those before the cut included."""
-    monkeypatch.setattr("varpin.control.augmented._OF_ROUND", 4)
-    problem = two_links(FAMILIES["velocities"], steps=20)
-    whole = vp.solve(problem, max_iterations=9, check=False)
-    part = vp.solve(problem, max_iterations=2, check=False)
-    rest = vp.solve(problem, resume=part, max_iterations=7, check=False)
-    assert rest.trajectory.q.tobytes() == whole.trajectory.q.tobytes()
-
-
 def test_centres_that_move_are_compared_by_where_they_are():
     """In another process the same function has another address."""
 
@@ -407,23 +202,6 @@ def test_jacobians(name):
         slope = (bound.value(q + e, v, u) - bound.value(q - e, v, u)) / 2e-6
         np.testing.assert_allclose(J[:, :, c], slope, atol=1e-8)
     assert not J[:, :, 6:].any()
-
-
-def test_penalties_gradient():
-    """The augmented Lagrangian's gradient against differences of its value."""
-    problem = two_links(FAMILIES["two"], steps=6)
-    rng = np.random.default_rng(0)
-    bound = problem.bound_constraints
-    given = [0.1 * rng.random(item.shape) for item in bound]
-    whole = penalized(problem, given, np.array([3.0, 0.01]), [np.zeros(item.shape) for item in bound])
-    u = rng.normal(size=(6, 2))
-    # Where steps are next to nothing, the cost to go is that of the motion itself.
-    found = backward(whole, whole.simulate(u), 1e9).gradient
-    for i in np.ndindex(u.shape):
-        e = np.zeros_like(u)
-        e[i] = 1e-5
-        slope = (whole.cost_of(whole.simulate(u + e)) - whole.cost_of(whole.simulate(u - e))) / 2e-5
-        assert slope == pytest.approx(found[i], abs=1e-5 * np.abs(found).max())
 
 
 def test_what_is_refused():
@@ -685,23 +463,6 @@ def test_scene_files(tmp_path):
         vp.load_scene(path)
 
 
-@pytest.mark.parametrize("steps", [8, 9])
-@pytest.mark.parametrize("noise", [vp.ControlNoise(0.05), vp.StateNoise(0.5)], ids=["control", "state"])
-def test_noise_that_depends_on_the_motion_does_not_move_a_plan_within_constraints(noise, steps):
-    """The motion is the one without noise; feedback and cost of the noise are those of the plain problem there."""
-    bounds = FAMILIES["velocities"]
-    still = vp.solve(two_links(bounds, steps=steps), check=False)
-    scene = vp.Scene(ROBOT, damping=0.1, noise=noise)
-    plan = vp.solve(two_links(bounds, steps=steps, scene=scene), noise="whole")
-    assert plan.status is vp.Status.CONVERGED, plan.reason
-    np.testing.assert_allclose(plan.controls, still.controls, rtol=0, atol=1e-6 * np.abs(still.controls).max())
-    free = two_links(steps=steps, scene=scene)
-    along = backward(free, plan.trajectory, 0.0).noise
-    assert plan.noise_cost == pytest.approx(along, rel=1e-9)
-    assert plan.noise_cost > 0.0
-    assert about(plan.warnings, "noise left out")
-
-
 @pytest.mark.parametrize("family", ["velocities", "positions"])
 @pytest.mark.parametrize(("damping", "fast"), [(200.0, True), (0.2, False)])
 def test_a_margin_of_velocities_under_fast_damping_is_told_of(family, damping, fast):
@@ -936,30 +697,6 @@ def test_a_motion_with_feedback_that_runs_away_is_no_small_violation():
     assert replace(seen, constraints=()).violation == 0.0
 
 
-@pytest.mark.slow
-def test_margins_settle_where_noise_follows_the_controls():
-    """They are those of the plan at every node, or more; plain rounds end with half and twice as much, in turns."""
-    robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.02})
-    begin = np.array([0.0, -0.5, 0.0, -1.8, 0.0, 1.5, 0.5])
-    goal = begin + 0.4
-    scene = vp.Scene(robot, damping=0.5, noise=vp.ControlNoise(0.05))
-    cost = vp.ControlCost(1e-3, scene.holding_torque(begin)) + vp.TrackingCost(goal, 10.0)
-    cost += vp.Terminal(vp.TrackingCost(goal, 100.0) + vp.VelocityCost(1.0))
-    within = vp.WithinJointLimits(robot, (begin - 0.3, goal - 0.1), margin=2.0)
-    grid = {"dt": 0.05, "steps": 20}
-    problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(7), constraints=[within], **grid)
-    plan = vp.solve(problem)
-    assert plan.status is vp.Status.CONVERGED, plan.reason
-    (bound,) = problem.bound_constraints
-    own = deviations(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains), bound)
-    assert (plan.multipliers.backoff.reshape(own.shape) >= 0.98 * 2.0 * own).all()
-    # The bound most often violated, by one path in 44 as promised, is no longer so by one in five.
-    assert not about(plan.warnings, "small margin")
-    options = {"controls": plan.policy, "integrator": problem.integrator}
-    found = vp.simulate_ensemble(scene, begin, np.zeros(7), paths=1000, rng=1, **grid, **options)
-    assert (found.q > goal - 0.1).mean(axis=0).max() < 0.05
-
-
 def test_linear_algebra_has_one_thread_within_constraints():
     """Of several plans at a time on one machine, each would take many times as long; afterwards it is as before."""
     problem, seen = two_links(FAMILIES["velocities"], steps=10), []
@@ -989,21 +726,3 @@ def test_linear_algebra_has_one_thread_until_the_last_of_several_searches_ends()
         assert threads() == {1}
         second.close()
         assert threads() == before
-
-
-def test_rows_are_gathered_by_their_steps():
-    """Several places in a step, steps without any, and rows without weight: the sums over each step are the same."""
-    rng, steps = np.random.default_rng(8), np.array([1, 1, 3, 4])
-    J, values = rng.normal(size=(4, 3, 5)), rng.normal(size=(4, 3))
-    weights = rng.random((4, 3)) * (rng.random((4, 3)) < 0.6)
-    slopes, pull, weighed = _by_step(steps, 6, J, weights, values)
-    gradient, hessian = np.zeros((6, 5)), np.zeros((6, 5, 5))
-    for k, step in enumerate(steps):
-        for row, weight, value in zip(J[k], weights[k], values[k], strict=True):
-            gradient[step] += weight * value * row
-            hessian[step] += weight * np.outer(row, row)
-    assert slopes.shape[2] == np.bincount(steps, (weights > 0.0).sum(axis=1)).max()
-    np.testing.assert_allclose((slopes @ (weighed * pull)[:, :, None])[:, :, 0], gradient, atol=1e-14)
-    np.testing.assert_allclose(slopes @ (weighed[:, :, None] * np.swapaxes(slopes, 1, 2)), hessian, atol=1e-14)
-    none, _, _ = _by_step(steps, 6, J, np.zeros((4, 3)), values)
-    assert none.shape == (6, 5, 0)

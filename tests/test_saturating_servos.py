@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 
 import varpin as vp
-from varpin.control import search
 from varpin.control.along import Along
-from varpin.control.backward import backward
-from varpin.errors import LinearizationError
 from varpin.simulation.spectrum import rate_at_rest
 
 GOAL = np.array([1.0, -0.7])
@@ -84,12 +81,6 @@ def demands_differentiated(problem, motion, u, j):
     return J.T @ J
 
 
-def test_squares_of_changes_of_demands(plan):
-    problem, motion, j = plan.problem, plan.trajectory, 7
-    expected = demands_differentiated(problem, motion, motion.u[j : j + 1], j)
-    np.testing.assert_allclose(Along(problem, motion).demands[j], expected, rtol=1e-6, atol=1e-6)
-
-
 def test_linear_controls_at_the_limits_of_drives():
     """By first derivatives alone 200 iterations are not enough."""
     found = vp.solve(reach(35.0, controls="linear"), check=False, max_iterations=100)
@@ -112,30 +103,3 @@ def test_dampers_of_servos_count_where_the_arm_begins():
     found = vp.OptimalControlProblem(scene, cost, begin, np.zeros(2), dt=0.02, steps=40)
     assert 0.02 * rate > 10.0
     assert found.integrator == vp.Radau(4)
-
-
-def test_a_search_does_not_return_to_where_it_cannot_linearize(monkeypatch, tmp_path):
-    """Full steps lead to motions without derivatives; under more and more regularization they end before those."""
-    scene = vp.Scene(vp.planar_chain(2), gravity=False)
-    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(GOAL, 1e3) + vp.VelocityCost(10.0))
-    problem = vp.OptimalControlProblem(scene, cost, np.zeros(2), np.zeros(2), dt=0.02, steps=40)
-    most = 0.5 * np.abs(vp.solve(problem, check=False, max_iterations=1).controls).max()
-
-    def refusing(problem, motion, *others, **options):
-        if np.abs(motion.u).max() > most:
-            raise LinearizationError(0, 0.0, "a step has no derivative")
-        return backward(problem, motion, *others, **options)
-
-    monkeypatch.setattr(search, "backward", refusing)
-    found = vp.solve(problem, check=False, max_iterations=12)
-    assert np.abs(found.controls).max() <= most
-    assert found.cost < 0.5 * problem.cost_of(problem.simulate(np.zeros(2)))
-    # A search that has just gone back goes on from a file as it would have.
-    begun = vp.solve(problem, check=False, max_iterations=2)
-    assert begun.search.returned
-    read = vp.Solution.load(begun.save(tmp_path / "plan.npz"), problem)
-    assert read.search.returned
-    resumed = vp.solve(problem, resume=read, check=False, max_iterations=10)
-    assert [(row.cost, row.regularization) for row in resumed.history] == [
-        (row.cost, row.regularization) for row in found.history
-    ]

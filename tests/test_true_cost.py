@@ -1,7 +1,6 @@
 """Plans to a wished true cost."""
 
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +9,7 @@ from naive import continuous
 from refusals import naming, refused, unnamed
 
 import varpin as vp
-from varpin.control.refinement import refine
-from varpin.control.refinement_within import Warm, refine_within
-from varpin.control.steps_tried import halved, start_of
+from varpin.control.steps_tried import halved
 
 
 def reach(steps: int, controls: str = "held", **options: object) -> vp.OptimalControlProblem:
@@ -75,68 +72,6 @@ def test_halvings_go_on_until_they_resolve_the_dampers() -> None:
     )
     above = last.true_cost / fine.cost - 1.0
     assert above <= last.excess <= 1.5 * above
-
-
-@pytest.mark.parametrize(("wish", "halvings"), [(0.2, 0), (0.02, 2)])
-def test_searches_that_end_early_are_finished_with_the_last_step(wish: float, halvings: int) -> None:
-    """Held controls cost 14, 3 and 1 % more with 3, 6 and 12 nodes: only the accepted plan needs to converge."""
-    finished = []
-
-    def some(problem: vp.OptimalControlProblem, start: object, iterations: int) -> vp.Solution:
-        resumed = {"resume": start} if isinstance(start, vp.Solution) else {"controls": start}
-        return vp.solve(problem, **resumed, max_iterations=iterations, tolerance=1e-5, check=False)
-
-    def finish(problem: vp.OptimalControlProblem, start: object) -> vp.Solution:
-        finished.append(problem.steps)
-        return some(problem, start, 100)
-
-    def few(problem: vp.OptimalControlProblem, start: object) -> vp.Solution:
-        return some(problem, start, 5 if start is None else 1)
-
-    plan = refine(reach(3), few, wish, lambda: np.inf, few, finish)
-    assert plan.refinement.met
-    assert plan.status.converged
-    steps = plan.problem.steps
-    assert steps == 3 * 2**halvings
-    assert set(finished) <= {steps}
-    assert plan.cost == pytest.approx(vp.solve(reach(steps), check=False).cost, rel=1e-4)
-
-
-def test_a_search_that_half_the_step_does_not_help_is_finished() -> None:
-    """Models of limited controls promise decreases that searches of few iterations do not reach on any grid."""
-
-    def creep(problem: vp.OptimalControlProblem, start: object) -> vp.Solution:
-        plan = vp.solve(problem, start, max_iterations=1 if start is None else 0, check=False)
-        last = plan.history[-1]
-        if last.expected_decrease > 0.01 * plan.cost:
-            last = replace(last, expected_decrease=plan.cost * problem.steps / 100)
-        return replace(plan, status=vp.Status.MAX_ITERATIONS, history=(*plan.history[:-1], last))
-
-    def finish(problem: vp.OptimalControlProblem, start: vp.Solution) -> vp.Solution:
-        return vp.solve(problem, start, tolerance=1e-5, check=False)
-
-    found = refine(reach(12), creep, 0.05, lambda: np.inf, creep, finish).refinement
-    assert found.met
-    assert [row.status.converged for row in found.tried] == [False, True]
-
-
-def test_slow_progress_ends_the_searches_of_coarse_steps() -> None:
-    """The swing-up by the elbow creeps with 20 nodes, and half the step leads on."""
-    up, down = np.array([-np.pi / 2, 0.0]), np.array([np.pi / 2, 0.0])
-    cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
-    cost += vp.Terminal(vp.TrackingCost(up, 1e3) + vp.VelocityCost(1e2))
-    scene = vp.Scene(vp.planar_chain(2), actuation=["joint2"], damping=0.02)
-    limits = (-8.0, 8.0)
-    problem = vp.OptimalControlProblem(scene, cost, down, np.zeros(2), dt=0.2, steps=20, control_limits=limits)
-    plan = vp.solve(problem, true_cost=0.01, check=False)
-    first = plan.refinement.tried[0]
-    assert first.status is vp.Status.MAX_ITERATIONS
-    assert first.iterations < 100
-    assert plan.refinement.met
-    assert plan.status.converged
-    finer = plan.problem.at(dt=plan.problem.dt / 2)
-    fine = vp.solve(finer, start_of(finer, plan), check=False)
-    assert plan.refinement.tried[-1].true_cost <= 1.01 * fine.cost
 
 
 def test_a_warm_start_is_the_plan_before() -> None:
@@ -334,45 +269,6 @@ def test_an_interrupted_comparison_keeps_the_plan() -> None:
     assert [row.steps for row in plan.refinement.tried] == [3]
     assert plan.violation <= 1e-9
     assert plan.cost == pytest.approx(first.cost, rel=1e-6)
-
-
-@pytest.mark.parametrize("status", [vp.Status.STALLED, vp.Status.INFEASIBLE])
-def test_comparisons_that_fail_prove_nothing(status: vp.Status) -> None:
-    """Half the step is not cheaper only if its search has converged within the constraints."""
-    coarse = vp.solve(goal_problem(), check=False)
-
-    def search(problem: vp.OptimalControlProblem, start: Warm | None) -> vp.Solution:
-        if start is None:
-            return coarse
-        plan = vp.solve(problem, start.controls, check=False)
-        return replace(plan, status=status, cost=2.0 * plan.cost)
-
-    plan = refine_within(goal_problem(), search, 0.5, lambda: np.inf)
-    found = plan.refinement
-    assert not found.met
-    assert plan.cost == coarse.cost
-    assert [row.excess for row in found.tried] == [np.inf] * len(found.tried)
-    assert len(found.tried) <= 4
-
-
-def test_interrupted_before_a_motion_is_made() -> None:
-    """Ctrl-C ends the call where there is no plan yet, and returns the best plan where there is one."""
-    coarse = vp.solve(reach(3), check=False)
-    for plans in ([], [coarse]):
-        left = list(plans)
-
-        def search(problem: vp.OptimalControlProblem, start: object, left: list = left) -> vp.Solution:
-            if not left:
-                raise KeyboardInterrupt
-            return left.pop()
-
-        if not plans:
-            with pytest.raises(KeyboardInterrupt):
-                refine(reach(3), search, 1e-12, lambda: np.inf, search, search)
-            continue
-        found = refine(reach(3), search, 1e-12, lambda: np.inf, search, search)
-        assert found.status is vp.Status.INTERRUPTED
-        assert found.cost == coarse.cost
 
 
 def test_the_default_integrator_is_chosen_on_each_grid() -> None:
