@@ -97,6 +97,7 @@ class SearchState:
         growth: Last factor of the regularization.
         first: Cost at stake on the first motion; -1 before it is known.
         counts: How often margins have been widened by counting motions.
+        second_order: Whether it uses second derivatives of the steps.
         iterations: Number of entries of the history that were made before.
     """
 
@@ -105,4 +106,5 @@ class SearchState:
     growth: float
     first: float
     counts: int
+    second_order: bool
     iterations: int

@@ -27,7 +27,7 @@ from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.line_search import ARMIJO, BACKTRACKING, Lengths
 from varpin.control.linear_controls import widened as widened_curvature
 from varpin.control.margins import widened
-from varpin.control.multipliers import FEASIBLE, REPORTED, Multipliers, flat, split
+from varpin.control.multipliers import FEASIBLE, Multipliers, flat, split
 from varpin.control.passes import Plan, foreseen, noise_shares, single_pass
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.qp import Minimum, Program
@@ -43,6 +43,7 @@ from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.noise import NoiseFieldError
 from varpin.simulation.failures import StepFailure, named
+from varpin.simulation.limits import saturates
 from varpin.simulation.record import located
 from varpin.trajectory import Trajectory
 
@@ -71,10 +72,9 @@ _STAYS = 1e-6
 _CORRECTIONS = 2
 # Decrease, as a share of the cost at stake, from which on rows between nodes and margins are looked at.
 _CLOSE = 1e-3
-# Violation between nodes from which a row is added where the problem asks for them.
-_BETWEEN = 1e-6
-# Share of the violation between nodes at which rows begin that is left in the end.
-_CLOSER = 0.1
+# Violation between nodes from which rows are added: where the problem asks for them, and in tenths of a constraint's
+# range with linear controls, which lead around nodes.
+_BETWEEN, _SHARE = 1e-6, 1e-3
 # How often margins are widened by counting motions.
 _COUNTS = 3
 # How often rows between nodes may follow the motion at its end.
@@ -208,6 +208,7 @@ class Search:
         self._move(plan.trajectory, self.problem.shares(plan.trajectory))
         self.weight, self.first, self.counts = state.weight, state.first, state.counts
         self.regularization, self.growth = state.regularization, state.growth
+        self.second_order = self.second_order or state.second_order
         self.history = list(plan.history[: state.iterations])
         if known is not None:
             self.take(known)
@@ -296,7 +297,9 @@ class Search:
         self._excess: list[Floats] = []
 
     def _state(self) -> SearchState:
-        return SearchState(self.weight, self.regularization, self.growth, self.first, self.counts, len(self.history))
+        return SearchState(
+            self.weight, self.regularization, self.growth, self.first, self.counts, self.second_order, len(self.history)
+        )
 
     def _next_step(self) -> bool:
         """Make the step of the motion, with more regularization where there is none; whether there is one."""
@@ -308,6 +311,9 @@ class Search:
     def _made(self) -> bool:
         """Make the feedback and the step of the motion with the present regularization; whether there is one."""
         problem, along = self.problem, self.along
+        if self.regularization > 0.0 and not self.second_order and self._is_saturated():
+            self.second_order = True
+            logger.info("%s: servos are at the limits of their drives: second derivatives from now on", self.label)
         curvature = curvature_along(along, self._costates()) if self.second_order else None
         # Within limits and rows the regularization is a cost of the quadratic program, whose model stays exact.
         free = not (self.bound or problem.limited)
@@ -345,6 +351,13 @@ class Search:
             least[0], most[0] = (np.where(np.isnan(given), part[0], 0.0) for part in (least, most))
         self.program = Program(stages, rows, (least, most), plan, self.regularization)
         return self._solve_program()
+
+    def _is_saturated(self) -> bool:
+        """Whether drives of servos are at their limits, and there are the second derivatives that tell of it."""
+        scene = self.problem.scene
+        smooth = scene.custom is None and not scene.constraints and not scene.noise.velocity_dependent
+        exists = smooth and self.problem.integrator.variational and not self.tick
+        return exists and saturates(scene, self.trajectory)
 
     def _pass(self, regularization: float, curvature: Floats | None = None) -> Plan | None:
         return single_pass(self.along, regularization, curvature=self._wide(curvature))[0]
@@ -539,9 +552,8 @@ class Search:
         count = len(problem.bound_constraints)
         backoff = self.backoff[:count]
         left = beyond(looked, backoff)
-        share = REPORTED * (_CLOSER if len(self.between.rows) else 1.0)
         bounds = np.array(
-            [_BETWEEN if problem.between_nodes else share * item.scale for item in problem.bound_constraints]
+            [_BETWEEN if problem.between_nodes else _SHARE * item.scale for item in problem.bound_constraints]
         )
         if not (left > bounds).any():
             return False
