@@ -298,7 +298,13 @@ class Search:
 
     def _state(self) -> SearchState:
         return SearchState(
-            self.weight, self.regularization, self.growth, self.first, self.counts, self.second_order, len(self.history)
+            weight=self.weight,
+            regularization=self.regularization,
+            growth=self.growth,
+            first=self.first,
+            counts=self.counts,
+            second_order=self.second_order,
+            iterations=len(self.history),
         )
 
     def _next_step(self) -> bool:
