@@ -128,12 +128,14 @@ def test_feedback_holds_a_disturbed_start(name: str) -> None:
     assert np.isfinite(plan.gains).all()
 
 
-@pytest.mark.parametrize("name", ["noise of constant strength", "noise of the controls"])
+@pytest.mark.parametrize(
+    "name", ["noise of constant strength", "noise of the controls", "noise of the controls, torques"]
+)
 def test_noise_costs_what_motions_under_noise_cost(name: str) -> None:
     plan = SMALL[name].plan
     found = plan.monte_carlo(4000, rng=0)
     assert plan.noise_cost > 0.1 * plan.cost
-    # The model is of second order in the noise.
+    # The model is of second order in the noise, and controls at limits have no feedback.
     assert abs(found.cost - plan.expected_cost) <= 4.0 * found.standard_error + 0.05 * plan.noise_cost
 
 
@@ -349,7 +351,7 @@ def test_any_start_leads_to_a_plan(name: str, alone: bool) -> None:
         plan = vp.solve(case.problem, check=False, **options)
         assert plan.status is vp.Status.CONVERGED, start
         assert violation(case.problem, plan.trajectory, plan.controls) <= MET
-        if alone or start not in ("zero", "rows"):
+        if alone or start in ("a plan", "a policy"):
             assert plan.cost <= (1.0 + ABOVE) * case.cost, start
 
 

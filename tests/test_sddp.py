@@ -150,7 +150,7 @@ def run(problem, controls):
 def test_riccati_with_multiplicative_noise(integrator):
     """One step solves it; gains and expected cost are those of the recursion by hand."""
     problem = lq_problem(integrator, "start", vp.AdditiveNoise(0.2) + vp.ControlNoise(0.5))
-    sol = vp.solve(problem, noise="held")
+    sol = vp.solve(problem)
     motion, plain = sol.trajectory, Plain(problem.scene, problem.dt, integrator)
     # The discretization by hand is that of the library.
     x = np.hstack([motion.q, motion.p if integrator.variational else motion.v])
