@@ -1,10 +1,10 @@
 """The gradient of an expected cost the slow way, by differences of the total."""
 
 import numpy as np
+from varpin.control.backward import backward
 
 import varpin as vp
 from varpin.control.along import Along
-from varpin.control.backward import backward
 from varpin.control.spread import Feedback
 
 

@@ -29,7 +29,7 @@ class Case:
         options: Of :func:`varpin.solve`.
         kkt: What may be left of the Lagrangian's gradient (:func:`oracles.kkt`); None where that is not looked at.
         scipy: Whether SciPy's SLSQP is to find the same least cost from the first controls.
-        within: The largest violation within steps; None where constraints hold at nodes alone.
+        within: The largest violation within steps: a thousandth of the range, with ``between_nodes`` a tenth of that.
     """
 
     build: Callable[[], vp.OptimalControlProblem]
@@ -139,7 +139,7 @@ SMALL: dict[str, Case] = {
     "held over 3 steps": Case(lambda: reach(speeds(2.2), dt=0.03, steps=24, hold=3, **LIMITS), 9.465277, scipy=True),
     "held over 2 steps, rates": Case(lambda: reach(vp.WithinControlRate(110.0), dt=0.03, steps=24, hold=2), 2.1258071),
     "held, between nodes": Case(
-        lambda: reach(speeds(1.8), between_nodes=True, dt=0.09, steps=8), 3.5974214, kkt=None, within=1e-4
+        lambda: reach(speeds(1.8), between_nodes=True, dt=0.09, steps=8), 3.5974214, kkt=None, within=3.6e-4
     ),
     "held, sphere between nodes": Case(
         lambda: reach(vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3), between_nodes=True, dt=0.09, steps=8),
@@ -153,27 +153,27 @@ SMALL: dict[str, Case] = {
     "linear, change of controls": Case(
         lambda: reach(more=vp.ControlRateCost(1e-4, before=[14.0, 4.0]), controls="linear", **LIMITS), 4.2462364
     ),
-    "linear, speeds": Case(lambda: reach(speeds(1.8), controls="linear"), 3.5263477, kkt=None, within=1e-4),
+    "linear, speeds": Case(lambda: reach(speeds(1.8), controls="linear"), 3.5263477, kkt=None, within=3.6e-3),
     "linear, speeds and torques": Case(
-        lambda: reach(speeds(2.2), controls="linear", **LIMITS), 9.1274867, kkt=None, within=1e-4
+        lambda: reach(speeds(2.2), controls="linear", **LIMITS), 9.1274867, kkt=None, within=4.4e-3
     ),
     "linear, joints": Case(
         lambda: reach(vp.WithinJointLimits(TWO, (-0.05, [0.9, 2.0])), controls="linear"),
         3.6565019,
         kkt=None,
-        within=1e-4,
+        within=1e-3,
     ),
     "linear, out of a sphere": Case(
         lambda: reach(vp.KeepOutOfSphere(TWO, "tip", [1.3, 0.0, -1.3], 0.3), controls="linear"),
         31.86263,
         kkt=None,
-        within=1e-4,
+        within=1e-3,
     ),
     "linear, clear of a ball": Case(
         lambda: reach(vp.KeepClear(TWO, [BALL], 0.05, capsules=CAPSULES), controls="linear"),
         39.999934,
         kkt=None,
-        within=1e-4,
+        within=1e-3,
     ),
     "three links": Case(
         lambda: wave(control_limits=(-12.0, 12.0)), 9.6697064, options={"tolerance": 1e-10}, kkt=1e-4, scipy=True
@@ -188,10 +188,12 @@ SMALL: dict[str, Case] = {
         lambda: reach(speeds(1.8), integrator=vp.SemiImplicitEuler(), sampling="midpoint"), 3.5644662
     ),
     "noise of constant strength": Case(lambda: reach(scene=noisy(vp.AdditiveNoise(0.3))), 6.1839502),
+    "noise of the controls": Case(lambda: reach(scene=noisy(vp.ControlNoise(0.03))), 2.7760496, kkt=None),
     "noise of the controls, torques": Case(
-        lambda: reach(scene=noisy(vp.ControlNoise(0.1)), **LIMITS), 13.851085, kkt=None
+        lambda: reach(scene=noisy(vp.ControlNoise(0.03)), control_limits=([-24.0, -8.0], [24.0, 8.0])),
+        3.5740886,
+        kkt=None,
     ),
-    "noise of the controls": Case(lambda: reach(scene=noisy(vp.ControlNoise(0.1))), 5.4958273, kkt=None),
 }
 
 
@@ -300,7 +302,7 @@ ARMS: dict[str, Case] = {
     "Z1, speeds, linear": Case(
         lambda: arm(*Z1, lambda r, *_: [vp.WithinVelocityLimits(r, (-0.45, 0.45))], controls="linear"),
         0.45452603,
-        within=1e-4,
+        within=9e-4,
     ),
 }
 # Those at the edge of what limits allow, where feedback has no room.

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from expected_cost import expected_cost_slopes
 from findings import about
+from varpin.control.backward import backward
 
 import varpin as vp
-from varpin.control.backward import backward
 from varpin.control.moments import left_within_steps, noise_cost, noise_cost_in_halves
 from varpin.control.spread import Feedback, covariances
 from varpin.integrators.base import diffusion_and_drift

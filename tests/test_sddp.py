@@ -148,7 +148,7 @@ def run(problem, controls):
 def test_riccati_with_multiplicative_noise(integrator):
     """One step solves it; gains and expected cost are those of the recursion by hand."""
     problem = lq_problem(integrator, "start", vp.AdditiveNoise(0.2) + vp.ControlNoise(0.5))
-    sol = vp.solve(problem, noise="held")
+    sol = vp.solve(problem)
     motion, plain = sol.trajectory, Plain(problem.scene, problem.dt, integrator)
     # The discretization by hand is that of the library.
     x = np.hstack([motion.q, motion.p if integrator.variational else motion.v])
@@ -159,18 +159,6 @@ def test_riccati_with_multiplicative_noise(integrator):
     assert sol.expected_cost == pytest.approx(value, rel=1e-10)
     assert sol.noise_cost > 0.02 * value
     np.testing.assert_allclose(sol.gains, policies[:, :, :-1], rtol=0, atol=1e-10 * np.abs(policies).max())
-
-
-def test_additive_noise_does_not_change_the_plan_of_an_arm():
-    """In (q, p) a kick does not depend on the state; in (q, v) it does, by the mass matrix."""
-    quiet, noisy = (
-        vp.solve(arm_problem("ur5", vp.Midpoint(), noise=noise, steps=40), tolerance=1e-13)
-        for noise in (None, vp.AdditiveNoise(0.3))
-    )
-    np.testing.assert_allclose(noisy.controls, quiet.controls, rtol=0, atol=1e-10 * np.abs(quiet.controls).max())
-    np.testing.assert_allclose(noisy.gains, quiet.gains, rtol=0, atol=1e-10 * np.abs(quiet.gains).max())
-    assert noisy.cost == pytest.approx(quiet.cost, rel=1e-13)
-    assert noisy.noise_cost > 0.1 * quiet.cost
 
 
 def test_line_search_is_on_the_expected_cost():
@@ -408,30 +396,6 @@ def slopes(values, ratio):
     return [np.log(a / b) / np.log(ratio) for a, b in pairwise(moved)]
 
 
-def middle_gains(problem, sol, k):
-    """Feedback of step k on the state in its middle, to which the control belongs: to first order (x + x') / 2."""
-    lin = vp.linearize(problem.scene, sol.trajectory, integrator=problem.integrator)
-    return sol.gains[k] @ np.linalg.inv(0.5 * (np.eye(12) + lin.A[k] + lin.B[k] @ sol.gains[k]))
-
-
-def test_plans_converge_with_the_square_of_dt():
-    """Cost, controls and gains in the middle of the horizon, which is in the middle of a step for odd N."""
-    costs, controls, gains, at_nodes = [], [], [], []
-    for steps in (21, 63, 189):
-        problem = reach_problem(0.48 / steps)
-        sol = vp.solve(problem, tolerance=1e-12)
-        assert sol.status is vp.Status.CONVERGED
-        costs.append(sol.cost)
-        controls.append(sol.controls[steps // 2])
-        gains.append(middle_gains(problem, sol, steps // 2))
-        at_nodes.append(sol.gains[steps // 2])
-    assert slopes(costs, 3)[0] > 1.9
-    assert slopes(controls, 3)[0] > 1.9
-    assert slopes(gains, 3)[0] > 1.9
-    # On the state at the start of a step they know that the control will be held: first order, whatever the method.
-    assert slopes(at_nodes, 3)[0] < 1.3
-
-
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.RungeKutta4()], ids=str)
 def test_sampled_data_plans_converge_with_the_square_of_dt(integrator):
     """Controls held over 40 ms, steps of 10 to 2.5 ms: everything that a user gets converges."""
@@ -556,10 +520,12 @@ def test_idle_actuator():
     np.testing.assert_array_equal(sol.controls[:, 1], 0.7)
 
 
-def test_an_optimum_that_costs_nothing():
-    sol = vp.solve(small(vp.TrackingCost([0.3, 0.1]) + vp.ControlCost(1.0)), controls=[1.0, -1.0])
+def test_heavy_regularization_is_not_mistaken_for_an_optimum():
+    best = vp.solve(small())
+    sol = vp.solve(small(), regularization=1e12)
     assert sol.status is vp.Status.CONVERGED
-    assert sol.cost < 1e-15
+    assert sol.cost == pytest.approx(best.cost, rel=1e-6)
+    assert vp.solve(small(), regularization=1e12, max_iterations=0).status is vp.Status.MAX_ITERATIONS
 
 
 def test_first_motion_that_cannot_be_integrated():
@@ -589,43 +555,6 @@ def test_cost_that_is_not_finite():
     assert np.isfinite(sol.cost)
     assert sol.cost < vp.solve(problem, max_iterations=0).cost
     assert sol.trajectory.q[:, 0].max() <= 0.8
-
-
-def test_history_and_callback():
-    seen = []
-    sol = vp.solve(reach_problem(0.02), callback=seen.append)
-    assert tuple(seen) == sol.history
-    assert [item.index for item in seen] == list(range(len(seen)))
-    costs = [item.cost for item in seen]
-    assert costs == sorted(costs, reverse=True)
-    assert costs[-1] == sol.cost
-    assert all(item.backward_passes >= 1 and item.seconds > 0.0 for item in seen)
-    assert sol.iterations == sum(item.rollouts > 0 for item in seen)
-    assert seen[-1].gradient == np.abs(sol.gradient).max()
-    lines = sol.table().splitlines()
-    assert lines[0].split() == [
-        "iter",
-        "cost",
-        "noise",
-        "cost",
-        "expected",
-        "decrease",
-        "grad",
-        "reg",
-        "step",
-        "rollouts",
-    ]
-    assert all(len(line) == len(lines[0]) for line in lines[: len(seen) + 1])
-    assert lines[len(seen) + 1 :] == [sol.status.value, f"({sol.reason})"]
-    for column in ("cost", "noise cost", "expected", "decrease", "grad", "reg", "step", "rollouts"):
-        assert f"\n    {column:11}" in vp.Solution.__doc__
-    # Without noise what a step brings is the difference of two motions' costs.
-    assert [item.decrease for item in seen[1:]] == pytest.approx([a - b for a, b in pairwise(costs)])
-    assert seen[-1].decrease == 0.0
-    # On a linear-quadratic problem the promise is kept.
-    first = vp.solve(small(), max_iterations=1).history[0]
-    before = vp.solve(small(), max_iterations=0).cost
-    assert before - first.cost == pytest.approx(first.expected_decrease, rel=1e-9)
 
 
 def test_warm_starts():

@@ -138,17 +138,6 @@ def test_additive_noise_changes_no_plan(strength, grid):
     assert_same_search(quiet, noisy, rtol=1e-9)
 
 
-def test_additive_noise_changes_no_plan_that_is_not_finished():
-    for most in (1, 3, 6):
-        quiet = vp.solve(swing(40), max_iterations=most)
-        problem = swing(40)
-        scene = vp.Scene(problem.scene.robot, noise=vp.AdditiveNoise(100.0))
-        noisy = vp.OptimalControlProblem(
-            scene, problem.cost, problem.q0, problem.v0, dt=problem.dt, steps=40, **MIDPOINT
-        )
-        assert_same_search(quiet, vp.solve(noisy, max_iterations=most), rtol=1e-9)
-
-
 def test_additive_noise_hides_nothing_of_noise_that_controls_steer():
     one = vp.solve(reach(noise=vp.ControlNoise(0.1)))
     both = vp.solve(reach(noise=vp.ControlNoise(0.1) + vp.AdditiveNoise(300.0)))
