@@ -378,7 +378,9 @@ class Search:
         program, rows = self.program, self.rows
         values = [row.values for row in rows]
         bad = self._badness
-        found, self._elastic = program.minimum(values), False
+        # Regularization shortens steps only where rows may be missed.
+        self._elastic = bool(rows) and self.regularization > _LITTLE
+        found = None if self._elastic else program.minimum(values)
         if found is None and rows:
             self._elastic = True
             self.weight = max(self.weight, _ELASTIC * max(abs(self.cost), self.first))
