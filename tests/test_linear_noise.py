@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from expected_cost import expected_cost_slopes
 from findings import about
-from varpin.control.backward import backward
 
 import varpin as vp
+from varpin.control.along import Along
 from varpin.control.moments import left_within_steps, noise_cost, noise_cost_in_halves
+from varpin.control.passes import single_pass
 from varpin.control.spread import Feedback, covariances
 from varpin.integrators.base import diffusion_and_drift
 
@@ -35,29 +35,6 @@ def line(problem: vp.OptimalControlProblem, u: np.ndarray) -> vp.LinearPolicy:
     return vp.LinearPolicy(u[1:], np.zeros((N, m, 2 * n)), np.zeros((N, 2 * n)), before=u[0], linear=True)
 
 
-@pytest.mark.parametrize(
-    ("noise", "options"),
-    [
-        (CONTROL, {"integrator": vp.Gauss(2)}),
-        (CONTROL, {"integrator": vp.Midpoint(), "joints": 1}),
-        (CONTROL, {"integrator": vp.RungeKutta4(), "rate": 1e-2}),
-        (STATE, {"integrator": vp.Gauss(2, kick="split")}),
-        (CONTROL + STATE, {"integrator": vp.Gauss(2, kick="held")}),
-    ],
-)
-def test_the_gradient_is_that_of_the_expected_cost(noise: object, options: dict) -> None:
-    """By differences of the cost and the noise's share, each with a backward pass of its own."""
-    if options.get("joints") == 1:
-        noise = vp.ControlNoise(0.3)
-    problem = reach(noise, **options)
-    m = problem.scene.controls
-    u = 2.0 * np.random.default_rng(0).normal(size=(problem.decisions, m))
-
-    whole, found, held = expected_cost_slopes(problem, lambda controls: problem.simulate(line(problem, controls)), u)
-    np.testing.assert_allclose(whole, found, atol=5e-8 * np.abs(found).max())
-    assert np.abs(held - found).max() > 1e-5 * np.abs(found).max()
-
-
 @pytest.mark.parametrize("noise", [vp.AdditiveNoise(0.3), CONTROL + STATE, SLIDING])
 @pytest.mark.parametrize("kick", ["left", "split", "held"])
 def test_the_noise_cost_is_that_of_the_covariance(noise: object, kick: str) -> None:
@@ -65,7 +42,7 @@ def test_the_noise_cost_is_that_of_the_covariance(noise: object, kick: str) -> N
     weight = 1e-3
     problem = reach(noise, integrator=vp.Gauss(2, kick=kick), rate=weight)
     motion = problem.simulate(line(problem, np.random.default_rng(1).normal(size=(problem.decisions, 2))))
-    plan = backward(problem, motion, 0.0)
+    plan, _ = single_pass(Along(problem, motion), 0.0)
     feedback = Feedback(plan.feedback, plan.previous)
     lin, C, changes, x = vp.linearize(problem.scene, motion), np.zeros((6, 6)), 0.0, 4
     nodes = covariances(problem, motion, feedback)
@@ -136,13 +113,6 @@ def test_paths_cost_what_the_plan_expects(noise: object, integrator: vp.Integrat
     within = left_within_steps(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains))
     assert (within > 0.0) == integrator.holds_noise
     assert first.cost == pytest.approx(np.mean(again) + within, rel=1e-12)
-
-
-def test_plans_with_the_whole_gradient_end_lower() -> None:
-    problem = reach(vp.ControlNoise(0.6), steps=8, dt=0.05, integrator=vp.Gauss(2))
-    held = vp.solve(problem, tolerance=1e-9, check=False)
-    whole = vp.solve(problem, noise="whole", tolerance=1e-9, check=False)
-    assert whole.expected_cost < held.expected_cost
 
 
 def test_an_ensemble_stores_the_controls_of_lines() -> None:

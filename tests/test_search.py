@@ -116,18 +116,6 @@ def test_scaling_a_cost_changes_nothing(factor, most):
     assert other.cost == pytest.approx(factor * plain.cost, rel=1e-9)
 
 
-def test_constants_and_scales_change_nothing_where_a_search_stalls():
-    plain = vp.solve(swing(50))
-    assert plain.status is vp.Status.STALLED
-    problem = swing(50)
-    scale = 2.0**-20
-    cost = scale * problem.cost + constant(1e6)
-    other = vp.OptimalControlProblem(
-        problem.scene, cost, problem.q0, problem.v0, dt=problem.dt, steps=problem.steps, **MIDPOINT
-    )
-    assert_same_search(plain, vp.solve(other))
-
-
 @pytest.mark.parametrize("strength", [1.0, 1e3])
 @pytest.mark.parametrize("grid", ["midpoint", "gauss"])
 def test_additive_noise_changes_no_plan(strength, grid):
@@ -228,5 +216,4 @@ def test_a_given_first_control_stays_exactly_as_it_is(iterations):
     before = np.random.default_rng(0).uniform(-5.0, 5.0, 2)
     problem = swing_up(controls="linear", constraints=[vp.WithinControlRate(400.0, before=before)])
     plan = vp.solve(problem, max_iterations=iterations, check=False)
-    assert any(row.step == 2.0 for row in plan.history)
-    np.testing.assert_array_equal(plan.search.trajectory.u_nodes[0], before)
+    np.testing.assert_array_equal(plan.trajectory.u_nodes[0], before)

@@ -75,7 +75,7 @@ def test_forces_belong_to_the_problem(force, tmp_path):
     ("name", "change"),
     [
         ("history", lambda rows: rows + 0.5),
-        ("search.history", lambda count: -count),
+        ("search.iterations", lambda count: -1 - count),
         ("status", lambda _: "DONE"),
         ("cost", lambda cost: 1.1 * cost),
     ],

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin import core
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Mask
 from varpin.control.costs import CostError, Expansion
 from varpin.control.descent import Model, Stake, at_stake
 from varpin.control.linear_controls import (
@@ -42,11 +42,6 @@ def states(problem: OptimalControlProblem, trajectory: Trajectory) -> Floats:
     return np.concatenate((trajectory.q, second), axis=1)
 
 
-def without_limits(controls: int, states: int) -> tuple[Floats, Floats]:
-    """Slack and expected states of a pass without limits, as the core takes them."""
-    return np.zeros((0, 2, controls)), np.zeros((0, states + controls))
-
-
 class Along:
     """Expansions along a motion that all its passes share; the linearization is kept where it is one block."""
 
@@ -67,6 +62,7 @@ class Along:
             block = max(1, _BLOCK // problem.hold) * problem.hold
             self.blocks = [(max(0, end - block), end) for end in range(problem.steps, 0, -block)][::-1]
         self.kept: tuple[Linearization, Floats] | None = None
+        self.held: Mask | None = None  # which controls (R, m) passes keep as they are
         self.processes = problem.processes  # number of Wiener processes that passes take into account
 
     @cached_property
@@ -197,7 +193,7 @@ class Along:
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
         lin, velocity = self.linearized(begin, end)
-        slack, expected = without_limits(problem.scene.controls, self.states)
+        slack, expected = self._limits(rows)
         G, Gx, Gu, count = lin.G, lin.Gx, lin.Gu, self.processes
         if count < G.shape[2]:
             G, Gx, Gu = (np.ascontiguousarray(array[:, :, :count]) for array in (G, Gx, Gu))
@@ -219,9 +215,18 @@ class Along:
             within=None if self.within is None else self.within[begin:end],
         )
 
+    def _limits(self, rows: slice) -> tuple[Floats, Floats]:
+        """Slack (R, 2, m) that keeps controls which are held, and expected states, as the core takes them."""
+        m = self.problem.scene.controls
+        expected = np.zeros((0, self.states + m))
+        if self.held is None:
+            return np.zeros((0, 2, m)), expected
+        far = np.where(self.held[rows], 0.0, np.inf)
+        return np.ascontiguousarray(np.stack([-far, far], axis=1)), expected
+
     def _on_lines(self, curvature: Floats | None) -> core.ExpandedSteps:
         X, m = self.line.B.shape[1:]
-        slack, expected = without_limits(m, X)
+        slack, expected = self._limits(slice(None))
         return core.ExpandedSteps(
             A=self.line.A,
             B=self.line.B,

@@ -72,7 +72,7 @@ class Program:
         self._gradient = np.zeros(size)
         np.add.at(self._gradient, at[at >= 0], gradient[at >= 0])
         # The scale of the cost, to which the solver's residuals are relative.
-        self._scale = max(float(np.abs(gradient).max()), np.finfo(np.float64).tiny)
+        self._scale = float(np.abs(gradient).max()) or float(np.abs(hessian).max()) or 1.0
         k = np.arange(layout.stages)
         after, controls = layout.state(k + 1), layout.control(np.arange(len(plan.feedforward)))
         numbers = np.arange(after.size).reshape(after.shape)

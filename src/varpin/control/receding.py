@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,6 +19,9 @@ from varpin.control.search import Search
 from varpin.control.solution import Solution
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
+
+# Share of the violation of the plan before that a tick has to remove.
+_LOWERED = 0.9
 
 
 def replan(
@@ -47,7 +50,22 @@ def replan(
         status = search.run(tolerance, max_iterations, deadline, lambda *_: None)
     except KeyboardInterrupt:
         status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
-    return search.solution(status)
+    return _judged(search.solution(status), previous)
+
+
+def _judged(plan: Solution, before: Solution) -> Solution:
+    """The plan of a tick, INFEASIBLE where it violates a constraint clearly and no less than the plan before."""
+    if plan.status in (Status.INTERRUPTED, Status.INFEASIBLE) or not plan.constraints:
+        return plan
+    told = max(
+        zip(plan.constraints, plan.problem.bound_constraints, strict=True),
+        key=lambda pair: pair[0].violation / pair[1].scale,
+    )
+    report, bound = told
+    if report.violation <= max(REPORTED * bound.scale, _LOWERED * before.violation):
+        return plan
+    reason = f"{report.label} is violated by {report.violation:.3g} {report.unit}, {report.where}, no less than before"
+    return replace(plan, status=Status.INFEASIBLE, reason=reason)
 
 
 def _margins(problem: OptimalControlProblem, previous: Solution, known: Multipliers) -> Multipliers:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Mask
 from varpin.control.along import Along, states
 from varpin.control.between_nodes import NOWHERE, Instants, beyond, enforced, extended, seen, watched
 from varpin.control.constraints import BoundBetween, BoundConstraint
@@ -55,7 +55,7 @@ logger = logging.getLogger(__name__)
 TRIAL_ERRORS = (CostError, NoiseFieldError, CustomForceError, LinearizationError)
 # The schedule of the regularization (Tassa, Erez and Todorov 2012), relative to the diagonal of Quu: it falls after
 # long steps and rises after a very short one, or after two short ones in a row.
-_GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e10
+_GROWTH, _LEAST, _MOST = 2.0, 1e-6, 1e16
 _LONG, _SHORT, _VERY_SHORT = 0.25, 0.1, 0.01
 # Greatest regularization with which a search may converge. Controls without effect or cost need some.
 _LITTLE = 1e-4
@@ -68,6 +68,8 @@ _NOTHING = 1e-9
 _ABOVE, _ELASTIC = 1.5, 10.0
 # A violation has not fallen where a step removes no more than this share of it.
 _STAYS = 1e-6
+# Share of the violations that a search expects to remove at the end, up to which the constraints are to blame.
+_LITTLE_LESS = 1e-2
 # Corrections of a full step for the curvature of rows and dynamics.
 _CORRECTIONS = 2
 # Decrease, as a share of the cost at stake, from which on rows between nodes and margins are looked at.
@@ -90,6 +92,8 @@ _EARLY, _EXTENSION = 0.85, 4.0
 _AS_FORESEEN, _LENGTHS, _FAR, _FOLLOWS = 0.7, (1.0, 0.75, 0.5), 2.0, 0.8
 # Greatest number of substeps of a trial, relative to the motion.
 _SUBSTEPS = 4.0
+# Distance from a limit, relative to it, at which a control is at it: quadratic programs end inside their bounds.
+_AT_LIMIT = 1e-6
 # Relative rounding error of Quu above which the gains are reported as unreliable.
 _LOSSY = 1e-8
 
@@ -238,33 +242,42 @@ class Search:
                 self.reason = f"the regularization has reached {self.regularization:.1e} of the diagonal of Quu"
                 return Status.INDEFINITE
             if self.first < 0.0:
-                self.first = self.along.stake.moved
+                stake = self.along.stake
+                self.first = stake.free if np.isfinite(stake.free) else stake.moved
             ended = self._ended(tolerance)
             if ended is Status.CONVERGED and self._goes_on():
                 continue
             if ended is None and self._near and self._looks_between():
                 continue
-            if ended is None and len(self.history) >= last:
-                ended = Status.MAX_ITERATIONS
-            if ended is None and time.perf_counter() > (deadline - longest if self.tick else deadline):
-                ended = Status.OUT_OF_TIME
+            ended = ended or self._out_of(last, deadline)
             if ended is not None:
                 self._note(report, started)
                 self.reason = self.reason or self._numbers(tolerance)
                 return ended
             step = self._known
-            taken = self._line_search()
             self._near = step.decrease <= _CLOSE * self.along.stake.moved
+            taken = self._line_search()
             self._note(report, started, taken)
             longest = max(longest, time.perf_counter() - started)
             if taken.length == 0.0 and step.decrease <= taken.hidden and self.violation <= FEASIBLE:
                 self.reason = f"{self._expected()}, and rounding hides {taken.hidden:.1e} of the cost"
                 return Status.CONVERGED
+            if self.tick and taken.length > 0.0 and (out := self._out_of(last, deadline - longest)) is not None:
+                # Without a further pass: the rest of the step is left.
+                self.step = step._replace(feedforward=(1.0 - min(taken.length, 1.0)) * step.feedforward)
+                self.reason = f"{self._expected()} before the last step"
+                return out
             if not self._regularize():
-                if self.violation > FEASIBLE:
+                if self._elastic and step.decrease <= _LITTLE_LESS * self.weight * self._badness:
                     return self._infeasible()
                 self.reason = f"no step lowers the cost, whatever the regularization; {self._numbers(tolerance)}"
                 return Status.STALLED
+
+    def _out_of(self, last: int, deadline: float) -> Status | None:
+        """The status where iterations or time end the search, else None."""
+        if len(self.history) >= last:
+            return Status.MAX_ITERATIONS
+        return Status.OUT_OF_TIME if time.perf_counter() > deadline else None
 
     @property
     def along(self) -> Along:
@@ -331,9 +344,11 @@ class Search:
             return False
         self.plan = self.noise = plan
         self.exact = curvature is not None
-        if problem.processes and free and self.regularization > 0.0:
-            # Noise grows under regularized gains.
-            self.noise = self._pass(0.0) or plan
+        if problem.processes:
+            # Noise grows under regularized gains, and controls at their limits do not react to it.
+            self.noise = self._pass(0.0, held=self._at_limits()) or plan
+            if problem.limited:
+                self.plan = self.noise
         if self._has_goals:
             self.plan = single_pass(self._with_goals(along), 0.0)[0] or plan
         if problem.processes and not self.tick:
@@ -365,8 +380,17 @@ class Search:
         exists = smooth and self.problem.integrator.variational and not self.tick
         return exists and saturates(scene, self.trajectory)
 
-    def _pass(self, regularization: float, curvature: Floats | None = None) -> Plan | None:
-        return single_pass(self.along, regularization, curvature=self._wide(curvature))[0]
+    def _pass(self, regularization: float, curvature: Floats | None = None, held: Mask | None = None) -> Plan | None:
+        """A backward pass of the costs, in which some controls (R, m) may be ``held`` as they are."""
+        along = copy(self.along)
+        along.held = held
+        return single_pass(along, regularization, curvature=self._wide(curvature))[0]
+
+    def _at_limits(self) -> Mask | None:
+        """Which controls of the motion are at their limits (R, m); None where there are none."""
+        u, (lower, upper) = self.problem.decided(self.trajectory), self.problem.control_limits
+        found = (u <= lower) | (u >= upper)
+        return found if found.any() else None
 
     def _wide(self, curvature: Floats | None) -> Floats | None:
         """Second derivatives of steps as the pass takes them."""
@@ -510,7 +534,7 @@ class Search:
 
     def _ended(self, tolerance: float) -> Status | None:
         """The status of a search whose step gains no more than the tolerance; None if it goes on."""
-        step, share = self._known, self._share(tolerance)
+        problem, step, share = self.problem, self._known, self._share(tolerance)
         met = self.violation <= FEASIBLE
         if not met and step.minimum is not None and self._elastic:
             bad = self._badness
@@ -518,6 +542,9 @@ class Search:
                 share, _STAYS * self.weight * bad
             ):
                 return self._infeasible()
+        if met and not problem.steered.any() and self.along.stake.free <= tolerance * _NOTHING * self.first:
+            # The cost is at its lower bound. Without costs of the controls the model may have no minimum even there.
+            return Status.CONVERGED
         if met and step.decrease <= share:
             if self.regularization > _LITTLE and self._gains_more(share):
                 return None
@@ -599,16 +626,17 @@ class Search:
         here = self._merit_here()
         best, length, trials, tried = Trial(), 0.0, 0, None
         ff, corrections = step.feedforward, _CORRECTIONS
+        z = None if step.minimum is None else step.minimum.z
         lengths = Lengths(self.backtracking)
         for a in lengths:
-            trial = self._try(a, ff, here)
+            trial = self._try(a, ff, here, z)
             trials += 1
             while a == 1.0 and trial.merit > self.armijo * step.slope and corrections and trial.attempt is not None:
                 corrections -= 1
                 again = self._corrected(trial.attempt)
                 if again is None:
                     break
-                other = self._try(1.0, again, here)
+                other = self._try(1.0, self._feedforward(again), here, again)
                 trials += 1
                 if other.merit >= trial.merit:
                     break
@@ -631,7 +659,7 @@ class Search:
                 break
         early = -_EARLY * step.slope
         while length >= 1.0 and step.minimum is None and -best.merit >= length * early and not self.tick:
-            longer = self._try(_EXTENSION * length, ff, here)
+            longer = self._try(_EXTENSION * length, ff, here, None)
             trials += 1
             if longer.merit >= best.merit:
                 break
@@ -650,14 +678,23 @@ class Search:
         assert self.noise is not None
         return Here(noise_shares(self.problem, self.trajectory, self.noise), self._badness)
 
-    def _try(self, length: float, feedforward: Floats, here: Here) -> Trial:
-        """A trial of a length along the step."""
+    def _try(self, length: float, feedforward: Floats, here: Here, z: Floats | None) -> Trial:
+        """A trial of a length along the step; with ``z``, the controls that it brings to a limit stay there."""
         problem = self.problem
         u = problem.decided(self.trajectory)
         if not self.closed:
             return self._run(held(u, problem)._replace(u=u + length * feedforward), here)
         commands = self._around(u, states(problem, self.trajectory)[: -1 : problem.hold])
-        return self._run(commands._replace(u=u + length * feedforward), here)
+        u = u + length * feedforward
+        if z is not None and problem.limited:
+            aim = problem.decided(self.trajectory) + length * self.stages.layout.controls_of(z)
+            for limit, sign in zip(problem.control_limits, (-1.0, 1.0), strict=True):
+                there = sign * (aim - limit) >= -_AT_LIMIT * np.abs(limit)
+                u = np.where(there, limit, u)
+                gains = commands.gains if not problem.linear else np.concatenate([commands.gains[:1], commands.gains])
+                gains = np.where(there[:, :, None], 0.0, gains)
+                commands = commands._replace(gains=np.ascontiguousarray(gains[1:] if problem.linear else gains))
+        return self._run(commands._replace(u=u), here)
 
     def _around(self, u: Floats, x: Floats) -> Commands:
         """Controls with the plan's feedback around states."""
@@ -764,7 +801,7 @@ class Search:
         ]
         weight = self.weight if self._elastic else None
         found = self.program.minimum(values, self.stages.gaps_of(z), weight)
-        return None if found is None else self._feedforward(found.z)
+        return None if found is None else found.z
 
     def _share(self, tolerance: float) -> float:
         """Tolerance on the expected decrease, in units of the cost."""

@@ -124,8 +124,8 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
         return around(problem, u, x, np.tile(gains, (len(u), 1, 1)), None)
     if controls is None:
         # Lines through the means of neighbours.
-        u = np.vstack([u[:1], 0.5 * (u[:-1] + u[1:]), u[-1:]])
-        u[1:] = with_ends(scene, u[1:], np.vstack([u[1:]])[:, :m])
+        held, u = u, np.vstack([u[:1], 0.5 * (u[:-1] + u[1:]), u[-1:]])
+        u[1:] = with_ends(scene, u[1:], held)
     u = problem.begun(u)
     # A line answers a state half a step later than a held control, so that feedback may do harm.
     tries = [
