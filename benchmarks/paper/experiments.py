@@ -132,7 +132,7 @@ def run(task: Task) -> Cell:
         return _under_noise(task)
     problem = cases.problem(task.setting, task.case, task.method, task.dt)
     started = time.perf_counter()
-    solution = solve(problem, **SEARCH, noise="held", check=False)  # type: ignore[arg-type]
+    solution = solve(problem, **SEARCH, check=False)  # type: ignore[arg-type]
     seconds = time.perf_counter() - started
     sampled = (np.nan, np.nan)
     if task.case is not None and task.dt >= 1e-3:
@@ -150,7 +150,7 @@ def _optimum(task: Task) -> Cell:
     )
     started = time.perf_counter()
     most = int(SEARCH["max_iterations"])
-    solution = solve(problem, tolerance=1e-9, max_iterations=most, noise="held", check=False)
+    solution = solve(problem, tolerance=1e-9, max_iterations=most, check=False)
     return _cell(task, solution, time.perf_counter() - started, (np.nan, np.nan))
 
 

@@ -29,7 +29,7 @@ from varpin.signals.policy import LinearPolicy
 
 # Tolerance of the searches, relative to the allowed loss.
 SUFFICIENT = 0.01
-# Greatest number of halvings of the step: the last steps of plans within many bounds take long on fine grids.
+# Greatest number of halvings of the step: plans within many bounds take long on fine grids.
 _HALVINGS = 7
 # Greatest violation of a constraint on the continuous system, relative to its range.
 _HOLDS = 0.1 * REPORTED
