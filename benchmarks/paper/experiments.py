@@ -1,6 +1,6 @@
 """The runs, one for each cell (setting, case, method, dt). They are kept on disk, to continue after an interruption.
 
-Equation (O10) of docs/mathematics.md.
+Equation (O14) of docs/mathematics.md.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def _cell(task: Task, solution: Solution, seconds: float, sampled: tuple[float, 
 
 
 def _middle_gains(solution: Solution) -> Floats:
-    """The feedback gains on x, referred to the state in the middle of each step, (O10), at ``GAIN_TIMES``.
+    """The feedback gains on x, referred to the state in the middle of each step, (O14), at ``GAIN_TIMES``.
 
     A held control reacts half a step late on average. Its gain on the state at the beginning of the step therefore
     differs from the continuous gain in first order, for every integrator; its gain on the state in the middle differs

@@ -1,4 +1,4 @@
-"""S-DDP: optimal control under noise by differential dynamic programming, on any integrator's linearization."""
+"""S-DDP: optimal control under noise, within limits and constraints, on any integrator's linearization."""
 
 from varpin.control.examination import looked_at as looked_at
 from varpin.control.history import Iteration as Iteration

@@ -78,9 +78,8 @@ def shifted_commands(problem: OptimalControlProblem, previous: Solution, decisio
         and old.control_limits is problem.control_limits
     )
     if problem.linear:
-        # Within constraints the last control often leaps, and gains contain penalties of rows that are active
-        # elsewhere. Neither fits beyond the end, where the motion goes on with the torques that hold the robot there.
-        # Limits of their rate keep controls from leaping.
+        # Within constraints the last control often leaps, which does not fit beyond the end, where the motion goes on
+        # with the torques that hold the robot there. Limits of their rate keep controls from leaping.
         leaps = bool(old.constraints) and not any(item.of_controls for item in old.bound_constraints)
         means = closest_controls(problem.scene, previous.trajectory.q[-1]) if leaps else None
         return first_commands(problem, rest_of(previous, previous.policy, decisions, before, means=means))

@@ -53,12 +53,10 @@ class Iteration:
         expected_decrease: Decrease of the expected cost by the quadratic model with a full step.
         decrease: Actual decrease of the expected cost, with the plan's model of the noise; 0 without a step.
         step: Length of the accepted step, 0 if there is none; 4 or more of one that was extended as the cost fell on
-            beyond, 2 of one along the parabola through the last motions. Of a step along foreseen states it is the
-            share of their changes.
+            beyond. Of a step along foreseen states it is the share of their changes.
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the cost's gradient in the controls.
-        backward_passes: Number of backward passes with different regularizations. Those that determine the controls at
-            their limits, on the same derivatives, do not count.
+        backward_passes: Number of backward passes with different regularizations.
         rollouts: Number of trials of the line search, one along foreseen states included.
         seconds: Time of the iteration [s].
         second_order: Whether second derivatives of the dynamics were used.

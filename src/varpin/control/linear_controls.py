@@ -2,7 +2,7 @@
 
 The state of the recursion is X = (x, w), with w the control at the node, and the decision is the control u at the next
 node: X' = (A x + (B - ramp) w + ramp u, u). The first control is a separate decision before the first step. Equation
-(O11) of docs/mathematics.md.
+(O4) of docs/mathematics.md.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def linear_steps(
     rate: Floats,
     pull: Floats,
 ) -> LinearSteps:
-    """The steps of a plan with linear controls, (O11).
+    """The steps of a plan with linear controls, (O4).
 
     Args:
         problem: The problem.

@@ -1,4 +1,4 @@
-"""Margins by count: how often motions under noise violate a bound, and how wide its margin has to be, (P5)."""
+"""Margins by count: how often motions under noise violate a bound, and how wide its margin has to be, (O13)."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def _joined(parts: Sequence[_Counted]) -> _Counted:
 
 
 def widened(plan: Solution, deadline: float = math.inf) -> list[Floats] | None:
-    """What has to be added to margins (K, rows) for each constraint, in its unit, (P5); None if they suffice.
+    """What has to be added to margins (K, rows) for each constraint, in its unit, (O13); None if they suffice.
 
     Margins are of the linear model. Where noise is strong, or where it follows the controls, values in motions are not
     normally distributed, and violate bounds more often. Nothing is added where only Python evaluates the noise, as

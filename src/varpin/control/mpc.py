@@ -195,11 +195,11 @@ class Mpc:
     plan's line begins at a control of its own, which reacts to the measured state at once; a
     :class:`ControlRateCost` makes the jump between the two small.
 
-    Constraints hold along every horizon, and moving obstacles are predicted. Multipliers are kept from tick to tick,
-    shifted with the plan. Each iteration of a tick is one of the augmented Lagrangian, so a plan satisfies its
-    constraints to the accuracy of few iterations; ``MpcRun.constraints`` has it for every tick. A goal
-    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. Held
-    controls keep to constraints at the nodes alone after the first plan, linear ones at the middles of steps, too.
+    Constraints hold along every horizon, and moving obstacles are predicted. Each iteration of a tick meets their
+    linearization, so a plan satisfies them to the accuracy of few iterations; ``MpcRun.constraints`` has it for every
+    tick. A goal (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first
+    plan. Held controls keep to constraints at the nodes alone after the first plan, linear ones at the middles of
+    steps, too.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -616,8 +616,7 @@ def _decision(plan: Solution, age: int, q: Floats, v: Floats, before: Floats | N
 def _at_rest(plan: Solution, q: Floats, v: Floats) -> Floats | None:
     """Control (m,) that brings the robot to rest where the plan ends; None where not every joint can be driven.
 
-    The plan's own last gains are of one step before its end. Repeated, those of steep terminal costs and of penalties
-    do not stabilize.
+    The plan's own last gains are of one step before its end. Repeated, those of steep terminal costs do not stabilize.
     """
     end = plan.problem.at(q0=plan.trajectory.q[-1], v0=np.zeros_like(v))
     gains = end.holding_feedback("velocity", slower=True)

@@ -34,7 +34,7 @@ class Minimum(NamedTuple):
 
 
 class Program:
-    """The program of one motion; :meth:`minimum` solves it, with other values of its rows for corrections."""
+    """The program (O10) of one motion; :meth:`minimum` solves it, with other values of its rows for corrections."""
 
     def __init__(
         self,

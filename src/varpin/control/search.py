@@ -1,6 +1,6 @@
 """The search for a plan: stages along the motion, feedback, a quadratic program, and a line search on true motions.
 
-Sequential quadratic programming in the form of differential dynamic programming, (O5) to (O8) of docs/mathematics.md:
+Sequential quadratic programming in the form of differential dynamic programming, (O10) to (O12) of docs/mathematics.md:
 feedback is that of the costs alone, and within limits and rows the changes of the controls come from one quadratic
 program over the horizon. Merit is the expected cost plus an l1 penalty of the rows.
 """
@@ -702,7 +702,7 @@ class Search:
         return around(self.problem, u, x, self.plan.feedback, self.plan.previous)
 
     def _run(self, commands: Commands, here: Here) -> Trial:
-        """A trial under commands."""
+        """A trial under commands, with its change of the merit, (O11)."""
         problem = self.problem
         assert self.noise is not None
         if problem.linear:
@@ -747,7 +747,7 @@ class Search:
         return min(best, self._run(commands, here), key=lambda trial: trial.merit), length, 2
 
     def _foreseen_path(self) -> tuple[Commands, float, float] | None:
-        """Commands along the states that the step foresees, its length and the foreseen change of the cost.
+        """Commands along the states that the step foresees, (O12), its length and the foreseen change of the cost.
 
         The controls are those of the inverse dynamics: what it is off by on the motion itself cancels. None where the
         states cost no less than the motion, or far from it.

@@ -92,8 +92,8 @@ class Solution(Frozen):
             (:class:`ControlRateCost`) or controls are linear between nodes:
             u_k + gains_k (x - x_k) + previous_gains_k (u_before - u_(k-1)). Else None.
         feedforward: Change of the controls (R, m) by the last backward pass; zero at an optimum.
-        gradient: Gradient of the expected cost in the controls (R, m), under the solver's model of the noise. At an
-            optimum it is zero except where it pushes a control against its limit.
+        gradient: Gradient of the expected cost in the controls (R, m), under the solver's model of the noise, with the
+            multipliers of constraints. At an optimum it is zero except where it pushes a control against its limit.
         cost: Cost of the motion without noise.
         noise_cost: Cost added by noise, by the solver's model, with what velocities do within steps of held noise.
         status: How the solver ended.
@@ -104,7 +104,7 @@ class Solution(Frozen):
             quarters, its velocities alternate or oscillate, its energy balance does not close, the requested true cost
             is not met.
         refinement: The steps tried where ``true_cost`` was given; else None.
-        multipliers: Multipliers of the problem's constraints and the state of their rounds; None without constraints.
+        multipliers: Multipliers of the problem's constraints, with their margins; None without constraints.
     """
 
     problem: OptimalControlProblem

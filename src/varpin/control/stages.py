@@ -1,4 +1,6 @@
-"""The stages along a motion: dynamics, cost and rows as one quadratic program in all decisions, (O5) and (P1).
+"""The stages along a motion: dynamics, cost and rows as one quadratic program in all decisions.
+
+Equation (O10) of docs/mathematics.md.
 
 The variables are the changes z = (u_0, x_1, u_1, ..., x_R) of the states before each decision and of the controls; with
 linear controls u_R follows. A control that is held over several steps makes one stage of them. No other file knows
@@ -116,7 +118,7 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Stages(Frozen):
-    """The expansions along a motion.
+    """The expansions along a motion, the matrices of (O10).
 
     Attributes:
         layout: Where the variables are.

@@ -13,7 +13,7 @@
 // previous control w adds R to Q_uu and to Q_ww and -R to Q_uw at a decision: gains on w follow from the formula for x
 // with -R in place of Q_ux, and the value before the decision depends on (x, w).
 //
-// Equations (O2), (O4) and (O6) of docs/mathematics.md.
+// Equations (O2) and (O6) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>
@@ -288,7 +288,7 @@ class BackwardPass {
         return true;
     }
 
-    // k within limits, (O4), at deviations `ahead` (2n + m) of the state and the previous control from the nominal
+    // k within limits, at deviations `ahead` (2n + m) of the state and the previous control from the nominal
     // ones, null for zero; the result applies at zero deviation again. Writes the gradient there into `pressure`,
     // unless null.
     bool keep_within(const double* slack, const double* ahead, const double* rate, double* k, double* pressure) {

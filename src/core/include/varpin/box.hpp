@@ -2,7 +2,6 @@
 // docs/mathematics.md, "Limits". Control-limited differential dynamic programming (Tassa, Mansard and Todorov 2014)
 // projects Newton steps onto the box instead. For ill-conditioned Hessians that may end at a point from which no
 // projected step descends.
-// Equation (O4) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>
@@ -13,7 +12,7 @@
 
 namespace varpin {
 
-// The decision within limits, (O4).
+// The decision within limits.
 class BoxMinimum {
   public:
     explicit BoxMinimum(int size) : factors(size * size), held(size), m(size), downhill(size), step(size) {}

@@ -65,7 +65,7 @@ class BoundConstraint(Frozen, ABC):
         times: Times of the places (K,) [s].
         rows: Description of each row of c.
         unit: Unit of c.
-        scale: About a tenth of the range of c, in its unit; it scales the first penalty weights and tolerances.
+        scale: About a tenth of the range of c, in its unit; violations count in it.
     """
 
     source: PlanConstraint

@@ -292,7 +292,6 @@ class SolveTable:
     forward: Annotated[str | None, word("closed", "open")] = None
     regularization: Annotated[float | None, number(least=0.0)] = None
     true_cost: Annotated[float | None, number(above=0.0)] = None
-    noise: Annotated[str | None, word("held", "whole")] = None
 
 
 def _output(*endings: str) -> Rule:
