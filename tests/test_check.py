@@ -295,15 +295,74 @@ def test_advice(options, integrator, dt):
     family, stages = re.search(r"integrator=varpin\.(\w+)\((\d)\)", told).groups()
     better = moved(scene, getattr(vp, family)(int(stages)), dt=dt, steps=steps)
     assert not about(better.warnings, "error")
-    for _ in range(3):
-        if "dt = " not in told:
+    follow(scene, told, integrator, 0.8, (Q0, V0), again=3)
+
+
+def follow(scene, told, integrator, duration, start, controls=None, again=1):
+    """What a sentence names of the step is taken as it is written, and ends in a motion without an error to tell."""
+    for _ in range(again):
+        if not (named := re.search(r"(dt|steps) = (\S+)", told)):
             return
-        steps = round(0.8 / float(re.search(r"dt = (\S+) s", told).group(1)))
-        found = about(moved(scene, integrator, dt=0.8 / steps, steps=steps).warnings, "error")
-        if not found:
+        options = {named[1]: (float if named[1] == "dt" else int)(named[2])}
+        motion = vp.simulate(scene, *start, duration=duration, **options, controls=controls, integrator=integrator)
+        if not (found := about(motion.warnings, "error")):
             return
         (told,) = found
     pytest.fail(told)
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.7 / 12, 1.0 / 18])
+@pytest.mark.parametrize("integrator", [MIDPOINT, EULER])
+def test_a_named_step_divides_the_duration_as_it_is_written(dt, integrator):
+    duration = dt * round(0.8 / dt)
+    motion = vp.simulate(FREE, Q0, V0, duration=duration, dt=dt, integrator=integrator)
+    (told,) = about(motion.warnings, "error")
+    follow(FREE, told, integrator, duration, (Q0, V0), again=4)
+
+
+def test_a_named_step_keeps_the_period_of_a_law_and_of_a_policy():
+    scene, wish = vp.Scene(vp.planar_chain(2)), np.array([0.6, -0.4])
+    options = {"q0": [0.0, 0.0], "v0": [8.0, 0.0], "duration": 1.2, "integrator": vp.Midpoint()}
+
+    def law(t, q, v):
+        return 20.0 * (wish - q) - 2.0 * v
+
+    motion = vp.simulate(scene, **options, dt=0.03, controls=law, period=2)
+    (told,) = about(motion.warnings, "error")
+    dt, period = re.search(r"dt = (\S+) s with period=(\d+)", told).groups()
+    assert float(dt) * int(period) == pytest.approx(0.06, rel=1e-12)
+    better = vp.simulate(scene, **options, dt=float(dt), controls=law, period=int(period))
+    assert better.error.max() < 0.5 * motion.error.max()
+    u, gains = np.tile(40.0 * wish, (20, 1)), np.zeros((20, 2, 4))
+    motion = vp.simulate(scene, **options, dt=0.03, controls=vp.LinearPolicy(u, gains, np.zeros((20, 4)), hold=2))
+    (told,) = about(motion.warnings, "error")
+    dt, hold = re.search(r"dt = (\S+) s with hold=(\d+)", told).groups()
+    policy = vp.LinearPolicy(u, gains, np.zeros((20, 4)), hold=int(hold))
+    assert vp.simulate(scene, **options, dt=float(dt), controls=policy).error.max() < 0.5 * motion.error.max()
+
+
+@pytest.mark.parametrize(("rate", "size"), [(60.0, 150.0), (300.0, 400.0), (300.0, 1000.0)])
+def test_of_waves_within_a_step_a_step_that_follows_them_is_named(rate, size):
+    """More stages change nothing there, or the error for the worse."""
+    scene, start, push = vp.Scene(vp.planar_chain(2), damping=0.0), ([0.4, 0.4], [0.0, 0.0]), size * np.array([-1, 1])
+    controls = vp.OpenLoop(lambda t: push * np.sin(2.0 * np.pi * rate * t + 0.3))
+    motion = vp.simulate(scene, *start, duration=0.5, dt=0.01, controls=controls)
+    (told,) = about(motion.warnings, "error")
+    assert "faster than the step" in told
+    assert "integrator" not in told
+    follow(scene, told, None, 0.5, start, controls)
+
+
+@pytest.mark.parametrize(("links", "damping", "width"), [(2, 100.0, 0.01), (2, 1000.0, 0.001), (3, 100.0, 0.05)])
+@pytest.mark.parametrize("integrator", [None, vp.Radau(3), vp.Gauss(2)], ids=str)
+@pytest.mark.parametrize("dt", [5e-3, 2e-2])
+def test_of_stops_within_a_step_a_step_that_resolves_them_is_named(links, damping, width, integrator, dt):
+    stop = vp.JointStop(1e6, damping, -0.5, 0.9, width)
+    scene, start = vp.Scene(vp.planar_chain(links), damping=0.0, forces=[stop]), (np.full(links, 0.4), np.zeros(links))
+    motion = vp.simulate(scene, *start, duration=1.0, dt=dt, integrator=integrator)
+    for told in about(motion.warnings, "error"):
+        assert "integrator" not in told
+        follow(scene, told, integrator, 1.0, start, again=2)
 
 
 def test_limits():

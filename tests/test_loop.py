@@ -148,6 +148,15 @@ def test_the_count_of_changes():
     assert naming([finding], "control 0", f"{finding.value:.0f} times", "300 periods", "0.01 s")
 
 
+def test_a_law_without_limits_does_not_go_from_one_to_the_other():
+    """A goal that swings 19 times a second is followed, as well as that goes."""
+
+    def law(t, q, v):
+        return -100.0 * np.sin(q - np.sin(120.0 * t)) - 5.0 * v
+
+    assert not told(run(ROD, [0.0], [0.0], law, dt=1e-2, steps=300))
+
+
 def swing_up(t, q, v):
     """It pumps from limit to limit, catches the pendulum upright and holds it."""
     if np.sin(q[0]) < -0.8:

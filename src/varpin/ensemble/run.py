@@ -15,7 +15,7 @@ from varpin.ensemble.looks import looked_at, looked_at_here
 from varpin.ensemble.paths import Part, Shared, simulate_paths, without_geometry
 from varpin.ensemble.record import Ensemble, EnsembleInterrupted
 from varpin.ensemble.statistics import Sums
-from varpin.errors import InputError, VarpinError
+from varpin.errors import InputError, VarpinError, WorkersLost
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
@@ -98,7 +98,8 @@ def simulate_ensemble(
         ForceError: A function of a :class:`varpin.CustomForce` failed. The error names the path and holds its motion up
             to the failure.
         AssemblyError: No configuration near q0 satisfies the scene's constraints.
-        VarpinError: Every path failed, or the executor has lost its workers.
+        VarpinError: Every path failed.
+        WorkersLost: The executor has lost its workers; holds the finished paths.
         EnsembleInterrupted: Ctrl-C; holds the finished paths, and those that threads had begun. It is a
             KeyboardInterrupt.
     """
@@ -132,11 +133,14 @@ def simulate_ensemble(
                 take_all(parts, sums.add, lambda: progress(sums.done, paths) if progress is not None else None)
             assert sums.done == paths
             found = looked_at(pool, shared, start[0], start[1], sums.extremes)
-        except KeyboardInterrupt:
-            if not sums.done:
-                raise EnsembleInterrupted(None) from None
-            seen = looked_at_here(shared, start[0][: sums.done], start[1][: sums.done], sums.extremes)
-            raise EnsembleInterrupted(sums.ensemble((*sums.lost(), *seen))) from None
+        except (KeyboardInterrupt, WorkersLost) as stop:
+            kept = None
+            if sums.done:
+                seen = looked_at_here(shared, start[0][: sums.done], start[1][: sums.done], sums.extremes)
+                kept = sums.ensemble((*sums.lost(), *seen))
+            if isinstance(stop, WorkersLost):
+                raise WorkersLost(stop.__cause__, kept) from stop.__cause__
+            raise EnsembleInterrupted(kept) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
     found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *sums.lost(), *found)

@@ -28,7 +28,7 @@ from varpin.signals.commands import control_of, ends_of, first_of
 from varpin.trajectory import Trajectory
 
 REASONS: dict[int, str] = {
-    Outcome.not_finite: "the state is no longer finite",
+    Outcome.not_finite: "the state is no longer finite: the motion runs away, as where damping is faster than the step",
     Outcome.singular: "the mass matrix is not positive definite",
 }
 
@@ -39,7 +39,8 @@ class _Explicit(Compiled):
 
     method: ClassVar[ExplicitMethod]
     variational = False
-    reasons = REASONS
+    # In a motion no mass matrix but that of angles beyond rounding is singular.
+    reasons = dict.fromkeys(REASONS, REASONS[Outcome.not_finite])
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
         """See :meth:`Integrator.start`."""

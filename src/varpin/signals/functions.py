@@ -24,6 +24,9 @@ ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Root mean square of what a step's polynomial leaves of a function of time, as a share of its largest value, up to
 # which the motion's own residual shows its error: a third order of it is lost.
 _RESOLVED = 0.02
+# The same share up to which more stages help: a jump has a quarter in a step of two stages, a fast wave more. And the
+# most parts of a step in which it is looked for.
+_FOLLOWED, _MOST_PARTS = 0.3, 64
 # Distance of a kinematic input from its control at the start [rad or m, rad/s or m/s] without a warning.
 _ELSEWHERE = 1e-6
 
@@ -123,6 +126,25 @@ def resolved(controls: Sampled, times: Times) -> bool:
     found = joined(controls.parts)
     rest = found.rest[:, max(1, len(times)) - 1]
     return bool(rest.max(initial=0.0) <= _RESOLVED * found.largest) and not len(found.unsettled)
+
+
+def parts_to_follow(controls: Sampled, times: Times) -> int:
+    """The parts of a step in which polynomials of a method with stages at ``times`` follow the function; 1 where whole.
+
+    They are looked for in the step in which the function is fastest.
+
+    Raises:
+        ControlError: The function failed.
+    """
+    order = max(1, len(times)) - 1
+    whole = joined(controls.parts)
+    worst, parts = int(whole.rest[:, order].argmax()), 1
+    here = whole.part(worst, worst + 1)
+    values = functools.partial(_values, controls, controls.scene)
+    while here.rest[:, order].max() > _FOLLOWED * whole.largest and parts < _MOST_PARTS:
+        parts *= 2
+        here = moments_of(values, worst * parts, parts, controls.dt / parts, controls.breaks)
+    return parts
 
 
 def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers) -> Floats:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.core import fastest_damping
 from varpin.errors import LinearizationError
 from varpin.integrators.explicit import accelerations
@@ -165,6 +165,29 @@ def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) ->
         if v[:, c].min() < 0.0 < v[:, c].max():
             still[:, c] = 0.0
         states.append((q[node], still, node))
+    states += _in_stops(scene, q, v)
+    q, v, at = (np.concatenate(rows) for rows in zip(*states, strict=True))
+    forces = np.ascontiguousarray(u[np.minimum(at, len(u) - 1)] @ scene.actuation.T)
+    return float(fastest_damping(scene.core, q, v, forces, least))
+
+
+def contact_rate(scene: Scene, q: Floats, v: Floats) -> float:
+    """The fastest rate [1/s] of a spring or damper, in the stops that joints reach; 0 where they reach none.
+
+    ``q`` and ``v`` are the nodes of a motion (N + 1, n).
+    """
+    states = _in_stops(scene, q, v)
+    if not states:
+        return 0.0
+    q, v, _ = (np.concatenate(rows) for rows in zip(*states, strict=True))
+    eased = np.diagonal(np.linalg.inv(masses(scene, q)), axis1=1, axis2=2)
+    _, by_q, by_v, _ = scene.core.forces(q, v, np.zeros_like(q))
+    return float(np.maximum(np.sqrt(np.maximum(-by_q * eased, 0.0)), -by_v * eased).max())
+
+
+def _in_stops(scene: Scene, q: Floats, v: Floats) -> list[tuple[Floats, Floats, Integers]]:
+    """States (1, n), (1, n) and nodes (1,) of a motion where joints are deepest in each stop, at full stiffness."""
+    states = []
     for stop in of_kind(scene.elements, "JointStop"):
         c, (lower, upper, *_, width) = stop.coordinate, stop.values
         for deepest, end, side in ((int(q[:, c].argmin()), lower, -1.0), (int(q[:, c].argmax()), upper, 1.0)):
@@ -172,9 +195,7 @@ def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) ->
                 pressed = q[deepest][None].copy()
                 pressed[0, c] = end + side * max(side * (q[deepest, c] - end), width)
                 states.append((pressed, v[deepest][None], np.array([deepest])))
-    q, v, at = (np.concatenate(rows) for rows in zip(*states, strict=True))
-    forces = np.ascontiguousarray(u[np.minimum(at, len(u) - 1)] @ scene.actuation.T)
-    return float(fastest_damping(scene.core, q, v, forces, least))
+    return states
 
 
 def stops_ahead(scene: Scene, q: Floats) -> Floats:
