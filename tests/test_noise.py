@@ -365,6 +365,21 @@ def test_python_and_compiled_fields_give_the_same_motion(kick, feedback):
 
 
 @pytest.mark.parametrize(
+    "integrator", [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Midpoint(kick="held"), vp.Radau(2)]
+)
+def test_the_mean_of_noise_in_proportion_to_the_velocity(integrator):
+    """Over two steps of the noise with the moments of a normal one: dv = s v o dw has the mean v exp(s^2 t / 2)."""
+    M, s, dt = vp.lagrangian_jet(vp.Scene(vp.planar_chain(1)), [0.0], [0.0]).Lvv[0, 0], 0.3, 0.01
+    noise = vp.CustomNoise(lambda q, v, u: [[s * M * v[0]]], 1, dv=lambda q, v, u: [[[s * M]]])
+    scene = vp.Scene(vp.planar_chain(1), noise=noise, gravity=False)
+    ends = [
+        vp.simulate(scene, [0.5], [1.0], dt=dt, steps=1, integrator=integrator, increments=[[dw]], check=False).v[1, 0]
+        for dw in (np.sqrt(dt), -np.sqrt(dt))
+    ]
+    assert np.mean(ends) - 1.0 == pytest.approx(0.5 * s**2 * dt, rel=2e-3)
+
+
+@pytest.mark.parametrize(
     "integrator", [vp.Midpoint(), pytest.param(vp.Midpoint(kick="split"), marks=pytest.mark.slow)], ids=str
 )
 def test_strong_order(integrator):
