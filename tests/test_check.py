@@ -536,6 +536,7 @@ def test_a_slide_that_hardly_moves_is_measured_by_the_arm_that_turns():
         rod, pin.Inertia(1.0, np.array([20.0, 0.0, 0.0]), np.diag([0.1, 0.1, 0.1])), pin.SE3.Identity()
     )
     model.addFrame(pin.Frame("tip", rod, 0, pin.SE3(np.eye(3), np.array([20.0, 0.0, 0.0])), pin.FrameType.OP_FRAME))
+    model.lowerPositionLimit[0], model.upperPositionLimit[0] = -1.0, 1.0
     scene = vp.Scene(vp.load_robot(model), gravity=(0.0, 0.0, -9.81))
     motion = vp.simulate(scene, [0.0, 0.3], [0.0, 6.0], dt=0.15, steps=40, integrator=MIDPOINT)
     own = motion.error.max(axis=0) / np.ptp(motion.q, axis=0)

@@ -322,8 +322,8 @@ def test_the_order_is_that_of_the_last_two_trials():
 
 
 def test_a_force_that_is_met_within_a_step_is_in_the_motion():
-    """A ridge of a tenth of a radian, which coarse steps would pass over; its energy gives the speed behind it."""
-    high, width, begin = 6.0, 0.1, 0.5
+    """A narrow ridge, which coarse steps would pass over; its energy gives the speed behind it."""
+    high, width, begin = 10.0, 0.06, 0.4
 
     def ridge(q, v):
         y = (q - begin) / width

@@ -86,7 +86,7 @@ def check(
         hold: The period of a control law in steps, 0 for none. Where a repetition under the recorded controls is far
             off, and the record tells the law, another one has its feedback.
     """
-    extremes = controls.extremes if isinstance(controls, Sampled) else None
+    extremes = controls.whole.extremes if isinstance(controls, Sampled) else None
     limits = beyond_limits(scene, trajectory, extremes)
     if not trajectory.steps:
         known = np.zeros_like(trajectory.q)

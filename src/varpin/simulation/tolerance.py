@@ -17,7 +17,7 @@ from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import open_loop
-from varpin.signals.controls import Controls, commands_of, held_rows
+from varpin.signals.controls import Controls, commands_of, control_rows
 from varpin.signals.functions import ControlLaw, Sampled, require_law
 from varpin.signals.inputs import held_in_parts
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
@@ -62,7 +62,7 @@ class _Search:
             elif isinstance(controls, FirstOrderHold):
                 self.rows = len(controls.u) - 1
         else:
-            self.controls = held_rows(scene, controls)
+            self.controls = control_rows(scene, controls)
             self.rows = len(self.controls)
         self.most = _MOST_WORK / len(q0)
         self.steps = self.evaluations = 0
