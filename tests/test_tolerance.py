@@ -317,7 +317,7 @@ def test_an_earlier_step_that_divides_the_duration_is_taken(duration):
 def test_the_order_is_that_of_the_last_two_trials():
     rung = Rung(vp.Gauss(2), 8, 1)
     for steps, error in ((8, 1e-2), (16, 1e-2), (32, 1e-2 / 16)):
-        rung.add(Trial(steps, error, steps))
+        rung.add(Trial(rung.integrator, steps, error, steps))
     assert rung.order == pytest.approx(4.0)
 
 

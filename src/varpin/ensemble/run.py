@@ -34,6 +34,7 @@ from varpin.support.checks import (
     flag,
     joint_array,
     require_finite,
+    require_memory,
 )
 from varpin.support.executors import executing, in_order, take_all
 
@@ -200,16 +201,8 @@ def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> Non
     n, m = scene.robot.dof, scene.controls
     stored = paths if store else 0
     row = 2 * n * (4 * n + 5) + m + stored * (3 * n + m + 1)
-    for shape, what in (
-        ((steps + 1, row), f"steps = {steps} with {stored} stored paths"),
-        ((paths, 2 * n), f"paths = {paths}"),
-    ):
-        try:
-            np.empty(shape)
-        except (MemoryError, ValueError, OverflowError):
-            raise InputError(
-                f"{what} needs more memory than there is: {8 * shape[1]} bytes a {what.partition(' ')[0][:-1]}"
-            ) from None
+    require_memory(steps + 1, row, f"steps = {steps} with {stored} stored paths", "step")
+    require_memory(paths, 2 * n, f"paths = {paths}", "path")
 
 
 def _per_path(name: str, value: JointValues, paths: int, joints: Sequence[str]) -> Floats:

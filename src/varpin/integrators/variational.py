@@ -169,13 +169,10 @@ class Variational(Compiled):
         """Factors of the guard's energy balance and energy budget."""
         return 1.0, 1.0
 
-    def _guards(self) -> Guards:
-        return _core_guards(self.guard, *self._shares())
-
-    def _guards_of(self, *, driven: bool) -> Guards:
-        """Guards of a scene; with kinematic inputs, which exchange energy, they do not check the energy."""
-        if self.guard is None or not driven:
-            return self._guards()
+    def _guards(self, *, energy: bool = True) -> Guards:
+        """Guards of the core. Without ``energy`` the balance is not checked: kinematic inputs exchange energy."""
+        if self.guard is None or energy:
+            return _core_guards(self.guard, *self._shares())
         return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
 
     def _guards_again(self, trajectory: Trajectory) -> Guards:
@@ -184,9 +181,7 @@ class Variational(Compiled):
         Without noise the steps are the same, and there is nothing to check. Otherwise the steps differ by the noise
         impulses, and their roots must lie on the branch that is connected to dt -> 0.
         """
-        if self.guard is None or not trajectory.noisy:
-            return _core_guards(None)
-        return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
+        return self._guards(energy=False) if trajectory.noisy else _core_guards(None)
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
@@ -204,7 +199,7 @@ class Variational(Compiled):
         """
         rollout: VariationalRollout | ConstrainedRollout
         method = scene.core, self._tableau()
-        options = float(self.tolerance), self._guards_of(driven=bool(scene.inputs))
+        options = float(self.tolerance), self._guards(energy=not scene.inputs)
         if scene.constraints:
             rollout = ConstrainedRollout(*method, self._places(scene), *options, len(q0), self.holds_noise)
         else:
@@ -215,7 +210,7 @@ class Variational(Compiled):
 
     def fork(self, state: Run) -> Run:
         """See :meth:`Integrator.fork`."""
-        return replace(state, paths=state.paths.fork(self._guards_of(driven=state.driven)))
+        return replace(state, paths=state.paths.fork(self._guards(energy=not state.driven)))
 
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:
         found = super()._segments(scene, paths, nodes)

@@ -11,7 +11,7 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import Times, changing, open_line, open_loop
+from varpin.signals.commands import Times, changing, on_lines, open_line, open_loop
 from varpin.signals.functions import Sampled
 from varpin.signals.inputs import prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
@@ -105,8 +105,5 @@ def control_rows(scene: Scene, controls: JointValues | None, steps: int | None =
 
 def _on_lines(u: Floats, times: Times) -> Commands:
     """Commands for controls (N + 1, m) at the nodes, linear between them, with stages at ``times``."""
-    before, after = u[:-1, None], u[1:, None]
-    if not times:
-        return open_loop(0.5 * (before + after)[:, 0])
-    share = np.array(times)[:, None]
-    return changing((1.0 - share) * before + share * after, times)
+    along = on_lines(u[:-1], u[1:], 1, times or (0.5,))
+    return changing(along, times) if times else open_loop(along[:, 0])

@@ -188,23 +188,29 @@ def contact_rate(scene: Scene, q: Floats, v: Floats) -> float:
 def _in_stops(scene: Scene, q: Floats, v: Floats) -> list[tuple[Floats, Floats, Integers]]:
     """States (1, n), (1, n) and nodes (1,) of a motion where joints are deepest in each stop, at full stiffness."""
     states = []
-    for stop in of_kind(scene.elements, "JointStop"):
-        c, (lower, upper, *_, width) = stop.coordinate, stop.values
-        for deepest, end, side in ((int(q[:, c].argmin()), lower, -1.0), (int(q[:, c].argmax()), upper, 1.0)):
-            if np.isfinite(end) and side * (q[deepest, c] - end) > 0.0:
-                pressed = q[deepest][None].copy()
-                pressed[0, c] = end + side * max(side * (q[deepest, c] - end), width)
-                states.append((pressed, v[deepest][None], np.array([deepest])))
+    for c, end, side, width in _ends(scene):
+        deepest = int((side * q[:, c]).argmax())
+        if (depth := side * (q[deepest, c] - end)) > 0.0:
+            pressed = q[deepest][None].copy()
+            pressed[0, c] = end + side * max(depth, width)
+            states.append((pressed, v[deepest][None], np.array([deepest])))
     return states
+
+
+def _ends(scene: Scene) -> list[tuple[int, float, float, float]]:
+    """The finite ends of joint stops: coordinate, place, -1 for a lower and 1 for an upper one, and width."""
+    found = []
+    for stop in of_kind(scene.elements, "JointStop"):
+        lower, upper, *_, width = stop.values
+        both = ((lower, -1.0), (upper, 1.0))
+        found += [(stop.coordinate, end, side, width) for end, side in both if np.isfinite(end)]
+    return found
 
 
 def stops_ahead(scene: Scene, q: Floats) -> Floats:
     """Configurations (K, n): ``q`` (n,) with one joint each in a stop, deep enough for the stop's full stiffness."""
-    rows = []
-    for own in of_kind(scene.elements, "JointStop"):
-        lower, upper, *_, width = own.values
-        for end in (lower - width, upper + width):
-            if np.isfinite(end):
-                rows.append(q.copy())
-                rows[-1][own.coordinate] = end
-    return np.array(rows).reshape(-1, q.size)
+    ends = _ends(scene)
+    rows = np.tile(q, (len(ends), 1))
+    for row, (c, end, side, width) in zip(rows, ends, strict=True):
+        row[c] = end + side * width
+    return rows

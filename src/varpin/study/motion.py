@@ -132,7 +132,7 @@ class Setting(Frozen):
             again = repeated(self.scene, integrator, motion)
             off = max(float(distance(again, motion)[0].max()), ROUNDING * max(1.0, float(np.abs(motion.q).max())))
         whole = motion.statistics.split_steps == 0
-        return Trial(steps, off if math.isfinite(off) else math.inf, outcome.seconds, whole=whole)
+        return Trial(integrator, steps, off if math.isfinite(off) else math.inf, outcome.seconds, whole=whole)
 
 
 def fastest(
