@@ -124,7 +124,9 @@ def simulate_ensemble(
         controls = scene.command_at(start[0][0])
     start, moved = _onto_constraints(scene, start)
     if integrator is None:
-        integrator = _usual(scene, start[0], start[1], dt)
+        noisy = scene.processes > 0
+        some = np.linspace(0, paths - 1, 1 if noisy else min(1 + paths // _OF, _CHOOSING)).astype(np.int64)
+        integrator = stronger(usual_integrator(scene, start[0][j], start[1][j], dt, noisy=noisy) for j in some)
     commands = commands_of(scene, integrator, controls, steps, dt)
     with executing(executor, workers) as pool:
         shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
@@ -147,19 +149,6 @@ def simulate_ensemble(
     found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene.announced, dt, found)
     return sums.ensemble(found)
-
-
-def _usual(
-    scene: Scene,
-    q0: Floats,
-    v0: Floats,
-    dt: float,
-) -> Integrator:
-    """The integrator of paths from (q0, v0) (P, n) where none is given: one that is right for a few of them."""
-    if scene.processes:
-        return usual_integrator(scene, q0[0], v0[0], dt, noisy=True)
-    some = np.linspace(0, len(q0) - 1, min(1 + len(q0) // _OF, _CHOOSING)).astype(np.int64)
-    return stronger(usual_integrator(scene, q0[path], v0[path], dt, noisy=False) for path in some)
 
 
 def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Floats], tuple[Finding, ...]]:

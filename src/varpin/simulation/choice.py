@@ -51,7 +51,7 @@ def stronger(chosen: Iterable[Integrator]) -> Integrator:
 
     The default where there are none.
     """
-    ranks = {str(member): rank for rank, member in enumerate((_USUAL, _SWINGING, _STOPPING))}
+    ranks = {str(member): rank for rank, member in enumerate((_NOISY, _USUAL, _SWINGING, _STOPPING))}
     return max(chosen, key=lambda own: ranks[str(own)], default=_USUAL)
 
 
