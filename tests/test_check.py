@@ -354,7 +354,7 @@ def test_of_waves_within_a_step_a_step_that_follows_them_is_named(rate, size, ph
     follow(scene, told, None, 0.5, start, controls)
 
 
-@pytest.mark.parametrize(("links", "damping", "width"), [(2, 100.0, 0.01), (2, 1000.0, 0.001), (3, 100.0, 0.05)])
+@pytest.mark.parametrize(("links", "damping", "width"), [(3, 0.0, 0.01), (2, 100.0, 0.01), (2, 1000.0, 0.001)])
 @pytest.mark.parametrize("integrator", [None, vp.Radau(3), vp.Gauss(2)], ids=str)
 @pytest.mark.parametrize("dt", [5e-3, 2e-2])
 def test_of_stops_within_a_step_a_step_that_resolves_them_is_named(links, damping, width, integrator, dt):
@@ -362,6 +362,7 @@ def test_of_stops_within_a_step_a_step_that_resolves_them_is_named(links, dampin
     scene, start = vp.Scene(vp.planar_chain(links), damping=0.0, forces=[stop]), (np.full(links, 0.4), np.zeros(links))
     motion = vp.simulate(scene, *start, duration=1.0, dt=dt, integrator=integrator)
     for told in about(motion.warnings, "error"):
+        assert "Stops are stiffer" in told
         assert "integrator" not in told
         follow(scene, told, integrator, 1.0, start, again=2)
 

@@ -370,7 +370,7 @@ def _cure(
     A policy on (q, v) takes no other method. A law with a period of ``hold`` steps, and a policy, keep their periods.
     """
     q, v, most = trajectory.q, trajectory.v, _RINGS / trajectory.dt
-    contact = contact_rate(scene, q, v)
+    contact = contact_rate(scene, q, v, trajectory.dt)
     damped_by_others = not (integrator.l_stable or scene.constraints or contact > most)
     if damped_by_others and fastest_rate(scene, q, v, trajectory.u, most) > 0.0:
         return "Damping or friction is faster than the step: use integrator=varpin.Radau(4)"
@@ -381,7 +381,7 @@ def _cure(
     times = (max(excess, 1.0) / _AIM) ** (1.0 / order)
     least = _MOST_PARTS if not times < _MOST_PARTS else max(2, math.ceil(times))
     follow = parts_to_follow(controls, integrator.stage_times) if isinstance(controls, Sampled) else 1
-    parts, smaller = finer(trajectory, max(least, math.ceil(contact * trajectory.dt)) * follow)
+    parts, smaller = finer(trajectory, max(least, math.ceil(contact / most)) * follow)
     if hold:
         smaller += f" with period={hold * parts}"
     elif isinstance(controls, LinearPolicy) and controls.period is None:

@@ -16,6 +16,7 @@ from varpin.core import fastest_damping
 from varpin.errors import LinearizationError
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.forces import dissipates, limited_servos, of_kind
+from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 
 # Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
@@ -171,17 +172,20 @@ def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) ->
     return float(fastest_damping(scene.core, q, v, forces, least))
 
 
-def contact_rate(scene: Scene, q: Floats, v: Floats) -> float:
+def contact_rate(scene: Scene, q: Floats, v: Floats, dt: float) -> float:
     """The fastest rate [1/s] of a spring or damper, in the stops that joints reach; 0 where they reach none.
 
-    ``q`` and ``v`` are the nodes of a motion (N + 1, n).
+    ``q`` and ``v`` are the nodes of a motion (N + 1, n) in steps of ``dt`` [s], within which a joint may come and go.
     """
-    states = _in_stops(scene, q, v)
+    states = _in_stops(scene, np.concatenate([q, q + dt * v]), np.concatenate([v, v]))
     if not states:
         return 0.0
     q, v, _ = (np.concatenate(rows) for rows in zip(*states, strict=True))
-    eased = np.diagonal(np.linalg.inv(masses(scene, q)), axis1=1, axis2=2)
-    _, by_q, by_v, _ = scene.core.forces(q, v, np.zeros_like(q))
+    # Springs of stops are in the potential, their dampers among the forces.
+    jets = [lagrangian_jet(scene, place, np.zeros_like(place)) for place in q]
+    eased = np.array([np.diag(np.linalg.inv(jet.Lvv)) for jet in jets])
+    by_q = np.array([np.diag(jet.Lqq) for jet in jets])
+    by_v = scene.core.forces(q, v, np.zeros_like(q))[2]
     return float(np.maximum(np.sqrt(np.maximum(-by_q * eased, 0.0)), -by_v * eased).max())
 
 
