@@ -10,6 +10,7 @@ import re
 import signal
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from findings import about
 from mechanisms import slider
@@ -295,15 +296,75 @@ def test_advice(options, integrator, dt):
     family, stages = re.search(r"integrator=varpin\.(\w+)\((\d)\)", told).groups()
     better = moved(scene, getattr(vp, family)(int(stages)), dt=dt, steps=steps)
     assert not about(better.warnings, "error")
-    for _ in range(3):
-        if "dt = " not in told:
+    follow(scene, told, integrator, 0.8, (Q0, V0), again=3)
+
+
+def follow(scene, told, integrator, duration, start, controls=None, again=1):
+    """What a sentence names of the step is taken as it is written, and ends in a motion without an error to tell."""
+    for _ in range(again):
+        if not (named := re.search(r"(dt|steps) = (\S+)", told)):
             return
-        steps = round(0.8 / float(re.search(r"dt = (\S+) s", told).group(1)))
-        found = about(moved(scene, integrator, dt=0.8 / steps, steps=steps).warnings, "error")
-        if not found:
+        options = {named[1]: (float if named[1] == "dt" else int)(named[2])}
+        motion = vp.simulate(scene, *start, duration=duration, **options, controls=controls, integrator=integrator)
+        if not (found := about(motion.warnings, "error")):
             return
         (told,) = found
     pytest.fail(told)
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.7 / 12, 1.0 / 18])
+@pytest.mark.parametrize("integrator", [MIDPOINT, EULER])
+def test_a_named_step_divides_the_duration_as_it_is_written(dt, integrator):
+    duration = dt * round(0.8 / dt)
+    motion = vp.simulate(FREE, Q0, V0, duration=duration, dt=dt, integrator=integrator)
+    (told,) = about(motion.warnings, "error")
+    follow(FREE, told, integrator, duration, (Q0, V0), again=4)
+
+
+def test_a_named_step_keeps_the_period_of_a_law_and_of_a_policy():
+    scene, wish = vp.Scene(vp.planar_chain(2)), np.array([0.6, -0.4])
+    options = {"q0": [0.0, 0.0], "v0": [8.0, 0.0], "duration": 1.2, "integrator": vp.Midpoint()}
+
+    def law(t, q, v):
+        return 20.0 * (wish - q) - 2.0 * v
+
+    motion = vp.simulate(scene, **options, dt=0.03, controls=law, period=2)
+    (told,) = about(motion.warnings, "error")
+    dt, period = re.search(r"dt = (\S+) s with period=(\d+)", told).groups()
+    assert float(dt) * int(period) == pytest.approx(0.06, rel=1e-12)
+    better = vp.simulate(scene, **options, dt=float(dt), controls=law, period=int(period))
+    assert better.error.max() < 0.5 * motion.error.max()
+    u, gains = np.tile(40.0 * wish, (20, 1)), np.zeros((20, 2, 4))
+    motion = vp.simulate(scene, **options, dt=0.03, controls=vp.LinearPolicy(u, gains, np.zeros((20, 4)), hold=2))
+    (told,) = about(motion.warnings, "error")
+    dt, hold = re.search(r"dt = (\S+) s with hold=(\d+)", told).groups()
+    policy = vp.LinearPolicy(u, gains, np.zeros((20, 4)), hold=int(hold))
+    assert vp.simulate(scene, **options, dt=float(dt), controls=policy).error.max() < 0.5 * motion.error.max()
+
+
+@pytest.mark.parametrize(("rate", "size", "phase"), [(60, 150.0, 0.3), (300, 400.0, 0.3), (100, 200.0, np.pi / 2)])
+def test_of_waves_within_a_step_a_step_that_follows_them_is_named(rate, size, phase):
+    """More stages change nothing there, or the error for the worse; two see nothing of the last one."""
+    scene, start, push = vp.Scene(vp.planar_chain(2), damping=0.0), ([0.4, 0.4], [0.0, 0.0]), size * np.array([-1, 1])
+    controls = vp.OpenLoop(lambda t: push * np.sin(2.0 * np.pi * rate * t + phase))
+    motion = vp.simulate(scene, *start, duration=0.5, dt=0.01, controls=controls)
+    (told,) = about(motion.warnings, "error")
+    assert "faster than the step" in told
+    assert "integrator" not in told
+    follow(scene, told, None, 0.5, start, controls)
+
+
+@pytest.mark.parametrize(("links", "damping", "width"), [(3, 0.0, 0.01), (2, 100.0, 0.01), (2, 1000.0, 0.001)])
+@pytest.mark.parametrize("integrator", [None, vp.Radau(3), vp.Gauss(2)], ids=str)
+@pytest.mark.parametrize("dt", [5e-3, 2e-2])
+def test_of_stops_within_a_step_a_step_that_resolves_them_is_named(links, damping, width, integrator, dt):
+    stop = vp.JointStop(1e6, damping, -0.5, 0.9, width)
+    scene, start = vp.Scene(vp.planar_chain(links), damping=0.0, forces=[stop]), (np.full(links, 0.4), np.zeros(links))
+    motion = vp.simulate(scene, *start, duration=1.0, dt=dt, integrator=integrator)
+    for told in about(motion.warnings, "error"):
+        assert "Stops are stiffer" in told
+        assert "integrator" not in told
+        follow(scene, told, integrator, 1.0, start, again=2)
 
 
 def test_limits():
@@ -464,6 +525,24 @@ def test_one_step_has_a_bound():
 def test_a_joint_that_hardly_turns_is_measured_by_the_others():
     scene = vp.Scene(vp.planar_chain(2), gravity=False, stiffness=[0.0, 1e3])
     assert not vp.simulate(scene, [0.0, 4e-5], [1.0, 0.0], dt=0.02, steps=50, integrator=MIDPOINT).warnings
+
+
+def test_a_slide_that_hardly_moves_is_measured_by_the_arm_that_turns():
+    """On a heavy carriage: what the arm of 20 m turns is metres at its end."""
+    model = pin.Model()
+    rail = model.addJoint(0, pin.JointModelPX(), pin.SE3.Identity(), "rail")
+    model.appendBodyToJoint(rail, pin.Inertia.FromSphere(1e3, 0.1), pin.SE3.Identity())
+    rod = model.addJoint(rail, pin.JointModelRY(), pin.SE3.Identity(), "rod")
+    model.appendBodyToJoint(
+        rod, pin.Inertia(1.0, np.array([20.0, 0.0, 0.0]), np.diag([0.1, 0.1, 0.1])), pin.SE3.Identity()
+    )
+    model.addFrame(pin.Frame("tip", rod, 0, pin.SE3(np.eye(3), np.array([20.0, 0.0, 0.0])), pin.FrameType.OP_FRAME))
+    model.lowerPositionLimit[0], model.upperPositionLimit[0] = -1.0, 1.0
+    scene = vp.Scene(vp.load_robot(model), gravity=(0.0, 0.0, -9.81))
+    motion = vp.simulate(scene, [0.0, 0.3], [0.0, 6.0], dt=0.15, steps=40, integrator=MIDPOINT)
+    own = motion.error.max(axis=0) / np.ptp(motion.q, axis=0)
+    assert own[1] < TOLD < own[0]
+    assert not about(motion.warnings, "error")
 
 
 @pytest.mark.parametrize("begin", [0.0037, 0.2037])

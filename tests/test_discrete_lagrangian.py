@@ -9,58 +9,11 @@ from scipy.integrate import solve_ivp
 
 import varpin as vp
 
-ALPHAS = [0.0, 0.25, 0.5, 1.0]
-
 
 @pytest.fixture(scope="module")
 def tree_scene() -> vp.Scene:
     robot = vp.load_robot(random_tree(2, 5))
     return vp.Scene(robot, gravity=(1.0, -2.0, -9.0), stiffness=1.5, rest=0.2)
-
-
-@pytest.fixture(scope="module", params=["tree", "panda"])
-def scene(request, tree_scene) -> vp.Scene:
-    return tree_scene if request.param == "tree" else vp.Scene(vp.load_robot("panda"))
-
-
-@pytest.mark.parametrize("h", [0.01, 0.3])
-@pytest.mark.parametrize("alpha", ALPHAS)
-class TestSlots:
-    def test_are_the_derivatives_of_the_discrete_lagrangian(self, scene, alpha, h):
-        n = scene.robot.dof
-        rng = np.random.default_rng(5)
-        q0 = rng.uniform(-2.0, 2.0, n)
-        q1 = q0 + h * rng.normal(0.0, 2.0, n)
-
-        def Ld(x):
-            start, end = x[..., :n], x[..., n:]
-            return h * naive.lagrangian(scene, (1 - alpha) * start + alpha * end, (end - start) / h)
-
-        slots = vp.discrete_lagrangian(scene, q0, q1, h, alpha=alpha)
-        x = np.concatenate([q0, q1])
-        first, second = naive.gradient(Ld, x), naive.hessian(Ld, x)
-        assert slots.Ld == pytest.approx(float(Ld(x)), rel=1e-11)
-        for name, expected in {"D1": first[:n], "D2": first[n:]}.items():
-            np.testing.assert_allclose(
-                getattr(slots, name), expected, rtol=0, atol=1e-11 * np.abs(first).max(), err_msg=name
-            )
-        blocks = {
-            "D1D1": second[:n, :n],
-            "D2D1": second[n:, :n].T,
-            "D1D2": second[:n, n:].T,
-            "D2D2": second[n:, n:],
-        }
-        for name, expected in blocks.items():
-            np.testing.assert_allclose(
-                getattr(slots, name), expected, rtol=0, atol=1e-11 * np.abs(second).max(), err_msg=name
-            )
-
-    def test_mixed_derivatives_are_transposes(self, scene, alpha, h):
-        rng = np.random.default_rng(6)
-        q0, q1 = rng.uniform(-2.0, 2.0, (2, scene.robot.dof))
-        slots = vp.discrete_lagrangian(scene, q0, q1, h, alpha=alpha)
-        assert np.array_equal(slots.D1D2, slots.D2D1.T)
-        assert not np.array_equal(slots.D1D2, slots.D2D1)
 
 
 class TestLegendreTransforms:

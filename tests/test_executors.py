@@ -261,10 +261,28 @@ def killing(task):
 def test_a_lost_worker_is_told_of():
     with (
         ProcessPoolExecutor(1) as pool,
-        refused(vp.VarpinError, "lost") as caught,
+        refused(vp.WorkersLost, "lost") as caught,
     ):
         list(in_order(pool, killing, range(3)))
     assert isinstance(caught.value.__cause__, BrokenProcessPool)
+
+
+def deadly(q, v):
+    if q[0] > 2.0:
+        os._exit(1)
+    return np.zeros(1)
+
+
+def test_paths_that_were_finished_before_a_worker_was_lost_are_kept():
+    scene, q0 = vp.Scene(vp.planar_chain(1), forces=[vp.CustomForce(deadly)]), np.linspace(-1.0, 0.0, 300)[:, None]
+    q0[-1] = 2.1
+    with ProcessPoolExecutor(1) as pool, refused(vp.WorkersLost, "lost", ".ensemble") as caught:
+        vp.simulate_ensemble(scene, q0, [0.0], paths=300, rng=0, dt=0.01, steps=20, executor=pool)
+    kept = caught.value.ensemble
+    assert 100 < len(kept.q) < 300
+    motion = vp.simulate(scene, q0[7], [0.0], dt=0.01, steps=20, check=False)
+    assert kept.q[7].tobytes() == motion.q.tobytes()
+    assert pickle.loads(pickle.dumps(caught.value)).ensemble.q.shape == kept.q.shape
 
 
 def failing(task):
@@ -287,7 +305,7 @@ def test_executors_of_others_that_break_are_told_of():
         def submit(self, fn, /, *args, **kwargs):
             raise BrokenExecutor("the cluster is gone")
 
-    with refused(vp.VarpinError, "the cluster is gone"):
+    with refused(vp.WorkersLost, "the cluster is gone"):
         run(executor=Broken())
 
 

@@ -1,4 +1,4 @@
-"""Controls that are constant over a step: rows, functions of time, and laws as digital controllers."""
+"""Laws are digital controllers: called once a period, in the order of time."""
 
 import numpy as np
 import pytest
@@ -18,26 +18,6 @@ def scene():
 def law(t, q, v):
     """A motor that tries to swing, a drag that grows with the square of the speed, and a spring of its own."""
     return np.array([3.0, 2.0, 1.0]) * np.sin(7.0 * t) - GAIN * v * np.abs(v) - 2.0 * q
-
-
-def swing(t):
-    return np.array([3.0, 2.0, 1.0]) * np.sin(7.0 * t)
-
-
-def test_an_open_loop_is_its_means_for_a_method_of_one_stage(scene):
-    options = {"dt": 0.01, "steps": 70, "integrator": vp.Midpoint()}
-    turns = np.cos(0.07 * np.arange(71))
-    rows = (turns[:-1] - turns[1:])[:, None] / 0.07 * [3.0, 2.0, 1.0]
-    by_rows = vp.simulate(scene, Q0, V0, controls=rows, **options)
-    by_time = vp.simulate(scene, Q0, V0, controls=vp.OpenLoop(swing), **options)
-    np.testing.assert_allclose(by_time.q, by_rows.q, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(by_time.u, by_rows.u, rtol=0, atol=1e-12)
-    noisy = vp.Scene(scene.robot, noise=vp.AdditiveNoise(0.1))
-    one, other = (
-        vp.simulate_ensemble(noisy, Q0, V0, controls=controls, paths=3, rng=0, **options)
-        for controls in (rows, vp.OpenLoop(swing))
-    )
-    np.testing.assert_allclose(one.q, other.q, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(3), vp.RungeKutta4(), vp.ExplicitEuler()], ids=str)
@@ -68,3 +48,20 @@ def test_a_period_that_the_steps_do_not_fill_is_cut(scene):
     np.testing.assert_allclose(called, [0.0, 0.05, 0.1, 0.15])
     assert motion.steps == 17
     assert [len(np.unique(motion.u[k : k + 5, 0])) for k in (0, 5, 10, 15)] == [1, 1, 1, 1]
+
+
+def test_noise_that_python_evaluates_keeps_the_period():
+    """Such noise is simulated step by step; the law still decides once a period."""
+    times = []
+
+    def law(t, q, v):
+        times.append(t)
+        return -10.0 * q - v
+
+    motions = []
+    for noise in (vp.CustomNoise(lambda q, v, u: np.eye(2) * 0.1, 2), vp.AdditiveNoise(0.1)):
+        times.clear()
+        scene = vp.Scene(vp.planar_chain(2), noise=noise)
+        motions.append(vp.simulate(scene, [0.3, 0], [0, 0], dt=1e-2, steps=17, controls=law, period=5, rng=3))
+        np.testing.assert_allclose(times, [0.0, 0.05, 0.1, 0.15])
+    np.testing.assert_allclose(motions[0].u, motions[1].u, atol=1e-12)

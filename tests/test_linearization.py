@@ -36,27 +36,6 @@ def worst(given, expected, rows, columns):
     return np.abs((given - expected) / rows[:, None] * columns[None, :]).max() / np.abs(scaled).max()
 
 
-def test_split_steps_are_chained():
-    """A step taken in parts is linearized in the same parts."""
-    scene = vp.Scene(vp.planar_chain(3))
-    q, v, dt = np.array([2.1, -2.8, 1.4]), np.array([-5.9, -4.4, -2.5]), 0.1
-    motion = vp.simulate(scene, q, v, dt=dt, steps=1)
-    assert motion.statistics.split_steps == 1
-    lin = vp.linearize(scene, motion)
-
-    def step(x):
-        v = np.linalg.solve(vp.lagrangian_jet(scene, x[:3], np.zeros(3)).Lvv, x[3:])
-        end = vp.simulate(scene, x[:3], v, dt=dt, steps=1, check=False)
-        assert end.statistics.substeps[0] == motion.statistics.substeps[0]
-        return np.concatenate([end.q[1], end.p[1]])
-
-    x = np.concatenate([q, motion.p[0]])
-    numeric = difference(step, x, np.full(6, 1e-3))
-    np.testing.assert_allclose(lin.A[0], numeric, rtol=0, atol=1e-8 * np.abs(numeric).max())
-    J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(3))
-    assert np.abs(lin.A[0].T @ J @ lin.A[0] - J).max() < 1e-11 * np.abs(lin.A[0]).max() ** 2
-
-
 def friction_noise(n, strength):
     """Fields F_i = c (1 + v_i^2 / 2 + q_i v_i) e_i, which depend on the velocity, with their derivatives."""
 

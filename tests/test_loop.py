@@ -148,6 +148,28 @@ def test_the_count_of_changes():
     assert naming([finding], "control 0", f"{finding.value:.0f} times", "300 periods", "0.01 s")
 
 
+def test_a_law_without_limits_does_not_go_from_one_to_the_other():
+    """A goal that swings 19 times a second is followed, as well as that goes."""
+
+    def law(t, q, v):
+        return -100.0 * np.sin(q - np.sin(120.0 * t)) - 5.0 * v
+
+    assert not told(run(ROD, [0.0], [0.0], law, dt=1e-2, steps=300))
+
+
+def test_a_law_that_rests_in_the_end_does_not_go_from_limit_to_limit():
+    motion = run(ROD, [0.0], [0.5], lambda t, q, v: -5.0 * np.sign(v) * (t < 2.2), dt=1e-2, steps=300)
+    assert np.count_nonzero(np.diff(motion.u[150:, 0])) > 50
+    assert not told(motion)
+
+
+def test_growth_that_the_law_would_have_at_any_period_is_not_its_own():
+    """A spring too weak to hold a rod upright."""
+    motion = run(PENDULUM, [0.02 - np.pi / 2], [0.0], pd(2.0, 0.5, goal=-np.pi / 2), dt=5e-3, steps=300)
+    assert abs(motion.q[-1, 0] + np.pi / 2) > 0.05
+    assert not told(motion)
+
+
 def swing_up(t, q, v):
     """It pumps from limit to limit, catches the pendulum upright and holds it."""
     if np.sin(q[0]) < -0.8:
@@ -257,3 +279,33 @@ def test_a_law_that_comes_to_rest_but_for_blips_does_not_go_from_limit_to_limit(
 
     motion = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.3], [0.0], dt=0.01, steps=200, controls=law)
     assert not about(motion.warnings, KIND)
+
+
+def test_no_motion_ends_silently_above_a_thousand_times_its_start():
+    """Whatever the law: torques that grow on and on."""
+    for kp, kd in ((10.0, 69.0), (1e3, 0.0), (1e4, 10.0), (3e3, 20.0)):
+        for shape in (lambda x: x, lambda x: x * (1.0 + 0.1 * np.sin(x)), lambda x: x + 0.1 * np.cos(x)):
+
+            def law(t, q, v, kp=kp, kd=kd, shape=shape):
+                return shape(-kp * (q - 1) - kd * v)
+
+            try:
+                motion = run(ROD, [0.0], [0.0], law, dt=1e-2, steps=400)
+            except vp.ControlError:
+                continue
+            assert told(motion) or np.abs(motion.u[-20:]).max() <= 1e3 * np.abs(motion.u[0]).max()
+
+
+def test_an_ensemble_whose_loop_is_unstable_says_so():
+    """The gains that a motion is warned of, with noise: as many paths as one likes run away."""
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, noise=vp.AdditiveNoise(1e-3))
+    N = 100
+    gains = np.tile([[[-100.0, -110.0]]], (N, 1, 1))
+    policy = vp.LinearPolicy(np.zeros((N, 1)), gains, np.tile([1.0, 0.0], (N, 1)), on="velocity")
+    options = {"dt": 1e-2, "steps": N, "integrator": vp.RungeKutta4()}
+    ensemble = vp.simulate_ensemble(scene, [0.0], [0.0], paths=20, rng=0, controls=policy, **options)
+    assert np.abs(ensemble.q).max() > 1e3
+    assert told(ensemble), ensemble.warnings
+    calm = vp.LinearPolicy(np.zeros((N, 1)), 0.2 * gains, policy.reference, on="velocity")
+    quiet = vp.simulate_ensemble(scene, [0.0], [0.0], paths=20, rng=0, controls=calm, **options)
+    assert not told(quiet), quiet.warnings

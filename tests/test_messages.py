@@ -151,6 +151,7 @@ FORMATTED = {
         (3, 0.03, "the correction does not contract"),
         "step 3 (t = 0.03 s) cannot be linearized: the correction does not contract; a smaller dt may help",
     ),
+    vp.WorkersLost: (("killed",), "the executor has lost its workers: killed"),
     vp.ToleranceError: (
         (1e-6, 200.0, 4096, 0.5),
         "tolerance = 1e-06 cannot be met over 200 s: with 4096 steps the error in q is still 5.0e-01 rad or m. No "

@@ -7,7 +7,6 @@ import pinocchio as pin
 import pytest
 import scipy.linalg
 from refusals import refused, unnamed
-from scipy.optimize import root
 from scipy.special import ellipj, ellipk
 
 import varpin as vp
@@ -18,26 +17,6 @@ GRAVITY = 9.81
 
 def slopes(errors, factor=2.0):
     return np.log(np.asarray(errors[:-1]) / np.asarray(errors[1:])) / np.log(factor)
-
-
-@pytest.mark.parametrize("alpha", [0.0, 0.3, 0.5, 1.0])
-def test_one_step_solves_the_discrete_euler_lagrange_equations(alpha):
-    """Against a plain solver: unknown q1, Pinocchio's derivatives, SciPy's root finder."""
-    scene = vp.Scene(vp.load_robot("ur5"), damping=0.7, stiffness=3.0, rest=0.2)
-    q0, v0, u = np.random.default_rng(3).normal(size=(3, 6))
-    dt = 5e-3
-    p0 = vp.lagrangian_jet(scene, q0, v0, backend="pinocchio").Lv
-
-    def slots(q1):
-        jet = vp.lagrangian_jet(scene, (1 - alpha) * q0 + alpha * q1, (q1 - q0) / dt, backend="pinocchio")
-        impulse = 0.5 * dt * (u - scene.damping * (q1 - q0) / dt)
-        return dt * (1 - alpha) * jet.Lq - jet.Lv + impulse, dt * alpha * jet.Lq + jet.Lv + impulse
-
-    solution = root(lambda q1: p0 + slots(q1)[0], q0 + dt * v0, tol=1e-13)
-    end = vp.simulate(scene, q0, v0, dt=dt, steps=1, controls=u, integrator=vp.Midpoint(alpha=alpha))
-    np.testing.assert_allclose(end.q[1], solution.x, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(end.p[1], slots(solution.x)[1], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(end.p[0], p0, rtol=0, atol=1e-13)
 
 
 def test_pendulum_against_the_elliptic_solution():
@@ -54,17 +33,6 @@ def test_pendulum_against_the_elliptic_solution():
         errors.append(np.abs((0.5 * np.pi - motion.q[:, 0]) - 2.0 * np.arcsin(k * sn)).max())
     assert ((slopes(errors) > 1.95) & (slopes(errors) < 2.05)).all(), errors
     assert errors[-1] < 1e-4
-
-
-def test_momentum_about_a_vertical_axis_is_conserved_to_rounding():
-    """Gravity does not see the first joint of an arm that stands upright."""
-    scene = vp.Scene(vp.load_robot("ur5"))
-    motion = vp.simulate(
-        scene, [0.3, -1.0, 0.8, 0.2, 0.4, 0.1], [2.0, 0.5, 0, 1, 0, 3], dt=2e-3, steps=20_000, integrator=vp.Midpoint()
-    )
-    about_axis = motion.p[:, 0]
-    assert np.ptp(motion.p[:, 1]) > 1.0
-    assert np.abs(about_axis - about_axis[0]).max() <= 4.0 * np.spacing(abs(about_axis[0]))
 
 
 @pytest.mark.slow
@@ -159,18 +127,6 @@ def test_branch_margin_bounds_the_smallest_eigenvalue():
         margins.append(smallest)
     assert min(margins) < 0.5
     assert len(margins) > 20
-
-
-def test_a_function_and_an_array_of_controls_do_the_same():
-    scene = vp.Scene(vp.load_robot("finger"), gravity=False, damping=1e-3)
-    u = np.random.default_rng(0).normal(size=(50, 3)) * 1e-3
-    start = np.zeros(3), np.zeros(3)
-    by_array = vp.simulate(scene, *start, dt=1e-3, steps=50, controls=u, integrator=vp.Midpoint())
-    by_law = vp.simulate(
-        scene, *start, dt=1e-3, steps=50, controls=lambda t, q, v: u[round(t / 1e-3)], integrator=vp.Midpoint()
-    )
-    np.testing.assert_array_equal(by_array.q, by_law.q)
-    np.testing.assert_array_equal(by_law.u, u)
 
 
 def test_interruption_keeps_what_was_done():

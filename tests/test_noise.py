@@ -6,7 +6,6 @@ from refusals import refused
 
 import varpin as vp
 from varpin.mechanics.noise import bind
-from varpin.mechanics.wiener import coarsen, wiener_increments
 from varpin.simulation.failures import NoiseError
 
 # Three coordinates, two controls: one joint is not actuated, and a control moves two joints.
@@ -365,33 +364,15 @@ def test_python_and_compiled_fields_give_the_same_motion(kick, feedback):
 
 
 @pytest.mark.parametrize(
-    "integrator", [vp.Midpoint(), pytest.param(vp.Midpoint(kick="split"), marks=pytest.mark.slow)], ids=str
+    "integrator", [vp.Midpoint(), vp.Midpoint(kick="split"), vp.Midpoint(kick="held"), vp.Radau(2)]
 )
-def test_strong_order(integrator):
-    """1, and 1/2 where the field depends on the velocity: the same paths at steps sixteen times as long."""
-    M = vp.lagrangian_jet(vp.Scene(vp.planar_chain(1)), [0.0], [0.0]).Lvv[0, 0]
-    in_velocity = vp.CustomNoise(lambda q, v, u: [[0.3 * M * v[0]]], 1, dv=lambda q, v, u: [[[0.3 * M]]])
-    in_place = vp.CustomNoise(
-        lambda q, v, u: [[0.3 * M * np.sin(q[0])]], 1, dq=lambda q, v, u: [[[0.3 * M * np.cos(q[0])]]]
-    )
-    orders = {}
-    for name, noise, paths in (("velocity", in_velocity, 60), ("place", in_place, 12)):
-        scene = vp.Scene(vp.planar_chain(1), noise=noise, gravity=(0.0, 0.0, 0.0))
-        errors = []
-        for path in range(paths):
-            fine = wiener_increments(1, 1.0 / 256, 256, path)
-
-            def end(factor, scene=scene, fine=fine):
-                motion = vp.simulate(
-                    scene, [0.5], [1.0], dt=factor / 256, steps=256 // factor, integrator=integrator,
-                    increments=coarsen(fine, factor), check=False,
-                )  # fmt: skip
-                return motion.v[-1, 0]
-
-            # Without gravity and with M constant, v is exactly v0 exp(0.3 w) in the one case.
-            exact = np.exp(0.3 * fine.sum()) if name == "velocity" else end(1)
-            errors.append([end(4) - exact, end(64) - exact])
-        small, large = np.sqrt(np.mean(np.square(errors), axis=0))
-        orders[name] = np.log(large / small) / np.log(16.0)
-    assert 0.35 < orders["velocity"] < 0.7
-    assert 0.8 < orders["place"] < 1.3
+def test_the_mean_of_noise_in_proportion_to_the_velocity(integrator):
+    """Over two steps of the noise with the moments of a normal one: dv = s v o dw has the mean v exp(s^2 t / 2)."""
+    M, s, dt = vp.lagrangian_jet(vp.Scene(vp.planar_chain(1)), [0.0], [0.0]).Lvv[0, 0], 0.3, 0.01
+    noise = vp.CustomNoise(lambda q, v, u: [[s * M * v[0]]], 1, dv=lambda q, v, u: [[[s * M]]])
+    scene = vp.Scene(vp.planar_chain(1), noise=noise, gravity=False)
+    ends = [
+        vp.simulate(scene, [0.5], [1.0], dt=dt, steps=1, integrator=integrator, increments=[[dw]], check=False).v[1, 0]
+        for dw in (np.sqrt(dt), -np.sqrt(dt))
+    ]
+    assert np.mean(ends) - 1.0 == pytest.approx(0.5 * s**2 * dt, rel=2e-3)

@@ -61,7 +61,7 @@ def test_a_plan_runs_at_finer_steps_as_it_is():
 
 
 def test_steps_that_do_not_fit_are_refused_with_what_does():
-    with refused(vp.InputError, "0.02 s", "0.003 s", "0.00285714 s"):
+    with refused(vp.InputError, "0.02 s", "0.003 s", f"dt = {0.02 / 7!r} s"):
         run(policy(), 0.003, 70)
     # As many steps as it has intervals, but longer ones: nothing told of it before.
     with refused(vp.InputError, "0.04 s", "0.02 s"):

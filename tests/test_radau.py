@@ -127,3 +127,14 @@ def test_a_spring_beside_a_damper_keeps_its_energy():
     np.testing.assert_allclose(energy / energy[0], 1.0, rtol=0, atol=0.01)
     exact = 0.5 * np.cos(50.0 * motion.t)
     assert np.abs(motion.q[:, 0] - exact).max() < 0.005
+
+
+@pytest.mark.parametrize(("stages", "dt"), [(2, 0.02), (2, 0.05), (3, 0.1)])
+def test_free_motions_keep_their_energy(stages, dt):
+    """The guard's budget is a hundredth of the one of one stage: a thousandth of the kinetic energy is kept so."""
+    scene = vp.Scene(vp.planar_chain(3), damping=0.0)
+    options = {"dt": dt, "steps": round(3.0 / dt), "integrator": vp.Radau(stages), "check": False}
+    motion = vp.simulate(scene, [0.3, 1.2, -0.8], [2.0, -3.0, 4.0], **options)
+    kinetic = [0.5 * v @ vp.lagrangian_jet(scene, q, v).Lvv @ v for q, v in zip(motion.q, motion.v, strict=True)]
+    assert motion.statistics.split_steps > 0
+    assert np.abs(motion.energy - motion.energy[0]).max() < 1e-3 * max(kinetic)

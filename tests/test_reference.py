@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from findings import about
 from refusals import refused
 
 import varpin as vp
@@ -47,27 +46,3 @@ def test_runaway_is_a_step_failure():
     with refused(vp.StepFailure) as caught:
         vp.simulate(scene, [1.0], [1.0], dt=10.0, steps=60, controls=policy, integrator=vp.Reference())
     assert np.isfinite(caught.value.trajectory.q).all()
-
-
-def test_every_integrator_knows_its_order():
-    orders = {
-        vp.Midpoint(): 2,
-        vp.Midpoint(alpha=0.3): 1,
-        vp.Gauss(stages=1): 2,
-        vp.Gauss(stages=4): 8,
-        vp.ExplicitEuler(): 1,
-        vp.SemiImplicitEuler(): 1,
-        vp.RungeKutta4(): 4,
-        vp.Reference(): 8,
-    }
-    assert all(integrator.order == order for integrator, order in orders.items())
-
-
-def test_dampers_are_resolved_whatever_dt_is():
-    """A wrist whose damper is forty times faster than dt: the motion is that of small steps, and nothing rings."""
-    scene = vp.Scene(vp.load_robot("ur10"), damping=2.0)
-    start = [0.0, -1.2, 1.0, 0.0, 0.0, 0.3], np.zeros(6)
-    motion = vp.simulate(scene, *start, dt=1e-2, steps=60, integrator=vp.Reference())
-    fine = vp.simulate(scene, *start, dt=1e-4, steps=6000)
-    np.testing.assert_allclose(motion.v, fine.v[::100], rtol=0, atol=1e-9)
-    assert not about(motion.warnings, "error")

@@ -1,4 +1,4 @@
-"""Second derivatives of steps in parts against differences of the first; sums of rows."""
+"""Second derivatives of steps: sums of rows, and what cannot be done."""
 
 import numpy as np
 import pytest
@@ -6,46 +6,6 @@ from refusals import refused
 
 import varpin as vp
 from varpin.model.chain import planar_chain
-
-WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-
-
-def differences_of_the_first(scene, motion, z, integrator, states_too):
-    """The contraction by eighth-order differences of A and B: rows and columns are those of (x, u)."""
-    n, m, dt = scene.robot.dof, scene.controls, motion.dt
-    light = 0.5 / np.diag(np.linalg.inv(vp.lagrangian_jet(scene, motion.q[0], motion.v[0]).Lvv))
-    units = np.concatenate([np.ones(n), light, np.abs(scene.actuation.T) @ light])
-    point = np.concatenate([motion.q[0], motion.p[0], motion.u[0]])
-
-    def gradient(y):
-        v = np.linalg.solve(vp.lagrangian_jet(scene, y[:n], np.zeros(n)).Lvv, y[n : 2 * n])
-        end = vp.simulate(scene, y[:n], v, dt=dt, steps=1, controls=y[2 * n :], integrator=integrator)
-        assert end.statistics.substeps[0] == motion.statistics.substeps[0], "the difference crosses a guard"
-        lin = vp.linearize(scene, end, integrator=integrator)
-        return z @ np.hstack([lin.A[0], lin.B[0]])
-
-    H = np.zeros((2 * n + m, 2 * n + m))
-    for c in range(2 * n + m):
-        e = np.zeros(2 * n + m)
-        e[c] = states_too * units[c]
-        total = sum(w * (gradient(point + i * e) - gradient(point - i * e)) for i, w in WEIGHTS.items())
-        H[:, c] = total / e[c]
-    return H, units[:, None] * units
-
-
-def whole(curvature):
-    return np.block([[curvature.xx[0], curvature.ux[0].T], [curvature.ux[0], curvature.uu[0]]])
-
-
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
-def test_a_step_in_parts_is_chained(integrator):
-    scene = vp.Scene(planar_chain(3))
-    motion = vp.simulate(scene, [0.3, 0.8, -1.0], [6.0, -5.0, 9.0], dt=0.1, steps=1, integrator=integrator)
-    assert motion.statistics.substeps[0] > 1
-    z = np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.4])
-    given = whole(vp.second_order(scene, motion, z))
-    expected, units = differences_of_the_first(scene, motion, z, integrator, 1e-4)
-    assert np.abs((given - expected) * units).max() <= 1e-6 * np.abs(expected * units).max()
 
 
 def tip_on_a_spring():

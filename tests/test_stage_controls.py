@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from findings import about
 from refusals import refused
 
 import varpin as vp
@@ -166,14 +165,6 @@ def test_steps_in_parts_keep_the_order(stages, balance):
         whole = vp.simulate(scene, CHAIN_Q, CHAIN_V, steps=steps, integrator=vp.Gauss(stages), **options)
         assert errors[-1] < 0.5 * np.abs(whole.q[-1] - end).max()
     assert np.log2(errors[0] / errors[1]) > 2 * stages - 0.5, errors
-
-
-def test_coarse_steps_are_told():
-    options = {"duration": 2.0, "controls": vp.OpenLoop(push), "integrator": vp.RungeKutta4()}
-    scene = vp.Scene(vp.planar_chain(3))
-    coarse = vp.simulate(scene, CHAIN_Q, CHAIN_V, steps=30, **options)
-    assert about(coarse.warnings, "error")
-    assert vp.simulate(scene, CHAIN_Q, CHAIN_V, steps=800, **options).warnings == ()
 
 
 def test_held_controls_have_no_ramp():

@@ -317,5 +317,20 @@ def test_an_earlier_step_that_divides_the_duration_is_taken(duration):
 def test_the_order_is_that_of_the_last_two_trials():
     rung = Rung(vp.Gauss(2), 8, 1)
     for steps, error in ((8, 1e-2), (16, 1e-2), (32, 1e-2 / 16)):
-        rung.add(Trial(steps, error, steps))
+        rung.add(Trial(rung.integrator, steps, error, steps))
     assert rung.order == pytest.approx(4.0)
+
+
+def test_a_force_that_is_met_within_a_step_is_in_the_motion():
+    """A narrow ridge, which coarse steps would pass over; its energy gives the speed behind it."""
+    high, width, begin = 10.0, 0.06, 0.4
+
+    def ridge(q, v):
+        y = (q - begin) / width
+        return np.where((y > 0.0) & (y < 1.0), -high * 30.0 * y**2 * (1.0 - y) ** 2, 0.0)
+
+    scene = vp.Scene(vp.planar_chain(1), gravity=False, forces=vp.CustomForce(ridge))
+    M = vp.lagrangian_jet(scene, [0.0], [0.0]).Lvv[0, 0]
+    motion = vp.simulate(scene, [0.0], [3.0], duration=0.4, tolerance=1e-4)
+    assert motion.accuracy.met
+    assert motion.v[-1, 0] == pytest.approx(np.sqrt(9.0 - 2.0 * high * width / M), abs=1e-3)

@@ -131,30 +131,6 @@ def test_simulate_refuses_what_it_cannot_use():
         run(rng="seed")
 
 
-@BOTH
-def test_one_step_is_a_kick_and_a_deterministic_step(kick):
-    """By hand: p + left F(q, u) dw, the deterministic step, and the rest of the kick at the state reached."""
-    noise = vp.AdditiveNoise([[0.5, 0.1], [0.2, 0.3]]) + vp.StateNoise([0.4, 0.9], center=[1.0, 0.0])
-    noise += vp.ControlNoise([0.7, 0.2])
-    scene, quiet = noisy_chain(noise), noisy_chain(None)
-    q0, v0, u, dt = np.array([0.1, 0.2]), np.array([0.5, 1.0]), np.array([0.6, -0.4]), 0.01
-    dw = 0.1 * np.random.default_rng(0).normal(size=6)
-    left = 1.0 if kick == "left" else 0.5
-
-    def impulse(q):
-        own = np.array([[0.5, 0.1], [0.2, 0.3]]) @ dw[:2] + [0.4, 0.9] * (q - [1.0, 0.0]) ** 2 * dw[2:4]
-        return own + [0.7, 0.2] * u * dw[4:]
-
-    M = vp.lagrangian_jet(scene, q0, v0, backend="pinocchio").Lvv
-    kicked = np.linalg.solve(M, M @ v0 + left * impulse(q0))
-    plain = vp.simulate(quiet, q0, kicked, dt=dt, steps=1, controls=u, integrator=vp.Midpoint())
-    end = vp.simulate(scene, q0, v0, dt=dt, steps=1, controls=u, increments=dw[None], integrator=vp.Midpoint(kick=kick))
-    np.testing.assert_allclose(end.q[1], plain.q[1], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(end.p[1], plain.p[1] + (1.0 - left) * impulse(plain.q[1]), rtol=0, atol=1e-13)
-    M = vp.lagrangian_jet(scene, end.q[1], v0, backend="pinocchio").Lvv
-    np.testing.assert_allclose(M @ end.v[1], end.p[1], rtol=0, atol=1e-13)
-
-
 NOISES = {
     "additive": vp.AdditiveNoise(0.5),
     "state": vp.StateNoise(0.4, center=[2.0, -0.5]),
@@ -287,9 +263,6 @@ def geometric_logs(kick, dv, steps, paths=40):
 
 def derivative_of_geometric_noise(q, v, u):
     return np.full((1, 1, 1), 0.5 * RATE)
-
-
-CORRECTED = ["left", "split"]
 
 
 @pytest.mark.parametrize("kick", ["left", pytest.param("split", marks=pytest.mark.slow)])

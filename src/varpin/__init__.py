@@ -28,6 +28,7 @@ from varpin.errors import UnknownJoint as UnknownJoint
 from varpin.errors import UnknownPosture as UnknownPosture
 from varpin.errors import UnsupportedJoint as UnsupportedJoint
 from varpin.errors import VarpinError as VarpinError
+from varpin.errors import WorkersLost as WorkersLost
 from varpin.finding import Finding as Finding
 from varpin.integrators import ExplicitEuler as ExplicitEuler
 from varpin.integrators import Gauss as Gauss

@@ -208,6 +208,20 @@ class MissingDependency(VarpinError, ImportError):
         super().__init__(f"{purpose} needs {' and '.join(self.missing)}: {command}")
 
 
+class WorkersLost(VarpinError, RuntimeError):
+    """An executor has lost its workers, as when a process of a pool is killed.
+
+    Attributes:
+        ensemble: The paths of :func:`varpin.simulate_ensemble` that were finished, in order from the first; None if
+            there are none, and elsewhere.
+    """
+
+    def __init__(self, cause: object, ensemble: Any = None) -> None:
+        self.ensemble = ensemble
+        kept = "" if ensemble is None else f"; {int(ensemble.statistics.count[0])} finished paths are in .ensemble"
+        super().__init__(f"the executor has lost its workers{kept}: {cause}")
+
+
 class LinearizationError(VarpinError, RuntimeError):
     """A step of a trajectory has no solution at zero noise, so it has no derivative.
 

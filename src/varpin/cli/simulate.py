@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import math
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -33,6 +32,7 @@ from varpin.mechanics.scene import Scene
 from varpin.show.replay import frame_names
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.simulate import simulate
+from varpin.simulation.time_steps import time_steps
 from varpin.support.checks import count, positive
 from varpin.support.tables import WIDTH, add_row, facts
 from varpin.trajectory import Trajectory
@@ -154,10 +154,10 @@ def _steps(request: argparse.Namespace) -> int | None:
         return None
     dt = _dt(request)
     if request.steps is None:
-        ratio = _duration(request) / dt
-        if ratio < 0.5:
-            raise InputError(f"--duration {request.duration:g} s is less than one step of {dt:g} s")
-        steps = round(ratio) if math.isfinite(ratio) else MOST_STEPS + 1
+        duration = _duration(request)
+        # The default of the duration gives way to the step.
+        given = request.duration is not None
+        steps = time_steps(dt, None, duration)[1] if given else max(1, round(min(duration / dt, MOST_STEPS + 1)))
     else:
         steps = count("--steps", request.steps, 1)
     if steps > MOST_STEPS:

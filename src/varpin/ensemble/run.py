@@ -15,7 +15,7 @@ from varpin.ensemble.looks import looked_at, looked_at_here
 from varpin.ensemble.paths import Part, Shared, simulate_paths, without_geometry
 from varpin.ensemble.record import Ensemble, EnsembleInterrupted
 from varpin.ensemble.statistics import Sums
-from varpin.errors import InputError, VarpinError
+from varpin.errors import InputError, VarpinError, WorkersLost
 from varpin.finding import Finding, announce
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
@@ -34,6 +34,7 @@ from varpin.support.checks import (
     flag,
     joint_array,
     require_finite,
+    require_memory,
 )
 from varpin.support.executors import executing, in_order, take_all
 
@@ -98,7 +99,8 @@ def simulate_ensemble(
         ForceError: A function of a :class:`varpin.CustomForce` failed. The error names the path and holds its motion up
             to the failure.
         AssemblyError: No configuration near q0 satisfies the scene's constraints.
-        VarpinError: Every path failed, or the executor has lost its workers.
+        VarpinError: Every path failed.
+        WorkersLost: The executor has lost its workers; holds the finished paths.
         EnsembleInterrupted: Ctrl-C; holds the finished paths, and those that threads had begun. It is a
             KeyboardInterrupt.
     """
@@ -122,7 +124,9 @@ def simulate_ensemble(
         controls = scene.command_at(start[0][0])
     start, moved = _onto_constraints(scene, start)
     if integrator is None:
-        integrator = _usual(scene, start[0], start[1], dt)
+        noisy = scene.processes > 0
+        some = np.linspace(0, paths - 1, 1 if noisy else min(1 + paths // _OF, _CHOOSING)).astype(np.int64)
+        integrator = stronger(usual_integrator(scene, start[0][j], start[1][j], dt, noisy=noisy) for j in some)
     commands = commands_of(scene, integrator, controls, steps, dt)
     with executing(executor, workers) as pool:
         shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
@@ -132,29 +136,19 @@ def simulate_ensemble(
                 take_all(parts, sums.add, lambda: progress(sums.done, paths) if progress is not None else None)
             assert sums.done == paths
             found = looked_at(pool, shared, start[0], start[1], sums.extremes)
-        except KeyboardInterrupt:
-            if not sums.done:
-                raise EnsembleInterrupted(None) from None
-            seen = looked_at_here(shared, start[0][: sums.done], start[1][: sums.done], sums.extremes)
-            raise EnsembleInterrupted(sums.ensemble((*sums.lost(), *seen))) from None
+        except (KeyboardInterrupt, WorkersLost) as stop:
+            kept = None
+            if sums.done:
+                seen = looked_at_here(shared, start[0][: sums.done], start[1][: sums.done], sums.extremes)
+                kept = sums.ensemble((*sums.lost(), *seen))
+            if isinstance(stop, WorkersLost):
+                raise WorkersLost(stop.__cause__, kept) from stop.__cause__
+            raise EnsembleInterrupted(kept) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
     found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene.announced, dt, found)
     return sums.ensemble(found)
-
-
-def _usual(
-    scene: Scene,
-    q0: Floats,
-    v0: Floats,
-    dt: float,
-) -> Integrator:
-    """The integrator of paths from (q0, v0) (P, n) where none is given: one that is right for a few of them."""
-    if scene.processes:
-        return usual_integrator(scene, q0[0], v0[0], dt, noisy=True)
-    some = np.linspace(0, len(q0) - 1, min(1 + len(q0) // _OF, _CHOOSING)).astype(np.int64)
-    return stronger(usual_integrator(scene, q0[path], v0[path], dt, noisy=False) for path in some)
 
 
 def _onto_constraints(scene: Scene, start: Sequence[Floats]) -> tuple[list[Floats], tuple[Finding, ...]]:
@@ -196,16 +190,8 @@ def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> Non
     n, m = scene.robot.dof, scene.controls
     stored = paths if store else 0
     row = 2 * n * (4 * n + 5) + m + stored * (3 * n + m + 1)
-    for shape, what in (
-        ((steps + 1, row), f"steps = {steps} with {stored} stored paths"),
-        ((paths, 2 * n), f"paths = {paths}"),
-    ):
-        try:
-            np.empty(shape)
-        except (MemoryError, ValueError, OverflowError):
-            raise InputError(
-                f"{what} needs more memory than there is: {8 * shape[1]} bytes a {what.partition(' ')[0][:-1]}"
-            ) from None
+    require_memory(steps + 1, row, f"steps = {steps} with {stored} stored paths", "step")
+    require_memory(paths, 2 * n, f"paths = {paths}", "path")
 
 
 def _per_path(name: str, value: JointValues, paths: int, joints: Sequence[str]) -> Floats:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar
 
@@ -20,8 +20,8 @@ from varpin.errors import InputError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import Fields, over_steps
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import contiguous, open_loop, rest_of_line, rows, steps_of
-from varpin.signals.inputs import with_ends
+from varpin.signals.commands import contiguous, control_of, ends_of, first_of, open_loop, rest_of_line, rows, steps_of
+from varpin.signals.inputs import in_parts_of_steps, prescribing, with_ends
 from varpin.trajectory import Bytes, StepStatistics, Trajectory, joined
 
 # Fields of a segment with one row for each node.
@@ -79,8 +79,7 @@ class Integrator(ABC):
 
     1. ``start``, which returns the state of a rollout at (q0, v0) and the first node, and ``fork``, which copies a
        state;
-    2. ``rollout_compiled``, many steps of many paths in the core, and ``step_in_python``, one step of one path with
-       noise that only Python can evaluate; both advance a state;
+    2. ``rollout_compiled``, which advances a state by many steps of many paths in the core;
     3. ``linearize``, the derivatives of its steps, ``linearize_with_ramps`` if it evaluates controls within a step, and
        ``quiet_ends`` if it applies noise after a step too;
     4. ``variational``, True if it maps (q, p) and False if it maps (q, v), and ``order``.
@@ -97,7 +96,7 @@ class Integrator(ABC):
 
         A trajectory stores it.
         """
-        return _name_of(self) if isinstance(self, Hashable) else written(self, self.named)
+        return written(self, self.named)
 
     def same_map(self, other: Integrator) -> bool:
         """Whether ``other`` has the same step map for undivided steps."""
@@ -158,21 +157,7 @@ class Integrator(ABC):
         included (:meth:`Scene.increments`), for controls that are linear between nodes. Returns a segment for each
         path; with diffusion fields that only Python can evaluate there is one path.
         """
-        if scene.noise.diffusion is not None:
-            commands = contiguous(commands)
-            return self.rollout_compiled(scene, state, commands, increments, np.zeros((0, 0, scene.robot.dof)), dt)
-        segments: list[Segment] = []
-        for j in range(steps_of(commands)):
-            row = rows(commands, j // commands.hold, j // commands.hold + 1, segments[-1].u[None, -1] if j else None)
-            if (taken := j % commands.hold) > 0:
-                row = open_loop(segments[-1].u)._replace(hold=commands.hold - taken)
-                if len(commands.stage_times):
-                    first = segments[j - taken - 1].u if j > taken else commands.before[:1]
-                    row = rest_of_line(row, first, taken, commands)
-            segments.append(self.step_in_python(scene, state, row, increments[:, j : j + 1], dt))
-            if segments[-1].failure is not None:
-                break
-        return [join(segments)]
+        return self.rollout_compiled(scene, state, contiguous(commands), increments, scene.no_drift, dt)
 
     def watched(
         self,
@@ -250,10 +235,6 @@ class Integrator(ABC):
             return None
         return np.array([part.q for part in parts]), np.array([part.v for part in parts])
 
-    @abstractmethod
-    def step_in_python(self, scene: Scene, state: Any, command: Commands, increment: Floats, dt: float) -> Segment:
-        """One step of one path with diffusion fields that are evaluated in Python."""
-
     def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
         """The ends of the steps at dw = 0, q and v (N, n), for integrators that apply noise after the step.
 
@@ -305,10 +286,12 @@ class Run:
     Attributes:
         paths: The paths, with their work arrays.
         start: Initial configurations (P, n) [rad or m].
+        driven: Whether the scene has kinematic inputs.
     """
 
     paths: Any
     start: Floats
+    driven: bool = False
 
 
 class Compiled(Integrator):
@@ -319,6 +302,56 @@ class Compiled(Integrator):
     @abstractmethod
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
         """The state of a rollout of P paths at (q0, v0), each (P, n)."""
+
+    @abstractmethod
+    def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
+        """The q, p and v (n,) of the only path."""
+
+    @abstractmethod
+    def kicked(
+        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
+    ) -> Segment:
+        """One step of the only path under a drift (n,), with a noise impulse (n,) or its first part."""
+
+    def rollout(self, scene: Scene, state: Run, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
+        """See :meth:`Integrator.rollout`."""
+        if scene.noise.diffusion is not None:
+            return super().rollout(scene, state, commands, increments, dt)
+        segments: list[Segment] = []
+        for j in range(steps_of(commands)):
+            row = rows(commands, j // commands.hold, j // commands.hold + 1, segments[-1].u[None, -1] if j else None)
+            if (taken := j % commands.hold) > 0:
+                row = open_loop(segments[-1].u)._replace(hold=commands.hold - taken)
+                if len(commands.stage_times):
+                    first = segments[j - taken - 1].u if j > taken else commands.before[:1]
+                    row = rest_of_line(row, first, taken, commands)
+            segments.append(self._step_in_python(scene, state, row, increments[:, j : j + 1], dt))
+            if segments[-1].failure is not None:
+                break
+        return [join(segments)]
+
+    def _step_in_python(self, scene: Scene, state: Run, command: Commands, increment: Floats, dt: float) -> Segment:
+        """One step of one path with diffusion fields that are evaluated in Python."""
+        q, p, v = self.state_of(state)
+        decided = control_of(command, 0, np.concatenate([q, p if self.variational else v]), command.before)
+        now, ends, start = first_of(command, decided, self.stage_times), ends_of(command, decided), state.start[0]
+        if scene.inputs:
+            after = in_parts_of_steps(scene, decided[None], q[None], v[None], dt * command.hold, command.hold)[:1]
+            now, ends = (
+                prescribing(scene, now, after),
+                (with_ends(scene, ends[0], after), with_ends(scene, ends[1], after)),
+            )
+        F, drift = diffusion_and_drift(scene, q, v, now.u[0], start, ends)
+        drawn = increment[0, 0] if len(increment) else None
+        impulse = None if drawn is None else noise_of_step(scene, F, q, v, ends, start, drawn)
+        segment = self.kicked(scene, state, now, self.drift_share * drift, impulse, dt)
+        if drawn is not None and self.left < 1.0 and segment.failure is None:
+            q, _, v = self.state_of(state)
+            F, _ = diffusion_and_drift(scene, q, v, now.u[0], start)
+            state.paths.kick((1.0 - self.left) * noise_of_step(scene, F, q, v, ends, start, drawn)[None])
+            _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
+        segment.u[:] = decided
+        return segment
 
     def rollout_compiled(
         self,
@@ -333,7 +366,11 @@ class Compiled(Integrator):
         """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
         state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
-        return segments_of(nodes, self.reasons, state.paths)
+        return self._segments(scene, state.paths, nodes)
+
+    def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:  # noqa: ARG002
+        """A segment for each of the core's paths, which have written ``nodes``."""
+        return segments_of(nodes, self.reasons, paths)
 
     def watched(
         self,
@@ -363,12 +400,6 @@ class Compiled(Integrator):
         nodes = new_nodes(len(q0), steps_of(commands), scene.robot.dof, scene.controls)
         state.paths.roll(dt, commands, scene.silence, scene.no_drift, nodes)
         return None if nodes.ended.any() else (nodes.q, nodes.v)
-
-
-@functools.lru_cache(maxsize=256)
-def _name_of(integrator: Integrator) -> str:
-    """The text of an integrator, which a program has few of."""
-    return written(integrator, integrator.named)
 
 
 def written(made: object, named: Sequence[str] = ()) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,19 +16,16 @@ from varpin.integrators.base import (
     Compiled,
     Run,
     Segment,
-    diffusion_and_drift,
     drifts,
     first_nodes,
     forces,
-    noise_of_step,
 )
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, refuse_constraints
-from varpin.signals.commands import control_of, ends_of, first_of
 from varpin.trajectory import Trajectory
 
 REASONS: dict[int, str] = {
-    Outcome.not_finite: "the state is no longer finite",
+    Outcome.not_finite: "the state is no longer finite: the motion runs away, as where damping is faster than the step",
     Outcome.singular: "the mass matrix is not positive definite",
 }
 
@@ -39,7 +36,8 @@ class _Explicit(Compiled):
 
     method: ClassVar[ExplicitMethod]
     variational = False
-    reasons = REASONS
+    # In a motion no mass matrix but that of angles beyond rounding is singular.
+    reasons = dict.fromkeys(REASONS, REASONS[Outcome.not_finite])
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
         """See :meth:`Integrator.start`."""
@@ -59,28 +57,25 @@ class _Explicit(Compiled):
 
     def fork(self, state: Run) -> Run:
         """See :meth:`Integrator.fork`."""
-        return Run(state.paths.copy(), state.start)
+        return replace(state, paths=state.paths.copy())
 
-    def step_in_python(self, scene: Scene, state: Run, command: Commands, increment: Floats, dt: float) -> Segment:
-        """One step of one path with diffusion fields that are evaluated in Python.
+    def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
+        """See :meth:`Compiled.state_of`; p is none of its own."""
+        return state.paths.q[0], state.paths.q[0, :0], state.paths.v[0]
+
+    def kicked(
+        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
+    ) -> Segment:
+        """See :meth:`Compiled.kicked`.
 
         The noise impulse is a constant force over the step for explicit Euler, where this is equivalent, and a jump of
         the velocity before the step for the other methods.
         """
-        q, v = state.paths.q[0], state.paths.v[0]
-        decided = control_of(command, 0, np.concatenate([q, v]), command.before)
-        now = first_of(command, decided, self.stage_times)
-        ends = ends_of(command, decided)
-        F, drift = diffusion_and_drift(scene, q, v, now.u[0], state.start[0], ends)
-        if len(increment):
-            impulse = noise_of_step(scene, F, q, v, ends, state.start[0], increment[0, 0])
-            if self.method is ExplicitMethod.euler:
-                drift = drift + impulse / dt
-            else:
-                v += np.linalg.solve(mass(scene, q), impulse)
-        (segment,) = self.rollout_compiled(scene, state, now, scene.silence, drift[None, None], dt)
-        segment.u[:] = decided
-        return segment
+        if impulse is not None and self.method is ExplicitMethod.euler:
+            drift = drift + impulse / dt
+        elif impulse is not None:
+            state.paths.v[0] += np.linalg.solve(mass(scene, state.paths.q[0]), impulse)
+        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt)[0]
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, v)."""

@@ -110,17 +110,6 @@ class Reference(Integrator):
         """See :meth:`Integrator.fork`."""
         return replace(state, x=state.x.copy())
 
-    def step_in_python(
-        self,
-        scene: Scene,  # noqa: ARG002
-        state: ReferenceRun,  # noqa: ARG002
-        command: Commands,  # noqa: ARG002
-        increment: Floats,  # noqa: ARG002
-        dt: float,  # noqa: ARG002
-    ) -> Segment:
-        """Refuse; :meth:`start` refuses scenes with noise, and others do not call it."""
-        raise InputError(f"{self} integrates no noise: leave it out of the scene")
-
     def rollout_compiled(
         self,
         scene: Scene,

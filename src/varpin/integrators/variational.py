@@ -22,25 +22,22 @@ from varpin.core import (
     variational_derivatives,
     variational_ends,
 )
-from varpin.core.arrays import Commands
+from varpin.core.arrays import Commands, RolloutArrays
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
 from varpin.integrators.base import (
     Compiled,
     Integrator,
     Run,
     Segment,
-    diffusion_and_drift,
     drifts,
     first_nodes,
     forces,
-    noise_of_step,
     without_inputs,
     written,
 )
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
-from varpin.signals.commands import control_of, cubics, ends_of, first_of
-from varpin.signals.inputs import in_parts_of_steps, prescribing, with_ends
+from varpin.signals.commands import cubics
 from varpin.support.checks import count, fraction, is_one_of, positive
 from varpin.trajectory import MOST_HALVINGS, Trajectory
 
@@ -99,13 +96,6 @@ class Guard:
     def __repr__(self) -> str:
         text = written(self)
         return text if text.endswith(")") else f"{text}()"
-
-
-@dataclass(frozen=True)
-class _Run(Run):
-    """A :class:`Run`, with whether the scene has kinematic inputs."""
-
-    driven: bool = False
 
 
 class Variational(Compiled):
@@ -179,13 +169,10 @@ class Variational(Compiled):
         """Factors of the guard's energy balance and energy budget."""
         return 1.0, 1.0
 
-    def _guards(self) -> Guards:
-        return _core_guards(self.guard, *self._shares())
-
-    def _guards_of(self, *, driven: bool) -> Guards:
-        """Guards of a scene; with kinematic inputs, which exchange energy, they do not check the energy."""
-        if self.guard is None or not driven:
-            return self._guards()
+    def _guards(self, *, energy: bool = True) -> Guards:
+        """Guards of the core. Without ``energy`` the balance is not checked: kinematic inputs exchange energy."""
+        if self.guard is None or energy:
+            return _core_guards(self.guard, *self._shares())
         return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
 
     def _guards_again(self, trajectory: Trajectory) -> Guards:
@@ -194,9 +181,7 @@ class Variational(Compiled):
         Without noise the steps are the same, and there is nothing to check. Otherwise the steps differ by the noise
         impulses, and their roots must lie on the branch that is connected to dt -> 0.
         """
-        if self.guard is None or not trajectory.noisy:
-            return _core_guards(None)
-        return _core_guards(replace(self.guard, energy_balance=_UNCHECKED, energy_budget=_UNCHECKED))
+        return self._guards(energy=False) if trajectory.noisy else _core_guards(None)
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
         """See :meth:`Integrator.start`; p0 = M(q0) v0."""
@@ -214,72 +199,40 @@ class Variational(Compiled):
         """
         rollout: VariationalRollout | ConstrainedRollout
         method = scene.core, self._tableau()
-        options = float(self.tolerance), self._guards_of(driven=bool(scene.inputs))
+        options = float(self.tolerance), self._guards(energy=not scene.inputs)
         if scene.constraints:
             rollout = ConstrainedRollout(*method, self._places(scene), *options, len(q0), self.holds_noise)
         else:
             rollout = VariationalRollout(*method, *options, self.left, len(q0), held=self.holds_noise)
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
-        return _Run(rollout, q0.copy(), bool(scene.inputs))
+        return Run(rollout, q0.copy(), bool(scene.inputs))
 
     def fork(self, state: Run) -> Run:
         """See :meth:`Integrator.fork`."""
-        driven = isinstance(state, _Run) and state.driven
-        return _Run(state.paths.fork(self._guards_of(driven=driven)), state.start, driven)
+        return replace(state, paths=state.paths.fork(self._guards(energy=not state.driven)))
 
-    def rollout_compiled(
-        self,
-        scene: Scene,
-        state: Run,
-        commands: Commands,
-        increments: Floats,
-        drift: Floats,
-        dt: float,
-        impulses: Floats | None = None,
-    ) -> list[Segment]:
-        """See :meth:`Integrator.rollout_compiled`."""
-        found = super().rollout_compiled(scene, state, commands, increments, drift, dt, impulses)
-        if isinstance(state.paths, ConstrainedRollout):
-            return [_constrained(scene, state.paths, i, segment) for i, segment in enumerate(found)]
-        return found
+    def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:
+        found = super()._segments(scene, paths, nodes)
+        if not isinstance(paths, ConstrainedRollout):
+            return found
+        return [_constrained(scene, paths, i, segment) for i, segment in enumerate(found)]
 
-    def step_in_python(self, scene: Scene, state: Run, command: Commands, increment: Floats, dt: float) -> Segment:
-        """One step of one path with diffusion fields that are evaluated in Python."""
+    def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
+        """See :meth:`Compiled.state_of`."""
         q, p, v, _ = state.paths.nodes()
-        decided = control_of(command, 0, np.concatenate([q[0], p[0]]), command.before)
-        now, ends = first_of(command, decided, self.stage_times), ends_of(command, decided)
-        if scene.inputs:
-            after = in_parts_of_steps(scene, decided[None], q, v, dt * command.hold, command.hold)[:1]
-            now, ends = (
-                prescribing(scene, now, after),
-                (with_ends(scene, ends[0], after), with_ends(scene, ends[1], after)),
-            )
-        F, drift = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0], ends)
-        drift, held = self.drift_share * drift, None
-        if len(increment):
-            impulse = noise_of_step(scene, F, q[0], v[0], ends, state.start[0], increment[0, 0])
-            if self.holds_noise:
-                held = np.stack([impulse, np.zeros_like(impulse)])[None, None]
-            else:
-                state.paths.kick(self.left * impulse[None])
-        (segment,) = self.rollout_compiled(
-            scene,
-            state,
-            now,
-            scene.silence,
-            drift[None, None],
-            dt,
-            held,
-        )
-        if len(increment) and self.left < 1.0 and segment.failure is None:
-            q, p, v, _ = state.paths.nodes()
-            F, _ = diffusion_and_drift(scene, q[0], v[0], now.u[0], state.start[0])
-            impulse = noise_of_step(scene, F, q[0], v[0], ends, state.start[0], increment[0, 0])
-            state.paths.kick((1.0 - self.left) * impulse[None])
-            _, segment.p[-1:], segment.v[-1:], segment.energy[-1:] = state.paths.nodes()
-        segment.u[:] = decided
-        return segment
+        return q[0], p[0], v[0]
+
+    def kicked(
+        self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
+    ) -> Segment:
+        """See :meth:`Compiled.kicked`."""
+        held = None
+        if impulse is not None and self.holds_noise:
+            held = np.stack([impulse, np.zeros_like(impulse)])[None, None]
+        elif impulse is not None:
+            state.paths.kick(self.left * impulse[None])
+        return self.rollout_compiled(scene, state, command, scene.silence, drift[None, None], dt, held)[0]
 
     def linearize(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats]:
         """See :meth:`Integrator.linearize`; the state is (q, p).

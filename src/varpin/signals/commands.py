@@ -115,14 +115,6 @@ def ends_of(command: Commands, decided: Floats) -> tuple[Floats, Floats]:
 
 def contiguous(commands: Commands) -> Commands:
     """Commands with C-contiguous arrays, as the core requires."""
-    if (
-        commands.u.flags.c_contiguous
-        and commands.gains.flags.c_contiguous
-        and commands.reference.flags.c_contiguous
-        and commands.limits.flags.c_contiguous
-        and commands.within.flags.c_contiguous
-    ):
-        return commands
     return commands._replace(
         u=np.ascontiguousarray(commands.u),
         gains=np.ascontiguousarray(commands.gains),

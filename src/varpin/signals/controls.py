@@ -11,7 +11,7 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.mechanics.scene import Scene
-from varpin.signals.commands import Times, changing, open_line, open_loop
+from varpin.signals.commands import Times, changing, on_lines, open_line, open_loop
 from varpin.signals.functions import Sampled
 from varpin.signals.inputs import prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
@@ -77,52 +77,33 @@ def commands_of(scene: Scene, integrator: Method, controls: Controls, steps: int
     return open_loop(control_rows(scene, controls, steps))
 
 
-def control_rows(scene: Scene, controls: JointValues | None, steps: int) -> Floats:
-    """Controls as one row a step, (steps, m).
+def control_rows(scene: Scene, controls: JointValues | None, steps: int | None = None) -> Floats:
+    """Controls as rows, one for each of so many steps; or as many as are given, each for an equal part of a motion.
 
     Raises:
         UnknownJoint: A name is not that of a driven joint.
         InputError: The array is neither (steps, m) nor (m,), or not finite.
     """
-    shape = (steps, scene.controls)
+    m = scene.controls
     if controls is None:
-        return np.zeros(shape)
+        return np.zeros((1 if steps is None else steps, m))
     if isinstance(controls, Mapping):
         controls = control_array("controls", controls, scene.control_joints)
     if hasattr(controls, "policy"):
         raise InputError("controls is a plan: give its law, plan.policy, or its controls, plan.trajectory.u")
     array = as_floats("controls", controls)
-    if array.shape != shape and array.shape != shape[1:]:
-        raise InputError(f"controls must have shape {shape}, one row a step, or {shape[1:]}, got {array.shape}")
-    rows = np.empty(shape)
+    number = max(1, len(np.atleast_2d(array))) if steps is None else steps
+    if array.shape not in ((number, m), (m,)):
+        raise InputError(
+            f"controls must have shape ({'R' if steps is None else steps}, {m}), one row a step, or ({m},), got "
+            f"{array.shape}"
+        )
+    rows = np.empty((number, m))
     rows[:] = require_finite("controls", array)
     return rows
 
 
-def held_rows(scene: Scene, controls: JointValues | None) -> Floats:
-    """Rows of controls, each held over an equal part of a motion, (R, m).
-
-    Raises:
-        UnknownJoint: A name is not that of a driven joint.
-        InputError: The array is neither (R, m) nor (m,), or not finite.
-    """
-    m = scene.controls
-    if controls is None:
-        return np.zeros((1, m))
-    if isinstance(controls, Mapping):
-        return control_array("controls", controls, scene.control_joints)[None]
-    if hasattr(controls, "policy"):
-        raise InputError("controls is a plan: give its law, plan.policy, or its controls, plan.trajectory.u")
-    held = np.atleast_2d(require_finite("controls", as_floats("controls", controls)))
-    if held.ndim != 2 or held.shape[1] != m or not len(held):
-        raise InputError(f"controls must have shape (R, {m}) or ({m},), got {np.shape(controls)}")
-    return held
-
-
 def _on_lines(u: Floats, times: Times) -> Commands:
     """Commands for controls (N + 1, m) at the nodes, linear between them, with stages at ``times``."""
-    before, after = u[:-1, None], u[1:, None]
-    if not times:
-        return open_loop(0.5 * (before + after)[:, 0])
-    share = np.array(times)[:, None]
-    return changing((1.0 - share) * before + share * after, times)
+    along = on_lines(u[:-1], u[1:], 1, times or (0.5,))
+    return changing(along, times) if times else open_loop(along[:, 0])

@@ -16,7 +16,7 @@ from varpin.finding import Finding
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import Times, changing, open_loop
 from varpin.signals.inputs import as_moved, prescribing
-from varpin.signals.moments import Moments, joined, moments_of
+from varpin.signals.moments import Moments, joined, moments_of, none_of
 from varpin.signals.policy import FirstOrderHold, OpenLoop
 from varpin.support.checks import JointValues, control_values, finite_array, require_finite, takes
 
@@ -24,6 +24,9 @@ ControlLaw = Callable[[float, Floats, Floats], JointValues]
 # Root mean square of what a step's polynomial leaves of a function of time, as a share of its largest value, up to
 # which the motion's own residual shows its error: a third order of it is lost.
 _RESOLVED = 0.02
+# The same share up to which more stages help: a jump has a quarter in a step of two stages, a fast wave more. And the
+# most parts of a step in which it is looked for.
+_FOLLOWED, _MOST_PARTS = 0.3, 64
 # Distance of a kinematic input from its control at the start [rad or m, rad/s or m/s] without a warning.
 _ELSEWHERE = 1e-6
 
@@ -61,12 +64,13 @@ class Sampled(OpenLoop):
     def __init__(self, given: OpenLoop, scene: Scene, dt: float) -> None:
         super().__init__(given.f, given.vectorized, given.breaks)
         # The frozen dataclass refuses assignments.
-        vars(self).update(scene=scene, dt=dt, parts=[], done=0)
+        vars(self).update(scene=scene, dt=dt, parts=[none_of(scene.controls)], done=0)
 
     @property
-    def extremes(self) -> Floats | None:
-        """The least and the largest controls in each step so far (2, N, m)."""
-        return joined(self.parts).extremes if self.parts else None
+    def whole(self) -> Moments:
+        """The moments over all steps so far."""
+        self.parts[:] = [joined(self.parts)]
+        return self.parts[0]
 
     def moments(self, first: int, last: int) -> Moments:
         """The moments over steps first .. last, which begin at a step that is known or the next one.
@@ -76,12 +80,11 @@ class Sampled(OpenLoop):
         """
         if last > self.done:
             values = functools.partial(_values, self, self.scene)
-            fresh = moments_of(values, self.done, last - self.done, self.dt, self.breaks)
-            self.parts.append(fresh)
+            self.parts.append(moments_of(values, self.done, last - self.done, self.dt, self.breaks))
             before, vars(self)["done"] = self.done, last
             if first == before:
-                return fresh
-        return joined(self.parts).part(first, last)
+                return self.parts[-1]
+        return self.whole.part(first, last)
 
     def commands(self, first: int, steps: int, times: Times) -> Commands:
         """The controls of ``steps`` steps from ``first`` on, for stages at ``times`` of a step.
@@ -103,8 +106,7 @@ class Sampled(OpenLoop):
 def function_findings(controls: Sampled, duration: float) -> tuple[Finding, ...]:
     """Warnings: the quadrature of a function of time has not settled in some steps, or no break is in the motion."""
     found: list[Finding] = []
-    steps = joined(controls.parts).unsettled.tolist() if controls.parts else []
-    if steps:
+    if steps := controls.whole.unsettled.tolist():
         text = (
             f"the controls of OpenLoop change too fast in {len(steps)} steps for their impulse to be known "
             f"(from t = {steps[0] * controls.dt:.3g} s). Name the instants of jumps, OpenLoop(f, breaks=[...])"
@@ -118,11 +120,28 @@ def function_findings(controls: Sampled, duration: float) -> tuple[Finding, ...]
 
 def resolved(controls: Sampled, times: Times) -> bool:
     """Whether the polynomials of a method with stages at ``times`` are nearly the function itself in all steps."""
-    if not controls.parts:
-        return True
-    found = joined(controls.parts)
+    found = controls.whole
     rest = found.rest[:, max(1, len(times)) - 1]
     return bool(rest.max(initial=0.0) <= _RESOLVED * found.largest) and not len(found.unsettled)
+
+
+def parts_to_follow(controls: Sampled, times: Times) -> int:
+    """The parts of a step in which polynomials of a method with stages at ``times`` follow the function; 1 where whole.
+
+    They are looked for in the step in which the function is fastest.
+
+    Raises:
+        ControlError: The function failed.
+    """
+    order = max(1, len(times)) - 1
+    whole = controls.whole
+    worst, parts = int(whole.rest[:, order].argmax()), 1
+    here = whole.part(worst, worst + 1)
+    values = functools.partial(_values, controls, controls.scene)
+    while here.rest[:, order].max() > _FOLLOWED * whole.largest and parts < _MOST_PARTS:
+        parts *= 2
+        here = moments_of(values, worst * parts, parts, controls.dt / parts, controls.breaks)
+    return parts
 
 
 def _values(controls: OpenLoop, scene: Scene, times: Floats, steps: Integers) -> Floats:

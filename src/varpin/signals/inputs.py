@@ -54,16 +54,8 @@ def prescribing(scene: Scene, commands: Commands, ends: Floats) -> Commands:
 
     All other controls stay as they are. Inputs have the same control at all stages of a step.
     """
-    own = scene.prescribed
-    if not len(own):
-        return commands
-    u = commands.u.copy()
-    u[:, own] = ends[:, own]
-    within = commands.within
-    if len(within):
-        within = within.copy()
-        within[:, :, own] = ends[:, None, own]
-    return commands._replace(u=u, within=within)
+    within = with_ends(scene, commands.within, ends) if len(commands.within) else commands.within
+    return commands._replace(u=with_ends(scene, commands.u, ends), within=within)
 
 
 def with_ends(scene: Scene, values: Floats, ends: Floats) -> Floats:

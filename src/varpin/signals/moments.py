@@ -125,6 +125,12 @@ def moments_of(values: Values, first: int, count: int, dt: float, breaks: Sequen
     return Moments(degrees[:, None] * total, rest, extremes, unsettled)
 
 
+def none_of(controls: int) -> Moments:
+    """The moments over no steps."""
+    shape = 0, MOMENTS
+    return Moments(np.zeros((*shape, controls)), np.zeros(shape), np.zeros((2, 0, controls)), np.zeros(0, np.int64))
+
+
 def joined(parts: Sequence[Moments]) -> Moments:
     """Consecutive steps as one."""
     if len(parts) == 1:

@@ -178,48 +178,47 @@ class LinearPolicy(Frozen):
         steps, m, size = shape
         if rows.shape == (steps + 1, size):
             rows = rows[:steps]
-        values = {
-            "u": finite_array("u", u, (steps, m)),
-            "gains": finite_array("gains", gains, shape),
-            "reference": finite_array("reference", rows, (steps, size)),
-        }
-        for name, value in values.items():
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "hold", count("hold", hold, least=1))
+        names = None if joints is None else tuple(joints)
         if on is not None and not is_one_of(on, ("momentum", "velocity")):
             raise InputError(f"on must be 'momentum', 'velocity' or None, got {on!r}")
-        object.__setattr__(self, "on", on)
-        names = None if joints is None else tuple(joints)
         if names is not None and len(names) != m:
             raise InputError(f"joints must name the joint of each of the {m} controls, got {names}")
-        object.__setattr__(self, "joints", names)
-        object.__setattr__(self, "servos", None if servos is None else tuple(servos))
-        object.__setattr__(self, "period", None if period is None else positive("period", period, "s"))
-        sides = () if limits is None else limits
-        by_name = isinstance(before, Mapping) or any(isinstance(side, Mapping) for side in sides)
-        if by_name and names is None:
+        if names is None and any(isinstance(given, Mapping) for given in (before, *(() if limits is None else limits))):
             raise InputError(
                 "limits and before by joint name take the names of the controls, joints=scene.control_joints"
             )
-        object.__setattr__(self, "limits", named_limits("limits", limits, names, m))
-        start = None if before is None else control_values("before", before, names, m)
-        object.__setattr__(self, "linear", bool(linear))
-        if linear and start is None:
+        if linear and before is None:
             raise InputError("controls that are linear between nodes need before, the control at the first node")
+        if previous is not None and previous_gains is None:
+            raise InputError("previous is the reference of previous_gains: give them too")
+        own = finite_array("u", u, (steps, m))
+        start = None if before is None else control_values("before", before, names, m)
         changes: Floats | None = None
         expected: Floats | None = None
         if previous_gains is not None:
             changes = finite_array("previous_gains", previous_gains, (steps, m, m))
-            expected = np.vstack([self.u[:1] if start is None else start[None], self.u[:-1]])[:steps]
+            expected = np.vstack([own[:1] if start is None else start[None], own[:-1]])[:steps]
             if previous is not None:
                 expected = finite_array("previous", previous, (steps, m))
-        elif previous is not None:
-            raise InputError("previous is the reference of previous_gains: give them too")
-        for name, array in {"previous_gains": changes, "previous": expected, "before": start}.items():
+        # The frozen dataclass refuses assignments.
+        vars(self).update(
+            u=own,
+            gains=finite_array("gains", gains, shape),
+            reference=finite_array("reference", rows, (steps, size)),
+            hold=count("hold", hold, least=1),
+            on=on,
+            limits=named_limits("limits", limits, names, m),
+            previous_gains=changes,
+            previous=expected,
+            before=start,
+            period=None if period is None else positive("period", period, "s"),
+            joints=names,
+            servos=None if servos is None else tuple(servos),
+            linear=bool(linear),
+        )
+        for array in (self.u, self.gains, self.reference, changes, expected, start):
             if array is not None:
                 array.setflags(write=False)
-            object.__setattr__(self, name, array)
 
     def __repr__(self) -> str:
         steps, m, size = self.gains.shape
@@ -229,20 +228,10 @@ class LinearPolicy(Frozen):
 
     def without_feedback(self) -> LinearPolicy:
         """The same feed-forward controls with zero gains."""
-        limits = (self.limits[0], self.limits[1])
-        return LinearPolicy(
-            self.u,
-            np.zeros_like(self.gains),
-            self.reference,
-            self.hold,
-            self.on,
-            limits,
-            before=self.before if self.linear else None,
-            period=self.period,
-            joints=self.joints,
-            servos=self.servos,
-            linear=self.linear,
-        )
+        gains = np.zeros_like(self.gains)
+        gains.setflags(write=False)
+        before = self.before if self.linear else None
+        return self.changed(gains=gains, previous_gains=None, previous=None, before=before)
 
     def hold_at(self, dt: float) -> int:
         """Number of steps of ``dt`` [s] in an interval.
@@ -256,7 +245,7 @@ class LinearPolicy(Frozen):
         if abs(hold * dt - self.period) > 1e-9 * self.period:
             raise InputError(
                 f"the policy has intervals of {self.period:g} s, which dt = {dt:g} s does not divide: "
-                f"dt = {self.period / hold:g} s does"
+                f"dt = {self.period / hold!r} s does"
             )
         return hold
 

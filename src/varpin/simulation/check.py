@@ -29,7 +29,7 @@ from varpin.mechanics.scene import Scene
 from varpin.model import joint_unit
 from varpin.signals.commands import changing, in_parts, open_loop, rows
 from varpin.signals.controls import Controls, commands_of
-from varpin.signals.functions import Sampled
+from varpin.signals.functions import Sampled, parts_to_follow
 from varpin.signals.inputs import in_parts_of_steps, prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.energy import energy_defects
@@ -38,7 +38,8 @@ from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
 from varpin.simulation.scales import speed_scales, travel_scales
 from varpin.simulation.short_forces import short_forces
-from varpin.simulation.spectrum import fastest_rate
+from varpin.simulation.spectrum import contact_rate, fastest_rate
+from varpin.simulation.time_steps import finer
 from varpin.trajectory import Trajectory
 
 # Errors from which on a motion is told of: of q as a share of the largest travel of its kind, of v as a share of the
@@ -50,6 +51,8 @@ _AIM = 0.2
 # Most parts of a step that are named; the order of motions with kinks in forces; the excess of an error of half the
 # travel.
 _MOST_PARTS, _KINKED, _LOST = 10, 2, 0.5 / TOLD
+# The rate of dampers and stops that a step resolves, in units of 1 / dt: with 1 to 3 the same advice is right.
+_RINGS = 2.0
 # Stages of the repetition beyond those of a motion of the same order.
 _MORE = 2
 # Steps of one joint between two checks for Ctrl-C: a tenth of a second.
@@ -83,7 +86,7 @@ def check(
         hold: The period of a control law in steps, 0 for none. Where a repetition under the recorded controls is far
             off, and the record tells the law, another one has its feedback.
     """
-    extremes = controls.extremes if isinstance(controls, Sampled) else None
+    extremes = controls.whole.extremes if isinstance(controls, Sampled) else None
     limits = beyond_limits(scene, trajectory, extremes)
     if not trajectory.steps:
         known = np.zeros_like(trajectory.q)
@@ -107,11 +110,10 @@ def check(
     else:
         try:
             off, speed_off = distance(repeat(), trajectory)
-            fed = isinstance(controls, LinearPolicy) and not integrator.variational
-            found = error_findings(scene, integrator, trajectory, off, speed_off, fed=fed, hold=hold)
+            found = error_findings(scene, integrator, trajectory, off, speed_off, controls, hold)
             if found and hold and (law := law_of(scene, trajectory, hold)) is not None:
                 off, speed_off = distance(repeat(law=_limited(scene, law, trajectory, hold), hold=hold), trajectory)
-                found = error_findings(scene, integrator, trajectory, off, speed_off, hold=hold)
+                found = error_findings(scene, integrator, trajectory, off, speed_off, controls, hold)
             found = found or short_forces(scene, integrator, trajectory)
         except (CustomForceError, CustomConstraintError) as error:
             off = np.full_like(trajectory.q, np.nan)
@@ -308,15 +310,14 @@ def error_findings(
     trajectory: Trajectory,
     off: Floats,
     speed_off: Floats,
-    *,
-    fed: bool = False,
+    controls: Controls | Commands = None,
     hold: int = 0,
 ) -> tuple[Finding, ...]:
     """The warning of a motion's error, if it is large, from errors of q and v at its nodes (N + 1, n).
 
-    ``fed``: its controls are a policy on (q, v). ``hold`` is the period of its control law in steps, 0 for none.
+    ``controls`` are those of :func:`check`; ``hold`` is the period of a control law in steps, 0 for none.
     """
-    cure = functools.partial(_cure, scene, integrator, trajectory, fed=fed, hold=hold)
+    cure = functools.partial(_cure, scene, integrator, trajectory, controls, hold)
     known = np.asarray(np.isfinite(off).all(axis=1))
     last = int(known.argmin()) if not known.all() else len(known)
     names, t = trajectory.joint_names, trajectory.t
@@ -356,22 +357,41 @@ def error_findings(
     return ()
 
 
-def _cure(scene: Scene, integrator: Integrator, trajectory: Trajectory, excess: float, *, fed: bool, hold: int) -> str:
+def _cure(
+    scene: Scene,
+    integrator: Integrator,
+    trajectory: Trajectory,
+    controls: Controls | Commands,
+    hold: int,
+    excess: float,
+) -> str:
     """What reduces an error that exceeds its threshold by a factor ``excess``.
 
-    A policy on (q, v), which is ``fed`` back, takes no other method. A law with a period of ``hold`` steps keeps it.
+    A policy on (q, v) takes no other method. A law with a period of ``hold`` steps, and a policy, keep their periods.
     """
-    if not (integrator.l_stable or scene.constraints) and damped_faster(scene, trajectory):
+    q, v, most = trajectory.q, trajectory.v, _RINGS / trajectory.dt
+    contact = contact_rate(scene, q, v, trajectory.dt)
+    damped_by_others = not (integrator.l_stable or scene.constraints or contact > most)
+    if damped_by_others and fastest_rate(scene, q, v, trajectory.u, most) > 0.0:
         return "Damping or friction is faster than the step: use integrator=varpin.Radau(4)"
     if isinstance(integrator, Reference):
         return "Use a smaller rtol"
     # Kinks of forces cost any method its order.
     order = integrator.order if scene.smooth else min(integrator.order, _KINKED)
     times = (max(excess, 1.0) / _AIM) ** (1.0 / order)
-    parts = _MOST_PARTS if not times < _MOST_PARTS else max(2, math.ceil(times))
-    period = f" with period={hold * parts}" if hold else ""
-    smaller = f"dt = {trajectory.dt / parts:.2g} s{period}"
+    least = _MOST_PARTS if not times < _MOST_PARTS else max(2, math.ceil(times))
+    follow = parts_to_follow(controls, integrator.stage_times) if isinstance(controls, Sampled) else 1
+    parts, smaller = finer(trajectory, max(least, math.ceil(contact / most)) * follow)
+    if hold:
+        smaller += f" with period={hold * parts}"
+    elif isinstance(controls, LinearPolicy) and controls.period is None:
+        smaller += f" with hold={controls.hold * parts} in the policy"
+    if follow > 1:
+        return f"The controls change faster than the step. Use {smaller}"
+    if contact > most:
+        return f"Stops are stiffer than the step resolves. Use {smaller}"
     stages = (integrator.order + 1) // 2 + _MORE
+    fed = isinstance(controls, LinearPolicy) and not integrator.variational
     if fed or stages > MOST_STAGES or not (scene.smooth or not scene.elements):
         return f"Use {smaller}"
     other = f"integrator=varpin.{'Radau' if integrator.l_stable else 'Gauss'}({stages})"
@@ -379,8 +399,3 @@ def _cure(scene: Scene, integrator: Integrator, trajectory: Trajectory, excess: 
     if times < _MOST_PARTS:
         return f"Use {other} or {smaller}"
     return f"Use {other} and a smaller dt" if excess > _LOST else f"Use {other}"
-
-
-def damped_faster(scene: Scene, trajectory: Trajectory, turns: float = 2.0) -> bool:
-    """Whether damping at one of some nodes is faster than ``turns`` a step."""
-    return fastest_rate(scene, trajectory.q, trajectory.v, trajectory.u, turns / trajectory.dt) > 0.0

@@ -34,14 +34,11 @@ def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: 
     if noisy:
         return _NOISY
     # Radau's methods do not keep constraints.
+    chosen: Gauss | Radau = _SWINGING if _swings_faster(scene, q0, _TURNS / dt) else _USUAL
     if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt):
-        return _of(_STOPPING, scene)
-    return _of(_SWINGING if _swings_faster(scene, q0, _TURNS / dt) else _USUAL, scene)
-
-
-def _of(chosen: Gauss | Radau, scene: Scene) -> Integrator:
-    """The choice with noise held over the step in scenes with noise: a motion without it may be linearized."""
-    return replace(chosen, kick="held") if scene.processes else chosen
+        chosen = _STOPPING
+    # A motion without the noise of its scene may be linearized.
+    return replace(chosen, kick=usual_kick(scene))
 
 
 def usual_kick(scene: Scene) -> Literal["left", "held"]:
@@ -54,7 +51,7 @@ def stronger(chosen: Iterable[Integrator]) -> Integrator:
 
     The default where there are none.
     """
-    ranks = {str(member): rank for rank, member in enumerate((_USUAL, _SWINGING, _STOPPING))}
+    ranks = {str(member): rank for rank, member in enumerate((_NOISY, _USUAL, _SWINGING, _STOPPING))}
     return max(chosen, key=lambda own: ranks[str(own)], default=_USUAL)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -64,35 +64,20 @@ class Trial:
     """A motion of a method.
 
     Attributes:
-        steps: Over the horizon.
-        error: The largest error of q [rad or m]; infinite if it failed.
-        cost: Of the motion alone.
-        whole: Whether guards divided none of its steps: divided ones show neither order nor cost of others.
-    """
-
-    steps: int
-    error: float
-    cost: float
-    whole: bool = True
-
-
-@dataclass(frozen=True)
-class Found:
-    """A method at a number of steps.
-
-    Attributes:
         integrator: The method.
         steps: Over the horizon.
-        error: The largest over nodes and joints [rad or m]; infinite where not known.
-        cost: In the units of the trials.
-        measured: Whether it was tried; else error and cost are predicted.
+        error: The largest error of q [rad or m]; infinite if it failed or is not known.
+        cost: Of the motion alone.
+        whole: Whether guards divided none of its steps: divided ones show neither order nor cost of others.
+        measured: Whether it was made; else error and cost are predicted.
     """
 
     integrator: Integrator
     steps: int
     error: float
     cost: float
-    measured: bool
+    whole: bool = True
+    measured: bool = True
 
 
 class Rung:
@@ -153,15 +138,15 @@ class Rung:
         """The predicted cost of so many steps."""
         return self.trials[-1].cost * steps / self.trials[-1].steps if self.trials else 0.0
 
-    def predicted(self, steps: int) -> Found:
+    def predicted(self, steps: int) -> Trial:
         """The method at a number of steps, by its order beyond its trials."""
         for trial in self.trials:
             if trial.steps == steps:
-                return Found(self.integrator, steps, trial.error, trial.cost, measured=True)
+                return trial
         near = min(self.trials, key=lambda trial: abs(math.log(trial.steps / steps)))
         known = near.error < SENSIBLE and steps <= REACH * near.steps
         error = near.error * (near.steps / steps) ** self.order if known else math.inf
-        return Found(self.integrator, steps, error, self.cost_of(steps), measured=False)
+        return replace(near, steps=steps, error=error, cost=self.cost_of(steps), measured=False)
 
 
 class Ladder:
@@ -208,7 +193,7 @@ class Ladder:
         """Try a method with a number of steps."""
         rung.add(self.attempt(rung.integrator, steps))
 
-    def for_tolerance(self, wish: float) -> tuple[list[Found], bool]:
+    def for_tolerance(self, wish: float) -> tuple[list[Trial], bool]:
         """The methods at the steps that meet an error [rad or m], the cheapest first, and whether one does.
 
         The first was tried at its steps; others may be predicted. If none meets the error, they are at the steps of
@@ -233,7 +218,7 @@ class Ladder:
             return self.least(), False
         return [taken, *(each for each in kept if each is not taken)], True
 
-    def for_budget(self, budget: float) -> tuple[list[Found], bool]:
+    def for_budget(self, budget: float) -> tuple[list[Trial], bool]:
         """The methods at the steps that a cost allows, the most accurate first, and whether there is one."""
         for rung in self.rungs:
             while not self.late() and rung.open:
@@ -244,25 +229,20 @@ class Ladder:
                 if rung.trials and steps < 1.1 * rung.trials[-1].steps:
                     break
                 self.climb(rung, max(steps, rung.rows))
-        found = [
-            rung.predicted(trial.steps)
-            for rung in self.rungs
-            for trial in rung.trials
-            if trial.cost <= budget and trial.error < SENSIBLE
-        ]
+        trials = [trial for rung in self.rungs for trial in rung.trials]
+        found = [trial for trial in trials if trial.cost <= budget and trial.error < SENSIBLE]
         best = {str(each.integrator): each for each in sorted(found, key=lambda each: -each.error)}
         if best:
             return sorted(best.values(), key=lambda each: (each.error, each.cost)), True
         return sorted(self.least(), key=lambda each: each.cost), False
 
-    def least(self) -> list[Found]:
+    def least(self) -> list[Trial]:
         """The trial of each method with the least error, the most accurate first.
 
         Raises:
             VarpinError: No motion got to the end.
         """
-        done = [(rung, min(rung.trials, key=lambda trial: trial.error)) for rung in self.rungs if rung.trials]
-        found = [Found(rung.integrator, own.steps, own.error, own.cost, measured=True) for rung, own in done]
+        found = [min(rung.trials, key=lambda trial: trial.error) for rung in self.rungs if rung.trials]
         if not any(math.isfinite(each.error) for each in found):
             if self.late():
                 raise VarpinError("no motion got to the end in time: give more patience, or a shorter duration")

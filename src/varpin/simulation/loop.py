@@ -37,6 +37,9 @@ _CHANGES = 1.0 / 7.0
 # Share of a control's range within which it is at a limit, so that half of the range is at neither. A control that is
 # at one in less than this share of the last quarter of the motion is calm.
 _AT = 0.25
+# Least share of periods in which a control with limits is at one, and how near, as a share of its range: waves are
+# there in 4 % of theirs.
+_CLIPPED, _NEAR = 0.1, 1e-3
 # Least share of the sides that a linear function of the state tells for them to be feedback: random ones have 2n / P.
 _FOLLOWS = 0.15
 # Least growth of controls from the first quarter to the last (10 to 1000: the same), up to a failed step (3 to 100).
@@ -137,7 +140,8 @@ def _from_limit_to_limit(scene: Scene, x: Floats, u: Floats, t: Floats, period: 
     late = np.array([(at >= len(u) // 2).sum() for at in changes])
     worst = int(np.argmax(late))
     calm = np.abs(sides[3 * len(u) // 4 :, worst]).mean() < _AT
-    if calm or late[worst] < max(4.0, 0.5 * _CHANGES * len(u)):
+    clips = (np.abs(u[:, worst] - low[worst] - 0.5 * span[worst]) >= (0.5 - _NEAR) * span[worst]).mean() > _CLIPPED
+    if calm or not clips or late[worst] < max(4.0, 0.5 * _CHANGES * len(u)):
         return ()
     # What flips whatever the state is excitation, not feedback.
     half = len(u) // 2

@@ -20,8 +20,6 @@ _LITTLE, _SLOW = 1e-2, 5e-2
 def largest_of_its_kind(scene: Scene, values: Floats) -> Floats:
     """For each coordinate (..., n), the largest value of all revolute joints, or of all prismatic ones."""
     sliding = scene.robot.slides
-    if not sliding.any():
-        return np.broadcast_to(values.max(axis=-1, initial=0.0, keepdims=True), values.shape)
     largest = [values[..., kind].max(axis=-1, initial=0.0, keepdims=True) for kind in (sliding, ~sliding)]
     each: Floats = np.where(sliding, *largest)
     return each

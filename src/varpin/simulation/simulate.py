@@ -30,7 +30,7 @@ from varpin.simulation.record import MotionRecord, function_error, next_block
 from varpin.simulation.start import controls_in_degrees, in_other_units, on_constraints
 from varpin.simulation.time_steps import duration_for_tolerance, time_steps
 from varpin.simulation.tolerance import steps_for_tolerance
-from varpin.support.checks import JointValues, as_floats, count, flag, joint_array
+from varpin.support.checks import JointValues, as_floats, count, flag, joint_array, require_memory
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
 
 logger = logging.getLogger(__name__)
@@ -144,7 +144,8 @@ def simulate(
     else:
         dt, steps = time_steps(dt, steps, duration, choosable=True)
     period, check = count("period", period, least=1), flag("check", check)
-    _require_memory(scene, steps)
+    columns = 3 * scene.robot.dof + 2 * scene.controls + len(STEP_NUMBERS) + 2
+    require_memory(steps + 1, columns, f"steps = {steps}", "step")
     law = callable(controls)
     if callable(controls):
         require_law(controls)
@@ -304,12 +305,3 @@ def noise_forgotten(
     if rng is not None and not scene.processes:
         return (Finding("nothing random", "rng= has no effect: the scene has no noise, Scene(robot, noise=...)"),)
     return ()
-
-
-def _require_memory(scene: Scene, steps: int) -> None:
-    """Refuse a number of steps whose record does not fit into memory."""
-    columns = 3 * scene.robot.dof + 2 * scene.controls + len(STEP_NUMBERS) + 2
-    try:
-        np.empty((steps + 1, columns))
-    except (MemoryError, ValueError, OverflowError):
-        raise InputError(f"steps = {steps} needs more memory than there is: {columns * 8} bytes a step") from None

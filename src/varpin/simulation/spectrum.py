@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from varpin.arrays import Floats
+from varpin.arrays import Floats, Integers
 from varpin.core import fastest_damping
 from varpin.errors import LinearizationError
 from varpin.integrators.explicit import accelerations
 from varpin.mechanics.forces import dissipates, limited_servos, of_kind
+from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 
 # Rank tolerance of the constraints in the metric of the kinetic energy, relative to the largest singular value.
@@ -165,25 +166,55 @@ def fastest_rate(scene: Scene, q: Floats, v: Floats, u: Floats, least: float) ->
         if v[:, c].min() < 0.0 < v[:, c].max():
             still[:, c] = 0.0
         states.append((q[node], still, node))
-    for stop in of_kind(scene.elements, "JointStop"):
-        c, (lower, upper, *_, width) = stop.coordinate, stop.values
-        for deepest, end, side in ((int(q[:, c].argmin()), lower, -1.0), (int(q[:, c].argmax()), upper, 1.0)):
-            if np.isfinite(end) and side * (q[deepest, c] - end) > 0.0:
-                pressed = q[deepest][None].copy()
-                pressed[0, c] = end + side * max(side * (q[deepest, c] - end), width)
-                states.append((pressed, v[deepest][None], np.array([deepest])))
+    states += _in_stops(scene, q, v)
     q, v, at = (np.concatenate(rows) for rows in zip(*states, strict=True))
     forces = np.ascontiguousarray(u[np.minimum(at, len(u) - 1)] @ scene.actuation.T)
     return float(fastest_damping(scene.core, q, v, forces, least))
 
 
+def contact_rate(scene: Scene, q: Floats, v: Floats, dt: float) -> float:
+    """The fastest rate [1/s] of a spring or damper, in the stops that joints reach; 0 where they reach none.
+
+    ``q`` and ``v`` are the nodes of a motion (N + 1, n) in steps of ``dt`` [s], within which a joint may come and go.
+    """
+    states = _in_stops(scene, np.concatenate([q, q + dt * v]), np.concatenate([v, v]))
+    if not states:
+        return 0.0
+    q, v, _ = (np.concatenate(rows) for rows in zip(*states, strict=True))
+    # Springs of stops are in the potential, their dampers among the forces.
+    jets = [lagrangian_jet(scene, place, np.zeros_like(place)) for place in q]
+    eased = np.array([np.diag(np.linalg.inv(jet.Lvv)) for jet in jets])
+    by_q = np.array([np.diag(jet.Lqq) for jet in jets])
+    by_v = scene.core.forces(q, v, np.zeros_like(q))[2]
+    return float(np.maximum(np.sqrt(np.maximum(-by_q * eased, 0.0)), -by_v * eased).max())
+
+
+def _in_stops(scene: Scene, q: Floats, v: Floats) -> list[tuple[Floats, Floats, Integers]]:
+    """States (1, n), (1, n) and nodes (1,) of a motion where joints are deepest in each stop, at full stiffness."""
+    states = []
+    for c, end, side, width in _ends(scene):
+        deepest = int((side * q[:, c]).argmax())
+        if (depth := side * (q[deepest, c] - end)) > 0.0:
+            pressed = q[deepest][None].copy()
+            pressed[0, c] = end + side * max(depth, width)
+            states.append((pressed, v[deepest][None], np.array([deepest])))
+    return states
+
+
+def _ends(scene: Scene) -> list[tuple[int, float, float, float]]:
+    """The finite ends of joint stops: coordinate, place, -1 for a lower and 1 for an upper one, and width."""
+    found = []
+    for stop in of_kind(scene.elements, "JointStop"):
+        lower, upper, *_, width = stop.values
+        both = ((lower, -1.0), (upper, 1.0))
+        found += [(stop.coordinate, end, side, width) for end, side in both if np.isfinite(end)]
+    return found
+
+
 def stops_ahead(scene: Scene, q: Floats) -> Floats:
     """Configurations (K, n): ``q`` (n,) with one joint each in a stop, deep enough for the stop's full stiffness."""
-    rows = []
-    for own in of_kind(scene.elements, "JointStop"):
-        lower, upper, *_, width = own.values
-        for end in (lower - width, upper + width):
-            if np.isfinite(end):
-                rows.append(q.copy())
-                rows[-1][own.coordinate] = end
-    return np.array(rows).reshape(-1, q.size)
+    ends = _ends(scene)
+    rows = np.tile(q, (len(ends), 1))
+    for row, (c, end, side, width) in zip(rows, ends, strict=True):
+        row[c] = end + side * width
+    return rows

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from varpin.errors import InputError
 from varpin.support.checks import count, positive
+from varpin.trajectory import Trajectory
+
+# Distance of a duration from a multiple of the step, as a share: rounding.
+_ROUNDING = 1e-9
 
 
 def time_steps(
@@ -35,11 +41,24 @@ def time_steps(
         return duration / steps, steps
     dt = positive("dt", dt, "s")
     steps = max(1, round(min(duration / dt, 1e15)))
-    if abs(steps * dt - duration) > 1e-9 * duration:
+    if abs(steps * dt - duration) > _ROUNDING * duration:
         raise InputError(
             f"duration = {duration:g} s is no multiple of dt = {dt:g} s, but of dt = {duration / steps!r} s"
         )
     return dt, steps
+
+
+def finer(trajectory: Trajectory, parts: int) -> tuple[int, str]:
+    """At least so many parts of a motion's steps, and the argument that asks for them, for example ``dt = 0.0025 s``.
+
+    The numbers of digits and parts are small: what is written divides the step of the motion. Where no short number
+    does, the argument is the number of steps.
+    """
+    for more in range(parts, 2 * parts + 1):
+        dt = trajectory.dt / more
+        if math.isclose(float(f"{dt:.4g}"), dt, rel_tol=_ROUNDING):
+            return more, f"dt = {dt:.4g} s"
+    return parts, f"steps = {trajectory.steps * parts}"
 
 
 def duration_for_tolerance(dt: float | None, steps: int | None, duration: float | None) -> float:

@@ -17,7 +17,7 @@ from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import open_loop
-from varpin.signals.controls import Controls, commands_of, held_rows
+from varpin.signals.controls import Controls, commands_of, control_rows
 from varpin.signals.functions import ControlLaw, Sampled, require_law
 from varpin.signals.inputs import held_in_parts
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
@@ -62,7 +62,7 @@ class _Search:
             elif isinstance(controls, FirstOrderHold):
                 self.rows = len(controls.u) - 1
         else:
-            self.controls = held_rows(scene, controls)
+            self.controls = control_rows(scene, controls)
             self.rows = len(self.controls)
         self.most = _MOST_WORK / len(q0)
         self.steps = self.evaluations = 0
@@ -104,7 +104,7 @@ class _Search:
         if steps > self.most:
             # Too long to run. Its cost is counted, which ends a search whose trials all fail in their first steps.
             self.evaluations += steps
-            return Trial(steps, math.inf, math.inf)
+            return Trial(integrator, steps, math.inf, math.inf)
         dt, controls = self.duration / steps, self.given(steps)
         commands = self.commands(integrator, steps)
         try:
@@ -112,9 +112,9 @@ class _Search:
             work = motion.statistics.jets.sum() + motion.statistics.sweeps.sum()
             self.steps, self.evaluations = self.steps + motion.steps, self.evaluations + int(work)
             if failure is not None:
-                return Trial(steps, math.inf, float(work) * steps / max(motion.steps, 1))
+                return Trial(integrator, steps, math.inf, float(work) * steps / max(motion.steps, 1))
             if short_forces(self.scene, integrator, motion):
-                return Trial(steps, math.inf, float(work))
+                return Trial(integrator, steps, math.inf, float(work))
             again = repeated(self.scene, integrator, motion, controls)
             # Each step of a repetition takes about twice the evaluations.
             parts = closer(self.scene, integrator, motion)[1]
@@ -125,14 +125,14 @@ class _Search:
             self.evaluations += steps
             if len(self._raised) >= _RAISES and not self._passed:
                 raise max(self._raised, key=lambda each: getattr(each, "step", -1)) from error
-            return Trial(steps, math.inf, float(steps))
+            return Trial(integrator, steps, math.inf, float(steps))
         self._passed = True
         off = distance(again, motion)[0]
         floor = ROUNDING * max(1.0, float(np.abs(motion.q).max()))
         self.errors[str(integrator), steps] = off
         largest = max(float(off.max()), floor)
         whole = motion.statistics.split_steps == 0
-        return Trial(steps, largest if math.isfinite(largest) else math.inf, float(work), whole=whole)
+        return Trial(integrator, steps, largest if math.isfinite(largest) else math.inf, float(work), whole=whole)
 
 
 def steps_for_tolerance(

@@ -17,7 +17,7 @@ from varpin.finding import announce
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.signals.commands import open_loop
-from varpin.signals.controls import held_rows
+from varpin.signals.controls import control_rows
 from varpin.signals.inputs import held_in_parts
 from varpin.simulation.check import distance, repeated
 from varpin.simulation.ladder import ROUNDING, Trial, candidates
@@ -88,7 +88,7 @@ class Setting(Frozen):
         if callable(controls):
             raise InputError("controls must be rows (R, m), each held over duration / R, or one row (m,)")
         begin, speed = joint_array("q0", q0, joints), joint_array("v0", v0, joints)
-        rows = held_rows(scene, scene.command_at(begin) if controls is None else controls)
+        rows = control_rows(scene, scene.command_at(begin) if controls is None else controls)
         duration = positive("duration", duration, "s")
         if scene.constraints:
             begin, speed, moved = on_constraints(scene, begin, speed)
@@ -132,7 +132,7 @@ class Setting(Frozen):
             again = repeated(self.scene, integrator, motion)
             off = max(float(distance(again, motion)[0].max()), ROUNDING * max(1.0, float(np.abs(motion.q).max())))
         whole = motion.statistics.split_steps == 0
-        return Trial(steps, off if math.isfinite(off) else math.inf, outcome.seconds, whole=whole)
+        return Trial(integrator, steps, off if math.isfinite(off) else math.inf, outcome.seconds, whole=whole)
 
 
 def fastest(

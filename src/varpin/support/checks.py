@@ -21,6 +21,14 @@ from varpin.errors import FileError, InputError, UnknownJoint
 JointValues: TypeAlias = ArrayLike | Mapping[str, float]
 
 
+def require_memory(rows: int, columns: int, what: str, row: str) -> None:
+    """Refuse arrays (rows, columns) that do not fit into memory; ``what`` asks for them, and each row is a ``row``."""
+    try:
+        np.empty((rows, columns))
+    except (MemoryError, ValueError, OverflowError):
+        raise InputError(f"{what} needs more memory than there is: {8 * columns} bytes a {row}") from None
+
+
 def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """``value`` as a new C-contiguous float array of exactly ``shape``.
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from typing import TypeVar
 
-from varpin.errors import InputError, VarpinError
+from varpin.errors import InputError, WorkersLost
 from varpin.support.checks import count
 
 Task = TypeVar("Task")
@@ -66,7 +66,7 @@ def in_order(
         result_bytes: Size of a result [bytes].
 
     Raises:
-        VarpinError: The executor has lost its workers.
+        WorkersLost: The executor has lost its workers.
         InputError: The tasks cannot be pickled for other processes.
         Exception: ``function`` raised it.
     """
@@ -89,7 +89,7 @@ def in_order(
             finally:
                 waiting.popleft()
     except BrokenExecutor as error:
-        raise VarpinError(f"the executor has lost its workers: {error}") from error
+        raise WorkersLost(error) from error
     except KeyboardInterrupt:
         yield from _begun(executor, waiting)
         raise
