@@ -688,7 +688,7 @@ class TestArmature:
 
     def test_of_talos_is_its_rotors_through_its_gears(self, load):
         robot = load("talos_arm")
-        srdf = ET.parse(example_robot_data.locate(example_robot_data.ROTORS["talos_arm"])).getroot()
+        srdf = ET.parse(example_robot_data.locate(example_robot_data.SRDF["talos_arm"])).getroot()
         rotors = {j.get("name"): j for j in srdf.find("rotor_params").findall("joint")}
         felt = {name: float(j.get("mass")) * float(j.get("gear_ratio")) ** 2 for name, j in rotors.items()}
         expected = [felt.get(name, 0.0) for name in robot.joint_names]

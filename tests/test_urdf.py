@@ -288,12 +288,14 @@ class TestLimits:
                 (-np.inf, np.inf, np.inf, np.inf),
                 (NONE, "'j1'"),
             ),
+            ('lower="-1" upper="-1" velocity="3" effort="3"', (-np.inf, np.inf, 3, 3), (NONE, "upper -1", "'j1'")),
+            ('lower="none" upper="None" velocity="nan" effort=""', (-np.inf, np.inf, np.inf, np.inf), (NONE, "None")),
             ('lower="-1" upper="1"', (-1, 1, np.inf, np.inf), (NONE, "no effort", "no velocity")),
             ("", (-np.inf, np.inf, np.inf, np.inf), (NONE, "no effort")),
             ('lower="-1e16" upper="1e16" velocity="3" effort="3"', (-np.inf, np.inf, 3, 3), (NONE, "1e16")),
             ('lower="-170" upper="172.5" velocity="3" effort="3"', (-170, 172.5, 3, 3), ("degrees", "-170 to 172.5")),
             ('lower="-6.28" upper="6.28" velocity="3" effort="3"', (-6.28, 6.28, 3, 3), ""),
-            ('lower="1" upper="-1" velocity="3" effort="3"', (1, -1, 3, 3), ("no room", "1 to -1 of 'j1'")),
+            ('lower="1" upper="-1" velocity="3" effort="3"', (1, -1, 3, 3), ("no room", "1 and -1 of 'j1'")),
             ('lower=" -1" upper="1 " velocity="3" effort="3"', (-1, 1, 3, 3), ""),
         ],
     )
@@ -305,7 +307,15 @@ class TestLimits:
         assert robot.unbounded.tolist() == [np.isinf(read[0])]
         assert len(caplog.messages) == bool(facts)
         assert not facts or naming(caplog.messages, facts)
-        assert not facts or naming(vp.inspect_robot(robot).warnings, facts)
+        told = vp.inspect_robot(robot).warnings
+        assert len(told) == bool(facts)
+        assert naming(told, (NONE, "'j1'") if NONE in facts else facts) == list(told)
+
+    @pytest.mark.parametrize(("upper", "told"), [("350", 1), ("12.5", 0)])
+    def test_of_a_slider_that_look_like_millimetres(self, tmp_path, caplog, upper, told):
+        path = arm(tmp_path, kind="prismatic")
+        vp.load_robot(written(tmp_path, path.read_text().replace('upper="1"', f'upper="{upper}"')))
+        assert len(naming(caplog.messages, "slider", "'j1'", "350 m", "millimetres")) == told == len(caplog.messages)
 
     def test_on_a_continuous_joint_are_told(self, tmp_path, caplog):
         assert vp.load_robot(arm(tmp_path, kind="continuous")).unbounded.all()
@@ -340,6 +350,8 @@ class TestToldAsLeftOut:
         np.testing.assert_allclose(robot.model.armature, model.armature, rtol=1e-14)
         assert model.armature[1] == pytest.approx(0.25)
         assert vp.load_robot(path, armature=0.5).model.armature.tolist() == [0.5, 0.5]
+        (plain := tmp_path / "plain.srdf").write_text('<robot name="plain"/>')
+        assert vp.load_robot(path, srdf=plain).model.armature.tolist() == [0.0, 0.0]
 
 
 class TestFaultyNumbers:

@@ -48,8 +48,8 @@ FIXED_BASE: dict[str, str] = {
     "z1": "z1_description/urdf/z1.urdf",
 }
 
-# SRDF files with rotor inertias and gear ratios, which give the armature.
-ROTORS: dict[str, str] = {"talos_arm": "talos_data/srdf/talos.srdf"}
+# SRDF files that are not beside their robots: that of talos has the rotors of its arm.
+SRDF: dict[str, str] = {"talos_arm": "talos_data/srdf/talos.srdf"}
 
 # Robots that walk, fly or swim: example-robot-data gives them a free-flyer.
 FLOATING_BASE = frozenset(

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -34,11 +34,11 @@ from varpin.model.tree import (
     to_pinocchio,
     tree_mass_matrix,
 )
-from varpin.model.units import ADVICE, NO_LIMIT, looks_like_degrees
-from varpin.model.urdf import build_model, build_shapes, read_urdf
+from varpin.model.units import ADVICE, NO_LIMIT, looks_like_degrees, slides_hint
+from varpin.model.urdf import build_model, build_shapes, listed, read_urdf
+from varpin.support import markup
 from varpin.support.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, listed, table
 
 logger = logging.getLogger(__name__)
 
@@ -113,14 +113,16 @@ class Robot(Frozen):
             ("mass that moves [kg]", float(self.tree.mass.sum())),
         ]
         if self.locked:
-            rows.append(("locked", listed(self.locked)))
+            rows.append(("locked", markup.listed(self.locked)))
         if self.ties:
-            rows.append(("tied to others", listed(self.free_model.names[tie.follower] for tie in self.ties)))
+            rows.append(("tied to others", markup.listed(self.free_model.names[tie.follower] for tie in self.ties)))
         if self.loops:
-            rows.append(("loops for a scene to close", listed(f"{a} on {b}" for a, b in self.loops)))
+            rows.append(("loops for a scene to close", markup.listed(f"{a} on {b}" for a, b in self.loops)))
         rows.append(("end effector", self.end_effector))
         head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
-        return facts(f"Robot {self.name}", rows, table(head, [(name, *map(float, row)) for name, *row in columns]))
+        return markup.facts(
+            f"Robot {self.name}", rows, markup.table(head, [(name, *map(float, row)) for name, *row in columns])
+        )
 
     @cached_property
     def dof(self) -> int:
@@ -286,13 +288,15 @@ class Robot(Frozen):
         """
         return self._limit("effortLimit", 1)
 
-    def limit_remarks(self) -> list[str]:
-        """A sentence about mimic joints whose limits are left out, if there are any."""
-        left_out = self._position_limits[2]
-        if not left_out:
-            return []
-        more = f" (and {len(left_out) - 1} more)" if len(left_out) > 1 else ""
-        return [f"the limits of mimic joint {left_out[0]!r}{more} leave the joint that it follows no room: left out"]
+    def limit_remarks(self) -> Iterator[str]:
+        """What is odd about limits, one sentence a kind."""
+        bounds = zip(self.joint_names, *self.position_limits, strict=True)
+        if tight := [f"{low:g} and {high:g} of {name!r}" for name, low, high in bounds if not low < high]:
+            yield f"limits leave no room to move (lock= holds a joint): {listed(tight, 'joints')}"
+        if names := self._position_limits[2]:
+            joints = listed(map(repr, names), "mimic joints")
+            yield f"limits that leave the joint that a mimic joint follows no room are left out: those of {joints}"
+        yield from filter(None, [slides_hint(self)])
 
     @property
     def damping(self) -> Floats:

@@ -52,6 +52,7 @@ _COUNTS = {"xyz": 3, "rpy": 3, "quat_xyzw": 4}
 
 # A bound in words that Pinocchio reads and :class:`varpin.Robot` takes as none.
 _NONE = "1e308"
+_WORDS = ("", "none", "nan")  # by which files say so
 
 _COMMENT = re.compile(rb"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
 
@@ -94,6 +95,7 @@ class Urdf:
         root: The ``<robot>`` element, with prefixes of names as written.
         mimics: Mimic elements by joint.
         remarks: How the file is read where that is not plain, one sentence a kind.
+        unlimited: A sentence about limits that are read as none; empty if there are none.
         notes: What of the file has no effect on purpose, likewise.
         plain: Whether nothing in it was tidied or mended: Pinocchio's own reading is varpin's.
     """
@@ -104,6 +106,7 @@ class Urdf:
     remarks: tuple[str, ...]
     notes: tuple[str, ...]
     plain: bool
+    unlimited: str = ""
 
     @property
     def loops(self) -> tuple[tuple[str, str], ...]:
@@ -158,10 +161,11 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
                 element.set(key, tidy)
                 tidied = True
     remarks = [*([f"its XML is not well-formed, and was mended: {fault}"] if fault else []), *_remarks(root)]
+    unlimited = _unlimited(root)
     mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
     soft = _joints_with(root, "safety_controller")
     notes = (f"soft limits of <safety_controller> have no effect: {listed(soft, 'joints')}",) if soft else ()
-    return Urdf(path, root, mimics, tuple(remarks), notes, plain=not (tidied or remarks))
+    return Urdf(path, root, mimics, tuple(remarks), notes, not (tidied or remarks or unlimited), unlimited)
 
 
 def build_model(urdf: Urdf) -> pin.Model:
@@ -241,6 +245,8 @@ def compared_model(urdf: Urdf, text: str | None) -> tuple[pin.Model, tuple[str, 
         for j, name in enumerate(model.names)
         if model.inertias[j] != own.inertias[j] or model.jointPlacements[j] != own.jointPlacements[j]
     ]
+    if urdf.unlimited and not odd:
+        return model, ()
     what = f"in the masses or places of {listed(odd, 'joints')}" if odd else "in limits or frames"
     return model, (f"Pinocchio's own reading of the file differs {what}: it reads numbers less leniently",)
 
@@ -404,8 +410,37 @@ def _xacro(root: ET.Element) -> dict[str, None]:
     return dict.fromkeys(f"<{part.tag}>" for part in root.iter() if part.tag.partition(":")[0] in prefixes)
 
 
+def _unlimited(root: ET.Element) -> str:
+    """Replace the limits by which exporters mean none; returns a sentence about them, empty if there are none.
+
+    Two bounds of 0 are none as well, as a URDF before version 1.2 without bounds is read.
+    """
+    stated, told = root.get("version") == "1.2", []
+    for joint in root.findall("joint"):
+        name, limit = joint.get("name", ""), joint.find("limit")
+        if limit is None and joint.get("type") in ("revolute", "prismatic"):
+            limit = ET.SubElement(joint, "limit")
+        if limit is None:
+            continue
+        bounded = bool({"lower", "upper"} & set(limit.keys()))
+        minus_one = _number(limit.get("lower")) == _number(limit.get("upper")) == -1.0
+        for key in ("lower", "upper", "effort", "velocity"):
+            word, drive = limit.get(key), key in ("effort", "velocity")
+            if word is None and (stated if drive else bounded or not stated):
+                continue
+            value = _number(word)
+            none = word is None or word.strip().lower() in _WORDS or math.isinf(value)
+            none |= value < 0.0 if drive else minus_one
+            if joint.get("type") != "fixed" and (none or (not drive and abs(value) > NO_LIMIT)):
+                told.append(f"no {key} of {name!r}" if word is None else f"{key} {word} of {name!r}")
+            if none:
+                limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)
+    what = "limits that are missing, infinite, negative or huge count as none"
+    return f"{what}: {listed(told, 'limits')}" if told else ""
+
+
 def _remarks(root: ET.Element) -> Iterator[str]:
-    """How limits and elements without effect are read, one sentence a kind. Limits that mean none become none."""
+    """How limits and elements without effect are read, one sentence a kind."""
     left = _xacro(root)
     left |= {
         f"<{part.tag} {key}={value!r}>": None
@@ -415,37 +450,14 @@ def _remarks(root: ET.Element) -> Iterator[str]:
     }
     if left:
         yield f"leftover xacro elements have no effect: {listed(left, 'kinds')}"
-    none, degrees, ignored, crossed = [], [], [], []
-    for joint in root.findall("joint"):
-        name, kind = repr(joint.get("name", "")), joint.get("type")
-        limit = joint.find("limit")
-        if limit is None and kind in ("revolute", "prismatic"):
-            limit = ET.SubElement(joint, "limit")
-        if limit is None:
-            continue
+    degrees, ignored = [], []
+    for joint in root.findall("joint[limit]"):
+        name, kind, limit = repr(joint.get("name", "")), joint.get("type"), joint.findall("limit")[0]
         low, high = (_number(limit.get(key)) for key in ("lower", "upper"))
         if kind == "continuous" and low < high and high - low < NO_LIMIT:
             ignored.append(name)
-        if kind != "continuous" and low > high:
-            crossed.append(f"{low:g} to {high:g} of {name}")
         if kind == "revolute" and limits_in_degrees(low, high):
             degrees.append(f"{low:g} to {high:g} of {name}")
-        # Before version 1.2, a bound that is missing is 0, and two bounds of 0 are none.
-        stated = root.get("version") == "1.2"
-        bounds = [key for key in ("lower", "upper") if key in limit.attrib] or (["lower", "upper"] if stated else [])
-        for key in (*bounds, "effort", "velocity"):
-            value, drive = _number(limit.get(key)), key in ("effort", "velocity")
-            unread = key not in limit.attrib or (drive and value < 0.0) or math.isinf(value)
-            if key in limit.attrib and kind != "fixed" and (unread or (not drive and abs(value) > NO_LIMIT)):
-                none.append(f"{key} {limit.attrib[key]} of {name}")
-            elif unread and not (drive and stated) and kind != "fixed":
-                none.append(f"no {key} of {name}")
-            if unread and not (drive and stated and key not in limit.attrib):
-                limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)
-    if none:
-        yield f"limits that are missing, infinite, negative or huge count as none: {listed(none, 'limits')}"
-    if crossed:
-        yield f"limits whose lower bound is above the upper one leave no room: {listed(crossed, 'joints')}"
     if degrees:
         yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
     if ignored:
@@ -532,9 +544,9 @@ def finite_number(word: str, what: str) -> float:
 
 
 def listed(names: Iterable[str], what: str) -> str:
-    """The first three of some names, and how many more there are."""
+    """Some names; of more than four the first three, and how many more there are."""
     names = list(names)
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more {what}" if len(names) > 3 else "")
+    return ", ".join(names[:3]) + f" and {len(names) - 3} more {what}" if len(names) > 4 else ", ".join(names)
 
 
 @dataclass(frozen=True)

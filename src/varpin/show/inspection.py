@@ -22,6 +22,7 @@ from varpin.model.additions import Base
 from varpin.model.inertia import fault, one_of_each, principal_moments
 from varpin.model.mimic import joint_index
 from varpin.model.tree import is_unbounded, joint_axis
+from varpin.model.units import NO_LIMIT
 from varpin.model.urdf import Inertial, Urdf, build_model, listed, read_inertials, read_urdf
 from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
 from varpin.support.checks import JointValues, joint_array
@@ -100,13 +101,14 @@ def inspect_robot(
     condition, scaled = _condition_numbers(jet.Lvv)
     urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
     inertials, lacks = ((), ()) if urdf is None else read_inertials(urdf, build_model(urdf))
-    joints, links = _joints(robot), _links(robot, inertials)
+    joints, links, (shapes, unread) = _joints(robot), _links(robot, inertials), readable_geometry(robot)
     warnings = [
         *(() if urdf is None else (*urdf.remarks, *urdf.notes)),
         *lacks,
         *robot.limit_remarks(),
-        *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links), _ratio_warnings(robot))),
-        *_mesh_warnings(robot),
+        *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes), _ratio_warnings(robot))),
+        *_mesh_warnings(robot, shapes),
+        *dict.fromkeys(what for _, what in unread.values()),
         *_matrix_warnings(robot, scaled),
         *one_of_each(_limit_warnings(joints, robot, None if q is None else configuration)),
         *one_of_each(_mimic_warnings(robot, urdf, joints, tied=mimic == "tied")),
@@ -164,8 +166,8 @@ def _joints(robot: Robot) -> tuple[JointReport, ...]:
                 kind=kind,
                 axis=axis,
                 unit="m" if slides else "rad",
-                lower=_limit(lower),
-                upper=_limit(upper),
+                lower=_limit(lower, NO_LIMIT),
+                upper=_limit(upper, NO_LIMIT),
                 velocity=_limit(model.velocityLimit[entry.idx_v]),
                 effort=_limit(model.effortLimit[entry.idx_v]),
                 follows=follows,
@@ -174,9 +176,9 @@ def _joints(robot: Robot) -> tuple[JointReport, ...]:
     return tuple(reports)
 
 
-def _limit(value: float) -> float:
-    """A limit; infinite for the largest double, which is no limit in Pinocchio."""
-    return float(np.copysign(np.inf, value)) if abs(value) >= 1e300 else float(value)
+def _limit(value: float, none: float = 1e300) -> float:
+    """A limit; infinite beyond ``none``: the largest double is no limit in Pinocchio."""
+    return float(np.copysign(np.inf, value)) if abs(value) > none else float(value)
 
 
 def _links(robot: Robot, inertials: Sequence[Inertial]) -> tuple[LinkReport, ...]:
@@ -253,8 +255,10 @@ def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
             yield "point mass", name, f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
 
 
-def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tuple[str, str, str]]:
-    length, corners = LENGTH_RATIO * _reach(robot) or LENGTH, _corners(robot)
+def _inertia_warnings(
+    robot: Robot, links: Sequence[LinkReport], shapes: pin.GeometryModel
+) -> Iterator[tuple[str, str, str]]:
+    length, corners = LENGTH_RATIO * _reach(robot) or LENGTH, _corners(shapes)
     frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
         if not link.joint or not link.inertia.any():
@@ -267,7 +271,7 @@ def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tup
         # A ball has the least inertia of all bodies of a given mass and density.
         radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
         gyration, against, size = float(np.sqrt(link.moments[-1] / link.mass)), _against_reach(robot), np.inf
-        near = [points for _, joint, points in corners if frame is not None and joint == frame.parentJoint]
+        near = [points for joint, points in corners if frame is not None and joint == frame.parentJoint]
         if frame is not None and near:
             size = float(np.linalg.norm(np.vstack(near) - frame.placement.act(link.center), axis=1).max())
         if SIZE_RATIO * size < length:
@@ -291,10 +295,10 @@ def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tup
             yield "away", link.name, f"{far}; are these millimetres?"
 
 
-def _corners(robot: Robot) -> list[tuple[str, int, Floats]]:
-    """The link, the joint and the corners (8, 3) [m], in the joint's frame, of the box around each readable shape."""
+def _corners(shapes: pin.GeometryModel) -> list[tuple[int, Floats]]:
+    """The joint and the corners (8, 3) [m], in the joint's frame, of the box around each shape."""
     found = []
-    for shape in readable_geometry(robot)[0].geometryObjects:
+    for shape in shapes.geometryObjects:
         if isinstance(shape.geometry, pin.coal.BVHModelBase):
             vertices = np.asarray(shape.geometry.vertices(), dtype=np.float64)
             low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -303,7 +307,7 @@ def _corners(robot: Robot) -> list[tuple[str, int, Floats]]:
             low, high = shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_
         corners = np.array(list(product(*zip(low, high, strict=True))))
         placed = corners @ shape.placement.rotation.T + shape.placement.translation
-        found.append((robot.free_model.frames[shape.parentFrame].name, shape.parentJoint, placed))
+        found.append((shape.parentJoint, placed))
     return found
 
 
@@ -344,10 +348,10 @@ def _ratio_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
                 )
 
 
-def _mesh_warnings(robot: Robot) -> Iterator[str]:
+def _mesh_warnings(robot: Robot, shapes: pin.GeometryModel) -> Iterator[str]:
     sizes = {
         shape: float(np.ptp(shape.geometry.vertices(), axis=0).max())
-        for shape in readable_geometry(robot)[0].geometryObjects
+        for shape in shapes.geometryObjects
         if shape.parentJoint and isinstance(shape.geometry, pin.coal.BVHModelBase)
     }
     reach = longest_reach(robot)
@@ -377,28 +381,19 @@ def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
 
 def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[tuple[str, str, str]]:
     bounded = [joint for joint in joints if joint.kind in ("revolute", "prismatic")]
-    driven = [joint for joint in joints if joint.kind != "mimic"]
-    missing = {
-        "position": [joint.name for joint in bounded if np.isinf(joint.lower) or np.isinf(joint.upper)],
-        "velocity": [joint.name for joint in driven if np.isinf(joint.velocity) or joint.velocity == 0.0],
-        "effort": [joint.name for joint in driven if np.isinf(joint.effort) or joint.effort == 0.0],
-    }
-    for what, names in missing.items():
-        if names:
-            yield what, "", f"no {what} limit, or one of 0: {listed(map(repr, names), 'joints')}"
-    for joint in bounded:
-        if joint.lower == joint.upper == 0.0:
-            yield (
-                "zeros",
-                joint.name,
-                (
-                    f"joint {joint.name!r} has the limits 0 and 0, which count as none, as in a URDF without limits; "
-                    "lock a joint to keep it from moving"
-                ),
-            )
-        elif joint.lower >= joint.upper:
-            words = f"limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
-            yield "no room", joint.name, f"joint {joint.name!r} has no room to move: {words}"
+    missing: dict[str, list[str]] = {}
+    for joint in joints:
+        none = {
+            "position": joint in bounded
+            and (joint.lower == joint.upper == 0.0 or not np.isfinite(joint.upper - joint.lower)),
+            "velocity": joint.kind != "mimic" and joint.velocity in (0.0, np.inf),
+            "effort": joint.kind != "mimic" and joint.effort in (0.0, np.inf),
+        }
+        if any(none.values()):
+            missing.setdefault(", ".join(what for what in none if none[what]), []).append(repr(joint.name))
+    if missing:
+        groups = "; ".join(f"{what} of {listed(names, 'joints')}" for what, names in missing.items())
+        yield "unlimited", "", f"no limits, or limits of 0, which count as none: {groups}"
     at_zero = q is None
     for name, at, low, high in zip(
         robot.joint_names, np.zeros(robot.dof) if q is None else q, *robot.position_limits, strict=True

@@ -22,6 +22,7 @@ from varpin.mechanics.reduction import Required, driving, idle_joints, joints_wi
 from varpin.mechanics.scene import Scene, closest_controls
 from varpin.model import Robot, combine, load_robot, looks_like_degrees
 from varpin.model.tree import frame_index
+from varpin.simulation.start import on_constraints
 
 # Largest number of times at which controls and references are sampled for checks.
 _SAMPLES = 2000
@@ -318,6 +319,11 @@ def _on_robot(tables: SceneTables, robot: Robot) -> Task:
         controls=controls,
     )
     _require_controls(task)
+    if scene.constraints:
+        try:
+            on_constraints(scene, q0, task.v0)
+        except VarpinError as error:
+            raise initial.at("q").error(str(error)) from None
     return task
 
 
