@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pinocchio as pin
-import scipy
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
@@ -387,12 +386,11 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
         coordinate: Coordinate that moves each body (b,).
         dof: n.
     """
-    tied = parent >= 0
-    links = scipy.sparse.coo_array(
-        (np.ones(tied.sum()), (coordinate[tied], coordinate[parent[tied]])), shape=(dof, dof)
-    )
-    _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
-    return np.asarray(label, dtype=np.int64)
+    label = np.arange(dof)
+    for body in np.flatnonzero(parent >= 0):
+        one, other = sorted(label[coordinate[[body, parent[body]]]])
+        label[label == other] = one
+    return np.asarray(np.unique(label, return_inverse=True)[1], dtype=np.int64)
 
 
 def path_coordinates(tree: Tree, body: int) -> Integers:

@@ -37,6 +37,9 @@ VERSIONS = ("1.0", "1.1", "1.2")  # of URDF, which Pinocchio reads
 # Most links one after another: its parser ends the process on chains of about 4,000.
 _LONGEST = 3000
 
+# A link with less than this share of the mass of all links on its joint is massless, but for rounding.
+_ROUNDING = 1e-12
+
 # The attributes of a URDF that hold numbers, by element.
 _NUMBERS = {
     "origin": ("xyz", "rpy", "quat_xyzw"),
@@ -192,21 +195,16 @@ def _require_all_links(urdf: Urdf, model: pin.Model) -> pin.Model:
 def read_inertials(urdf: Urdf, model: pin.Model) -> tuple[tuple[Inertial, ...], tuple[str, ...]]:
     """The inertias of the links that have one, as Pinocchio reads them, and remarks about those it reads in part."""
     given = {link.get("name", ""): link for link in urdf.root.findall("link") if link.find("inertial") is not None}
-    frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given]
-    if len({frame.parentJoint for frame in frames}) < len(frames):
-        # Pinocchio merges links on fixed joints into one body; a joint that moves keeps them apart.
-        small = _part(urdf.root, "link/inertial", "joint/parent", "joint/child")
-        for joint in small.findall("joint"):
-            child = joint.find("child")
-            joint.set("type", "floating" if child is not None and child.get("link") in given else "fixed")
-        apart = _build(small)
-        if isinstance(apart, str):
-            return (), ()
-        model = apart
+    # Pinocchio merges links on fixed joints into one body, whose parts are in the frames of these joints.
+    fixed = [frame for frame in model.frames if frame.type == pin.FrameType.FIXED_JOINT and frame.inertia.mass]
     found, remarks = [], []
     for frame in (frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given):
-        name, link = frame.name, given[frame.name]
-        body = frame.placement.actInv(model.inertias[frame.parentJoint])
+        name, link, up = frame.name, given[frame.name], model.frames[frame.parentFrame]
+        body = up.inertia if up.inertia.mass else frame.inertia
+        if up.type == pin.FrameType.JOINT:
+            body = model.inertias[frame.parentJoint]
+            if parts := [part for part in fixed if part.parentJoint == frame.parentJoint]:
+                body = _without(body, [part.placement.act(part.inertia) for part in parts])
         if fault := next(_faults_of_numbers(link.findall("inertial")[0], required=True), ""):
             effect = "massless" if body.mass == 0.0 else "a point mass"
             remarks.append(f"link {name!r} is {effect}, as Pinocchio reads it: {fault}")
@@ -214,6 +212,12 @@ def read_inertials(urdf: Urdf, model: pin.Model) -> tuple[tuple[Inertial, ...], 
             found.append(Inertial(name, body.mass, np.array(body.lever), np.array(body.inertia)))
     more = f" ({len(remarks) - 1} more links are read in part)" if len(remarks) > 1 else ""
     return tuple(found), tuple(remark + more for remark in remarks[:1])
+
+
+def _without(body: pin.Inertia, parts: Sequence[pin.Inertia]) -> pin.Inertia:
+    """A body without some of its parts; zero if they leave rounding errors alone."""
+    rest = body.toDynamicParameters() - sum(part.toDynamicParameters() for part in parts)
+    return pin.Inertia.FromDynamicParameters(rest) if rest[0] > _ROUNDING * body.mass else pin.Inertia.Zero()
 
 
 def compared_model(urdf: Urdf, text: str | None) -> tuple[pin.Model, tuple[str, ...]]:
