@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -21,10 +21,10 @@ from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
 from varpin.model.kinematics import place_on_body
 from varpin.model.meshes import Reader, read_mesh, with_own_meshes
-from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model
+from varpin.model.mimic import Tie, joint_index, tied_model
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.payload import Payload, carry
-from varpin.model.sources import Description, describe, hang_shapes
+from varpin.model.sources import Description, describe
 from varpin.model.srdf import Posture, of_joints
 from varpin.model.tree import (
     flatten,
@@ -50,9 +50,8 @@ class Part(NamedTuple):
     """A robot within a combined one."""
 
     robot: "Robot"
-    prefix: str  # prefix of its joint and frame names in the combined model
-    shift: int  # joint index in the combined model minus joint index in the robot
-    place: pin.SE3  # placement of its world in the combined world
+    prefix: str  # of its joint and frame names in the combined model
+    place: pin.SE3 | None  # placement of its world in the combined one
 
 
 @dataclass(frozen=True, eq=False)
@@ -470,21 +469,34 @@ def hold_joints(robot: Robot, positions: Mapping[str, ArrayLike]) -> Robot:
         RobotError: No joint is left.
     """
     whole = Description(robot.name, robot.free_model, robot.ties, visuals=robot.visuals)
-    model, ties, visuals, locked = _lock(whole, positions)
+    description, locked = _lock(whole, positions)
+    return robot.changed(
+        **core_of(robot.name, description.model, description.ties),
+        locked=MappingProxyType({**robot.locked, **locked}),
+        visuals=description.visuals,
+        loops=_open(robot.loops, description.model),
+    )
+
+
+def core_of(name: str, model: pin.Model, ties: tuple[Tie, ...], why: str = "") -> dict[str, Any]:
+    """The attributes of a robot that follow from its model without mimic joints.
+
+    Raises:
+        RobotError: No joint moves; the message ends with ``why``.
+        UnsupportedJoint: A joint has no single axis.
+    """
     followers = {tie.follower for tie in ties}
     coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
     if not coordinates:
-        raise RobotError(f"robot {robot.name!r} has no joint left that moves")
-    return robot.changed(
-        model=tied_model(model, ties),
-        joint_names=tuple(model.names[joint] for joint in coordinates),
-        free_model=model,
-        ties=ties,
-        tree=flatten(model, ties, coordinates),
-        locked=MappingProxyType({**robot.locked, **locked}),
-        visuals=visuals,
-        loops=_open(robot.loops, model),
-    )
+        raise RobotError(f"robot {name!r} has no joint that moves{why}")
+    return {
+        "name": name,
+        "model": tied_model(model, ties),
+        "joint_names": tuple(model.names[joint] for joint in coordinates),
+        "free_model": model,
+        "ties": ties,
+        "tree": flatten(model, ties, coordinates),
+    }
 
 
 def _built(
@@ -513,32 +525,19 @@ def _built(
         raise RobotError(f"robot {description.name!r} has several joints named {', '.join(map(repr, twice))}")
     if mimic == "free":
         description = replace(description, ties=())
-    model, ties, visuals, locked = _lock(description, _locks(description, lock, keep))
-    unwound = _unwound(model, ties)
-    if visuals is not None:
-        hang_shapes(visuals, model, unwound)
-    model = unwound
-    followers = {tie.follower for tie in ties}
-    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
-    if not coordinates:
-        why = "".join(f"; {remark}" for remark in description.remarks[:1])
-        raise RobotError(f"robot {description.name!r} has no joint that moves{why}")
-    with_rotors(model, armature, coordinates, tuple(locked))
-    tree = flatten(model, ties, coordinates)
+    whole, (description, locked) = description, _lock(description, _locks(description, lock, keep))
+    model = description.model
+    with_rotors(model, armature, description.ties, tuple(locked))
+    why = "".join(f"; {remark}" for remark in description.remarks[:1])
     robot = Robot(
-        name=description.name,
-        model=tied_model(model, ties),
-        joint_names=tuple(model.names[joint] for joint in coordinates),
-        free_model=model,
-        ties=ties,
-        tree=tree,
+        **core_of(description.name, model, description.ties, why),
         locked=MappingProxyType(locked),
         urdf=description.urdf,
         expanded=description.expanded,
         mjcf=description.mjcf,
         package_dirs=description.package_dirs,
-        visuals=visuals,
-        group_states=of_joints(description.postures, description.model.names),
+        visuals=description.visuals,
+        group_states=of_joints(description.postures, whole.model.names),
         loops=_open(description.loops, model),
         equalities=description.equalities,
     )
@@ -587,13 +586,15 @@ def _locks(
 
 def _lock(
     description: Description, lock: Mapping[str, ArrayLike]
-) -> tuple[pin.Model, tuple[Tie, ...], pin.GeometryModel | None, dict[str, float | tuple[float, ...]]]:
-    """Remove the locked joints, and the followers of locked leaders, from model, ties and geometry."""
-    model, visuals = description.model, description.visuals
+) -> tuple[Description, dict[str, float | tuple[float, ...]]]:
+    """The robot without the locked joints and the followers of locked leaders, and their positions.
+
+    Continuous joints among leaders and followers become revolute joints without limits: a (cos, sin) pair loses whole
+    turns, which matter to a gear, and Pinocchio cannot tie such a joint to one of another kind.
+    """
+    model = description.model
     index = joint_index(model)
     leaders = {tie.follower: tie for tie in description.ties}
-    reference = pin.neutral(model)
-    locked: dict[str, float | tuple[float, ...]] = {}
     positions: dict[int, Floats] = {}
     for name, value in lock.items():
         if name not in index:
@@ -603,43 +604,29 @@ def _lock(
             leader = model.names[leaders[joint].leader]
             raise InputError(f"lock: joint {name!r} mimics {leader!r}; locking {leader!r} locks both")
         positions[joint] = _locked_position(model, joint, value)
-        locked[name] = float(positions[joint][0]) if positions[joint].size == 1 else tuple(positions[joint].tolist())
     for tie in description.ties:
         if tie.leader in positions:
             positions[tie.follower] = tie.ratio * positions[tie.leader] + tie.offset
-            locked[model.names[tie.follower]] = float(positions[tie.follower][0])
-    if not positions:
-        return model, description.ties, visuals, {}
-    for joint, position in positions.items():
-        kind = model.joints[joint]
-        if is_unbounded(model, joint):
-            reference[kind.idx_q : kind.idx_q + 2] = np.cos(position[0]), np.sin(position[0])
-        else:
-            reference[kind.idx_q : kind.idx_q + kind.nq] = position
-    joints = sorted(positions)
-    # pin.buildReducedModel looks frames up by name alone, where a link and a joint may have the same.
-    renamed = model.copy()
-    names: dict[str, str] = {}
-    for k in set(range(1, model.nframes)).difference(joint_frames(model)):
-        frame = renamed.frames[k]
-        names[f"{k} {frame.name}"] = frame.name
-        frame.name = f"{k} {frame.name}"
-    if visuals is None:
-        reduced = pin.buildReducedModel(renamed, joints, reference)
-    else:
-        reduced, visuals = pin.buildReducedModel(renamed, visuals, joints, reference)
-    for frame in reduced.frames:
-        frame.name = names.get(frame.name, frame.name)
-    if visuals is not None:
-        hang_shapes(visuals, reduced, reduced)
-    reduced.gravity = model.gravity
-    left = joint_index(reduced)
-    ties = tuple(
-        Tie(left[model.names[tie.follower]], left[model.names[tie.leader]], tie.ratio, tie.offset)
-        for tie in description.ties
-        if tie.follower not in positions
-    )
-    return reduced, ties, visuals, locked
+    held = {joint: _motion(model, joint, position) for joint, position in positions.items()}
+    geared = {joint for tie in description.ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
+    kinds = {joint: pin.JointModelRevoluteUnaligned(joint_axis(model, joint)[1]) for joint in geared - set(held)}
+    if held or kinds:
+        description = description.rebuilt(held=held, kinds=kinds)
+    locked = {
+        model.names[joint]: float(at[0]) if at.size == 1 else tuple(at.tolist()) for joint, at in positions.items()
+    }
+    return description, locked
+
+
+def _motion(model: pin.Model, joint: int, position: Floats) -> pin.SE3:
+    """The motion of a joint at its position."""
+    kind, q = model.joints[joint], pin.neutral(model)
+    if is_unbounded(model, joint):
+        position = np.array([np.cos(position[0]), np.sin(position[0])])
+    q[kind.idx_q : kind.idx_q + kind.nq] = position
+    data = kind.createData()
+    kind.calc(data, q)
+    return pin.SE3(data.M)
 
 
 def _open(loops: Sequence[tuple[str, str]], model: pin.Model) -> tuple[tuple[str, str], ...]:
@@ -649,24 +636,6 @@ def _open(loops: Sequence[tuple[str, str]], model: pin.Model) -> tuple[tuple[str
         return {frame.parentJoint for frame in model.frames if frame.name == name and frame.type != pin.FrameType.JOINT}
 
     return tuple((a, b) for a, b in loops if carriers(a).isdisjoint(carriers(b)))
-
-
-def _unwound(model: pin.Model, ties: tuple[Tie, ...]) -> pin.Model:
-    """``model`` with the continuous joints among leaders and followers as revolute joints without limits.
-
-    A (cos, sin) pair loses whole turns, which matter to a gear, and Pinocchio cannot tie such a joint to one of another
-    kind.
-    """
-    geared = {joint for tie in ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
-    if not geared:
-        return model
-
-    def joint_of(joint: int) -> pin.JointModel:
-        if joint in geared:
-            return pin.JointModelRevoluteUnaligned(joint_axis(model, joint)[1])
-        return model.joints[joint]
-
-    return rebuild(model, range(1, model.njoints), joint_of)
 
 
 def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
@@ -722,75 +691,51 @@ def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.Geome
         The shapes of the links that can be read, and for each other link by name, its joint in ``free_model`` and its
         fault in words; missing meshes share one message.
     """
+    joints = {frame.name: frame.parentJoint for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
+    together = pin.GeometryModel()
+    faulty: dict[str, tuple[int, str]] = {}
+    for part, prefix, _ in robot.parts:
+        shapes, what = readable_geometry(part, read)
+        faulty |= {prefix + name: (joints[prefix + name], fault) for name, (_, fault) in what.items()}
+        _hang(robot, part.free_model, shapes, prefix)
+        for shape in shapes.geometryObjects:
+            shape.name = prefix + shape.name
+            together.addGeometryObject(shape)
     if robot.parts:
-        found = [readable_geometry(part.robot, read) for part in robot.parts]
-        faults_of_links = {
-            part.prefix + name: (joint + part.shift if joint else 0, what)
-            for part, (_, faulty) in zip(robot.parts, found, strict=True)
-            for name, (joint, what) in faulty.items()
-        }
-        return _of_parts(robot, [shapes for shapes, _ in found]), faults_of_links
-    frames = [frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY]
+        return together, faulty
     try:
         if robot.visuals is not None:
             return with_own_meshes(robot.visuals, read), {}
         if robot.mjcf is not None:
-            return _on_joints(robot, *mjcf_shapes(robot.mjcf)), {}
+            full, shapes = mjcf_shapes(robot.mjcf)
+            return _hang(robot, full, shapes), {}
         if robot.urdf is None:
-            return pin.GeometryModel(), {}
+            return together, {}
         urdf = read_urdf(robot.urdf, robot.expanded)
         full = build_model(urdf)
-        shapes, faulty = build_shapes(urdf, full, robot.package_dirs, read)
+        shapes, unread = build_shapes(urdf, full, robot.package_dirs, read)
     except RobotError as error:
-        return pin.GeometryModel(), {frame.name: (frame.parentJoint, str(error)) for frame in frames}
-    joints = {frame.name: frame.parentJoint for frame in frames}
-    return _on_joints(robot, full, shapes), {link: (joints[link], what) for link, what in faulty.items()}
+        return together, {name: (joint, str(error)) for name, joint in joints.items()}
+    return _hang(robot, full, shapes), {link: (joints[link], what) for link, what in unread.items()}
 
 
-def _of_parts(robot: Robot, shapes: Sequence[pin.GeometryModel]) -> pin.GeometryModel:
-    """The shapes of each part of a combined robot on its joints."""
-    together, model = pin.GeometryModel(), robot.free_model
-    for part, geometry in zip(robot.parts, shapes, strict=True):
-        for given in geometry.geometryObjects:
-            shape = given.copy()
-            link = part.robot.free_model.frames[given.parentFrame]
-            shape.name = part.prefix + given.name
-            shape.parentFrame = model.getFrameId(part.prefix + link.name, link.type) if given.parentFrame else 0
-            if given.parentJoint:
-                shape.parentJoint = given.parentJoint + part.shift
-            else:
-                shape.placement = part.place * given.placement
-            together.addGeometryObject(shape)
-    return together
-
-
-def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin.GeometryModel:
-    """The shapes of a robot's file on the joints of the robot.
+def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str = "") -> pin.GeometryModel:
+    """Hang shapes of another model, such as that of the file before joints were locked, on the frames of a robot.
 
     Args:
-        robot: The robot; some joints may be locked, or in another order than in the file.
-        full: The model of its file, without locked joints.
-        visuals: Shapes on ``full``.
+        robot: The robot.
+        full: The other model.
+        shapes: Shapes on ``full``.
+        prefix: Prefix of its frames in the robot.
     """
-    # Joints are matched by name, locked joints through their frame.
-    index = joint_index(robot.free_model)
-    for shape in visuals.geometryObjects:
+    model = robot.free_model
+    for shape in shapes.geometryObjects:
         link = full.frames[shape.parentFrame]
-        frame = robot.free_model.getFrameId(link.name, link.type)
-        name = full.names[shape.parentJoint]
-        if name in index:
-            shape.parentJoint = index[name]
-        elif not shape.parentJoint:
-            # Shapes of the file's world belong to the robot's base.
-            joint_frame = robot.free_model.frames[frame]
-            shape.placement = joint_frame.placement * link.placement.inverse() * shape.placement
-            shape.parentJoint = joint_frame.parentJoint
-        else:
-            joint_frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
-            shape.placement = joint_frame.placement * shape.placement
-            shape.parentJoint = joint_frame.parentJoint
-        shape.parentFrame = frame
-    return visuals
+        shape.parentFrame = model.getFrameId(prefix + link.name, link.type) if shape.parentFrame else 0
+        frame = model.frames[shape.parentFrame]
+        shape.placement = frame.placement * link.placement.inverse() * shape.placement
+        shape.parentJoint = frame.parentJoint
+    return shapes
 
 
 def check_inertia(robot: Robot, known: Sequence[str] = ()) -> None:

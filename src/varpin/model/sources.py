@@ -1,10 +1,13 @@
 """Sources of robots: files, bundled robots, example-robot-data, robot_descriptions, models in memory."""
 
+from __future__ import annotations
+
 import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -12,16 +15,7 @@ import pinocchio as pin
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.model import example_robot_data, robot_descriptions
 from varpin.model.equalities import Closure, Equality
-from varpin.model.mimic import (
-    JOINT_PARAMETERS,
-    Tie,
-    depth_first,
-    joint_frames,
-    reordered,
-    repair_velocity_limits,
-    ties_of,
-    untied_model,
-)
+from varpin.model.mimic import JOINT_PARAMETERS, Tie, depth_first, joint_frames, of_mimics, rebuild, ties_of
 from varpin.model.mjcf import is_mjcf, read_mjcf, root_tag
 from varpin.model.packages import Packages
 from varpin.model.srdf import Posture, beside, read_postures, read_rotors, reference_postures
@@ -69,6 +63,11 @@ class Description:
     postures: tuple[Posture, ...] = ()
     loops: tuple[tuple[str, str], ...] = ()
     equalities: tuple[Equality, ...] = ()
+
+    def rebuilt(self, **changes: Any) -> Description:
+        """The robot with its model rebuilt; see :func:`varpin.model.mimic.rebuild`."""
+        new = rebuild(self.model, **changes)
+        return replace(self, model=new.model, ties=new.ties(self.ties), visuals=new.shapes(self.visuals))
 
 
 def models_dir() -> Path:
@@ -218,30 +217,31 @@ def _urdf_files(folder: Path) -> str:
 def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) -> Description:
     _check_model(model, name)
     # Copies, so that later changes of the user's model do not change the robot.
-    free, ties = untied_model(model.copy())
     shapes = visuals.copy() if visuals is not None else None
     for shape in shapes.geometryObjects if shapes is not None else ():
-        if shape.parentJoint >= free.njoints:
+        if shape.parentJoint >= model.njoints:
             raise RobotError(
                 f"shape {shape.name!r} has the parent joint {shape.parentJoint}, which model {name!r} does not have"
             )
-    order = depth_first(free, ties)
-    in_order = order == sorted(order)
-    if not (in_order and _has_joint_frames(free)):
-        free, ties = reordered(free, ties, order)
-        for shape in shapes.geometryObjects if shapes is not None else ():
-            shape.parentJoint = [0, *order].index(shape.parentJoint)
-    if not in_order:
+    ties, kinds = of_mimics(model)
+    description = Description(name, model.copy(), ties, visuals=shapes, postures=reference_postures(model))
+    order = depth_first(model, ties)
+    if kinds or order != sorted(order) or len(joint_frames(model)) < model.njoints - 1:
+        description = description.rebuilt(order=order, kinds=kinds)
+    if order != sorted(order):
         # Pinocchio accepts joints in any order, but then computes a wrong mass matrix silently.
         logger.warning(
             "the joints of model %r were not added subtree by subtree, as Pinocchio's algorithms need: reordered to %s",
             name,
-            ", ".join(list(free.names)[1:]),
+            ", ".join(list(description.model.names)[1:]),
         )
-    repair_velocity_limits(free)
-    if shapes is not None:
-        hang_shapes(shapes, model, free)
-    return Description(name, free, ties, visuals=shapes, postures=reference_postures(model))
+    frames = description.model.frames
+    for shape in shapes.geometryObjects if (shapes := description.visuals) is not None else ():
+        # Where a shape has no frame of its joint, it has the joint's.
+        if shape.parentFrame >= len(frames) or frames[shape.parentFrame].parentJoint != shape.parentJoint:
+            joint = description.model.names[shape.parentJoint]
+            shape.parentFrame = description.model.getFrameId(joint, pin.FrameType.JOINT) if shape.parentJoint else 0
+    return description
 
 
 def _check_model(model: pin.Model, name: str) -> None:
@@ -271,29 +271,6 @@ def _check_model(model: pin.Model, name: str) -> None:
     for frame in model.frames:
         if frame.parentJoint >= n or frame.parentFrame >= model.nframes:
             raise RobotError(f"model {name!r} is damaged: the parent of frame {frame.name!r} does not exist")
-
-
-def _has_joint_frames(model: pin.Model) -> bool:
-    """Whether every joint has its frame, before other frames on the joint, as pin.buildReducedModel needs.
-
-    pin.buildReducedModel reads out of bounds where a joint frame is missing.
-    """
-    frame_of = {model.frames[index].parentJoint: index for index in joint_frames(model)}
-    if len(frame_of) < model.njoints - 1:
-        return False
-    return all(frame_of.get(frame.parentJoint, 0) <= index for index, frame in enumerate(model.frames))
-
-
-def hang_shapes(shapes: pin.GeometryModel, old: pin.Model, new: pin.Model) -> None:
-    """Reattach shapes from the frames of ``old`` to those of ``new``, or else to their joint's frame."""
-    for shape in shapes.geometryObjects:
-        frame = new.nframes
-        if shape.parentFrame < old.nframes:
-            link = old.frames[shape.parentFrame]
-            frame = new.getFrameId(link.name, link.type)
-        if frame >= new.nframes:
-            frame = new.getFrameId(new.names[shape.parentJoint], pin.FrameType.JOINT) if shape.parentJoint else 0
-        shape.parentFrame = frame
 
 
 def _of_file(path: Path, name: str, request: _Request) -> Description:
@@ -333,16 +310,10 @@ def _of_urdf(path: Path, name: str, request: _Request, expanded: str | None = No
     remarks = (*urdf.remarks, *filter(None, [urdf.unlimited]), *differences)
     for note in urdf.notes:
         logger.info("robot %r: %s", name, note)
-    ties: tuple[Tie, ...] = ()
-    if request.mimic:
-        ties = ties_of(urdf.mimics, model)
-        order = depth_first(model, ties)
-        if order != sorted(order):
-            model, ties = reordered(model, ties, order)
-    return Description(
+    description = Description(
         name=name,
         model=model,
-        ties=ties,
+        ties=ties_of(urdf.mimics, model) if request.mimic else (),
         urdf=path,
         expanded=expanded,
         package_dirs=_places(path, request.folders),
@@ -351,6 +322,8 @@ def _of_urdf(path: Path, name: str, request: _Request, expanded: str | None = No
         faults=lacks,
         loops=urdf.loops,
     )
+    order = depth_first(model, description.ties)
+    return description if order == sorted(order) else description.rebuilt(order=order)
 
 
 def _with_srdf(description: Description, request: _Request) -> Description:

@@ -22,7 +22,7 @@ from varpin.io.scenefile.reading import suggestion
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.shown import marks_of
 from varpin.io.scenefile.tables import SceneTables, read_scene
-from varpin.io.scenefile.task import Task, required_of, task_of
+from varpin.io.scenefile.task import Task, require_start, required_of, task_of
 from varpin.mechanics.reduction import Required
 from varpin.mechanics.scene import Scene, closest_controls
 from varpin.model import Robot, models_dir
@@ -99,6 +99,7 @@ class SceneFile:
         spec, horizon = self.spec, self.spec.horizon
         if not spec.cost:
             raise spec.where.at("cost").error("is missing; a scene to solve needs at least one [[cost]]")
+        require_start(task)
         most, constraints = task.control_limit, []
         for index, given in enumerate(spec.plan_constraint):
             try:
@@ -153,9 +154,11 @@ class SceneFile:
         """The motion under the controls of ``[simulate]``, with noise if it gives a seed.
 
         Raises:
+            SceneFileError: The start is off the constraints.
             StepFailure, Interrupted: As :func:`varpin.simulate`.
         """
         spec = self.spec
+        require_start(self._task)
         return simulate(
             self.scene,
             self.q0,

@@ -319,12 +319,20 @@ def _on_robot(tables: SceneTables, robot: Robot) -> Task:
         controls=controls,
     )
     _require_controls(task)
-    if scene.constraints:
-        try:
-            on_constraints(scene, q0, task.v0)
-        except VarpinError as error:
-            raise initial.at("q").error(str(error)) from None
     return task
+
+
+def require_start(task: Task) -> None:
+    """Refuse a start off the constraints.
+
+    Raises:
+        SceneFileError: It misses them by too much.
+    """
+    if task.scene.constraints:
+        try:
+            on_constraints(task.scene, task.q0, task.v0)
+        except VarpinError as error:
+            raise task.tables.where.at("initial").at("q").error(str(error)) from None
 
 
 def _refuse_degrees(place: Where, values: Floats, robot: Robot) -> None:
