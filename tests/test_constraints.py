@@ -710,7 +710,7 @@ def test_scene_files_have_constraints(tmp_path):
         vp.Distance("tool0", "upper_arm_link", 0.7),
     ]
     scene = vp.Scene(vp.load_robot("ur5"), constraints=constraints)
-    with refused(vp.InputError, "q0", "assemble"):
+    with refused(vp.SceneFileError, "loop.toml", "initial.q", "q0", "assemble"):
         vp.load_scene(path).simulate()
     q = vp.assemble(scene, [0.1, -1.0, 1.2, 0.3, 0.4, -0.7])
     path.write_text(SCENE_FILE.replace("[0.1, -1.0, 1.2, 0.3, 0.4, -0.7]", str(q.tolist())))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats, Integers
-from varpin.core import Mechanism as Core
+from varpin.core import Mechanism
 from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
 from varpin.errors import InputError, RobotError
 from varpin.finding import Told
@@ -47,7 +47,7 @@ from varpin.mechanics.forces import (
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
 from varpin.model import Robot, degrees_hint, require_robot, require_sound
-from varpin.model.tree import block_ends, path_coordinates
+from varpin.model.tree import block_ends, mechanism, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
@@ -113,11 +113,6 @@ _RANK = 1e-9
 _NAMED = 7
 _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
 EARTH = (0.0, 0.0, -9.81)
-# Fields of the robot's tree that are arguments of the core.
-_TREE = (
-    "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
-    "origin", "loads", "carried", "periodic",
-)  # fmt: skip
 # Depth to which a joint may press into a stop, in widths of the stop.
 _STOP_DEPTH = 2.0
 
@@ -517,14 +512,12 @@ class Scene(Frozen):
         return self.processes + (len(self.noise.sloped) if linear else 0)
 
     @cached_property
-    def core(self) -> Core:
+    def core(self) -> Mechanism:
         """The scene in the compiled core, without noise fields that only Python can evaluate."""
-        tree, fields = self.robot.tree, self.diffusion
-        values = {name: getattr(tree, name) for name in _TREE}
-        if self.constraints:
-            values |= self._of_constrained_tree()
-        return Core.make(
-            **values,
+        fields = self.diffusion
+        return mechanism(
+            self.robot.tree,
+            **(self._of_constrained_tree() if self.constraints else {}),
             group=self.group,
             groups=int(self.group.max()) + 1,
             ends=np.array([self.robot.dof]) if self.constraints else block_ends(self.group),

@@ -30,9 +30,9 @@ from varpin.model.tree import (
     flatten,
     is_unbounded,
     joint_axis,
+    mechanism,
     place_of_frame,
     to_pinocchio,
-    tree_mass_matrix,
 )
 from varpin.model.units import ADVICE, NO_LIMIT, looks_like_degrees, slides_hint
 from varpin.model.urdf import build_model, build_shapes, listed, read_urdf
@@ -194,7 +194,8 @@ class Robot(Frozen):
         q = as_floats("q", q)
         if q.shape[-1:] != (self.dof,):
             raise InputError(f"q must have shape (..., {self.dof}), got {q.shape}")
-        return self._spread(self.model, q)
+        order = [self.joint_names.index(name) for name in self.model.names if name in self.joint_names]
+        return to_pinocchio(self.model, q[..., order])
 
     def free_positions(self, q: ArrayLike) -> Floats:
         """``q`` (..., n) as configurations (..., free_model.nq) of ``free_model``."""
@@ -346,20 +347,6 @@ class Robot(Frozen):
         limit.setflags(write=False)
         return limit
 
-    def _spread(self, model: pin.Model, q: Floats) -> Floats:
-        configuration = np.empty((*q.shape[:-1], model.nq))
-        index = joint_index(model)
-        for c, name in enumerate(self.joint_names):
-            joint = model.joints[index[name]]
-            if joint.nq == 2:
-                configuration[..., joint.idx_q], configuration[..., joint.idx_q + 1] = (
-                    np.cos(q[..., c]),
-                    np.sin(q[..., c]),
-                )
-            else:
-                configuration[..., joint.idx_q] = q[..., c]
-        return configuration
-
 
 def require_robot(robot: object, taker: str = "") -> Robot:
     """``robot`` itself; an InputError if it is no Robot, which names the taker, if there is one."""
@@ -433,32 +420,24 @@ def load_robot(
     """
     if not is_one_of(inertia, ("file", "meshes")):
         raise InputError(f"inertia must be 'file' or 'meshes', got {inertia!r}")
-    shaped = inertia == "meshes"
-    robot, description = _built(
-        source, package_dirs, lock, keep, mimic, payload, xacro_args, srdf, base, armature, density if shaped else None
+    robot, description = build_robot(
+        source,
+        package_dirs=package_dirs,
+        lock=lock,
+        keep=keep,
+        mimic=mimic,
+        payload=payload,
+        xacro_args=xacro_args,
+        srdf=srdf,
+        base=base,
+        armature=armature,
+        density=density if inertia == "meshes" else None,
     )
     wrong = (*description.faults, *faults(robot.free_model, description.inertials))
     for remark in (*description.remarks, *wrong, *robot.limit_remarks()):
         logger.warning("robot %r: %s", robot.name, remark)
     check_inertia(robot, description.faults)
     return robot
-
-
-def build_robot(
-    source: object,
-    *,
-    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
-    lock: Mapping[str, ArrayLike] | None = None,
-    keep: Sequence[str] | None = None,
-    mimic: Literal["tied", "free"] = "tied",
-    payload: Payload | Sequence[Payload] = (),
-    xacro_args: Mapping[str, object] | None = None,
-    srdf: str | os.PathLike[str] | None = None,
-    base: Base = None,
-    armature: JointValues | None = None,
-) -> Robot:
-    """:func:`load_robot` without its checks of inertia, to inspect faulty models."""
-    return _built(source, package_dirs, lock, keep, mimic, payload, xacro_args, srdf, base, armature, None)[0]
 
 
 def hold_joints(robot: Robot, positions: Mapping[str, ArrayLike]) -> Robot:
@@ -499,20 +478,21 @@ def core_of(name: str, model: pin.Model, ties: tuple[Tie, ...], why: str = "") -
     }
 
 
-def _built(
+def build_robot(
     source: object,
-    package_dirs: Sequence[str | os.PathLike[str]] | None,
-    lock: Mapping[str, ArrayLike] | None,
-    keep: Sequence[str] | None,
-    mimic: Literal["tied", "free"],
-    payload: Payload | Sequence[Payload],
-    xacro_args: Mapping[str, object] | None,
-    srdf: str | os.PathLike[str] | None,
-    base: Base,
-    armature: JointValues | None,
-    density: float | None,
+    *,
+    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
+    lock: Mapping[str, ArrayLike] | None = None,
+    keep: Sequence[str] | None = None,
+    mimic: Literal["tied", "free"] = "tied",
+    payload: Payload | Sequence[Payload] = (),
+    xacro_args: Mapping[str, object] | None = None,
+    srdf: str | os.PathLike[str] | None = None,
+    base: Base = None,
+    armature: JointValues | None = None,
+    density: float | None = None,
 ) -> tuple[Robot, Description]:
-    """The robot and the description of its source."""
+    """:func:`load_robot` without its checks of inertia, and the description of its source."""
     if not is_one_of(mimic, ("tied", "free")):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     description = describe(source, package_dirs, mimic=mimic == "tied", xacro_args=xacro_args, srdf=srdf)
@@ -749,10 +729,10 @@ def check_inertia(robot: Robot, known: Sequence[str] = ()) -> None:
         SingularMassMatrix: The mass matrix is singular; the message names the joints that move no inertia.
         RobotError: The mass matrix is not finite.
     """
-    rng = np.random.default_rng(0)
+    rng, core = np.random.default_rng(0), mechanism(robot.tree)
     for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
         with np.errstate(all="ignore"):
-            M = tree_mass_matrix(robot.tree, q)
+            M = core.jet(q, np.zeros(robot.dof))[-1]
         if not np.isfinite(M).all():
             raise RobotError(
                 f"the mass matrix of robot {robot.name!r} is not finite: masses, inertias, distances or "

@@ -1,13 +1,15 @@
 """A Pinocchio model as flat arrays, with joint frames turned so that every joint axis is z."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
-from varpin.core.arrays import Tree
+from varpin.core import Mechanism
+from varpin.core.arrays import ConstraintRows, Tree
 from varpin.errors import InputError, RobotError, UnknownFrame, UnsupportedJoint
 from varpin.model.mimic import Tie
 
@@ -190,12 +192,12 @@ def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tu
 
 
 def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
-    """Joint positions (..., k) as configurations (..., model.nq) of a model without mimic joints.
+    """Joint positions (..., k), of the joints that are no mimic joints, as configurations (..., model.nq) of a model.
 
     The angle of a continuous joint becomes Pinocchio's (cos, sin).
     """
     configuration = np.empty((*positions.shape[:-1], model.nq))
-    for k, joint in enumerate(model.joints[1:]):
+    for k, joint in enumerate(joint for joint in model.joints[1:] if joint.nv):
         if joint.nq == 2:
             configuration[..., joint.idx_q] = np.cos(positions[..., k])
             configuration[..., joint.idx_q + 1] = np.sin(positions[..., k])
@@ -334,48 +336,12 @@ def require_sound(tree: Tree) -> None:
         raise RobotError("the robot's tree is damaged: its blocks do not end where its groups end")
 
 
-def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
-    """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for i an ancestor of j, or j itself; see jet.hpp.
-
-    Plain NumPy needs n^2 memory, Pinocchio's data n^3.
-    """
-    bodies = tree.parent.size
-    rotation, position = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
-    for j, s in enumerate(tree.ratio * q[tree.coordinate] + tree.offset):
-        up = tree.parent[j]
-        R, p = (rotation[up], position[up]) if up >= 0 else (np.eye(3), np.zeros(3))
-        rotation[j], position[j] = R @ tree.rotation[j], p + R @ tree.translation[j]
-        if tree.prismatic[j]:
-            position[j] += s * rotation[j, :, 2]
-        else:
-            rotation[j] = rotation[j] @ _turn(s)
-    turns = (tree.prismatic == 0)[:, None]
-    z = rotation[:, :, 2]
-    axis = np.hstack([np.where(turns, np.cross(position, z), z), np.where(turns, z, 0.0)])
-    center = position + np.einsum("bij,bj->bi", rotation, tree.center)
-    lever = np.zeros((bodies, 3, 3))  # cross product with the centre of mass
-    lever[:, [2, 0, 1], [1, 2, 0]] = center
-    lever -= lever.transpose(0, 2, 1)
-    about_center = tree.inertia[:, [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
-    m = tree.mass[:, None, None]
-    inertia = np.empty((bodies, 6, 6))
-    inertia[:, :3, :3], inertia[:, :3, 3:], inertia[:, 3:, :3] = m * np.eye(3), -m * lever, m * lever
-    inertia[:, 3:, 3:] = rotation @ about_center @ rotation.transpose(0, 2, 1) - m * lever @ lever
-    for j in range(bodies - 1, -1, -1):
-        if tree.parent[j] >= 0:
-            inertia[tree.parent[j]] += inertia[j]
-    dual = np.einsum("bij,bj->bi", inertia, axis)
-    M = np.where(ancestors(tree.parent), dual @ axis.T, 0.0)
-    M += np.tril(M, -1).T
-    G = np.zeros((bodies, tree.armature.size))
-    G[np.arange(bodies), tree.coordinate] = tree.ratio
-    return np.asarray(G.T @ M @ G + np.diag(tree.armature))
-
-
-def _turn(angle: float) -> Floats:
-    """Rotation (3, 3) about z."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def mechanism(tree: Tree, **values: Any) -> Mechanism:
+    """A tree in the compiled core, with other ``values``: forces, for one, of which it has none."""
+    n = tree.armature.size
+    none: dict[str, Any] = dict.fromkeys(("actuation", "constant", "quadratic", "centers"), np.zeros((n, 0)))
+    none |= {"gravity": np.zeros(3), "forces": (), "couplings": (), "constraints": ConstraintRows(), "custom": None}
+    return Mechanism.make(**(tree._asdict() | none | {"control": np.zeros((n, 0, 0))} | values))
 
 
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:

@@ -118,12 +118,13 @@ def _typed(values: Floats) -> NDArray[np.bool_]:
     return (np.abs(values) < _DEGREES) & whole
 
 
-def longest_reach(robot: Robot, *, slides: bool = True) -> float:
+def longest_reach(robot: Robot, *, slides: bool = True, centers: bool = True) -> float:
     """Upper bound on the distance of a centre of mass from the root of its tree [m]; infinite on free rails.
 
     Args:
         robot: The robot.
         slides: Whether sliders extend it.
+        centers: Whether it is that of a centre of mass, not of a joint.
     """
     tree = robot.tree
     lower, upper = robot.position_limits
@@ -134,7 +135,7 @@ def longest_reach(robot: Robot, *, slides: bool = True) -> float:
         if slides and tree.prismatic[body]:
             ends = np.array([lower[tree.coordinate[body]], upper[tree.coordinate[body]]])
             path[body] += float(np.abs(tree.ratio[body] * ends + tree.offset[body]).max())
-    return float((path + np.linalg.norm(tree.center, axis=1)).max())
+    return float((path + (np.linalg.norm(tree.center, axis=1) if centers else 0.0)).max())
 
 
 def slides_hint(robot: Robot) -> str:

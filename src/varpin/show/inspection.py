@@ -87,7 +87,7 @@ def inspect_robot(
             )
         robot = source
     else:
-        robot = build_robot(
+        robot, _ = build_robot(
             source, package_dirs=package_dirs, lock=lock, keep=keep, mimic=mimic, base=base, armature=armature
         )
     scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())
@@ -258,7 +258,7 @@ def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
 def _inertia_warnings(
     robot: Robot, links: Sequence[LinkReport], shapes: pin.GeometryModel
 ) -> Iterator[tuple[str, str, str]]:
-    length, corners = LENGTH_RATIO * _reach(robot) or LENGTH, _corners(shapes)
+    length, corners = LENGTH_RATIO * longest_reach(robot, slides=False, centers=False) or LENGTH, _corners(shapes)
     frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
         if not link.joint or not link.inertia.any():
@@ -311,17 +311,8 @@ def _corners(shapes: pin.GeometryModel) -> list[tuple[int, Floats]]:
     return found
 
 
-def _reach(robot: Robot) -> float:
-    """The longest path from a root of the tree to a joint, along the offsets between joints [m]."""
-    path = np.zeros(len(robot.tree.parent))
-    for body, parent in enumerate(robot.tree.parent):
-        if parent >= 0:
-            path[body] = path[parent] + np.linalg.norm(robot.tree.translation[body])
-    return float(path.max())
-
-
 def _against_reach(robot: Robot) -> str:
-    reach = _reach(robot)
+    reach = longest_reach(robot, slides=False, centers=False)
     return f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
 
 
