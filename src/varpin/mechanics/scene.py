@@ -32,7 +32,6 @@ from varpin.mechanics.constraints import (
 from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import (
-    COUPLINGS,
     ELEMENTS,
     CoulombFriction,
     Force,
@@ -58,53 +57,17 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Messages where forces of these kinds differ, which have better names than their kinds.
-_NAMES = {
-    "CoulombFriction": "dry friction differs",
-    "JointStop": "joint stops differ",
-    "PositionServo": "position servos differ",
-    "FrameLoad": "forces on frames differ",
-    "FrameWrench": "forces on frames differ",
-    "FrameSpring": "springs between frames differ",
-    "FrameLengthSpring": "springs between frames differ",
-    "FrameTurnSpring": "springs between frames differ",
-    "FrameDamper": "dampers between frames differ",
-    "FrameTurnDamper": "dampers between frames differ",
-}
 # Kinds of elements that are among the values as sums by joint.
 _SUMMED = ("Armature", "JointDamper", "JointSpring")
-# Other forces on joints among the values, a row (coordinate, numbers) for each element; and the message where they
-# differ.
-OF_ELEMENTS = {kind: _NAMES.get(kind, f"{kind} differs") for kind in ELEMENTS if kind not in _SUMMED}
-# Forces on frames, a row (body a, body b, numbers) for each; left out where there are none.
-OF_COUPLINGS = {kind: _NAMES.get(kind, f"{kind} differs") for kind in COUPLINGS}
-# Names of a scene's values, and the message where they differ; values by joint are also reported with numbers.
-VALUES = {
-    "gravity": "gravity differs",
-    "damping": "damping differs",
-    "stiffness": "stiffness differs",
-    "rest": "rest differs",
-    "armature": "armature differs",
-    "actuation": "actuation differs",
-    "center": "the robot's centres of mass differ",
-    "inertia": "the robot's inertias differ",
-    "rotation": "the axes of the robot's joints differ",
-    "translation": "the positions of the robot's joints differ",
-    "ratio": "the ratios of the robot's mimic joints differ",
-    "offset": "the offsets of the robot's mimic joints differ",
-    **OF_ELEMENTS,
-    **OF_COUPLINGS,
-    "functions": "custom forces differ",
-    "constraints.between": "constraints between frames differ",
-    "constraints.ties": "joint ties differ",
-    "constraints.custom": "custom constraints differ",
-    "noise.constant": "the intensity of the noise differs",
-    "noise.control": "the intensity of the noise differs",
-    "noise.quadratic": "the intensity of the noise differs",
-    "noise.center": "the center of the noise differs",
+# What a difference in values of these names is called.
+_WORDS = {
+    "center": "the robot's centres of mass",
+    "inertia": "the robot's inertias",
+    "rotation": "the axes of the robot's joints",
+    "translation": "the positions of the robot's joints",
+    "ratio": "the ratios of the robot's mimic joints",
+    "offset": "the offsets of the robot's mimic joints",
 }
-# Constraints among the values; left out where there are none.
-OF_CONSTRAINTS = ("constraints.between", "constraints.ties", "constraints.custom")
 # Largest constraint residual of a given configuration, and of a start that is projected without request [m or rad].
 _OFF, CORRECTED = 1e-6, 0.02
 # Rank tolerance of the constraint Jacobian, relative to its largest singular value.
@@ -587,33 +550,27 @@ class Scene(Frozen):
 
     @cached_property
     def values(self) -> Mapping[str, Floats]:
-        """The numbers that motions depend on, by the names of :data:`VALUES`; a trajectory stores them.
+        """The numbers that motions depend on, by name; a trajectory stores them.
 
+        Forces are rows (coordinate, numbers) or (body a, body b, numbers), those of springs and dampers on joints sums.
         The noise is stored as intensities (n, k); its factors of the controls are reduced to their norm. A
         :class:`varpin.CustomNoise` is not stored.
         """
-        tree, values = (
-            self.robot.tree,
-            {name: getattr(self, name) for name in ("gravity", "damping", "stiffness", "rest")},
-        )
-        values |= {
-            "actuation": self.actuation,
-            "armature": self.armature,
-            "center": tree.center,
-            "inertia": tree.inertia,
+        tree = self.robot.tree
+        values = {
+            name: getattr(self, name) for name in ("gravity", "damping", "stiffness", "rest", "armature", "actuation")
         }
-        for kind in OF_ELEMENTS:
+        values |= {name: getattr(tree, name) for name in _WORDS}
+        for kind in (kind for kind in ELEMENTS if kind not in _SUMMED):
             rows = [(each.coordinate, *each.values) for each in of_kind(self.elements, kind)]
             values[kind] = np.array(rows) if rows else np.zeros((0, 0))
-        for kind in OF_COUPLINGS:
-            if ends := [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]:
-                values[kind] = np.array(ends, dtype=np.float64)
+        for kind in dict.fromkeys(each.kind for each in self.couplings):
+            ends = [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]
+            values[kind] = np.array(ends, dtype=np.float64)
         if self.custom is not None:
             # Functions are stored as their number only.
             values["functions"] = np.array([float(len(self.custom.parts))])
         values |= _numbers_of(self.bound_constraints.rows)
-        values |= {"rotation": tree.rotation, "translation": tree.translation}
-        values |= {"ratio": tree.ratio, "offset": tree.offset}
         if self.noise.diffusion is not None:
             fields = self.noise.diffusion
             values |= {"noise.constant": fields.constant, "noise.control": np.linalg.norm(fields.control, axis=2)}
@@ -715,7 +672,7 @@ def _unowned(rows: ConstraintRows) -> ConstraintRows:
 
 
 def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
-    """The numbers of constraints by the names of :data:`VALUES`; kinds without rows are left out."""
+    """The numbers of constraints by the names of :attr:`Scene.values`; kinds without rows are left out."""
     found: dict[str, Floats] = {}
     if rows.products:
         table = []
@@ -812,43 +769,40 @@ def tangent_basis(scene: Scene, q: Floats, off: float = _OFF) -> Floats:
 def same(one: Floats, other: Floats) -> bool:
     """Whether values of scenes agree up to rounding; versions of Pinocchio may read a robot differently by as much."""
     if one.shape != other.shape:
-        return False
+        return not (one.size or other.size)
     least = 1e-12 * max(float(np.abs(x[np.isfinite(x)]).max(initial=0.0)) for x in (one, other))
     return bool(np.isclose(one, other, rtol=1e-9, atol=least, equal_nan=True).all())
 
 
 def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> list[str]:
     """Messages on how a scene differs from the one of these :attr:`Scene.values`, with ``noise`` or without."""
-    # A file may be of another version, or of a core with forces of one's own.
-    found = [
-        f"the motion depends on {name}, which this installation of varpin does not know"
-        for name, before in values.items()
-        if name not in VALUES and before.size and (noise or not name.startswith("noise."))
-    ]
-    for name, before in ((name, values[name]) for name in VALUES if name in values):
-        now = scene.values.get(name)
-        if name.startswith("noise.") and (not noise or now is None):
+    found: list[str] = []
+    lost: list[str] = []
+    new: list[str] = []
+    for name in dict.fromkeys((*values, *scene.values)) if values else ():
+        nothing = np.zeros(0)
+        before, now = values.get(name, nothing), scene.values.get(name, nothing)
+        # A CustomNoise has no numbers.
+        if (name.startswith("noise.") and not (noise and now.size and before.size)) or same(before, now):
             continue
-        if now is not None and now.shape == before.shape:
-            if same(now, before):
-                continue
-            if name in _OF_JOINTS:
-                c = int(np.argmax(np.abs(now - before)))
-                joint = scene.robot.joint_names[c]
-                found.append(f"{name} was {before[c]:.6g} at joint {joint!r}, and is {now[c]:.6g} in the scene")
-                continue
-            if name == "gravity":
-                then, here = (f"({', '.join(f'{g:g}' for g in x)})" for x in (before, now))
-                found.append(f"gravity was {then} m/s^2, and is {here} in the scene")
-                continue
-        found.append(f"{VALUES[name]} in the scene")
-    if values:
-        found += [
-            f"{VALUES[name]} in the scene"
-            for name in (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS, "functions")
-            if name not in values and np.size(scene.values.get(name, ()))
-        ]
-    return list(dict.fromkeys(found))
+        what = _WORDS.get(name, name)
+        if not (before.size and now.size):
+            # Files of earlier versions lack numbers of the robot.
+            if name not in _WORDS:
+                (lost if before.size else new).append(name)
+        elif name == "gravity":
+            then, here = (f"({', '.join(f'{g:g}' for g in x)})" for x in (before, now))
+            found.append(f"gravity was {then} m/s^2, and is {here} in the scene")
+        elif name in _OF_JOINTS and before.shape == now.shape:
+            c = int(np.argmax(np.abs(now - before)))
+            joint = scene.robot.joint_names[c]
+            found.append(f"{name} was {before[c]:.6g} at joint {joint!r}, and is {now[c]:.6g} in the scene")
+        else:
+            found.append(f"{what} differs in the scene".replace("s differs", "s differ"))
+    for has, names in (("no", lost), ("also", new)):
+        if names:
+            found.append(f"the scene has {has} {listed(names)}")
+    return found
 
 
 def require_scene(scene: object) -> Scene:
