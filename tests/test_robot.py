@@ -375,44 +375,6 @@ class TestLocking:
         ratio, offset = mimics_of(baxter.urdf)[names[follower]][1:]
         assert locked[names[follower]] == ratio * 0.01 + offset
 
-    def test_in_a_model_with_velocity_limits(self):
-        # pin.Model.addJoint leaves lower limits that pin.buildReducedModel refuses.
-        model = vp.planar_chain(2).model.copy()
-        model.velocityLimit = np.array([3.0, 5.0])
-        robot = vp.load_robot(model, lock={"joint1": 0.1})
-        assert robot.velocity_limit.tolist() == [5.0]
-
-    @pytest.mark.parametrize("frames", ["none", "some", "late"])
-    def test_in_a_model_without_proper_joint_frames(self, frames):
-        # pin.buildReducedModel crashes the interpreter, or refuses, unless every joint's frame is there and early.
-        whole = vp.planar_chain(3)
-        model, joint_id = pin.Model(), 0
-        for k in range(1, 4):
-            source = whole.free_model
-            joint_id = model.addJoint(joint_id, source.joints[k], source.jointPlacements[k], source.names[k])
-            model.appendBodyToJoint(joint_id, source.inertias[k], pin.SE3.Identity())
-        tip = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.0]))
-        if frames == "some":
-            model.addJointFrame(1)
-        model.addFrame(pin.Frame("tip", 3, tip, pin.FrameType.OP_FRAME))
-        if frames == "late":
-            for k in range(1, 4):
-                model.addJointFrame(k)
-        shapes = pin.GeometryModel()
-        tip_frame = model.getFrameId("tip")
-        shapes.addGeometryObject(pin.GeometryObject("ball", 3, tip_frame, tip, pin.hppfcl.Sphere(0.1)))
-        robot = vp.load_robot(pin.RobotWrapper(model, shapes, shapes), lock={"joint2": 0.5})
-        locked, unlocked = jet_at(robot, [0.1, 0.2], [1, 2]), jet_at(whole, [0.1, 0.5, 0.2], [1, 0, 2])
-        assert_same_jet(locked, unlocked, [0, 2])
-        data, visuals = robot.model.createData(), geometry(robot)
-        pin.framesForwardKinematics(robot.model, data, np.array([0.1, 0.2]))
-        placed = visuals.createData()
-        pin.updateGeometryPlacements(robot.model, data, visuals, placed)
-        angles = np.cumsum([0.1, 0.5, 0.2])
-        expected = [np.cos(angles).sum(), 0.0, -np.sin(angles).sum()]
-        np.testing.assert_allclose(data.oMf[robot.model.getFrameId("tip")].translation, expected, atol=1e-14)
-        np.testing.assert_allclose(placed.oMg[0].translation, expected, atol=1e-14)
-
     @pytest.mark.parametrize(
         ("kind", "position"),
         [
