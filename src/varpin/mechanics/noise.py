@@ -12,8 +12,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from dataclasses import dataclass, fields, is_dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,14 +58,6 @@ class Fields:
 
 class Noise(ABC):
     """A diffusion model. A subclass provides ``bind``, which applies it to a robot."""
-
-    def named(self, joints: Sequence[str]) -> Noise:  # noqa: ARG002
-        """The model with its parameters by joint name replaced by arrays in the order of ``joints``.
-
-        Raises:
-            UnknownJoint: A name is not in ``joints``.
-        """
-        return self
 
     @abstractmethod
     def bind(self, actuation: Floats) -> BoundNoise:
@@ -275,10 +266,6 @@ class AdditiveNoise(Noise):
 
     intensity: JointValues
 
-    def named(self, joints: Sequence[str]) -> Noise:
-        """See :meth:`Noise.named`."""
-        return _named(self, joints, "intensity")
-
     def bind(self, actuation: Floats) -> CompiledFields:
         """See :meth:`Noise.bind`."""
         n, m = actuation.shape
@@ -325,10 +312,6 @@ class StateNoise(Noise):
 
     intensity: JointValues
     center: JointValues | None = None
-
-    def named(self, joints: Sequence[str]) -> Noise:
-        """See :meth:`Noise.named`."""
-        return _named(self, joints, "intensity", "center")
 
     def bind(self, actuation: Floats) -> CompiledFields:
         """See :meth:`Noise.bind`."""
@@ -475,27 +458,25 @@ class NoiseSum(Noise):
 
     terms: tuple[Noise, ...]
 
-    def named(self, joints: Sequence[str]) -> Noise:
-        """See :meth:`Noise.named`."""
-        return NoiseSum(tuple(term.named(joints) for term in self.terms))
-
     def bind(self, actuation: Floats) -> BoundNoise:
         """See :meth:`Noise.bind`."""
         return CompositeFields(tuple(term.bind(actuation) for term in self.terms))
 
 
-_Model = TypeVar("_Model", "AdditiveNoise", "StateNoise")
+def _named(noise: Noise, joints: Sequence[str]) -> Noise:
+    """The model with arrays in the order of ``joints`` in place of numbers by joint name.
 
-
-def _named(noise: _Model, joints: Sequence[str], *names: str) -> _Model:
-    """The model with arrays in place of numbers by joint name."""
-    given = {name: getattr(noise, name) for name in names}
-    by_name = {
-        name: joint_array(f"{type(noise).__name__} {name}", value, joints)
-        for name, value in given.items()
-        if isinstance(value, Mapping)
-    }
-    return replace(noise, **by_name) if by_name else noise
+    Raises:
+        UnknownJoint: A name is not in ``joints``.
+    """
+    if isinstance(noise, NoiseSum):
+        return NoiseSum(tuple(_named(term, joints) for term in noise.terms))
+    given: dict[str, Floats] = {}
+    for item in fields(noise) if is_dataclass(noise) else ():  # type: ignore[var-annotated]
+        value = getattr(noise, item.name)
+        if "JointValues" in str(item.type) and isinstance(value, Mapping):
+            given[item.name] = joint_array(f"{type(noise).__name__} {item.name}", value, joints)
+    return replace(noise, **given) if given else noise  # type: ignore[type-var]
 
 
 def _terms(noise: Noise) -> tuple[Noise, ...]:
@@ -534,6 +515,6 @@ def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats, joints: Seque
     for model in models:
         if not isinstance(model, Noise):
             raise InputError(f"noise must be a varpin noise model or several of them, got {type(model).__name__}")
-        known = model if joints is None else model.named(joints)
+        known = model if joints is None else _named(model, joints)
         bound.append(_sound(known, known.bind(actuation), *actuation.shape))
     return bound[0] if len(bound) == 1 else CompositeFields(tuple(bound))
