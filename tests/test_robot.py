@@ -13,8 +13,6 @@ from refusals import naming, refused
 
 import varpin as vp
 from varpin.model import bundled_robots, example_robot_data, geometry
-from varpin.model.mimic import Tie
-from varpin.model.tree import coordinate_armature
 
 MOVING = ("revolute", "continuous", "prismatic")
 
@@ -656,12 +654,6 @@ class TestArmature:
         expected = [felt.get(name, 0.0) for name in robot.joint_names]
         assert np.count_nonzero(expected) == sum(name.startswith("arm_left") for name in robot.joint_names) > 0
         np.testing.assert_allclose(robot.tree.armature, expected, rtol=1e-15)
-
-    def test_of_followers_is_felt_by_their_leaders(self):
-        model = random_tree(6, bodies=3, branching=False)
-        ties = (Tie(follower=3, leader=1, ratio=-2.0, offset=0.1),)
-        own = model.armature
-        assert coordinate_armature(model, ties, (1, 2)) == pytest.approx([own[0] + 4.0 * own[2], own[1]])
 
 
 def test_planar_chain_is_rods_in_the_vertical_plane():

@@ -350,6 +350,9 @@ class TestToldAsLeftOut:
         np.testing.assert_allclose(robot.model.armature, model.armature, rtol=1e-14)
         assert model.armature[1] == pytest.approx(0.25)
         assert vp.load_robot(path, armature=0.5).model.armature.tolist() == [0.5, 0.5]
+        follower = joint("j2", "a", "b", inside=mimic("j1", -2))
+        tied = write_urdf(tmp_path, link("a"), link("b"), joint("j1", "base", "a"), follower, name="tied")
+        assert vp.load_robot(tied, srdf=srdf).tree.armature == pytest.approx([4.0 * 0.25])
         (plain := tmp_path / "plain.srdf").write_text('<robot name="plain"/>')
         assert vp.load_robot(path, srdf=plain).model.armature.tolist() == [0.0, 0.0]
 
