@@ -150,7 +150,7 @@ class TestRefused:
         ("f", "facts"),
         [
             (lambda q, v: np.zeros(2), "(3,)"),
-            (lambda q, v: None, "(3,)"),
+            (lambda q, v: None, "real numbers"),
             (lambda q, v: 1j * v, "real numbers"),
             (lambda q, v: v / 0.0 if q[0] > 0.31 else v, ("finite", "q = ")),
             (lambda q, v: 1 / 0, "ZeroDivisionError"),

@@ -22,7 +22,7 @@ from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tie
 from varpin.errors import InputError, UnknownJoint
 from varpin.mechanics.forces import Described, Point, point_of, require_index, require_movable, shown
 from varpin.model import Robot
-from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, tuple_of
+from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, returned, tuple_of
 
 _AXES = "xyz"
 
@@ -329,16 +329,8 @@ def _called(name: str, call: Callable[[], ArrayLike], shape: tuple[int, ...], q:
     Raises:
         CustomConstraintError: The function raised, or its result is not a finite array of this shape.
     """
-    what = f"the {name} of a CustomConstraint"
-    try:
-        given = call()
-    except Exception as error:
-        at = np.array2string(q, precision=6)
-        raise CustomConstraintError(f"{what} raised {error!r} at q = {at}") from error
-    try:
-        return finite_array(what, given, shape)
-    except InputError as error:
-        raise CustomConstraintError(str(error)) from None
+    at = f" at q = {np.array2string(q, precision=6)}"
+    return returned(f"the {name} of a CustomConstraint", call, shape, at, CustomConstraintError)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +29,7 @@ from varpin.support.checks import (
     finite_array,
     joint_array,
     require_finite,
+    returned,
 )
 from varpin.support.frozen import Frozen
 
@@ -403,18 +405,9 @@ class CustomFields(BoundNoise):
     ) -> Floats:
         if function is None:
             return np.zeros((len(points), *shape))
-        return np.array([self._call(f"CustomNoise {name}(q, v, u)", function, point, shape) for point in points])
-
-    @staticmethod
-    def _call(name: str, function: Field, point: tuple[Floats, Floats, Floats], shape: tuple[int, ...]) -> Floats:
-        try:
-            value = function(*point)
-        except Exception as error:
-            raise NoiseFieldError(f"{name} raised {error!r}") from error
-        try:
-            return finite_array(name, value, shape)
-        except InputError as error:
-            raise NoiseFieldError(str(error)) from None
+        what = f"CustomNoise {name}(q, v, u)"
+        rows = [returned(what, partial(function, *at), shape, error=NoiseFieldError) for at in points]
+        return np.array(rows)
 
     def check(self) -> None:
         """Compare the derivatives with central differences at three seeded random points.
