@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism
 from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
-from varpin.errors import InputError, RobotError
+from varpin.errors import InputError
 from varpin.finding import Told
 from varpin.mechanics.constraints import (
     Bound,
@@ -45,7 +45,7 @@ from varpin.mechanics.forces import (
     of_kind,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
-from varpin.model import Robot, degrees_hint, require_robot, require_sound
+from varpin.model import Robot, degrees_hint, require_robot
 from varpin.model.tree import block_ends, mechanism, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
 from varpin.support.frozen import Frozen
@@ -177,10 +177,6 @@ class Scene(Frozen):
             UnknownFrame: A force or constraint names a frame that the robot does not have.
         """
         require_robot(robot)
-        require_sound(robot.tree)
-        n = robot.dof
-        if robot.tree.armature.size != n:
-            raise RobotError(f"the robot's tree is damaged: it has {robot.tree.armature.size} coordinates, not {n}")
         values: dict[str, Any] = {
             "robot": robot,
             "gravity": _gravity(gravity, robot),

@@ -15,7 +15,7 @@ from varpin.errors import InputError
 from varpin.model.additions import transform
 from varpin.model.equalities import prefixed
 from varpin.model.mimic import rebuild
-from varpin.model.robot import Part, Robot, core_of
+from varpin.model.robot import Part, Robot
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +74,9 @@ def combine(
     )
     pairs = list(zip(robots, given, strict=True))
     return Robot(
-        **core_of(model.name, model, ties),
+        model.name,
+        model,
+        ties,
         locked=MappingProxyType({word + name: at for robot, word in pairs for name, at in robot.locked.items()}),
         package_dirs=tuple(dict.fromkeys(chain.from_iterable(robot.package_dirs for robot in robots))),
         group_states=tuple(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -63,12 +63,8 @@ class Robot(Frozen):
 
     Attributes:
         name: Name of the file, the bundled robot or the model.
-        model: The Pinocchio model with mimic joints tied to their leaders; ``model.nv == dof``. A continuous joint
-            takes two entries of Pinocchio's configuration: see :meth:`configuration`.
-        joint_names: Names of the joints that are coordinates, in order.
         free_model: The model with mimic joints independent, on which Pinocchio computes every derivative.
         ties: The mimic joints, by index in ``free_model``.
-        tree: Flat arrays for the core.
         locked: Locked joints and their positions [rad or m].
         urdf: The URDF or xacro file the robot was read from, or None.
         expanded: The URDF text of a xacro file.
@@ -83,11 +79,8 @@ class Robot(Frozen):
     """
 
     name: str
-    model: pin.Model
-    joint_names: tuple[str, ...]
     free_model: pin.Model = field(repr=False)
     ties: tuple[Tie, ...] = field(repr=False)
-    tree: Tree = field(repr=False)
     locked: Mapping[str, float | tuple[float, ...]] = field(default_factory=lambda: MappingProxyType({}))
     urdf: Path | None = None
     expanded: str | None = field(default=None, repr=False)
@@ -122,6 +115,34 @@ class Robot(Frozen):
         return markup.facts(
             f"Robot {self.name}", rows, markup.table(head, [(name, *map(float, row)) for name, *row in columns])
         )
+
+    @cached_property
+    def model(self) -> pin.Model:
+        """The Pinocchio model with mimic joints tied to their leaders; ``model.nv == dof``.
+
+        A continuous joint takes two entries of Pinocchio's configuration: see :meth:`configuration`.
+        """
+        return tied_model(self.free_model, self.ties)
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints that are coordinates, in order."""
+        return tuple(self.free_model.names[joint] for joint in self._coordinates)
+
+    @property
+    def _coordinates(self) -> tuple[int, ...]:
+        """Indices in ``free_model`` of the joints that are coordinates."""
+        followers = {tie.follower for tie in self.ties}
+        return tuple(joint for joint in range(1, self.free_model.njoints) if joint not in followers)
+
+    @cached_property
+    def tree(self) -> Tree:
+        """Flat arrays for the core.
+
+        Raises:
+            UnsupportedJoint: A joint has no single axis.
+        """
+        return flatten(self.free_model, self.ties, self._coordinates)
 
     @cached_property
     def dof(self) -> int:
@@ -449,33 +470,22 @@ def hold_joints(robot: Robot, positions: Mapping[str, ArrayLike]) -> Robot:
     """
     whole = Description(robot.name, robot.free_model, robot.ties, visuals=robot.visuals)
     description, locked = _lock(whole, positions)
-    return robot.changed(
-        **core_of(robot.name, description.model, description.ties),
+    left = robot.changed(
+        free_model=description.model,
+        ties=description.ties,
         locked=MappingProxyType({**robot.locked, **locked}),
         visuals=description.visuals,
         loops=_open(robot.loops, description.model),
     )
+    _require_tree(left)
+    return left
 
 
-def core_of(name: str, model: pin.Model, ties: tuple[Tie, ...], why: str = "") -> dict[str, Any]:
-    """The attributes of a robot that follow from its model without mimic joints.
-
-    Raises:
-        RobotError: No joint moves; the message ends with ``why``.
-        UnsupportedJoint: A joint has no single axis.
-    """
-    followers = {tie.follower for tie in ties}
-    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
-    if not coordinates:
-        raise RobotError(f"robot {name!r} has no joint that moves{why}")
-    return {
-        "name": name,
-        "model": tied_model(model, ties),
-        "joint_names": tuple(model.names[joint] for joint in coordinates),
-        "free_model": model,
-        "ties": ties,
-        "tree": flatten(model, ties, coordinates),
-    }
+def _require_tree(robot: Robot, why: str = "") -> None:
+    """Refuse a robot without a tree; ``why`` none of its joints moves."""
+    if not robot.joint_names:
+        raise RobotError(f"robot {robot.name!r} has no joint that moves{why}")
+    robot.tree  # noqa: B018
 
 
 def build_robot(
@@ -508,9 +518,10 @@ def build_robot(
     whole, (description, locked) = description, _lock(description, _locks(description, lock, keep))
     model = description.model
     with_rotors(model, armature, description.ties, tuple(locked))
-    why = "".join(f"; {remark}" for remark in description.remarks[:1])
     robot = Robot(
-        **core_of(description.name, model, description.ties, why),
+        description.name,
+        model,
+        description.ties,
         locked=MappingProxyType(locked),
         urdf=description.urdf,
         expanded=description.expanded,
@@ -521,6 +532,7 @@ def build_robot(
         loops=_open(description.loops, model),
         equalities=description.equalities,
     )
+    _require_tree(robot, "".join(f"; {remark}" for remark in description.remarks[:1]))
     return robot, description
 
 

@@ -298,44 +298,6 @@ def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Float
     return periodic
 
 
-def require_sound(tree: Tree) -> None:
-    """Refuse a tree of inconsistent arrays or with indices out of range.
-
-    :func:`flatten` returns none; a tree that was changed afterwards may be inconsistent.
-
-    Raises:
-        RobotError: The tree is inconsistent; the message names the array.
-    """
-    b, n = np.size(tree.parent), np.size(tree.armature)
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
-        ("parent", "prismatic", "mass", "coordinate", "ratio", "origin"), (b,)
-    )
-    shapes |= {"offset": (b,), "rotation": (b, 3, 3), "translation": (b, 3), "center": (b, 3), "inertia": (b, 6)}
-    shapes |= {"armature": (n,), "group": (n,), "periodic": (n,)}
-    shapes |= {"loads": (np.size(tree.loads),), "carried": (np.size(tree.loads), n)}
-    whole = ("parent", "prismatic", "coordinate", "group", "origin", "periodic", "loads", "carried")
-    for name, shape in shapes.items():
-        array = getattr(tree, name)
-        kind = np.int64 if name in whole else np.float64
-        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != kind:
-            raise RobotError(f"the robot's tree is damaged: its {name} is no array {shape} of {np.dtype(kind)}")
-        if kind is np.float64 and not np.isfinite(array).all():
-            raise RobotError(f"the robot's tree is damaged: its {name} is not finite")
-    # (name, lowest value, highest value + 1)
-    for name, low, high in (
-        ("parent", -1, np.arange(b)),
-        ("coordinate", 0, n),
-        ("group", 0, min(n, tree.groups)),
-        ("loads", 0, b),
-    ):
-        values = getattr(tree, name)
-        if ((values < low) | (values >= high)).any():
-            raise RobotError(f"the robot's tree is damaged: its {name} has an index out of range")
-    known = block_ends(tree.group)
-    if not isinstance(tree.ends, np.ndarray) or tree.ends.dtype != np.int64 or not np.array_equal(tree.ends, known):
-        raise RobotError("the robot's tree is damaged: its blocks do not end where its groups end")
-
-
 def mechanism(tree: Tree, **values: Any) -> Mechanism:
     """A tree in the compiled core, with other ``values``: forces, for one, of which it has none."""
     n = tree.armature.size
