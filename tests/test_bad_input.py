@@ -86,6 +86,11 @@ class TestFiles:
             (b"<robot name='a'>\n<link name='x'>\n</robot>", ("XML", "line 3")),
             (b"<robot name='a'>\n<link name='x'/>\n", ("XML", "line 3")),
             (b"<robot name='a'>\0\0</robot>", "XML"),
+            (b" \r\n", "empty"),
+            (
+                b"<robot name='a'><link name='x'><inertial><mass value='${m}'/></inertial></link></robot>",
+                ("xacro", "<mass value='${m}'>"),
+            ),
             (bytes(range(256)) * 20, "XML"),
             (b"\x7fELF\x02\x01\x01" + bytes(500), "XML"),
             (b"<robot><link name='x'/></robot>", ("<robot>", "name")),

@@ -94,6 +94,10 @@ ODD = {
         ),
         "<x:insert>",
     ),
+    "a xacro expression that is no number": (
+        lambda text: text.replace("</visual>", '<material name="${color}"/></visual>'),
+        "<material name='${color}'>",
+    ),
     "comments with dashes": (lambda text: text.replace("<joint", "<!-- one -- two --- -->\n<!---->\n<joint"), ""),
     "a comment around a joint": (lambda text: text.replace("</robot>", "<!--<joint name='k'/>--></robot>"), ""),
     "unknown elements": (lambda text: text.replace("</link>", "<sensor><camera/></sensor><mass/></link>"), ""),
@@ -195,30 +199,6 @@ class TestOdd:
         odd = vp.load_robot(written(tmp_path, two + "<more/>"))
         assert odd.ties == sound.ties
         assert vp.load_robot(written(tmp_path, two + "<more/>"), mimic="free").dof == 2
-
-    @pytest.mark.parametrize(
-        ("change", "facts"),
-        [
-            (lambda text: "", "empty"),
-            (lambda text: " \r\n", "empty"),
-            (lambda text: "hello", "XML"),
-            (lambda text: text[:-10], "XML"),
-            (lambda text: text.replace('"1.3"', '"${m}"', 1), ("xacro", "<mass value='${m}'>")),
-            (lambda text: text.replace("robot", "sdf"), "<sdf>"),
-            (lambda text: '<robot name="a"/>', "link"),
-            (lambda text: "<!DOCTYPE html><html><body></html>", "web page"),
-        ],
-    )
-    def test_files_that_are_none(self, tmp_path, two, change, facts):
-        assert change(two) != two
-        with refused(vp.RobotError, facts) as info:
-            vp.load_robot(written(tmp_path, change(two)))
-        assert "odd.urdf" in str(info.value)
-
-    def test_folder(self, tmp_path, two):
-        written(tmp_path, two)
-        with refused(vp.RobotError, "made_up.urdf", "odd.urdf"):
-            vp.load_robot(tmp_path)
 
 
 H = np.sqrt(0.5)
@@ -392,49 +372,6 @@ class TestFaultyNumbers:
             vp.load_robot(written(tmp_path, text))
 
 
-class TestPackages:
-    BOX = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
-
-    def robot(self, folder, mesh):
-        """A robot in urdf/ of package my_arm, whose folder is named otherwise."""
-        for name in ("urdf", "meshes"):
-            (folder / "ws" / "Some-Repo" / name).mkdir(parents=True, exist_ok=True)
-        package = folder / "ws" / "Some-Repo"
-        (package / "package.xml").write_text("<package><name>my_arm</name></package>")
-        (package / "meshes" / "box.obj").write_text(self.BOX)
-        shape = f'<visual><geometry><mesh filename="{mesh}"/></geometry></visual>'
-        return write_urdf(package / "urdf", link("l1", extra=shape), joint("j1", "base", "l1"))
-
-    @pytest.mark.parametrize(
-        "mesh",
-        [
-            "package://my_arm/meshes/box.obj",
-            "$(find my_arm)/meshes/box.obj",
-            "model://my_arm/meshes/box.obj",
-            "../meshes/box.obj",
-        ],
-    )
-    def test_have_the_name_in_their_package_xml(self, tmp_path, mesh):
-        path = self.robot(tmp_path, mesh)
-        assert geometry(vp.load_robot(path)).ngeoms == 1
-        moved = tmp_path / "elsewhere.urdf"
-        moved.write_text(path.read_text())
-        for folder in (tmp_path / "ws", tmp_path / "ws" / "Some-Repo"):
-            if "://" in mesh or "$" in mesh:
-                assert geometry(vp.load_robot(moved, package_dirs=[folder])).ngeoms == 1
-
-    @pytest.mark.parametrize("mesh", ["package://my_arm/Meshes/box.obj", "../meshes/BOX.obj"])
-    def test_a_file_in_other_case_is_named(self, tmp_path, mesh):
-        robot = vp.load_robot(self.robot(tmp_path, mesh))
-        with refused(vp.RobotError, mesh, "box.obj is there", "'l1'"):
-            geometry(robot)
-
-    def test_a_file_that_is_not_there_is_named_with_where_it_was_looked_for(self, tmp_path):
-        robot = vp.load_robot(self.robot(tmp_path, "package://your_arm/box.obj"))
-        with refused(vp.RobotError, "package://your_arm/box.obj", "package_dirs"):
-            geometry(robot)
-
-
 class TestInertia:
     @pytest.mark.parametrize(
         ("ixx", "facts"),
@@ -523,10 +460,3 @@ class TestMany:
             worker.join()
         os.write(2, b"still here")
         assert "still here" in capfd.readouterr().err
-
-
-def test_xacro_expressions_that_are_no_numbers_are_told_of(tmp_path, caplog):
-    ball = '<visual><geometry><sphere radius="0.1"/></geometry><material name="${color}"/></visual>'
-    robot = vp.load_robot(write_urdf(tmp_path, link("a", extra=ball), joint("j1", "base", "a")))
-    assert robot.dof == 1
-    assert "<material name='${color}'>" in caplog.text
