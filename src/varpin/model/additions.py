@@ -31,7 +31,7 @@ def on_base(description: Description, base: Base) -> Description:
     if base is None:
         return description
     if not isinstance(base, str):
-        return description.rebuilt(place=transform(base))
+        return description.rebuilt(place=transform(base, "base", ", or 'planar'"))
     if base != "planar":
         raise InputError(f"base must be 'planar', a transform (4, 4) or a pin.SE3, got {base!r}")
     if taken := sorted(set(PLANAR) & set(description.model.names)):
@@ -40,15 +40,15 @@ def on_base(description: Description, base: Base) -> Description:
     return description.rebuilt(root=tuple(zip(PLANAR, kinds, strict=True)))
 
 
-def transform(base: ArrayLike | pin.SE3, what: str = "base") -> pin.SE3:
+def transform(base: ArrayLike | pin.SE3, what: str, otherwise: str = "") -> pin.SE3:
     """A placement from a matrix (4, 4) of rounded numbers.
 
     Raises:
-        InputError: It is none; the message calls it ``what``.
+        InputError: It is none; the message calls it ``what``, and names what it may be ``otherwise``.
     """
     matrix = as_floats(what, base.homogeneous if isinstance(base, pin.SE3) else base)
     if matrix.shape != (4, 4):
-        raise InputError(f"{what} must be 'planar', a transform (4, 4) or a pin.SE3, got shape {matrix.shape}")
+        raise InputError(f"{what} must be a transform (4, 4) or a pin.SE3{otherwise}, got shape {matrix.shape}")
     turn = matrix[:3, :3]
     rigid = np.isfinite(matrix).all() and np.abs(turn.T @ turn - np.eye(3)).max() < 1e-6 and np.linalg.det(turn) > 0.0
     if not rigid or (matrix[3] != [0.0, 0.0, 0.0, 1.0]).any():
