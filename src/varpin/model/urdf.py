@@ -282,12 +282,12 @@ def build_shapes(
         lines = complaints()
     if lines:
         logger.warning("%s: shapes are read in part: %s", urdf.path, "; ".join(lines)[:120])
-    absent = missing_meshes(urdf, package_dirs)
-    faults = dict.fromkeys(absent, missing_meshes_message(urdf, absent, package_dirs))
+    packages = Packages(urdf.path, tuple(package_dirs))
+    faults = _missing_meshes(urdf, packages)
     for shape in shapes.geometryObjects:
         look = looks.get(shape.name, _Look(""))
         if look.texture:
-            texture = _located(look.texture, urdf.path, package_dirs)
+            texture = packages.locate(look.texture)
             if texture is None:
                 logger.warning("%s: texture %r is not there", urdf.path, look.texture)
             shape.meshTexturePath = "" if texture is None else str(texture)
@@ -296,7 +296,7 @@ def build_shapes(
             try:
                 if len(scale) != 3 or not all(math.isfinite(number) and number for number in scale):
                     raise FileError(f"mesh {look.mesh} has the scale {look.scale!r}: give three numbers other than 0")
-                put_mesh(shape, str(_located(look.mesh, urdf.path, package_dirs)), scale, read)
+                put_mesh(shape, str(packages.locate(look.mesh)), scale, read)
             except FileError as error:
                 faults[look.link] = f"link {look.link!r}: {error}"
     found = pin.GeometryModel()
@@ -306,27 +306,21 @@ def build_shapes(
     return found, faults
 
 
-def missing_meshes(urdf: Urdf, package_dirs: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """The missing visual meshes by link, as the file names them."""
-    missing, packages = {}, Packages(urdf.path, tuple(package_dirs))
-    for element in urdf.root.findall("link"):
-        files = [mesh.get("filename", "") for mesh in element.iterfind("visual/geometry/mesh")]
-        if absent := tuple(file for file in files if packages.locate(file) is None):
-            missing[element.get("name", "")] = absent
-    return missing
-
-
-def missing_meshes_message(urdf: Urdf, missing: Mapping[str, Sequence[str]], package_dirs: Sequence[str]) -> str:
-    """The error message for meshes from :func:`missing_meshes`."""
-    packages = Packages(urdf.path, tuple(package_dirs))
+def _missing_meshes(urdf: Urdf, packages: Packages) -> dict[str, str]:
+    """The links whose visual meshes are missing, each with the message about all of them."""
+    missing: dict[str, list[str]] = {}
+    for link in urdf.root.findall("link"):
+        for mesh in link.iterfind("visual/geometry/mesh"):
+            if packages.locate(file := mesh.get("filename", "")) is None:
+                missing.setdefault(link.get("name", ""), []).append(file)
+    if not missing:
+        return {}
     links = listed((f"link {link!r}: {', '.join(files)}" for link, files in missing.items()), "links")
-    first = next(iter(missing.values()), ("",))[0]
-    if there := packages.in_other_case(first):
-        return f"meshes of {urdf.path} are missing: {links}; {there} is there, in other upper and lower case"
+    message = f"meshes of {urdf.path} are missing: {links}; "
+    if there := packages.in_other_case(next(iter(missing.values()))[0]):
+        return dict.fromkeys(missing, f"{message}{there} is there, in other upper and lower case")
     places = ", ".join(map(str, packages.places)) or "no folder"
-    return (
-        f"meshes of {urdf.path} are missing: {links}; looked beside the file and in {places} (package_dirs=[...] adds)"
-    )
+    return dict.fromkeys(missing, f"{message}looked beside the file and in {places} (package_dirs=[...] adds)")
 
 
 def _mended(content: bytes) -> str:
@@ -606,11 +600,6 @@ def _has_color(material: ET.Element) -> bool:
     if color is None:
         return False
     return material.find("texture") is None or any(word.strip("0.") for word in color.get("rgba", "").split()[:3])
-
-
-def _located(name: str, urdf: Path, package_dirs: Sequence[str]) -> Path | None:
-    """The path of a file named in a URDF; None if it does not exist."""
-    return Packages(urdf, tuple(package_dirs)).locate(name)
 
 
 def _head(root: ET.Element) -> dict[str, str]:
