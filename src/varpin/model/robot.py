@@ -330,8 +330,7 @@ class Robot(Frozen):
     @cached_property
     def slides(self) -> NDArray[np.bool_]:
         """Whether each coordinate (n,) belongs to a prismatic joint and is in [m]."""
-        index = joint_index(self.model)
-        sliding = np.array([joint_axis(self.model, index[name])[0] for name in self.joint_names], dtype=bool)
+        sliding = self.tree.prismatic[np.array(self._coordinates) - 1] == 1
         sliding.setflags(write=False)
         return sliding
 
