@@ -19,7 +19,7 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, build_robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.additions import Base
-from varpin.model.inertia import fault, one_of_each, principal_moments
+from varpin.model.inertia import fault, inertials_of, one_of_each, principal_moments
 from varpin.model.mimic import joint_index
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.units import NO_LIMIT
@@ -182,12 +182,10 @@ def _limit(value: float, none: float = 1e300) -> float:
 
 
 def _links(robot: Robot, inertials: Sequence[Inertial]) -> tuple[LinkReport, ...]:
-    if not inertials:
-        bodies = range(1, robot.free_model.njoints)
-        return tuple(_body(robot, joint) for joint in bodies)
     # The links of the URDF: Pinocchio merges links on fixed joints into one body, which can hide a faulty inertia.
     model = robot.free_model
-    joints = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
+    joints = joint_index(model)
+    joints |= {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
     return tuple(
         LinkReport(
             name=link.link,
@@ -197,7 +195,7 @@ def _links(robot: Robot, inertials: Sequence[Inertial]) -> tuple[LinkReport, ...
             inertia=link.inertia,
             moments=principal_moments(link.inertia),
         )
-        for link in inertials
+        for link in inertials or inertials_of(model)
         if link.link in joints
     )
 
@@ -221,18 +219,6 @@ def _frames(robot: Robot) -> tuple[FrameReport, ...]:
         # A frame that a user has added may have the world as its parent frame and yet move with a joint.
         reports[frame.name] = FrameReport(frame.name, kind, on or ("" if kind == "joint" else joint), joint)
     return tuple(reports.values())
-
-
-def _body(robot: Robot, joint: int) -> LinkReport:
-    body, inertia = robot.free_model.inertias[joint], np.array(robot.free_model.inertias[joint].inertia)
-    return LinkReport(
-        name=_body_name(robot, joint),
-        joint=robot.free_model.names[joint],
-        mass=float(body.mass),
-        center=np.array(body.lever),
-        inertia=inertia,
-        moments=np.linalg.eigvalsh(inertia),
-    )
 
 
 def _body_name(robot: Robot, joint: int) -> str:
