@@ -285,23 +285,24 @@ def build_shapes(
     packages = Packages(urdf.path, tuple(package_dirs))
     faults = _missing_meshes(urdf, packages)
     for shape in shapes.geometryObjects:
-        look = looks.get(shape.name, _Look(""))
-        if look.texture:
-            texture = packages.locate(look.texture)
-            if texture is None:
-                logger.warning("%s: texture %r is not there", urdf.path, look.texture)
-            shape.meshTexturePath = "" if texture is None else str(texture)
-        if look.mesh and look.link not in faults:
-            scale = [_number(word) for word in look.scale.split()]
+        link, mesh, texture = looks.get(shape.name, ("", None, ""))
+        if texture:
+            image = packages.locate(texture)
+            if image is None:
+                logger.warning("%s: texture %r is not there", urdf.path, texture)
+            shape.meshTexturePath = "" if image is None else str(image)
+        if mesh is not None and link not in faults:
+            file, words = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
+            scale = [_number(word) for word in words.split()]
             try:
                 if len(scale) != 3 or not all(math.isfinite(number) and number for number in scale):
-                    raise FileError(f"mesh {look.mesh} has the scale {look.scale!r}: give three numbers other than 0")
-                put_mesh(shape, str(packages.locate(look.mesh)), scale, read)
+                    raise FileError(f"mesh {file} has the scale {words!r}: give three numbers other than 0")
+                put_mesh(shape, str(packages.locate(file)), scale, read)
             except FileError as error:
-                faults[look.link] = f"link {look.link!r}: {error}"
+                faults[link] = f"link {link!r}: {error}"
     found = pin.GeometryModel()
     for shape in shapes.geometryObjects:
-        if shape.name not in looks or looks[shape.name].link not in faults:
+        if shape.name not in looks or looks[shape.name][0] not in faults:
             found.addGeometryObject(shape)
     return found, faults
 
@@ -547,18 +548,10 @@ def listed(names: Iterable[str], what: str) -> str:
     return ", ".join(names[:3]) + f" and {len(names) - 3} more {what}" if len(names) > 4 else ", ".join(names)
 
 
-@dataclass(frozen=True)
-class _Look:
-    """What Pinocchio does not read of a ``<visual>``: names of its mesh and texture, as in the file, or empty."""
+def _looks(root: ET.Element) -> tuple[ET.Element, dict[str, tuple[str, ET.Element | None, str]]]:
+    """The part of a URDF for Pinocchio's shapes: joints, and links with their visuals; and what it does not read.
 
-    link: str
-    texture: str = ""
-    mesh: str = ""
-    scale: str = "1 1 1"
-
-
-def _looks(root: ET.Element) -> tuple[ET.Element, dict[str, _Look]]:
-    """The part of a URDF for Pinocchio's shapes: joints, and links with their visuals; and the rest by shape.
+    That is for each shape, by the name that Pinocchio gives it, its link, its mesh and the file of its texture, or "".
 
     Spheres stand for the meshes, as coal's loader misreads some.
 
@@ -583,14 +576,8 @@ def _looks(root: ET.Element) -> tuple[ET.Element, dict[str, _Look]]:
                     ET.SubElement(ET.SubElement(plain, "geometry"), "sphere", radius="1")
                 else:
                     plain.append(child)
-            # The name that Pinocchio gives to the shape.
-            name = link.get("name", "")
-            looks[f"{name}_{k}"] = _Look(
-                name,
-                "" if texture is None else texture.get("filename", ""),
-                "" if mesh is None else mesh.get("filename", ""),
-                "1 1 1" if mesh is None else mesh.get("scale", "1 1 1"),
-            )
+            image = "" if texture is None else texture.get("filename", "")
+            looks[f"{link.get('name', '')}_{k}"] = link.get("name", ""), mesh, image
     small.extend(root.findall("joint"))
     return small, looks
 
