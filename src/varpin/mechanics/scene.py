@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core import Mechanism
-from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
+from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element, Tied
 from varpin.errors import InputError
 from varpin.finding import Told
 from varpin.mechanics.constraints import (
@@ -381,16 +381,12 @@ class Scene(Frozen):
     def inputs(self) -> Mapping[int, int]:
         """The core's row of each :class:`KinematicInput`, mapped to the coordinate of its joint."""
         rows = self.bound_constraints.rows
-        return {
-            len(rows.products) + k: tie.follower
-            for k, tie in enumerate(rows.ties)
-            if tie.follower == tie.leader and not tie.coefficients
-        }
+        return {len(rows.products) + k: tie.follower for k, tie in enumerate(rows.ties) if _is_input(tie)}
 
     @cached_property
     def rates(self) -> tuple[int, ...]:
         """For each of :attr:`inputs`, the control with its velocity at the end of a step; -1 for a linear input."""
-        return tuple(tie.rate for tie in self.bound_constraints.rows.ties if tie.follower == tie.leader)
+        return tuple(tie.rate for tie in self.bound_constraints.rows.ties if _is_input(tie))
 
     @cached_property
     def prescribed(self) -> Integers:
@@ -967,6 +963,11 @@ def _refuse_noisy_servos(noise: Noise | Sequence[Noise] | None, elements: Sequen
         )
 
 
+def _is_input(tie: Tied) -> bool:
+    """Whether a tie is a :class:`KinematicInput`."""
+    return tie.follower == tie.leader and not tie.coefficients
+
+
 def _sole_control(actuation: Floats, c: int) -> int | None:
     """The control that drives coordinate ``c`` alone, with factor 1; None where there is no such control."""
     drives = np.flatnonzero(actuation[c])
@@ -977,9 +978,7 @@ def _sole_control(actuation: Floats, c: int) -> int | None:
 def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
     """Refuse a KinematicInput whose joint has no control of its own, or also has a servo."""
     served = {servo.coordinate for servo in of_kind(elements, "PositionServo")}
-    for tie in bound.rows.ties:
-        if tie.follower != tie.leader or tie.coefficients:
-            continue
+    for tie in filter(_is_input, bound.rows.ties):
         c, name = tie.follower, robot.joint_names[tie.follower]
         if c in served:
             raise InputError(f"joint {name!r} has both a PositionServo and a KinematicInput")
@@ -992,9 +991,8 @@ def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Eleme
 
 def _of_forces(actuation: Floats, bound: Bound) -> Floats:
     """The actuation with zeros for the positions of kinematic inputs, which absorb all forces on their joints."""
-    moved = [tie.follower for tie in bound.rows.ties if tie.follower == tie.leader and not tie.coefficients]
     forces = actuation.copy()
-    forces[moved] = 0.0
+    forces[[tie.follower for tie in filter(_is_input, bound.rows.ties)]] = 0.0
     return forces
 
 

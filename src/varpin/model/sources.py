@@ -279,14 +279,9 @@ def _of_file(path: Path, name: str, request: _Request) -> Description:
 
 
 def _of_mjcf(path: Path, name: str) -> Description:
-    mjcf = read_mjcf(path)
-    return replace(
-        _of_model(mjcf.model, name, None),
-        mjcf=path,
-        remarks=mjcf.remarks,
-        loops=tuple((each.a.body, each.b.body) for each in mjcf.equalities if isinstance(each, Closure)),
-        equalities=mjcf.equalities,
-    )
+    model, remarks, equalities = read_mjcf(path)
+    loops = tuple((each.a.body, each.b.body) for each in equalities if isinstance(each, Closure))
+    return replace(_of_model(model, name, None), mjcf=path, remarks=remarks, loops=loops, equalities=equalities)
 
 
 def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
