@@ -184,7 +184,7 @@ def over_steps(
 
 @dataclass(frozen=True, eq=False)
 class CompositeFields(BoundNoise):
-    """The concatenated processes of several bound models."""
+    """The concatenated processes of several bound models, some of them in Python."""
 
     parts: tuple[BoundNoise, ...]
 
@@ -197,15 +197,6 @@ class CompositeFields(BoundNoise):
     def velocity_dependent(self) -> bool:
         """See :attr:`BoundNoise.velocity_dependent`."""
         return any(part.velocity_dependent for part in self.parts)
-
-    @property
-    def diffusion(self) -> Diffusion | None:
-        """The concatenated arrays of the parts; None if a part has none."""
-        diffusions = [part.diffusion for part in self.parts]
-        if any(fields is None for fields in diffusions):
-            return None
-        columns = zip(*(fields for fields in diffusions if fields is not None), strict=True)
-        return Diffusion(*(np.concatenate(arrays, axis=1) for arrays in columns))
 
     @property
     def sloped(self) -> Integers:
@@ -453,7 +444,7 @@ class NoiseSum(Noise):
 
     def bind(self, actuation: Floats) -> BoundNoise:
         """See :meth:`Noise.bind`."""
-        return CompositeFields(tuple(term.bind(actuation) for term in self.terms))
+        return _together([term.bind(actuation) for term in self.terms])
 
 
 def _named(noise: Noise, joints: Sequence[str]) -> Noise:
@@ -470,6 +461,14 @@ def _named(noise: Noise, joints: Sequence[str]) -> Noise:
         if "JointValues" in str(item.type) and isinstance(value, Mapping):
             given[item.name] = joint_array(f"{type(noise).__name__} {item.name}", value, joints)
     return replace(noise, **given) if given else noise  # type: ignore[type-var]
+
+
+def _together(parts: Sequence[BoundNoise]) -> BoundNoise:
+    """The concatenated processes of several bound models; in the form of the core if all are."""
+    arrays = [part.diffusion for part in parts if part.diffusion is not None]
+    if len(parts) == 1 or len(arrays) < len(parts):
+        return parts[0] if len(parts) == 1 else CompositeFields(tuple(parts))
+    return CompiledFields(Diffusion(*(np.concatenate(columns, axis=1) for columns in zip(*arrays, strict=True))))
 
 
 def _terms(noise: Noise) -> tuple[Noise, ...]:
@@ -510,4 +509,4 @@ def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats, joints: Seque
             raise InputError(f"noise must be a varpin noise model or several of them, got {type(model).__name__}")
         known = model if joints is None else _named(model, joints)
         bound.append(_sound(known, known.bind(actuation), *actuation.shape))
-    return bound[0] if len(bound) == 1 else CompositeFields(tuple(bound))
+    return _together(bound)
