@@ -210,7 +210,7 @@ def read_inertials(urdf: Urdf, model: pin.Model) -> tuple[tuple[Inertial, ...], 
             remarks.append(f"link {name!r} is {effect}, as Pinocchio reads it: {fault}")
         if body.mass or body.inertia.any():
             found.append(Inertial(name, body.mass, np.array(body.lever), np.array(body.inertia)))
-    more = f" ({len(remarks) - 1} more links are read in part)" if len(remarks) > 1 else ""
+    more = f" (and {len(remarks) - 1} more)" if len(remarks) > 1 else ""
     return tuple(found), tuple(remark + more for remark in remarks[:1])
 
 
