@@ -170,7 +170,7 @@ def test_limits_that_are_missing_or_leave_no_room(tmp_path):
     zeros = '<limit lower="0" upper="0" effort="0" velocity="0"/>'
     for bare in (write_arm(tmp_path, ROD, ROD, joint=zeros), vp.planar_chain(2)):
         (warning,) = inspect_robot(bare).warnings
-        assert not unnamed(warning, "no limits", "position, velocity, effort of 'joint1', 'joint2'")
+        assert not unnamed(warning, "count as none", "position, velocity, effort of 'joint1', 'joint2'")
     tight = inspect_robot(
         write_arm(tmp_path, ROD, ROD, joint='<limit lower="0.2" upper="0.2" effort="1" velocity="1"/>')
     )

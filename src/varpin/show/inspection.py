@@ -370,7 +370,7 @@ def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | Non
             missing.setdefault(", ".join(what for what in none if none[what]), []).append(repr(joint.name))
     if missing:
         groups = "; ".join(f"{what} of {listed(names, 'joints')}" for what, names in missing.items())
-        yield "unlimited", "", f"no limits, or limits of 0, which count as none: {groups}"
+        yield "unlimited", "", f"limits that are missing, 0, negative or huge count as none: {groups}"
     at_zero = q is None
     for name, at, low, high in zip(
         robot.joint_names, np.zeros(robot.dof) if q is None else q, *robot.position_limits, strict=True
