@@ -347,6 +347,24 @@ class TestLocking:
             pytest.approx(shift, abs=1e-11) == jet_at(robot, elsewhere[keep], v[keep]).L - jet_at(whole, elsewhere, v).L
         )
 
+    @pytest.mark.parametrize(("name", "held"), [("kinova", (0, 2)), ("ur5", (1, 4)), ("xarm7", (0, 1, 5))])
+    def test_is_pinocchio_s_reduced_model(self, load, name, held):
+        whole = load(name)
+        at = {whole.joint_names[c]: 0.3 - 0.2 * c for c in held}
+        robot, full = vp.load_robot(name, lock=at), whole.free_model
+        q = whole.configuration([at.get(joint_name, 0.0) for joint_name in whole.joint_names])
+        expected = pin.buildReducedModel(full, [full.getJointId(joint_name) for joint_name in at], q)
+        assert list(robot.model.names) == list(expected.names)
+        positions = robot.configuration(np.random.default_rng(1).uniform(-1.0, 1.0, robot.dof))
+        ours, theirs = robot.model.createData(), expected.createData()
+        for model, data in ((robot.model, ours), (expected, theirs)):
+            pin.framesForwardKinematics(model, data, positions)
+        for k, frame in enumerate(robot.model.frames):
+            other = theirs.oMf[expected.getFrameId(frame.name, frame.type)]
+            np.testing.assert_allclose(ours.oMf[k].homogeneous, other.homogeneous, rtol=0, atol=1e-14)
+        M, other = full_crba(robot.model, positions), full_crba(expected, positions)
+        np.testing.assert_allclose(M, other, rtol=0, atol=1e-13 * np.abs(other).max())
+
     @pytest.mark.parametrize("lock", [{}, {"wrist_roll": 0.2}, {"gripper": 0.3}])
     def test_a_link_keeps_the_name_that_a_joint_elsewhere_has_too(self, tmp_path, lock):
         robot = vp.load_robot("so100", lock=lock)
