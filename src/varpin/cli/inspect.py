@@ -77,7 +77,7 @@ def add_robots(parser: argparse.ArgumentParser) -> None:
 def _robots(_request: argparse.Namespace, _errors: Console) -> int:
     table = table_of("Robots", ("name", "joints"))
     for name in robot_names():
-        add_row(table, name, str(build_robot(name)[0].dof))
+        add_row(table, name, str(build_robot(name).dof))
     console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
     console.print(table)
     say(console, "joints without mimic joints; --lock locks some of them", prefix="")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -440,7 +440,7 @@ def load_robot(
     """
     if not is_one_of(inertia, ("file", "meshes")):
         raise InputError(f"inertia must be 'file' or 'meshes', got {inertia!r}")
-    robot, description = build_robot(
+    robot, description = _built(
         source,
         package_dirs=package_dirs,
         lock=lock,
@@ -487,7 +487,12 @@ def _require_tree(robot: Robot, why: str = "") -> None:
     robot.tree  # noqa: B018
 
 
-def build_robot(
+def build_robot(source: object, **options: Any) -> Robot:
+    """:func:`load_robot` without its checks of inertia, to inspect faulty models."""
+    return _built(source, **options)[0]
+
+
+def _built(
     source: object,
     *,
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
@@ -501,7 +506,7 @@ def build_robot(
     armature: JointValues | None = None,
     density: float | None = None,
 ) -> tuple[Robot, Description]:
-    """:func:`load_robot` without its checks of inertia, and the description of its source."""
+    """The robot, and the description of its source."""
     if not is_one_of(mimic, ("tied", "free")):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     description = describe(source, package_dirs, mimic=mimic == "tied", xacro_args=xacro_args, srdf=srdf)

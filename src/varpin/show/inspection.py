@@ -87,7 +87,7 @@ def inspect_robot(
             )
         robot = source
     else:
-        robot, _ = build_robot(
+        robot = build_robot(
             source, package_dirs=package_dirs, lock=lock, keep=keep, mimic=mimic, base=base, armature=armature
         )
     scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())

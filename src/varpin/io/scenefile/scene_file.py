@@ -22,7 +22,7 @@ from varpin.io.scenefile.reading import suggestion
 from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.shown import marks_of
 from varpin.io.scenefile.tables import SceneTables, read_scene
-from varpin.io.scenefile.task import Task, require_start, required_of, task_of
+from varpin.io.scenefile.task import Task, required_of, task_of
 from varpin.mechanics.reduction import Required
 from varpin.mechanics.scene import Scene, closest_controls
 from varpin.model import Robot, models_dir
@@ -99,7 +99,7 @@ class SceneFile:
         spec, horizon = self.spec, self.spec.horizon
         if not spec.cost:
             raise spec.where.at("cost").error("is missing; a scene to solve needs at least one [[cost]]")
-        require_start(task)
+        task.require_start()
         most, constraints = task.control_limit, []
         for index, given in enumerate(spec.plan_constraint):
             try:
@@ -158,7 +158,7 @@ class SceneFile:
             StepFailure, Interrupted: As :func:`varpin.simulate`.
         """
         spec = self.spec
-        require_start(self._task)
+        self._task.require_start()
         return simulate(
             self.scene,
             self.q0,

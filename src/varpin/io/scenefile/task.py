@@ -67,6 +67,18 @@ class Task:
     costs: tuple[CostTerm, ...]
     controls: Timeline | str | None
 
+    def require_start(self) -> None:
+        """Refuse a start off the constraints.
+
+        Raises:
+            SceneFileError: It misses them by too much.
+        """
+        if self.scene.constraints:
+            try:
+                on_constraints(self.scene, self.q0, self.v0)
+            except VarpinError as error:
+                raise self.tables.where.at("initial").at("q").error(str(error)) from None
+
     def without(self, joints: Sequence[str]) -> Task:
         """The same task with ``joints`` held at their initial positions, and without what acts on them alone."""
         if not joints:
@@ -320,19 +332,6 @@ def _on_robot(tables: SceneTables, robot: Robot) -> Task:
     )
     _require_controls(task)
     return task
-
-
-def require_start(task: Task) -> None:
-    """Refuse a start off the constraints.
-
-    Raises:
-        SceneFileError: It misses them by too much.
-    """
-    if task.scene.constraints:
-        try:
-            on_constraints(task.scene, task.q0, task.v0)
-        except VarpinError as error:
-            raise task.tables.where.at("initial").at("q").error(str(error)) from None
 
 
 def _refuse_degrees(place: Where, values: Floats, robot: Robot) -> None:
