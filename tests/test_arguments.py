@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import pickle
 import warnings
 
 import numpy as np
@@ -145,28 +144,6 @@ def test_ensemble(name, value):
 
 
 class TestTheCoreGetsWhatFits:
-    @pytest.mark.parametrize(
-        ("name", "value"),
-        [
-            ("parent", np.array([-1, 7])),
-            ("parent", np.array([1, -1])),
-            ("parent", np.array([-1, 0], dtype=np.int32)),
-            ("coordinate", np.array([0, 2])),
-            ("coordinate", np.array([0, -1])),
-            ("group", np.array([0, 5])),
-            ("mass", np.ones(1)),
-            ("mass", np.array([1.0, np.nan])),
-            ("rotation", np.zeros((2, 3))),
-            ("armature", np.zeros(3)),
-            ("inertia", None),
-        ],
-    )
-    def test_trees_changed_by_hand(self, name, value):
-        robot = pickle.loads(pickle.dumps(dataclasses.replace(ROBOT, locked={}, tree=ROBOT.tree)))
-        robot = dataclasses.replace(robot, tree=robot.tree._replace(**{name: value}))
-        with refused(vp.RobotError, "damaged"):
-            vp.Scene(robot)
-
     @pytest.mark.parametrize("field", Diffusion._fields)
     @pytest.mark.parametrize("value", [np.zeros((1, 1)), np.zeros((9, 9)), None, np.full((2, 2), np.inf, dtype="f4")])
     def test_noise_of_one_s_own(self, field, value):

@@ -6,12 +6,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from findings import about
-from mechanisms import INERTIAL, joint, link, mass_matrix, random_tree, write_urdf
+from mechanisms import INERTIAL, joint, link, random_tree, write_urdf
 from refusals import refused
 
 import varpin as vp
 from varpin.model import geometry
-from varpin.model.tree import tree_mass_matrix
 
 
 class TestUrdf:
@@ -99,21 +98,3 @@ class TestModels:
         change(model)
         with refused(vp.RobotError, facts):
             vp.load_robot(model)
-
-    @pytest.mark.parametrize("seed", range(5))
-    def test_mass_matrix_in_numpy_is_pinocchio_s(self, seed):
-        robot = vp.load_robot(random_tree(seed, 8))
-        q = np.random.default_rng(seed).normal(size=8)
-        expected = mass_matrix(robot, q, robot.free_model.createData())
-        np.testing.assert_allclose(
-            tree_mass_matrix(robot.tree, q), expected, rtol=0, atol=1e-13 * np.abs(expected).max()
-        )
-
-    @pytest.mark.parametrize("name", ["tiago", "allegro_left_hand", "panda"])
-    def test_mass_matrix_in_numpy_knows_mimic_joints(self, load, name):
-        robot = load(name)
-        q = np.random.default_rng(0).normal(size=robot.dof)
-        expected = mass_matrix(robot, q, robot.free_model.createData())
-        np.testing.assert_allclose(
-            tree_mass_matrix(robot.tree, q), expected, rtol=0, atol=1e-13 * np.abs(expected).max()
-        )

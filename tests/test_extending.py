@@ -23,7 +23,6 @@ from varpin.io.scenefile.tables import CONSTRAINTS
 from varpin.mechanics import constraints, forces
 from varpin.mechanics.forces import point_of
 from varpin.mechanics.noise import CompiledFields
-from varpin.mechanics.scene import OF_COUPLINGS, OF_ELEMENTS
 from varpin.simulation import choice
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
@@ -148,8 +147,6 @@ def test_the_core_says_of_its_forces_what_they_have():
         "FrameTurnSpring": (1, True, False),
         "FrameWrench": (7, False, True),
     }
-    assert set(OF_ELEMENTS) == set(element_kinds()) - {"JointSpring", "JointDamper"}
-    assert set(OF_COUPLINGS) == set(coupling_kinds())
 
 
 def blocks(language):

@@ -1,12 +1,9 @@
 """Branches that share no inertia: a step treats each by itself, and the answer is that of each alone."""
 
-import dataclasses
-
 import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import joint, link, mimic, random_inertia, random_rotation, random_tree, write_urdf
-from refusals import refused
 
 import varpin as vp
 from varpin.model.tree import block_ends, independent_groups
@@ -171,11 +168,3 @@ def test_in_halves():
     J = np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(together.dof))
     for A in lin.A:
         np.testing.assert_allclose(A.T @ J @ A, J, rtol=0, atol=1e-9 * np.abs(A).max() ** 2)
-
-
-def test_a_tree_with_other_blocks_is_refused():
-    robot = forest(0, 1, 2)
-    for ends in (np.array([8, 8]), np.array([2, 8]), (8,), np.array([3.0, 4.0, 8.0]), None):
-        damaged = dataclasses.replace(robot, tree=robot.tree._replace(ends=ends))
-        with refused(vp.RobotError, "blocks"):
-            vp.Scene(damaged)

@@ -25,8 +25,8 @@ def mesh(name):
 
 @pytest.fixture
 def package(tmp_path):
-    """A ROS package with a mesh."""
-    folder = tmp_path / "workspace" / "my_arm"
+    """A ROS package with a mesh, whose folder has another name."""
+    folder = tmp_path / "workspace" / "Some-Repo"
     (folder / "meshes").mkdir(parents=True)
     (folder / "urdf").mkdir()
     (folder / "meshes" / "ball.obj").write_text(TRIANGLE)
@@ -41,7 +41,11 @@ def two_links(folder, first, second=""):
 
 @pytest.mark.parametrize(
     "name",
-    ["package://my_arm/meshes/ball.obj", "model://my_arm/meshes/ball.obj", "../meshes/ball.obj", "{}", "file://{}"],
+    [
+        *(f"{package}/meshes/ball.obj" for package in ("package://my_arm", "$(find my_arm)", "model://my_arm", "..")),
+        "{}",
+        "file://{}",
+    ],
 )
 def test_found_from_any_folder(package, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
@@ -65,6 +69,13 @@ def test_packages_elsewhere(package, tmp_path, monkeypatch, variable):
         monkeypatch.setenv(variable, str(package.parent if variable.startswith("ROS") else tmp_path))
     folders = [] if variable else [package.parent]
     assert geometry(vp.load_robot(path, package_dirs=folders)).ngeoms == 1
+
+
+@pytest.mark.parametrize("name", ["package://my_arm/Meshes/ball.obj", "../meshes/BALL.obj"])
+def test_a_file_in_other_case_is_named(package, name):
+    robot = vp.load_robot(two_links(package / "urdf", mesh(name)))
+    with refused(vp.RobotError, name, "ball.obj is there", "'l1'"):
+        geometry(robot)
 
 
 def test_home_in_package_dirs(package, tmp_path, monkeypatch):

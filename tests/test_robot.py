@@ -13,8 +13,6 @@ from refusals import naming, refused
 
 import varpin as vp
 from varpin.model import bundled_robots, example_robot_data, geometry
-from varpin.model.mimic import Tie
-from varpin.model.tree import coordinate_armature
 
 MOVING = ("revolute", "continuous", "prismatic")
 
@@ -349,6 +347,24 @@ class TestLocking:
             pytest.approx(shift, abs=1e-11) == jet_at(robot, elsewhere[keep], v[keep]).L - jet_at(whole, elsewhere, v).L
         )
 
+    @pytest.mark.parametrize(("name", "held"), [("kinova", (0, 2)), ("ur5", (1, 4)), ("xarm7", (0, 1, 5))])
+    def test_is_pinocchio_s_reduced_model(self, load, name, held):
+        whole = load(name)
+        at = {whole.joint_names[c]: 0.3 - 0.2 * c for c in held}
+        robot, full = vp.load_robot(name, lock=at), whole.free_model
+        q = whole.configuration([at.get(joint_name, 0.0) for joint_name in whole.joint_names])
+        expected = pin.buildReducedModel(full, [full.getJointId(joint_name) for joint_name in at], q)
+        assert list(robot.model.names) == list(expected.names)
+        positions = robot.configuration(np.random.default_rng(1).uniform(-1.0, 1.0, robot.dof))
+        ours, theirs = robot.model.createData(), expected.createData()
+        for model, data in ((robot.model, ours), (expected, theirs)):
+            pin.framesForwardKinematics(model, data, positions)
+        for k, frame in enumerate(robot.model.frames):
+            other = theirs.oMf[expected.getFrameId(frame.name, frame.type)]
+            np.testing.assert_allclose(ours.oMf[k].homogeneous, other.homogeneous, rtol=0, atol=1e-14)
+        M, other = full_crba(robot.model, positions), full_crba(expected, positions)
+        np.testing.assert_allclose(M, other, rtol=0, atol=1e-13 * np.abs(other).max())
+
     @pytest.mark.parametrize("lock", [{}, {"wrist_roll": 0.2}, {"gripper": 0.3}])
     def test_a_link_keeps_the_name_that_a_joint_elsewhere_has_too(self, tmp_path, lock):
         robot = vp.load_robot("so100", lock=lock)
@@ -374,44 +390,6 @@ class TestLocking:
         locked = vp.load_robot("baxter", lock={names[leader]: 0.01}).locked
         ratio, offset = mimics_of(baxter.urdf)[names[follower]][1:]
         assert locked[names[follower]] == ratio * 0.01 + offset
-
-    def test_in_a_model_with_velocity_limits(self):
-        # pin.Model.addJoint leaves lower limits that pin.buildReducedModel refuses.
-        model = vp.planar_chain(2).model.copy()
-        model.velocityLimit = np.array([3.0, 5.0])
-        robot = vp.load_robot(model, lock={"joint1": 0.1})
-        assert robot.velocity_limit.tolist() == [5.0]
-
-    @pytest.mark.parametrize("frames", ["none", "some", "late"])
-    def test_in_a_model_without_proper_joint_frames(self, frames):
-        # pin.buildReducedModel crashes the interpreter, or refuses, unless every joint's frame is there and early.
-        whole = vp.planar_chain(3)
-        model, joint_id = pin.Model(), 0
-        for k in range(1, 4):
-            source = whole.free_model
-            joint_id = model.addJoint(joint_id, source.joints[k], source.jointPlacements[k], source.names[k])
-            model.appendBodyToJoint(joint_id, source.inertias[k], pin.SE3.Identity())
-        tip = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.0]))
-        if frames == "some":
-            model.addJointFrame(1)
-        model.addFrame(pin.Frame("tip", 3, tip, pin.FrameType.OP_FRAME))
-        if frames == "late":
-            for k in range(1, 4):
-                model.addJointFrame(k)
-        shapes = pin.GeometryModel()
-        tip_frame = model.getFrameId("tip")
-        shapes.addGeometryObject(pin.GeometryObject("ball", 3, tip_frame, tip, pin.hppfcl.Sphere(0.1)))
-        robot = vp.load_robot(pin.RobotWrapper(model, shapes, shapes), lock={"joint2": 0.5})
-        locked, unlocked = jet_at(robot, [0.1, 0.2], [1, 2]), jet_at(whole, [0.1, 0.5, 0.2], [1, 0, 2])
-        assert_same_jet(locked, unlocked, [0, 2])
-        data, visuals = robot.model.createData(), geometry(robot)
-        pin.framesForwardKinematics(robot.model, data, np.array([0.1, 0.2]))
-        placed = visuals.createData()
-        pin.updateGeometryPlacements(robot.model, data, visuals, placed)
-        angles = np.cumsum([0.1, 0.5, 0.2])
-        expected = [np.cos(angles).sum(), 0.0, -np.sin(angles).sum()]
-        np.testing.assert_allclose(data.oMf[robot.model.getFrameId("tip")].translation, expected, atol=1e-14)
-        np.testing.assert_allclose(placed.oMg[0].translation, expected, atol=1e-14)
 
     @pytest.mark.parametrize(
         ("kind", "position"),
@@ -688,18 +666,12 @@ class TestArmature:
 
     def test_of_talos_is_its_rotors_through_its_gears(self, load):
         robot = load("talos_arm")
-        srdf = ET.parse(example_robot_data.locate(example_robot_data.ROTORS["talos_arm"])).getroot()
+        srdf = ET.parse(example_robot_data.locate(example_robot_data.SRDF["talos_arm"])).getroot()
         rotors = {j.get("name"): j for j in srdf.find("rotor_params").findall("joint")}
         felt = {name: float(j.get("mass")) * float(j.get("gear_ratio")) ** 2 for name, j in rotors.items()}
         expected = [felt.get(name, 0.0) for name in robot.joint_names]
         assert np.count_nonzero(expected) == sum(name.startswith("arm_left") for name in robot.joint_names) > 0
         np.testing.assert_allclose(robot.tree.armature, expected, rtol=1e-15)
-
-    def test_of_followers_is_felt_by_their_leaders(self):
-        model = random_tree(6, bodies=3, branching=False)
-        ties = (Tie(follower=3, leader=1, ratio=-2.0, offset=0.1),)
-        own = model.armature
-        assert coordinate_armature(model, ties, (1, 2)) == pytest.approx([own[0] + 4.0 * own[2], own[1]])
 
 
 def test_planar_chain_is_rods_in_the_vertical_plane():

@@ -458,6 +458,10 @@ MISTAKES = {
         "cost[2].reference",
     ),
     "degrees for radians": (changed("q = [0.5, 0.3]", "q = [30.0, 20.0]"), "initial.q"),
+    "start off a tie": (
+        GOOD + '[[constraint]]\ntype = "joint_tie"\njoint = "pip"\nleader = "mcp"',
+        "initial.q",
+    ),
     "locked in degrees": (changed("dip = 0.2", "dip = 20"), "robot.lock.dip"),
     "unknown driven joint": (changed('["mcp", "pip"]', '["mcp", "pop"]'), "actuation.joints[1]"),
     "driven joint twice": (changed('["mcp", "pip"]', '["mcp", "mcp"]'), "actuation.joints[1]"),

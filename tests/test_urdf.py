@@ -94,6 +94,10 @@ ODD = {
         ),
         "<x:insert>",
     ),
+    "a xacro expression that is no number": (
+        lambda text: text.replace("</visual>", '<material name="${color}"/></visual>'),
+        "<material name='${color}'>",
+    ),
     "comments with dashes": (lambda text: text.replace("<joint", "<!-- one -- two --- -->\n<!---->\n<joint"), ""),
     "a comment around a joint": (lambda text: text.replace("</robot>", "<!--<joint name='k'/>--></robot>"), ""),
     "unknown elements": (lambda text: text.replace("</link>", "<sensor><camera/></sensor><mass/></link>"), ""),
@@ -196,30 +200,6 @@ class TestOdd:
         assert odd.ties == sound.ties
         assert vp.load_robot(written(tmp_path, two + "<more/>"), mimic="free").dof == 2
 
-    @pytest.mark.parametrize(
-        ("change", "facts"),
-        [
-            (lambda text: "", "empty"),
-            (lambda text: " \r\n", "empty"),
-            (lambda text: "hello", "XML"),
-            (lambda text: text[:-10], "XML"),
-            (lambda text: text.replace('"1.3"', '"${m}"', 1), ("xacro", "<mass value='${m}'>")),
-            (lambda text: text.replace("robot", "sdf"), "<sdf>"),
-            (lambda text: '<robot name="a"/>', "link"),
-            (lambda text: "<!DOCTYPE html><html><body></html>", "web page"),
-        ],
-    )
-    def test_files_that_are_none(self, tmp_path, two, change, facts):
-        assert change(two) != two
-        with refused(vp.RobotError, facts) as info:
-            vp.load_robot(written(tmp_path, change(two)))
-        assert "odd.urdf" in str(info.value)
-
-    def test_folder(self, tmp_path, two):
-        written(tmp_path, two)
-        with refused(vp.RobotError, "made_up.urdf", "odd.urdf"):
-            vp.load_robot(tmp_path)
-
 
 H = np.sqrt(0.5)
 SPEC = (
@@ -288,12 +268,14 @@ class TestLimits:
                 (-np.inf, np.inf, np.inf, np.inf),
                 (NONE, "'j1'"),
             ),
+            ('lower="-1" upper="-1" velocity="3" effort="3"', (-np.inf, np.inf, 3, 3), (NONE, "upper -1", "'j1'")),
+            ('lower="none" upper="None" velocity="nan" effort=""', (-np.inf, np.inf, np.inf, np.inf), (NONE, "None")),
             ('lower="-1" upper="1"', (-1, 1, np.inf, np.inf), (NONE, "no effort", "no velocity")),
             ("", (-np.inf, np.inf, np.inf, np.inf), (NONE, "no effort")),
             ('lower="-1e16" upper="1e16" velocity="3" effort="3"', (-np.inf, np.inf, 3, 3), (NONE, "1e16")),
             ('lower="-170" upper="172.5" velocity="3" effort="3"', (-170, 172.5, 3, 3), ("degrees", "-170 to 172.5")),
             ('lower="-6.28" upper="6.28" velocity="3" effort="3"', (-6.28, 6.28, 3, 3), ""),
-            ('lower="1" upper="-1" velocity="3" effort="3"', (1, -1, 3, 3), ("no room", "1 to -1 of 'j1'")),
+            ('lower="1" upper="-1" velocity="3" effort="3"', (1, -1, 3, 3), ("no room", "1 and -1 of 'j1'")),
             ('lower=" -1" upper="1 " velocity="3" effort="3"', (-1, 1, 3, 3), ""),
         ],
     )
@@ -305,7 +287,15 @@ class TestLimits:
         assert robot.unbounded.tolist() == [np.isinf(read[0])]
         assert len(caplog.messages) == bool(facts)
         assert not facts or naming(caplog.messages, facts)
-        assert not facts or naming(vp.inspect_robot(robot).warnings, facts)
+        told = vp.inspect_robot(robot).warnings
+        assert len(told) == bool(facts)
+        assert naming(told, (NONE, "'j1'") if NONE in facts else facts) == list(told)
+
+    @pytest.mark.parametrize(("upper", "told"), [("350", 1), ("12.5", 0)])
+    def test_of_a_slider_that_look_like_millimetres(self, tmp_path, caplog, upper, told):
+        path = arm(tmp_path, kind="prismatic")
+        vp.load_robot(written(tmp_path, path.read_text().replace('upper="1"', f'upper="{upper}"')))
+        assert len(naming(caplog.messages, "slider", "'j1'", "350 m", "millimetres")) == told == len(caplog.messages)
 
     def test_on_a_continuous_joint_are_told(self, tmp_path, caplog):
         assert vp.load_robot(arm(tmp_path, kind="continuous")).unbounded.all()
@@ -340,6 +330,11 @@ class TestToldAsLeftOut:
         np.testing.assert_allclose(robot.model.armature, model.armature, rtol=1e-14)
         assert model.armature[1] == pytest.approx(0.25)
         assert vp.load_robot(path, armature=0.5).model.armature.tolist() == [0.5, 0.5]
+        follower = joint("j2", "a", "b", inside=mimic("j1", -2))
+        tied = write_urdf(tmp_path, link("a"), link("b"), joint("j1", "base", "a"), follower, name="tied")
+        assert vp.load_robot(tied, srdf=srdf).tree.armature == pytest.approx([4.0 * 0.25])
+        (plain := tmp_path / "plain.srdf").write_text('<robot name="plain"/>')
+        assert vp.load_robot(path, srdf=plain).model.armature.tolist() == [0.0, 0.0]
 
 
 class TestFaultyNumbers:
@@ -375,49 +370,6 @@ class TestFaultyNumbers:
         text = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 123\n"
         with refused(vp.RobotError, "odd.urdf", "Git LFS", "git lfs pull"):
             vp.load_robot(written(tmp_path, text))
-
-
-class TestPackages:
-    BOX = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
-
-    def robot(self, folder, mesh):
-        """A robot in urdf/ of package my_arm, whose folder is named otherwise."""
-        for name in ("urdf", "meshes"):
-            (folder / "ws" / "Some-Repo" / name).mkdir(parents=True, exist_ok=True)
-        package = folder / "ws" / "Some-Repo"
-        (package / "package.xml").write_text("<package><name>my_arm</name></package>")
-        (package / "meshes" / "box.obj").write_text(self.BOX)
-        shape = f'<visual><geometry><mesh filename="{mesh}"/></geometry></visual>'
-        return write_urdf(package / "urdf", link("l1", extra=shape), joint("j1", "base", "l1"))
-
-    @pytest.mark.parametrize(
-        "mesh",
-        [
-            "package://my_arm/meshes/box.obj",
-            "$(find my_arm)/meshes/box.obj",
-            "model://my_arm/meshes/box.obj",
-            "../meshes/box.obj",
-        ],
-    )
-    def test_have_the_name_in_their_package_xml(self, tmp_path, mesh):
-        path = self.robot(tmp_path, mesh)
-        assert geometry(vp.load_robot(path)).ngeoms == 1
-        moved = tmp_path / "elsewhere.urdf"
-        moved.write_text(path.read_text())
-        for folder in (tmp_path / "ws", tmp_path / "ws" / "Some-Repo"):
-            if "://" in mesh or "$" in mesh:
-                assert geometry(vp.load_robot(moved, package_dirs=[folder])).ngeoms == 1
-
-    @pytest.mark.parametrize("mesh", ["package://my_arm/Meshes/box.obj", "../meshes/BOX.obj"])
-    def test_a_file_in_other_case_is_named(self, tmp_path, mesh):
-        robot = vp.load_robot(self.robot(tmp_path, mesh))
-        with refused(vp.RobotError, mesh, "box.obj is there", "'l1'"):
-            geometry(robot)
-
-    def test_a_file_that_is_not_there_is_named_with_where_it_was_looked_for(self, tmp_path):
-        robot = vp.load_robot(self.robot(tmp_path, "package://your_arm/box.obj"))
-        with refused(vp.RobotError, "package://your_arm/box.obj", "package_dirs"):
-            geometry(robot)
 
 
 class TestInertia:
@@ -508,10 +460,3 @@ class TestMany:
             worker.join()
         os.write(2, b"still here")
         assert "still here" in capfd.readouterr().err
-
-
-def test_xacro_expressions_that_are_no_numbers_are_told_of(tmp_path, caplog):
-    ball = '<visual><geometry><sphere radius="0.1"/></geometry><material name="${color}"/></visual>'
-    robot = vp.load_robot(write_urdf(tmp_path, link("a", extra=ball), joint("j1", "base", "a")))
-    assert robot.dof == 1
-    assert "<material name='${color}'>" in caplog.text

@@ -150,11 +150,6 @@ def test_arguments_of_what_is_no_xacro_file(tmp_path):
         vp.load_robot("ur5", xacro_args=["prefix"])
 
 
-def test_no_such_file(tmp_path):
-    with refused(vp.RobotNotFound, "arm.urdf.xacro"):
-        vp.load_robot("arm.urdf.xacro")
-
-
 @pytest.mark.parametrize("how", ['"$(arg tool)"', "\"${xacro.arg('tool')}\""])
 def test_an_argument_without_a_default_is_named(tmp_path, how):
     path = tmp_path / "arm.urdf.xacro"

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -20,10 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.arrays import Floats
 from varpin.core.arrays import Carried, ConstraintRows, CustomRows, Product, Tied
 from varpin.errors import InputError, UnknownJoint
-from varpin.mechanics.forces import Point, kept, point_of, require_index, require_movable, shown
+from varpin.mechanics.forces import Described, Point, point_of, require_index, require_movable, shown
 from varpin.model import Robot
-from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, tuple_of
-from varpin.support.frozen import Frozen
+from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, returned, tuple_of
 
 _AXES = "xyz"
 
@@ -38,19 +37,8 @@ class Bound(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Constraint(Frozen, ABC):
+class Constraint(Described, ABC):
     """A holonomic constraint of one or several rows g(q) = 0."""
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if not callable(value):
-                object.__setattr__(self, item.name, kept(item.name, value))
-
-    def __repr__(self) -> str:
-        items = [(item, getattr(self, item.name)) for item in fields(self)]
-        given = [f"{item.name}={_shown(value)}" for item, value in items if item.repr and value is not None]
-        return f"{type(self).__name__}({', '.join(given)})"
 
     @abstractmethod
     def bind(self, robot: Robot) -> Bound:
@@ -88,12 +76,6 @@ def bound_constraint(constraint: Constraint, robot: Robot) -> Bound:
     if len(bound.labels) != rows:
         raise InputError(f"{where} {len(bound.labels)} labels for {rows} rows")
     return bound
-
-
-def _shown(value: Any) -> str:
-    if callable(value) or isinstance(value, int):
-        return str(getattr(value, "__name__", repr(value)))
-    return shown(value)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -347,16 +329,8 @@ def _called(name: str, call: Callable[[], ArrayLike], shape: tuple[int, ...], q:
     Raises:
         CustomConstraintError: The function raised, or its result is not a finite array of this shape.
     """
-    what = f"the {name} of a CustomConstraint"
-    try:
-        given = call()
-    except Exception as error:
-        at = np.array2string(q, precision=6)
-        raise CustomConstraintError(f"{what} raised {error!r} at q = {at}") from error
-    try:
-        return finite_array(what, given, shape)
-    except InputError as error:
-        raise CustomConstraintError(str(error)) from None
+    at = f" at q = {np.array2string(q, precision=6)}"
+    return returned(f"the {name} of a CustomConstraint", call, shape, at, CustomConstraintError)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError
 from varpin.mechanics.forces import Force
 from varpin.model import Robot
+from varpin.support.checks import returned
 from varpin.support.frozen import Frozen
 
 Field: TypeAlias = Callable[[Floats, Floats], ArrayLike]
@@ -94,8 +95,7 @@ class CustomForce(Force):
         Raises:
             CustomForceError: The function raised, or its result is not a finite real array (n,).
         """
-        value = self._called(lambda: self.f(q.copy(), v.copy()), "f(q, v)", q, v)
-        return self._read(value, "f(q, v)", (q.size,), q, v)
+        return self._read(lambda: self.f(q.copy(), v.copy()), "f(q, v)", (q.size,), q, v)
 
     def slopes(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
         """Derivatives dF/dq and dF/dv, each (n, n).
@@ -105,24 +105,16 @@ class CustomForce(Force):
         """
         n = q.size
         if callable(self.derivatives):
-            derivatives = self.derivatives
-            value = self._called(lambda: derivatives(q.copy(), v.copy()), "derivatives(q, v)", q, v)
-            if not isinstance(value, tuple | list) or len(value) != 2:
-                raise CustomForceError(
-                    f"CustomForce {self.name}: derivatives(q, v) must return dF/dq and dF/dv, two matrices {(n, n)}, "
-                    f"got {reprlib.repr(value)}"
-                )
-            parts = zip(value, ("dF/dq", "dF/dv"), strict=True)
-            by_q, by_v = (self._read(part, f"{name} of derivatives(q, v)", (n, n), q, v) for part, name in parts)
-            return by_q, by_v
+            derivatives, shape = self.derivatives, (2, n, n)
+            return tuple(self._read(lambda: derivatives(q.copy(), v.copy()), "derivatives(q, v)", shape, q, v))
         return self._complex(q, v) if self.derivatives == "complex" else self._differences(q, v)
 
     def _complex(self, q: Floats, v: Floats) -> tuple[Floats, Floats]:
         def column(moved: int, c: int) -> Floats:
             state = [q.astype(complex), v.astype(complex)]
             state[moved][c] += 1j * _TINY
-            value = self._called(lambda: self.f(*state), "f(q, v) of complex numbers", q, v)
-            return self._read(np.imag(np.asarray(value)) / _TINY, "f(q, v) of complex numbers", (q.size,), q, v)
+            what = "f(q, v) of complex numbers"
+            return self._read(lambda: np.imag(np.asarray(self.f(*state))) / _TINY, what, (q.size,), q, v)
 
         return self._columns(column, q.size)
 
@@ -206,24 +198,8 @@ class CustomForce(Force):
                     f"{column[r]:.8g}, at {_state_text(q, v)}"
                 )
 
-    def _called(self, call: Callable[[], object], what: str, q: Floats, v: Floats) -> object:
-        try:
-            return call()
-        except Exception as error:
-            raise CustomForceError(
-                f"CustomForce {self.name}: {what} raised {error!r} at {_state_text(q, v)}"
-            ) from error
-
-    def _read(self, value: object, what: str, shape: tuple[int, ...], q: Floats, v: Floats) -> Floats:
-        given = np.asarray(value)
-        if given.dtype.kind not in "fiu" or given.shape != shape:
-            raise CustomForceError(
-                f"CustomForce {self.name}: {what} must return real numbers of shape {shape}, got "
-                f"{reprlib.repr(value)} of shape {given.shape}"
-            )
-        if not np.isfinite(given).all():
-            raise CustomForceError(f"CustomForce {self.name}: {what} is not finite at {_state_text(q, v)}: {given}")
-        return np.ascontiguousarray(given, dtype=np.float64)
+    def _read(self, call: Callable[[], object], what: str, shape: tuple[int, ...], q: Floats, v: Floats) -> Floats:
+        return returned(f"CustomForce {self.name}: {what}", call, shape, f" at {_state_text(q, v)}", CustomForceError)
 
 
 def _state_text(q: Floats, v: Floats) -> str:

@@ -37,17 +37,22 @@ _ROTATION = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Force(Frozen, ABC):
-    """A force on single joints or on frames."""
+class Described(Frozen):
+    """What its parameters describe, of which it keeps immutable copies."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
             object.__setattr__(self, item.name, kept(item.name, getattr(self, item.name)))
 
     def __repr__(self) -> str:
-        items = [(item.name, getattr(self, item.name)) for item in fields(self)]
+        items = [(item.name, getattr(self, item.name)) for item in fields(self) if item.repr]
         given = [f"{name}={shown(value)}" for name, value in items if value is not None]
         return f"{type(self).__name__}({', '.join(given)})"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Force(Described, ABC):
+    """A force on single joints or on frames."""
 
     @abstractmethod
     def bind(self, robot: Robot) -> tuple[Element | Coupling, ...]:
@@ -107,7 +112,7 @@ def require_index(what: str, index: Any, least: int, end: int) -> None:
 
 def kept(name: str, value: Any) -> Any:
     """An immutable copy of a parameter."""
-    if value is None or isinstance(value, str):
+    if value is None or isinstance(value, str) or callable(value):
         return value
     if isinstance(value, Mapping):
         return MappingProxyType(dict(value))
@@ -120,8 +125,10 @@ def kept(name: str, value: Any) -> Any:
 
 def shown(value: Any) -> str:
     """A parameter as text."""
-    if isinstance(value, str):
+    if isinstance(value, str | int):
         return repr(value)
+    if callable(value):
+        return str(getattr(value, "__name__", repr(value)))
     if isinstance(value, tuple):
         return f"({', '.join(map(shown, value))})"
     return str(dict(value) if isinstance(value, Mapping) else value.tolist())

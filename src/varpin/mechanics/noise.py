@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +29,7 @@ from varpin.support.checks import (
     finite_array,
     joint_array,
     require_finite,
+    returned,
 )
 from varpin.support.frozen import Frozen
 
@@ -59,14 +60,6 @@ class Fields:
 
 class Noise(ABC):
     """A diffusion model. A subclass provides ``bind``, which applies it to a robot."""
-
-    def named(self, joints: Sequence[str]) -> Noise:  # noqa: ARG002
-        """The model with its parameters by joint name replaced by arrays in the order of ``joints``.
-
-        Raises:
-            UnknownJoint: A name is not in ``joints``.
-        """
-        return self
 
     @abstractmethod
     def bind(self, actuation: Floats) -> BoundNoise:
@@ -191,7 +184,7 @@ def over_steps(
 
 @dataclass(frozen=True, eq=False)
 class CompositeFields(BoundNoise):
-    """The concatenated processes of several bound models."""
+    """The concatenated processes of several bound models, some of them in Python."""
 
     parts: tuple[BoundNoise, ...]
 
@@ -204,15 +197,6 @@ class CompositeFields(BoundNoise):
     def velocity_dependent(self) -> bool:
         """See :attr:`BoundNoise.velocity_dependent`."""
         return any(part.velocity_dependent for part in self.parts)
-
-    @property
-    def diffusion(self) -> Diffusion | None:
-        """The concatenated arrays of the parts; None if a part has none."""
-        diffusions = [part.diffusion for part in self.parts]
-        if any(fields is None for fields in diffusions):
-            return None
-        columns = zip(*(fields for fields in diffusions if fields is not None), strict=True)
-        return Diffusion(*(np.concatenate(arrays, axis=1) for arrays in columns))
 
     @property
     def sloped(self) -> Integers:
@@ -275,10 +259,6 @@ class AdditiveNoise(Noise):
 
     intensity: JointValues
 
-    def named(self, joints: Sequence[str]) -> Noise:
-        """See :meth:`Noise.named`."""
-        return _named(self, joints, "intensity")
-
     def bind(self, actuation: Floats) -> CompiledFields:
         """See :meth:`Noise.bind`."""
         n, m = actuation.shape
@@ -325,10 +305,6 @@ class StateNoise(Noise):
 
     intensity: JointValues
     center: JointValues | None = None
-
-    def named(self, joints: Sequence[str]) -> Noise:
-        """See :meth:`Noise.named`."""
-        return _named(self, joints, "intensity", "center")
 
     def bind(self, actuation: Floats) -> CompiledFields:
         """See :meth:`Noise.bind`."""
@@ -420,18 +396,9 @@ class CustomFields(BoundNoise):
     ) -> Floats:
         if function is None:
             return np.zeros((len(points), *shape))
-        return np.array([self._call(f"CustomNoise {name}(q, v, u)", function, point, shape) for point in points])
-
-    @staticmethod
-    def _call(name: str, function: Field, point: tuple[Floats, Floats, Floats], shape: tuple[int, ...]) -> Floats:
-        try:
-            value = function(*point)
-        except Exception as error:
-            raise NoiseFieldError(f"{name} raised {error!r}") from error
-        try:
-            return finite_array(name, value, shape)
-        except InputError as error:
-            raise NoiseFieldError(str(error)) from None
+        what = f"CustomNoise {name}(q, v, u)"
+        rows = [returned(what, partial(function, *at), shape, error=NoiseFieldError) for at in points]
+        return np.array(rows)
 
     def check(self) -> None:
         """Compare the derivatives with central differences at three seeded random points.
@@ -475,27 +442,33 @@ class NoiseSum(Noise):
 
     terms: tuple[Noise, ...]
 
-    def named(self, joints: Sequence[str]) -> Noise:
-        """See :meth:`Noise.named`."""
-        return NoiseSum(tuple(term.named(joints) for term in self.terms))
-
     def bind(self, actuation: Floats) -> BoundNoise:
         """See :meth:`Noise.bind`."""
-        return CompositeFields(tuple(term.bind(actuation) for term in self.terms))
+        return _together([term.bind(actuation) for term in self.terms])
 
 
-_Model = TypeVar("_Model", "AdditiveNoise", "StateNoise")
+def _named(noise: Noise, joints: Sequence[str]) -> Noise:
+    """The model with arrays in the order of ``joints`` in place of numbers by joint name.
+
+    Raises:
+        UnknownJoint: A name is not in ``joints``.
+    """
+    if isinstance(noise, NoiseSum):
+        return NoiseSum(tuple(_named(term, joints) for term in noise.terms))
+    given: dict[str, Floats] = {}
+    for item in fields(noise) if is_dataclass(noise) else ():  # type: ignore[var-annotated]
+        value = getattr(noise, item.name)
+        if "JointValues" in str(item.type) and isinstance(value, Mapping):
+            given[item.name] = joint_array(f"{type(noise).__name__} {item.name}", value, joints)
+    return replace(noise, **given) if given else noise  # type: ignore[type-var]
 
 
-def _named(noise: _Model, joints: Sequence[str], *names: str) -> _Model:
-    """The model with arrays in place of numbers by joint name."""
-    given = {name: getattr(noise, name) for name in names}
-    by_name = {
-        name: joint_array(f"{type(noise).__name__} {name}", value, joints)
-        for name, value in given.items()
-        if isinstance(value, Mapping)
-    }
-    return replace(noise, **by_name) if by_name else noise
+def _together(parts: Sequence[BoundNoise]) -> BoundNoise:
+    """The concatenated processes of several bound models; in the form of the core if all are."""
+    arrays = [part.diffusion for part in parts if part.diffusion is not None]
+    if len(parts) == 1 or len(arrays) < len(parts):
+        return parts[0] if len(parts) == 1 else CompositeFields(tuple(parts))
+    return CompiledFields(Diffusion(*(np.concatenate(columns, axis=1) for columns in zip(*arrays, strict=True))))
 
 
 def _terms(noise: Noise) -> tuple[Noise, ...]:
@@ -534,6 +507,6 @@ def bind(noise: Noise | Sequence[Noise] | None, actuation: Floats, joints: Seque
     for model in models:
         if not isinstance(model, Noise):
             raise InputError(f"noise must be a varpin noise model or several of them, got {type(model).__name__}")
-        known = model if joints is None else model.named(joints)
+        known = model if joints is None else _named(model, joints)
         bound.append(_sound(known, known.bind(actuation), *actuation.shape))
-    return bound[0] if len(bound) == 1 else CompositeFields(tuple(bound))
+    return _together(bound)

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats, Integers
-from varpin.core import Mechanism as Core
-from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element
-from varpin.errors import InputError, RobotError
+from varpin.core import Mechanism
+from varpin.core.arrays import ConstraintRows, Coupling, Diffusion, Element, Tied
+from varpin.errors import InputError
 from varpin.finding import Told
 from varpin.mechanics.constraints import (
     Bound,
@@ -32,7 +32,6 @@ from varpin.mechanics.constraints import (
 from varpin.mechanics.custom import CustomForce, CustomForces
 from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import (
-    COUPLINGS,
     ELEMENTS,
     CoulombFriction,
     Force,
@@ -46,8 +45,8 @@ from varpin.mechanics.forces import (
     of_kind,
 )
 from varpin.mechanics.noise import BoundNoise, ControlNoise, Noise, NoiseSum, bind
-from varpin.model import Robot, degrees_hint, require_robot, require_sound
-from varpin.model.tree import block_ends, path_coordinates
+from varpin.model import Robot, degrees_hint, require_robot
+from varpin.model.tree import block_ends, mechanism, path_coordinates
 from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, listed
@@ -58,53 +57,17 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Messages where forces of these kinds differ, which have better names than their kinds.
-_NAMES = {
-    "CoulombFriction": "dry friction differs",
-    "JointStop": "joint stops differ",
-    "PositionServo": "position servos differ",
-    "FrameLoad": "forces on frames differ",
-    "FrameWrench": "forces on frames differ",
-    "FrameSpring": "springs between frames differ",
-    "FrameLengthSpring": "springs between frames differ",
-    "FrameTurnSpring": "springs between frames differ",
-    "FrameDamper": "dampers between frames differ",
-    "FrameTurnDamper": "dampers between frames differ",
-}
 # Kinds of elements that are among the values as sums by joint.
 _SUMMED = ("Armature", "JointDamper", "JointSpring")
-# Other forces on joints among the values, a row (coordinate, numbers) for each element; and the message where they
-# differ.
-OF_ELEMENTS = {kind: _NAMES.get(kind, f"{kind} differs") for kind in ELEMENTS if kind not in _SUMMED}
-# Forces on frames, a row (body a, body b, numbers) for each; left out where there are none.
-OF_COUPLINGS = {kind: _NAMES.get(kind, f"{kind} differs") for kind in COUPLINGS}
-# Names of a scene's values, and the message where they differ; values by joint are also reported with numbers.
-VALUES = {
-    "gravity": "gravity differs",
-    "damping": "damping differs",
-    "stiffness": "stiffness differs",
-    "rest": "rest differs",
-    "armature": "armature differs",
-    "actuation": "actuation differs",
-    "center": "the robot's centres of mass differ",
-    "inertia": "the robot's inertias differ",
-    "rotation": "the axes of the robot's joints differ",
-    "translation": "the positions of the robot's joints differ",
-    "ratio": "the ratios of the robot's mimic joints differ",
-    "offset": "the offsets of the robot's mimic joints differ",
-    **OF_ELEMENTS,
-    **OF_COUPLINGS,
-    "functions": "custom forces differ",
-    "constraints.between": "constraints between frames differ",
-    "constraints.ties": "joint ties differ",
-    "constraints.custom": "custom constraints differ",
-    "noise.constant": "the intensity of the noise differs",
-    "noise.control": "the intensity of the noise differs",
-    "noise.quadratic": "the intensity of the noise differs",
-    "noise.center": "the center of the noise differs",
+# What a difference in values of these names is called.
+_WORDS = {
+    "center": "the robot's centres of mass",
+    "inertia": "the robot's inertias",
+    "rotation": "the axes of the robot's joints",
+    "translation": "the positions of the robot's joints",
+    "ratio": "the ratios of the robot's mimic joints",
+    "offset": "the offsets of the robot's mimic joints",
 }
-# Constraints among the values; left out where there are none.
-OF_CONSTRAINTS = ("constraints.between", "constraints.ties", "constraints.custom")
 # Largest constraint residual of a given configuration, and of a start that is projected without request [m or rad].
 _OFF, CORRECTED = 1e-6, 0.02
 # Rank tolerance of the constraint Jacobian, relative to its largest singular value.
@@ -113,11 +76,6 @@ _RANK = 1e-9
 _NAMED = 7
 _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
 EARTH = (0.0, 0.0, -9.81)
-# Fields of the robot's tree that are arguments of the core.
-_TREE = (
-    "parent", "prismatic", "rotation", "translation", "mass", "center", "inertia", "coordinate", "ratio", "offset",
-    "origin", "loads", "carried", "periodic",
-)  # fmt: skip
 # Depth to which a joint may press into a stop, in widths of the stop.
 _STOP_DEPTH = 2.0
 
@@ -219,10 +177,6 @@ class Scene(Frozen):
             UnknownFrame: A force or constraint names a frame that the robot does not have.
         """
         require_robot(robot)
-        require_sound(robot.tree)
-        n = robot.dof
-        if robot.tree.armature.size != n:
-            raise RobotError(f"the robot's tree is damaged: it has {robot.tree.armature.size} coordinates, not {n}")
         values: dict[str, Any] = {
             "robot": robot,
             "gravity": _gravity(gravity, robot),
@@ -427,16 +381,12 @@ class Scene(Frozen):
     def inputs(self) -> Mapping[int, int]:
         """The core's row of each :class:`KinematicInput`, mapped to the coordinate of its joint."""
         rows = self.bound_constraints.rows
-        return {
-            len(rows.products) + k: tie.follower
-            for k, tie in enumerate(rows.ties)
-            if tie.follower == tie.leader and not tie.coefficients
-        }
+        return {len(rows.products) + k: tie.follower for k, tie in enumerate(rows.ties) if _is_input(tie)}
 
     @cached_property
     def rates(self) -> tuple[int, ...]:
         """For each of :attr:`inputs`, the control with its velocity at the end of a step; -1 for a linear input."""
-        return tuple(tie.rate for tie in self.bound_constraints.rows.ties if tie.follower == tie.leader)
+        return tuple(tie.rate for tie in self.bound_constraints.rows.ties if _is_input(tie))
 
     @cached_property
     def prescribed(self) -> Integers:
@@ -517,14 +467,12 @@ class Scene(Frozen):
         return self.processes + (len(self.noise.sloped) if linear else 0)
 
     @cached_property
-    def core(self) -> Core:
+    def core(self) -> Mechanism:
         """The scene in the compiled core, without noise fields that only Python can evaluate."""
-        tree, fields = self.robot.tree, self.diffusion
-        values = {name: getattr(tree, name) for name in _TREE}
-        if self.constraints:
-            values |= self._of_constrained_tree()
-        return Core.make(
-            **values,
+        fields = self.diffusion
+        return mechanism(
+            self.robot.tree,
+            **(self._of_constrained_tree() if self.constraints else {}),
             group=self.group,
             groups=int(self.group.max()) + 1,
             ends=np.array([self.robot.dof]) if self.constraints else block_ends(self.group),
@@ -594,33 +542,27 @@ class Scene(Frozen):
 
     @cached_property
     def values(self) -> Mapping[str, Floats]:
-        """The numbers that motions depend on, by the names of :data:`VALUES`; a trajectory stores them.
+        """The numbers that motions depend on, by name; a trajectory stores them.
 
+        Forces are rows (coordinate, numbers) or (body a, body b, numbers), those of springs and dampers on joints sums.
         The noise is stored as intensities (n, k); its factors of the controls are reduced to their norm. A
         :class:`varpin.CustomNoise` is not stored.
         """
-        tree, values = (
-            self.robot.tree,
-            {name: getattr(self, name) for name in ("gravity", "damping", "stiffness", "rest")},
-        )
-        values |= {
-            "actuation": self.actuation,
-            "armature": self.armature,
-            "center": tree.center,
-            "inertia": tree.inertia,
+        tree = self.robot.tree
+        values = {
+            name: getattr(self, name) for name in ("gravity", "damping", "stiffness", "rest", "armature", "actuation")
         }
-        for kind in OF_ELEMENTS:
+        values |= {name: getattr(tree, name) for name in _WORDS}
+        for kind in (kind for kind in ELEMENTS if kind not in _SUMMED):
             rows = [(each.coordinate, *each.values) for each in of_kind(self.elements, kind)]
             values[kind] = np.array(rows) if rows else np.zeros((0, 0))
-        for kind in OF_COUPLINGS:
-            if ends := [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]:
-                values[kind] = np.array(ends, dtype=np.float64)
+        for kind in dict.fromkeys(each.kind for each in self.couplings):
+            ends = [(each.a, each.b, *each.values) for each in self.couplings if each.kind == kind]
+            values[kind] = np.array(ends, dtype=np.float64)
         if self.custom is not None:
             # Functions are stored as their number only.
             values["functions"] = np.array([float(len(self.custom.parts))])
         values |= _numbers_of(self.bound_constraints.rows)
-        values |= {"rotation": tree.rotation, "translation": tree.translation}
-        values |= {"ratio": tree.ratio, "offset": tree.offset}
         if self.noise.diffusion is not None:
             fields = self.noise.diffusion
             values |= {"noise.constant": fields.constant, "noise.control": np.linalg.norm(fields.control, axis=2)}
@@ -722,7 +664,7 @@ def _unowned(rows: ConstraintRows) -> ConstraintRows:
 
 
 def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
-    """The numbers of constraints by the names of :data:`VALUES`; kinds without rows are left out."""
+    """The numbers of constraints by the names of :attr:`Scene.values`; kinds without rows are left out."""
     found: dict[str, Floats] = {}
     if rows.products:
         table = []
@@ -819,43 +761,40 @@ def tangent_basis(scene: Scene, q: Floats, off: float = _OFF) -> Floats:
 def same(one: Floats, other: Floats) -> bool:
     """Whether values of scenes agree up to rounding; versions of Pinocchio may read a robot differently by as much."""
     if one.shape != other.shape:
-        return False
+        return not (one.size or other.size)
     least = 1e-12 * max(float(np.abs(x[np.isfinite(x)]).max(initial=0.0)) for x in (one, other))
     return bool(np.isclose(one, other, rtol=1e-9, atol=least, equal_nan=True).all())
 
 
 def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> list[str]:
     """Messages on how a scene differs from the one of these :attr:`Scene.values`, with ``noise`` or without."""
-    # A file may be of another version, or of a core with forces of one's own.
-    found = [
-        f"the motion depends on {name}, which this installation of varpin does not know"
-        for name, before in values.items()
-        if name not in VALUES and before.size and (noise or not name.startswith("noise."))
-    ]
-    for name, before in ((name, values[name]) for name in VALUES if name in values):
-        now = scene.values.get(name)
-        if name.startswith("noise.") and (not noise or now is None):
+    found: list[str] = []
+    lost: list[str] = []
+    new: list[str] = []
+    for name in dict.fromkeys((*values, *scene.values)) if values else ():
+        nothing = np.zeros(0)
+        before, now = values.get(name, nothing), scene.values.get(name, nothing)
+        # A CustomNoise has no numbers.
+        if (name.startswith("noise.") and not (noise and now.size and before.size)) or same(before, now):
             continue
-        if now is not None and now.shape == before.shape:
-            if same(now, before):
-                continue
-            if name in _OF_JOINTS:
-                c = int(np.argmax(np.abs(now - before)))
-                joint = scene.robot.joint_names[c]
-                found.append(f"{name} was {before[c]:.6g} at joint {joint!r}, and is {now[c]:.6g} in the scene")
-                continue
-            if name == "gravity":
-                then, here = (f"({', '.join(f'{g:g}' for g in x)})" for x in (before, now))
-                found.append(f"gravity was {then} m/s^2, and is {here} in the scene")
-                continue
-        found.append(f"{VALUES[name]} in the scene")
-    if values:
-        found += [
-            f"{VALUES[name]} in the scene"
-            for name in (*OF_ELEMENTS, *OF_COUPLINGS, *OF_CONSTRAINTS, "functions")
-            if name not in values and np.size(scene.values.get(name, ()))
-        ]
-    return list(dict.fromkeys(found))
+        what = _WORDS.get(name, name)
+        if not (before.size and now.size):
+            # Files of earlier versions lack numbers of the robot.
+            if name not in _WORDS:
+                (lost if before.size else new).append(name)
+        elif name == "gravity":
+            then, here = (f"({', '.join(f'{g:g}' for g in x)})" for x in (before, now))
+            found.append(f"gravity was {then} m/s^2, and is {here} in the scene")
+        elif name in _OF_JOINTS and before.shape == now.shape:
+            c = int(np.argmax(np.abs(now - before)))
+            joint = scene.robot.joint_names[c]
+            found.append(f"{name} was {before[c]:.6g} at joint {joint!r}, and is {now[c]:.6g} in the scene")
+        else:
+            found.append(f"{what} differs in the scene".replace("s differs", "s differ"))
+    for has, names in (("no", lost), ("also", new)):
+        if names:
+            found.append(f"the scene has {has} {listed(names)}")
+    return found
 
 
 def require_scene(scene: object) -> Scene:
@@ -1024,6 +963,11 @@ def _refuse_noisy_servos(noise: Noise | Sequence[Noise] | None, elements: Sequen
         )
 
 
+def _is_input(tie: Tied) -> bool:
+    """Whether a tie is a :class:`KinematicInput`."""
+    return tie.follower == tie.leader and not tie.coefficients
+
+
 def _sole_control(actuation: Floats, c: int) -> int | None:
     """The control that drives coordinate ``c`` alone, with factor 1; None where there is no such control."""
     drives = np.flatnonzero(actuation[c])
@@ -1034,9 +978,7 @@ def _sole_control(actuation: Floats, c: int) -> int | None:
 def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
     """Refuse a KinematicInput whose joint has no control of its own, or also has a servo."""
     served = {servo.coordinate for servo in of_kind(elements, "PositionServo")}
-    for tie in bound.rows.ties:
-        if tie.follower != tie.leader or tie.coefficients:
-            continue
+    for tie in filter(_is_input, bound.rows.ties):
         c, name = tie.follower, robot.joint_names[tie.follower]
         if c in served:
             raise InputError(f"joint {name!r} has both a PositionServo and a KinematicInput")
@@ -1049,9 +991,8 @@ def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Eleme
 
 def _of_forces(actuation: Floats, bound: Bound) -> Floats:
     """The actuation with zeros for the positions of kinematic inputs, which absorb all forces on their joints."""
-    moved = [tie.follower for tie in bound.rows.ties if tie.follower == tie.leader and not tie.coefficients]
     forces = actuation.copy()
-    forces[moved] = 0.0
+    forces[[tie.follower for tie in filter(_is_input, bound.rows.ties)]] = 0.0
     return forces
 
 

@@ -13,7 +13,6 @@ from varpin.model.robot import require_robot as require_robot
 from varpin.model.sources import bundled_robots as bundled_robots
 from varpin.model.sources import models_dir as models_dir
 from varpin.model.sources import robot_names as robot_names
-from varpin.model.tree import require_sound as require_sound
 from varpin.model.units import ADVICE as ADVICE
 from varpin.model.units import AFAR as AFAR
 from varpin.model.units import ASIDE as ASIDE

@@ -1,6 +1,6 @@
 """Additions to a robot's description: base placement or planar base, armature, inertias from meshes."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
@@ -9,8 +9,8 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from varpin.errors import InputError, RobotError, UnknownJoint
-from varpin.model.mimic import Tie, joint_index, rebuild
-from varpin.model.sources import Description, hang_shapes
+from varpin.model.mimic import Tie, joint_index
+from varpin.model.sources import Description
 from varpin.model.urdf import build_model, build_shapes, listed, read_urdf
 from varpin.support.checks import JointValues, as_floats, broadcast_array, finite, positive
 
@@ -30,61 +30,34 @@ def on_base(description: Description, base: Base) -> Description:
     """
     if base is None:
         return description
-    if isinstance(base, str):
-        if base != "planar":
-            raise InputError(f"base must be 'planar', a transform (4, 4) or a pin.SE3, got {base!r}")
-        return _on_plane(description)
-    return _on_base(description, _transform(base))
+    if not isinstance(base, str):
+        return description.rebuilt(place=transform(base, "base", ", or 'planar'"))
+    if base != "planar":
+        raise InputError(f"base must be 'planar', a transform (4, 4) or a pin.SE3, got {base!r}")
+    if taken := sorted(set(PLANAR) & set(description.model.names)):
+        raise InputError(f"base='planar' adds the joints {', '.join(PLANAR)}, but the robot already has {taken[0]!r}")
+    kinds = pin.JointModelPX(), pin.JointModelPY(), pin.JointModelRZ()
+    return description.rebuilt(root=tuple(zip(PLANAR, kinds, strict=True)))
 
 
-def _transform(base: ArrayLike | pin.SE3) -> pin.SE3:
-    matrix = as_floats("base", base.homogeneous if isinstance(base, pin.SE3) else base)
+def transform(base: ArrayLike | pin.SE3, what: str, otherwise: str = "") -> pin.SE3:
+    """A placement from a matrix (4, 4) of rounded numbers.
+
+    Raises:
+        InputError: It is none; the message calls it ``what``, and names what it may be ``otherwise``.
+    """
+    matrix = as_floats(what, base.homogeneous if isinstance(base, pin.SE3) else base)
     if matrix.shape != (4, 4):
-        raise InputError(f"base must be 'planar', a transform (4, 4) or a pin.SE3, got shape {matrix.shape}")
+        raise InputError(f"{what} must be a transform (4, 4) or a pin.SE3{otherwise}, got shape {matrix.shape}")
     turn = matrix[:3, :3]
     rigid = np.isfinite(matrix).all() and np.abs(turn.T @ turn - np.eye(3)).max() < 1e-6 and np.linalg.det(turn) > 0.0
     if not rigid or (matrix[3] != [0.0, 0.0, 0.0, 1.0]).any():
-        raise InputError("base must be a rotation and a translation, with 0 0 0 1 in its last row")
-    # Orthonormalize a rotation of rounded numbers.
+        raise InputError(f"{what} must be a rotation and a translation, with 0 0 0 1 in its last row")
     u, _, v = np.linalg.svd(turn)
     return pin.SE3(u @ v, matrix[:3, 3])
 
 
-def _on_base(description: Description, base: pin.SE3) -> Description:
-    model = description.model.copy()
-    for joint in range(1, model.njoints):
-        if model.parents[joint] == 0:
-            model.jointPlacements[joint] = base * model.jointPlacements[joint]
-    for frame in list(model.frames)[1:]:
-        if frame.parentJoint == 0:
-            frame.placement = base * frame.placement
-    model.inertias[0] = base.act(model.inertias[0])
-    visuals = None if description.visuals is None else description.visuals.copy()
-    for shape in visuals.geometryObjects if visuals is not None else ():
-        if shape.parentJoint == 0:
-            shape.placement = base * shape.placement
-    return replace(description, model=model, visuals=visuals)
-
-
-def _on_plane(description: Description) -> Description:
-    old = description.model
-    if taken := sorted(set(PLANAR) & set(old.names)):
-        raise InputError(f"base='planar' adds the joints {', '.join(PLANAR)}, but the robot already has {taken[0]!r}")
-    root = zip(PLANAR, (pin.JointModelPX(), pin.JointModelPY(), pin.JointModelRZ()), strict=True)
-    model = rebuild(old, range(1, old.njoints), lambda joint: old.joints[joint], tuple(root))
-    shift = len(PLANAR)
-    ties = tuple(Tie(tie.follower + shift, tie.leader + shift, tie.ratio, tie.offset) for tie in description.ties)
-    visuals = None if description.visuals is None else description.visuals.copy()
-    if visuals is not None:
-        for shape in visuals.geometryObjects:
-            shape.parentJoint += shift
-        hang_shapes(visuals, old, model)
-    return replace(description, model=model, ties=ties, visuals=visuals)
-
-
-def with_rotors(
-    model: pin.Model, armature: JointValues | None, coordinates: tuple[int, ...], others: Collection[str]
-) -> None:
+def with_rotors(model: pin.Model, armature: JointValues | None, ties: Sequence[Tie], others: Collection[str]) -> None:
     """Replace the armature of the model's coordinates by a number, (n,) or values by joint name.
 
     Values of ``others``, the locked joints, are ignored.
@@ -95,6 +68,8 @@ def with_rotors(
     """
     if armature is None:
         return
+    followers = {tie.follower for tie in ties}
+    coordinates = [joint for joint in range(1, model.njoints) if joint not in followers]
     names = tuple(model.names[joint] for joint in coordinates)
     armatures = np.array([model.armature[model.joints[joint].idx_v] for joint in coordinates])
     if isinstance(armature, Mapping):

@@ -120,6 +120,11 @@ class Obstacle(Frozen):
         center = at + R @ middle
         return cls(str(name), center, center, 0.0, None, R, hull.changed(points=hull.points - middle))
 
+    @property
+    def edged(self) -> bool:
+        """Whether it is a box or a hull."""
+        return self.sides is not None or self.hull is not None
+
     def moving(self, shift: Callable[[float], ArrayLike]) -> Obstacle:
         """The obstacle displaced by ``shift(t)`` (3,) [m] from its described position at each time t [s].
 
@@ -159,36 +164,17 @@ class Obstacle(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """A capsule, a box or a hull, on a link or in the world.
+    """A body in the world or on a link.
 
     Attributes:
-        name: Name of the link or obstacle.
+        solid: The obstacle; or the link's capsule in its own axes, with the link's name.
         kinematics: Kinematics of the link; None in the world.
-        begin: One end of its axis (3,) [m]; the centre of a box or a hull.
-        end: The other end (3,) [m].
-        radius: Radius [m]; 0 for a box or a hull.
-        sides: Sides of a box (3,) [m], else None.
-        rotation: Axes of a box or a hull (3, 3).
-        hull: A hull around its centre, else None.
-        obstacle: The obstacle; None for a link.
         shifts: Displacements of the obstacle at the times in question (K, 3) [m].
     """
 
-    name: str
-    kinematics: FrameKinematics | None
-    begin: Floats
-    end: Floats
-    radius: float
-    sides: Floats | None
-    rotation: Floats
-    hull: Hull | None = None
-    obstacle: Obstacle | None = None
+    solid: Obstacle
+    kinematics: FrameKinematics | None = None
     shifts: Floats = field(default_factory=lambda: np.zeros((1, 3)))
-
-    @property
-    def edged(self) -> bool:
-        """Whether it is a box or a hull."""
-        return self.sides is not None or self.hull is not None
 
 
 class Clearance(Frozen):
@@ -196,13 +182,14 @@ class Clearance(Frozen):
 
     def __init__(self, bodies: Sequence[_Body], pairs: Sequence[tuple[int, int]]) -> None:
         self._bodies, self._pairs = tuple(bodies), tuple(pairs)
-        self.names = tuple(f"{bodies[i].name} and {bodies[k].name}" for i, k in pairs)
-        self.capsules = {body.name: (body.begin, body.end, body.radius) for body in bodies if body.kinematics}
+        self.names = tuple(f"{bodies[i].solid.name} and {bodies[k].solid.name}" for i, k in pairs)
+        links = [body.solid for body in bodies if body.kinematics]
+        self.capsules = {link.name: (link.begin, link.end, link.radius) for link in links}
 
     @property
     def moves(self) -> bool:
         """Whether an obstacle moves."""
-        return any(body.obstacle is not None and body.obstacle.shift is not None for body in self._bodies)
+        return any(body.solid.shift is not None for body in self._bodies)
 
     def over(self, times: Floats) -> Clearance:
         """The same with the obstacles at times (K,) [s].
@@ -215,10 +202,7 @@ class Clearance(Frozen):
         """
         if not self.moves:
             return self
-        bodies = [
-            body if body.obstacle is None else replace(body, shifts=body.obstacle.shifts(times))
-            for body in self._bodies
-        ]
+        bodies = [replace(body, shifts=body.solid.shifts(times)) for body in self._bodies]
         return Clearance(bodies, self._pairs)
 
     def distances(self, q: Floats) -> Floats:
@@ -248,7 +232,7 @@ class Clearance(Frozen):
         d, normal = np.empty((N, P)), np.empty((N, P, 3))
         first, second = np.empty((N, P, 3)), np.empty((N, P, 3))
         for p, (i, k) in enumerate(self._pairs):
-            one, other = self._bodies[i], self._bodies[k]
+            one, other = self._bodies[i].solid, self._bodies[k].solid
             measure = _edged if one.edged or other.edged else _round
             d[:, p], normal[:, p], first[:, p], second[:, p] = measure(one, other, placed[i], placed[k])
         return d, normal, first, second
@@ -258,16 +242,16 @@ class Clearance(Frozen):
         """Ends of the axis (N, 3) and (N, 3), and the axes of a box or a hull (N, 3, 3), in the world."""
         if body.kinematics is None:
             way = np.tile(body.shifts, (len(q) // len(body.shifts), 1))
-            ends = (x + way for x in (body.begin, body.end))
-            return *ends, np.broadcast_to(body.rotation, (len(q), 3, 3))  # type: ignore[return-value]
+            ends = (x + way for x in (body.solid.begin, body.solid.end))
+            return *ends, np.broadcast_to(body.solid.rotation, (len(q), 3, 3))  # type: ignore[return-value]
         R, p = body.kinematics.placements(q)
-        return R @ body.begin + p, R @ body.end + p, R @ body.rotation
+        return R @ body.solid.begin + p, R @ body.solid.end + p, R @ body.solid.rotation
 
 
 _Placed = tuple[Floats, Floats, Floats]
 
 
-def _round(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
+def _round(one: Obstacle, other: Obstacle, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
     """Distances of two capsules: that of their axes less both radii (Ericson, "Real-time collision detection", 5.1.9).
 
     Returns:
@@ -299,7 +283,7 @@ def _round(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Flo
     )
 
 
-def _edged(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
+def _edged(one: Obstacle, other: Obstacle, here: _Placed, there: _Placed) -> tuple[Floats, Floats, Floats, Floats]:
     """As :func:`_round`, for two bodies of which at least one is a box or a hull, computed by coal."""
     N = len(here[0])
     d, normal, first, second = np.empty(N), np.empty((N, 3)), np.empty((N, 3)), np.empty((N, 3))
@@ -315,7 +299,7 @@ def _edged(one: _Body, other: _Body, here: _Placed, there: _Placed) -> tuple[Flo
     return d, normal, first, second
 
 
-def _shape(body: _Body) -> Any:
+def _shape(body: Obstacle) -> Any:
     if body.sides is not None:
         return coal.Box(*map(float, body.sides))
     if body.hull is not None:
@@ -324,7 +308,7 @@ def _shape(body: _Body) -> Any:
     return coal.Capsule(body.radius, length) if length > 0.0 else coal.Sphere(body.radius)
 
 
-def _transform(body: _Body, at: _Placed, k: int) -> Any:
+def _transform(body: Obstacle, at: _Placed, k: int) -> Any:
     begin, end, R = at[0][k], at[1][k], at[2][k]
     if not body.edged:
         way = end - begin
@@ -384,18 +368,15 @@ def clearance(
         # A link that no joint moves is fixed in the world.
         if body < 0:
             _, R, p = place_of_frame(robot.free_model, name, robot.name)
-            bodies.append((body, _Body(name, None, R @ shape[0] + p, R @ shape[1] + p, shape[2], None, np.eye(3))))
-        else:
-            bodies.append((body, _Body(name, frame_kinematics(robot, name), *shape, None, np.eye(3))))
+            shape = R @ shape[0] + p, R @ shape[1] + p, shape[2]
+        solid = Obstacle(name, *shape, None, np.eye(3))
+        bodies.append((body, _Body(solid, None if body < 0 else frame_kinematics(robot, name))))
     parts = [part for _, part in bodies]
     moving = [i for i, part in enumerate(parts) if part.kinematics is not None]
-    pairs = []
-    if itself:
-        pairs = _of_links(robot, bodies, _disabled(robot, srdf))
+    pairs = _of_links(robot, bodies, _disabled(robot, srdf)) if itself else []
     for obstacle in obstacles:
         pairs += [(i, len(parts)) for i in moving]
-        solid = (obstacle.begin, obstacle.end, obstacle.radius, obstacle.sides, obstacle.rotation, obstacle.hull)
-        parts.append(_Body(obstacle.name, None, *solid, obstacle=obstacle))
+        parts.append(_Body(obstacle))
     if not pairs:
         raise InputError(
             f"robot {robot.name!r} has nothing to keep clear of: give obstacles, or itself=True, and links with shapes "
@@ -414,7 +395,7 @@ def _of_links(
         for k, (other, second) in enumerate(bodies[:i]):
             near = one == other or (one >= 0 and parent[one] == other) or (other >= 0 and parent[other] == one)
             still = first.kinematics is None and second.kinematics is None
-            if not near and not still and frozenset((first.name, second.name)) not in disabled:
+            if not near and not still and frozenset((first.solid.name, second.solid.name)) not in disabled:
                 found.append((k, i))
     if not found:
         return []

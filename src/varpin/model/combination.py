@@ -8,17 +8,14 @@ from dataclasses import replace
 from itertools import chain
 from types import MappingProxyType
 
-import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from varpin.errors import InputError
-from varpin.model.additions import on_base
+from varpin.model.additions import transform
 from varpin.model.equalities import prefixed
-from varpin.model.mimic import Tie, rebuild, tied_model
+from varpin.model.mimic import rebuild
 from varpin.model.robot import Part, Robot
-from varpin.model.sources import Description
-from varpin.model.tree import flatten
 
 logger = logging.getLogger(__name__)
 
@@ -61,28 +58,25 @@ def combine(
         raise InputError(f"prefixes must be one string for each of {len(robots)} robots, got {prefixes!r}")
     if twice := _twice(robots, given):
         raise InputError(f"with the prefixes {given} there are two joints or frames named {twice[0]!r}")
-    model, ties, parts = pin.Model(), [], []
-    model.gravity = robots[0].model.gravity
+    model = pin.Model()
+    model.name, model.gravity = "+".join(robot.name for robot in robots), robots[0].model.gravity
     if any((robot.model.gravity.linear != model.gravity.linear).any() for robot in robots):
         logger.warning("robots of different gravity are combined: that of %r is the default of scenes", robots[0].name)
-    for robot, place, prefix in zip(robots, placements, given, strict=True):
-        part = robot.free_model if place is None else _placed(robot, place)
-        shift = model.njoints - 1
-        rebuild(part, range(1, part.njoints), part.joints.__getitem__, onto=model, prefix=prefix)
-        ties += [Tie(tie.follower + shift, tie.leader + shift, tie.ratio, tie.offset) for tie in robot.ties]
-        moved = pin.SE3.Identity() if place is None else pin.SE3(_homogeneous(place))
-        parts.append(Part(robot, prefix, shift, moved))
-    model.name = "+".join(robot.name for robot in robots)
-    followers = {tie.follower for tie in ties}
-    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
+    places = [
+        None if place is None else transform(place, f"placement of {robot.name!r}")
+        for robot, place in zip(robots, placements, strict=True)
+    ]
+    parts = tuple(map(Part, robots, given, places))
+    ties = tuple(
+        tie
+        for robot, prefix, place in parts
+        for tie in rebuild(robot.free_model, onto=model, prefix=prefix, place=place).ties(robot.ties)
+    )
     pairs = list(zip(robots, given, strict=True))
     return Robot(
-        name=model.name,
-        model=tied_model(model, ties),
-        joint_names=tuple(model.names[joint] for joint in coordinates),
-        free_model=model,
-        ties=tuple(ties),
-        tree=flatten(model, tuple(ties), coordinates),
+        model.name,
+        model,
+        ties,
         locked=MappingProxyType({word + name: at for robot, word in pairs for name, at in robot.locked.items()}),
         package_dirs=tuple(dict.fromkeys(chain.from_iterable(robot.package_dirs for robot in robots))),
         group_states=tuple(
@@ -92,21 +86,10 @@ def combine(
             for robot, word in pairs
             for state in robot.group_states
         ),
-        parts=tuple(parts),
+        parts=parts,
         loops=tuple((word + a, word + b) for robot, word in pairs for a, b in robot.loops),
         equalities=tuple(prefixed(each, word) for robot, word in pairs for each in robot.equalities),
     )
-
-
-def _placed(robot: Robot, place: ArrayLike | pin.SE3) -> pin.Model:
-    try:
-        return on_base(Description(robot.name, robot.free_model), place).model
-    except InputError as error:
-        raise InputError(f"placement of {robot.name!r}: {error}") from None
-
-
-def _homogeneous(place: ArrayLike | pin.SE3) -> ArrayLike:
-    return place.homogeneous if isinstance(place, pin.SE3) else np.asarray(place, dtype=np.float64)
 
 
 def _names(robot: Robot) -> set[str]:

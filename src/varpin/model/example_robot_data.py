@@ -48,53 +48,17 @@ FIXED_BASE: dict[str, str] = {
     "z1": "z1_description/urdf/z1.urdf",
 }
 
-# SRDF files with rotor inertias and gear ratios, which give the armature.
-ROTORS: dict[str, str] = {"talos_arm": "talos_data/srdf/talos.srdf"}
+# SRDF files that are not beside their robots: that of talos has the rotors of its arm.
+SRDF: dict[str, str] = {"talos_arm": "talos_data/srdf/talos.srdf"}
 
 # Robots that walk, fly or swim: example-robot-data gives them a free-flyer.
-FLOATING_BASE = frozenset(
-    [
-        "a1",
-        "alexander",
-        "anymal",
-        "anymal_c",
-        "anymal_kinova",
-        "b1",
-        "b1_z1",
-        "bluevolta_bravo7_gripper",
-        "bluevolta_bravo7_no_ee",
-        "bolt",
-        "borinot",
-        "cassie",
-        "centauro",
-        "falcon_bravo7_gripper",
-        "falcon_bravo7_no_ee",
-        "g1",
-        "g1_with_hands",
-        "go1",
-        "go2",
-        "hector",
-        "hextilt",
-        "human",
-        "hyq",
-        "icub",
-        "icub_reduced",
-        "iris",
-        "laikago",
-        "pr2",
-        "quadruped",
-        "romeo",
-        "simple_humanoid",
-        "simple_humanoid_classical",
-        "solo12",
-        "solo8",
-        "talos",
-        "talos_box",
-        "talos_full",
-        "talos_full_box",
-        "talos_legs",
-    ]
-)
+FLOATING_BASE = frozenset([
+    "a1", "alexander", "anymal", "anymal_c", "anymal_kinova", "b1", "b1_z1", "bluevolta_bravo7_gripper",
+    "bluevolta_bravo7_no_ee", "bolt", "borinot", "cassie", "centauro", "falcon_bravo7_gripper",
+    "falcon_bravo7_no_ee", "g1", "g1_with_hands", "go1", "go2", "hector", "hextilt", "human", "hyq", "icub",
+    "icub_reduced", "iris", "laikago", "pr2", "quadruped", "romeo", "simple_humanoid", "simple_humanoid_classical",
+    "solo12", "solo8", "talos", "talos_box", "talos_full", "talos_full_box", "talos_legs",
+])  # fmt: skip
 
 
 def locate(relative: str) -> Path:

@@ -73,13 +73,17 @@ def faults(model: pin.Model, inertials: Iterable[Inertial]) -> Iterator[str]:
         inertials: Inertias of the links of a URDF; if none of them moves, those of the model's bodies are checked.
     """
     links = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
-    if not (found := [(x.link, x.mass, x.inertia) for x in inertials if links.get(x.link, 0)]):
-        names = {joint: name for name, joint in reversed(links.items())}
-        bodies = [(names.get(j, model.names[j]), model.inertias[j]) for j in range(1, model.njoints)]
-        found = [(name, body.mass, np.array(body.inertia)) for name, body in bodies]
+    found = [each for each in inertials if links.get(each.link, 0)] or inertials_of(model)
     return one_of_each(
-        (kind, name, sentence)
-        for name, mass, inertia in found
-        if np.isfinite(inertia).all()
-        for kind, sentence in [fault(name, mass, principal_moments(inertia))]
+        (kind, each.link, sentence)
+        for each in found
+        if np.isfinite(each.inertia).all()
+        for kind, sentence in [fault(each.link, each.mass, principal_moments(each.inertia))]
     )
+
+
+def inertials_of(model: pin.Model) -> list[Inertial]:
+    """The bodies of a model's joints, with the name of their first link, or of the joint if it has no link."""
+    links = {frame.parentJoint: frame.name for frame in reversed(model.frames) if frame.type == pin.FrameType.BODY}
+    bodies = list(enumerate(model.inertias))[1:]
+    return [Inertial(links.get(j, model.names[j]), x.mass, np.array(x.lever), np.array(x.inertia)) for j, x in bodies]

@@ -6,7 +6,7 @@ followers are tied to their leaders, and a free one in which every joint is inde
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from varpin.model.urdf import Mimic
 
 logger = logging.getLogger(__name__)
 
+_POSITIONS = ("lowerPositionLimit", "upperPositionLimit")
 # Attributes of a pin.Model with one number for each degree of freedom.
 JOINT_PARAMETERS = (
     "lowerVelocityLimit",
@@ -145,28 +146,15 @@ def depth_first(model: pin.Model, ties: Sequence[Tie]) -> list[int]:
     return order[1:]
 
 
-def reordered(model: pin.Model, ties: Sequence[Tie], order: Sequence[int]) -> tuple[pin.Model, tuple[Tie, ...]]:
-    """``model`` and ``ties`` with the joints in another order."""
-    new_index = {joint: k + 1 for k, joint in enumerate(order)}
-    new_ties = tuple(Tie(new_index[tie.follower], new_index[tie.leader], tie.ratio, tie.offset) for tie in ties)
-    return rebuild(model, order, lambda joint: model.joints[joint]), new_ties
-
-
-def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
-    """``model`` without mimic joints, and the ties that it had."""
-    ties = []
-    mimics = [j for j in range(1, model.njoints) if model.joints[j].nv == 0 and "Mimic" in model.joints[j].shortname()]
-    if not mimics:
-        return model, ()
+def of_mimics(model: pin.Model) -> tuple[tuple[Tie, ...], dict[int, pin.JointModel]]:
+    """The ties of a model's mimic joints, and independent joints in their place."""
+    ties, free = [], {}
     leaders = dict(zip(model.mimicking_joints, model.mimicked_joints, strict=True))
-
-    def free_joint(joint: int) -> pin.JointModel:
-        if joint not in mimics:
-            return model.joints[joint]
+    for joint, leader in leaders.items():
         follower = model.joints[joint].extract()
         if follower.scaling == 0.0:
             raise RobotError(
-                f"joint {model.names[joint]!r} mimics {model.names[leaders[joint]]!r} with multiplier 0, for which "
+                f"joint {model.names[joint]!r} mimics {model.names[leader]!r} with multiplier 0, for which "
                 "Pinocchio keeps no axis: make it a fixed joint, or load the URDF file by path"
             )
         data = model.joints[joint].createData()
@@ -174,99 +162,130 @@ def untied_model(model: pin.Model) -> tuple[pin.Model, tuple[Tie, ...]]:
         subspace = np.asarray(data.S, dtype=float).reshape(6)
         slides = bool(subspace[:3].any())
         axis = (subspace[:3] if slides else subspace[3:]) / follower.scaling
-        tie = Tie(joint, leaders[joint], float(follower.scaling), float(follower.offset))
+        ties.append(tie := Tie(joint, leader, float(follower.scaling), float(follower.offset)))
         _require_usable(tie, model)
-        ties.append(tie)
-        return pin.JointModelPrismaticUnaligned(axis) if slides else pin.JointModelRevoluteUnaligned(axis)
-
-    return rebuild(model, range(1, model.njoints), free_joint), tuple(ties)
+        free[joint] = pin.JointModelPrismaticUnaligned(axis) if slides else pin.JointModelRevoluteUnaligned(axis)
+    return tuple(ties), free
 
 
-def joint_frames(model: pin.Model) -> list[int]:
-    """Indices of the frames of joints: of type JOINT, with the name of their joint."""
-    return [
-        index
+def joint_frames(model: pin.Model) -> dict[int, int]:
+    """The index of the frame of each joint that has one: of type JOINT, with the joint's name."""
+    return {
+        frame.parentJoint: index
         for index, frame in enumerate(model.frames)
-        if frame.parentJoint and frame.type == pin.FrameType.JOINT and frame.name == model.names[frame.parentJoint]
-    ]
+        if frame.type == pin.FrameType.JOINT and frame.name == model.names[frame.parentJoint]
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Rebuilt:
+    """A model rebuilt from another one, by :func:`rebuild`.
+
+    Attributes:
+        model: The new model.
+        joints: The joint of the new model that carries the bodies of each old joint.
+        places: The placement of each old joint in that one.
+        frames: The index in the new model of each old frame.
+        held: The old joints that are no joints of the new one.
+    """
+
+    model: pin.Model
+    joints: Mapping[int, int]
+    places: Mapping[int, pin.SE3]
+    frames: Mapping[int, int]
+    held: Collection[int]
+
+    def ties(self, ties: Sequence[Tie]) -> tuple[Tie, ...]:
+        """Those of the ties whose joints are still there."""
+        return tuple(
+            Tie(self.joints[tie.follower], self.joints[tie.leader], tie.ratio, tie.offset)
+            for tie in ties
+            if tie.follower not in self.held
+        )
+
+    def shapes(self, shapes: pin.GeometryModel | None) -> pin.GeometryModel | None:
+        """A copy of shapes of the old model, on the new one."""
+        if shapes is None:
+            return None
+        hung = shapes.copy()
+        for shape in hung.geometryObjects:
+            shape.placement = self.places[shape.parentJoint] * shape.placement
+            shape.parentFrame = self.frames.get(shape.parentFrame, shape.parentFrame)
+            shape.parentJoint = self.joints[shape.parentJoint]
+        return hung
 
 
 def rebuild(
     model: pin.Model,
-    order: Sequence[int],
-    joint_of: Callable[[int], pin.JointModel],
+    *,
+    order: Sequence[int] = (),
+    kinds: Mapping[int, pin.JointModel] | None = None,
+    held: Mapping[int, pin.SE3] | None = None,
     root: Sequence[tuple[str, pin.JointModel]] = (),
+    place: pin.SE3 | None = None,
     onto: pin.Model | None = None,
     prefix: str = "",
-) -> pin.Model:
-    """``model`` rebuilt with its joints in another order or of another kind.
+) -> Rebuilt:
+    """Rebuild a model with other joints, or elsewhere. Links, frames, limits and armature are kept.
 
-    Links, frames, limits and armature are kept.
+    Every joint of the new model has a frame.
 
     Args:
         model: The model.
-        order: Its joints in the new order, without the universe.
-        joint_of: The new joint model of each joint.
-        root: Names and models of joints to insert in series between the universe and the model's root joints.
+        order: Its joints in their new order, without the universe; as they are if left out.
+        kinds: Joints of another kind.
+        held: Joints to fix, and their motion there.
+        root: Names and kinds of joints to insert in series between the universe and the model's root joints.
+        place: Placement of the model's universe; the identity if left out.
         onto: A model to append to, after its joints; a new one if left out.
         prefix: Prefix of the names of joints and frames.
     """
-    new = pin.Model() if onto is None else onto
-    if onto is None:
-        new.name = model.name
-        new.gravity = model.gravity
-    new_index = {0: 0}
+    kinds, held, new = kinds or {}, held or {}, onto
+    if new is None:
+        new = pin.Model()
+        new.name, new.gravity = model.name, model.gravity
+    joints, places, frames = {0: 0}, {0: place or pin.SE3.Identity()}, {0: 0}
     for name, kind in root:
-        new_index[0] = new.addJoint(new_index[0], kind, pin.SE3.Identity(), name)
-    new.appendBodyToJoint(new_index[0], model.inertias[0], pin.SE3.Identity())
-    for joint in order:
-        source = joint_of(joint)
-        new_index[joint] = new.addJoint(
-            new_index[model.parents[joint]], source, model.jointPlacements[joint], prefix + model.names[joint]
-        )
-        new.appendBodyToJoint(new_index[joint], model.inertias[joint], pin.SE3.Identity())
-        old, copy = model.joints[joint], new.joints[new_index[joint]]
-        if old.nq == copy.nq:
-            for limits in ("lowerPositionLimit", "upperPositionLimit"):
-                getattr(new, limits)[copy.idx_q : copy.idx_q + copy.nq] = getattr(model, limits)[
-                    old.idx_q : old.idx_q + old.nq
-                ]
-        if old.nv == copy.nv:
-            for limits in JOINT_PARAMETERS:
-                getattr(new, limits)[copy.idx_v : copy.idx_v + copy.nv] = getattr(model, limits)[
-                    old.idx_v : old.idx_v + old.nv
-                ]
-    # Joint frames first: pin.buildReducedModel looks for a frame's joint among the preceding frames.
-    old_frames = {model.frames[index].parentJoint: index for index in joint_frames(model)}
-    new_frames, frames = {0: 0}, {0: 0}
-    for joint in range(1, len(root) + 1):
-        new_frames[0] = frames[0] = new.addJointFrame(joint, new_frames[0])
-    for joint in order:
-        new_frames[joint] = new.addJointFrame(new_index[joint], new_frames[model.parents[joint]])
-        if joint in old_frames:
-            frames[old_frames[joint]] = new_frames[joint]
-    for index, frame in enumerate(model.frames):
-        if index not in frames:
-            frames[index] = new.addFrame(
-                pin.Frame(
-                    prefix + frame.name,
-                    new_index[frame.parentJoint],
-                    frames.get(frame.parentFrame, frames[0]),
-                    frame.placement,
-                    frame.type,
-                    pin.Inertia.Zero(),
-                ),
-                False,
-            )
-    repair_velocity_limits(new)
-    return new
+        joints[0] = new.addJoint(joints[0], kind, pin.SE3.Identity(), name)
+        frames[0] = new.addJointFrame(joints[0], frames[0])
+    new.appendBodyToJoint(joints[0], model.inertias[0], places[0])
+    for joint in order or range(1, model.njoints):
+        parent, old = model.parents[joint], model.joints[joint]
+        joints[joint], places[joint] = joints[parent], places[parent] * model.jointPlacements[joint]
+        if joint in held:
+            places[joint] = places[joint] * held[joint]
+        else:
+            index = new.addJoint(joints[joint], kinds.get(joint, old), places[joint], prefix + model.names[joint])
+            joints[joint], places[joint] = index, pin.SE3.Identity()
+            copy = new.joints[index]
+            for names, first, own, size in (
+                (_POSITIONS, copy.idx_q, old.idx_q, old.nq if old.nq == copy.nq else 0),
+                (JOINT_PARAMETERS, copy.idx_v, old.idx_v, old.nv if old.nv == copy.nv else 0),
+            ):
+                for name in names:
+                    getattr(new, name)[first : first + size] = getattr(model, name)[own : own + size]
+        new.appendBodyToJoint(joints[joint], model.inertias[joint], places[joint])
+    framed = joint_frames(model)
+    missing: dict[int, int] = {}
+    for joint, carrier in joints.items():
+        if joint and joint not in framed and joint not in held:
+            missing[joint] = new.addJointFrame(carrier, missing.get(model.parents[joint], frames[0]))
+    for index, frame in list(enumerate(model.frames))[1:]:
+        joint, kind = frame.parentJoint, frame.type
+        if framed.get(joint) == index and joint in held:
+            kind = pin.FrameType.FIXED_JOINT
+        up = frames.get(frame.parentFrame, frames[0])
+        placement = places[joint] * frame.placement
+        copied = pin.Frame(prefix + frame.name, joints[joint], up, placement, kind, pin.Inertia.Zero())
+        frames[index] = new.addFrame(copied, False)
+    _repair_velocity_limits(new)
+    return Rebuilt(new, joints, places, frames, held)
 
 
-def repair_velocity_limits(model: pin.Model) -> None:
+def _repair_velocity_limits(model: pin.Model) -> None:
     """Replace a lower velocity limit above the upper one by -upper.
 
-    Pinocchio's addJoint sets the lower limit to the largest double with the wrong sign, and its buildReducedModel then
-    rejects the model.
+    Pinocchio's addJoint sets the lower limit to the largest double with the wrong sign.
     """
     lower, upper = np.array(model.lowerVelocityLimit), np.array(model.upperVelocityLimit)
     model.lowerVelocityLimit = np.where(lower > upper, -upper, lower)

@@ -7,7 +7,6 @@ import logging
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,21 +40,6 @@ _GREY = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 _PLATE = 5e-4
 
 
-@dataclass(frozen=True, eq=False)
-class Mjcf:
-    """An MJCF file, read by :func:`read_mjcf`.
-
-    Attributes:
-        model: Its bodies, joints, sites and keyframes, and its gravity.
-        remarks: What the model leaves out, in words.
-        equalities: Its active equality constraints.
-    """
-
-    model: pin.Model
-    remarks: tuple[str, ...]
-    equalities: tuple[Equality, ...]
-
-
 def is_mjcf(path: Path) -> bool:
     """Whether a file is an MJCF by its root element; only ``.xml`` and ``.mjcf`` files are opened."""
     return path.suffix.lower() in (".xml", ".mjcf") and root_tag(path) in ("mujoco", "mujocoinclude")
@@ -73,8 +57,12 @@ def root_tag(path: Path) -> str:
         return ""
 
 
-def read_mjcf(path: Path) -> Mjcf:
+def read_mjcf(path: Path) -> tuple[pin.Model, tuple[str, ...], tuple[Equality, ...]]:
     """Read an MJCF file.
+
+    Returns:
+        Its bodies, joints, sites, keyframes and gravity as a model; what that leaves out, in words; and the file's
+        active equality constraints.
 
     Raises:
         MissingDependency: MuJoCo is not installed.
@@ -91,7 +79,7 @@ def read_mjcf(path: Path) -> Mjcf:
         for each in equalities
         if isinstance(each, Closure) and each.plane is not None
     ]
-    return Mjcf(walk.model, tuple(remarks), equalities)
+    return walk.model, tuple(remarks), equalities
 
 
 def mjcf_shapes(path: Path) -> tuple[pin.Model, pin.GeometryModel]:

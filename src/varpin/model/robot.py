@@ -2,12 +2,12 @@
 
 import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -21,24 +21,24 @@ from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
 from varpin.model.kinematics import place_on_body
 from varpin.model.meshes import Reader, read_mesh, with_own_meshes
-from varpin.model.mimic import Tie, joint_frames, joint_index, rebuild, tied_model
+from varpin.model.mimic import Tie, joint_index, tied_model
 from varpin.model.mjcf import mjcf_shapes
 from varpin.model.payload import Payload, carry
-from varpin.model.sources import Description, describe, hang_shapes
+from varpin.model.sources import Description, describe
 from varpin.model.srdf import Posture, of_joints
 from varpin.model.tree import (
     flatten,
     is_unbounded,
     joint_axis,
+    mechanism,
     place_of_frame,
     to_pinocchio,
-    tree_mass_matrix,
 )
-from varpin.model.units import ADVICE, NO_LIMIT, looks_like_degrees
-from varpin.model.urdf import build_model, build_shapes, read_urdf
+from varpin.model.units import ADVICE, NO_LIMIT, looks_like_degrees, slides_hint
+from varpin.model.urdf import build_model, build_shapes, listed, read_urdf
+from varpin.support import markup
 from varpin.support.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
 from varpin.support.frozen import Frozen
-from varpin.support.markup import facts, listed, table
 
 logger = logging.getLogger(__name__)
 
@@ -50,9 +50,8 @@ class Part(NamedTuple):
     """A robot within a combined one."""
 
     robot: "Robot"
-    prefix: str  # prefix of its joint and frame names in the combined model
-    shift: int  # joint index in the combined model minus joint index in the robot
-    place: pin.SE3  # placement of its world in the combined world
+    prefix: str  # of its joint and frame names in the combined model
+    place: pin.SE3 | None  # placement of its world in the combined one
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +63,8 @@ class Robot(Frozen):
 
     Attributes:
         name: Name of the file, the bundled robot or the model.
-        model: The Pinocchio model with mimic joints tied to their leaders; ``model.nv == dof``. A continuous joint
-            takes two entries of Pinocchio's configuration: see :meth:`configuration`.
-        joint_names: Names of the joints that are coordinates, in order.
         free_model: The model with mimic joints independent, on which Pinocchio computes every derivative.
         ties: The mimic joints, by index in ``free_model``.
-        tree: Flat arrays for the core.
         locked: Locked joints and their positions [rad or m].
         urdf: The URDF or xacro file the robot was read from, or None.
         expanded: The URDF text of a xacro file.
@@ -84,11 +79,8 @@ class Robot(Frozen):
     """
 
     name: str
-    model: pin.Model
-    joint_names: tuple[str, ...]
     free_model: pin.Model = field(repr=False)
     ties: tuple[Tie, ...] = field(repr=False)
-    tree: Tree = field(repr=False)
     locked: Mapping[str, float | tuple[float, ...]] = field(default_factory=lambda: MappingProxyType({}))
     urdf: Path | None = None
     expanded: str | None = field(default=None, repr=False)
@@ -113,14 +105,44 @@ class Robot(Frozen):
             ("mass that moves [kg]", float(self.tree.mass.sum())),
         ]
         if self.locked:
-            rows.append(("locked", listed(self.locked)))
+            rows.append(("locked", markup.listed(self.locked)))
         if self.ties:
-            rows.append(("tied to others", listed(self.free_model.names[tie.follower] for tie in self.ties)))
+            rows.append(("tied to others", markup.listed(self.free_model.names[tie.follower] for tie in self.ties)))
         if self.loops:
-            rows.append(("loops for a scene to close", listed(f"{a} on {b}" for a, b in self.loops)))
+            rows.append(("loops for a scene to close", markup.listed(f"{a} on {b}" for a, b in self.loops)))
         rows.append(("end effector", self.end_effector))
         head = ("joint", "lower [rad or m]", "upper", "velocity [1/s]", "torque [N m or N]")
-        return facts(f"Robot {self.name}", rows, table(head, [(name, *map(float, row)) for name, *row in columns]))
+        return markup.facts(
+            f"Robot {self.name}", rows, markup.table(head, [(name, *map(float, row)) for name, *row in columns])
+        )
+
+    @cached_property
+    def model(self) -> pin.Model:
+        """The Pinocchio model with mimic joints tied to their leaders; ``model.nv == dof``.
+
+        A continuous joint takes two entries of Pinocchio's configuration: see :meth:`configuration`.
+        """
+        return tied_model(self.free_model, self.ties)
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints that are coordinates, in order."""
+        return tuple(self.free_model.names[joint] for joint in self._coordinates)
+
+    @property
+    def _coordinates(self) -> tuple[int, ...]:
+        """Indices in ``free_model`` of the joints that are coordinates."""
+        followers = {tie.follower for tie in self.ties}
+        return tuple(joint for joint in range(1, self.free_model.njoints) if joint not in followers)
+
+    @cached_property
+    def tree(self) -> Tree:
+        """Flat arrays for the core.
+
+        Raises:
+            UnsupportedJoint: A joint has no single axis.
+        """
+        return flatten(self.free_model, self.ties, self._coordinates)
 
     @cached_property
     def dof(self) -> int:
@@ -193,7 +215,8 @@ class Robot(Frozen):
         q = as_floats("q", q)
         if q.shape[-1:] != (self.dof,):
             raise InputError(f"q must have shape (..., {self.dof}), got {q.shape}")
-        return self._spread(self.model, q)
+        order = [self.joint_names.index(name) for name in self.model.names if name in self.joint_names]
+        return to_pinocchio(self.model, q[..., order])
 
     def free_positions(self, q: ArrayLike) -> Floats:
         """``q`` (..., n) as configurations (..., free_model.nq) of ``free_model``."""
@@ -286,13 +309,15 @@ class Robot(Frozen):
         """
         return self._limit("effortLimit", 1)
 
-    def limit_remarks(self) -> list[str]:
-        """A sentence about mimic joints whose limits are left out, if there are any."""
-        left_out = self._position_limits[2]
-        if not left_out:
-            return []
-        more = f" (and {len(left_out) - 1} more)" if len(left_out) > 1 else ""
-        return [f"the limits of mimic joint {left_out[0]!r}{more} leave the joint that it follows no room: left out"]
+    def limit_remarks(self) -> Iterator[str]:
+        """What is odd about limits, one sentence a kind."""
+        bounds = zip(self.joint_names, *self.position_limits, strict=True)
+        if tight := [f"{low:g} and {high:g} of {name!r}" for name, low, high in bounds if not low < high]:
+            yield f"limits leave no room to move (lock= holds a joint): {listed(tight, 'joints')}"
+        if names := self._position_limits[2]:
+            joints = listed(map(repr, names), "mimic joints")
+            yield f"limits that leave the joint that a mimic joint follows no room are left out: those of {joints}"
+        yield from filter(None, [slides_hint(self)])
 
     @property
     def damping(self) -> Floats:
@@ -305,8 +330,7 @@ class Robot(Frozen):
     @cached_property
     def slides(self) -> NDArray[np.bool_]:
         """Whether each coordinate (n,) belongs to a prismatic joint and is in [m]."""
-        index = joint_index(self.model)
-        sliding = np.array([joint_axis(self.model, index[name])[0] for name in self.joint_names], dtype=bool)
+        sliding = self.tree.prismatic[np.array(self._coordinates) - 1] == 1
         sliding.setflags(write=False)
         return sliding
 
@@ -342,20 +366,6 @@ class Robot(Frozen):
                 limit[c] = min(limit[c], value * ratio**power)
         limit.setflags(write=False)
         return limit
-
-    def _spread(self, model: pin.Model, q: Floats) -> Floats:
-        configuration = np.empty((*q.shape[:-1], model.nq))
-        index = joint_index(model)
-        for c, name in enumerate(self.joint_names):
-            joint = model.joints[index[name]]
-            if joint.nq == 2:
-                configuration[..., joint.idx_q], configuration[..., joint.idx_q + 1] = (
-                    np.cos(q[..., c]),
-                    np.sin(q[..., c]),
-                )
-            else:
-                configuration[..., joint.idx_q] = q[..., c]
-        return configuration
 
 
 def require_robot(robot: object, taker: str = "") -> Robot:
@@ -430,9 +440,18 @@ def load_robot(
     """
     if not is_one_of(inertia, ("file", "meshes")):
         raise InputError(f"inertia must be 'file' or 'meshes', got {inertia!r}")
-    shaped = inertia == "meshes"
     robot, description = _built(
-        source, package_dirs, lock, keep, mimic, payload, xacro_args, srdf, base, armature, density if shaped else None
+        source,
+        package_dirs=package_dirs,
+        lock=lock,
+        keep=keep,
+        mimic=mimic,
+        payload=payload,
+        xacro_args=xacro_args,
+        srdf=srdf,
+        base=base,
+        armature=armature,
+        density=density if inertia == "meshes" else None,
     )
     wrong = (*description.faults, *faults(robot.free_model, description.inertials))
     for remark in (*description.remarks, *wrong, *robot.limit_remarks()):
@@ -441,7 +460,39 @@ def load_robot(
     return robot
 
 
-def build_robot(
+def hold_joints(robot: Robot, positions: Mapping[str, ArrayLike]) -> Robot:
+    """A robot that is no combined one, with further joints locked at ``positions`` by name [rad or m].
+
+    Raises:
+        UnknownJoint: The robot has no such joint.
+        RobotError: No joint is left.
+    """
+    whole = Description(robot.name, robot.free_model, robot.ties, visuals=robot.visuals)
+    description, locked = _lock(whole, positions)
+    left = robot.changed(
+        free_model=description.model,
+        ties=description.ties,
+        locked=MappingProxyType({**robot.locked, **locked}),
+        visuals=description.visuals,
+        loops=_open(robot.loops, description.model),
+    )
+    _require_tree(left)
+    return left
+
+
+def _require_tree(robot: Robot, why: str = "") -> None:
+    """Refuse a robot without a tree; ``why`` none of its joints moves."""
+    if not robot.joint_names:
+        raise RobotError(f"robot {robot.name!r} has no joint that moves{why}")
+    robot.tree  # noqa: B018
+
+
+def build_robot(source: object, **options: Any) -> Robot:
+    """:func:`load_robot` without its checks of inertia, to inspect faulty models."""
+    return _built(source, **options)[0]
+
+
+def _built(
     source: object,
     *,
     package_dirs: Sequence[str | os.PathLike[str]] | None = None,
@@ -453,50 +504,9 @@ def build_robot(
     srdf: str | os.PathLike[str] | None = None,
     base: Base = None,
     armature: JointValues | None = None,
-) -> Robot:
-    """:func:`load_robot` without its checks of inertia, to inspect faulty models."""
-    return _built(source, package_dirs, lock, keep, mimic, payload, xacro_args, srdf, base, armature, None)[0]
-
-
-def hold_joints(robot: Robot, positions: Mapping[str, ArrayLike]) -> Robot:
-    """A robot that is no combined one, with further joints locked at ``positions`` by name [rad or m].
-
-    Raises:
-        UnknownJoint: The robot has no such joint.
-        RobotError: No joint is left.
-    """
-    whole = Description(robot.name, robot.free_model, robot.ties, visuals=robot.visuals)
-    model, ties, visuals, locked = _lock(whole, positions)
-    followers = {tie.follower for tie in ties}
-    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
-    if not coordinates:
-        raise RobotError(f"robot {robot.name!r} has no joint left that moves")
-    return robot.changed(
-        model=tied_model(model, ties),
-        joint_names=tuple(model.names[joint] for joint in coordinates),
-        free_model=model,
-        ties=ties,
-        tree=flatten(model, ties, coordinates),
-        locked=MappingProxyType({**robot.locked, **locked}),
-        visuals=visuals,
-        loops=_open(robot.loops, model),
-    )
-
-
-def _built(
-    source: object,
-    package_dirs: Sequence[str | os.PathLike[str]] | None,
-    lock: Mapping[str, ArrayLike] | None,
-    keep: Sequence[str] | None,
-    mimic: Literal["tied", "free"],
-    payload: Payload | Sequence[Payload],
-    xacro_args: Mapping[str, object] | None,
-    srdf: str | os.PathLike[str] | None,
-    base: Base,
-    armature: JointValues | None,
-    density: float | None,
+    density: float | None = None,
 ) -> tuple[Robot, Description]:
-    """The robot and the description of its source."""
+    """The robot, and the description of its source."""
     if not is_one_of(mimic, ("tied", "free")):
         raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     description = describe(source, package_dirs, mimic=mimic == "tied", xacro_args=xacro_args, srdf=srdf)
@@ -509,35 +519,24 @@ def _built(
         raise RobotError(f"robot {description.name!r} has several joints named {', '.join(map(repr, twice))}")
     if mimic == "free":
         description = replace(description, ties=())
-    model, ties, visuals, locked = _lock(description, _locks(description, lock, keep))
-    unwound = _unwound(model, ties)
-    if visuals is not None:
-        hang_shapes(visuals, model, unwound)
-    model = unwound
-    followers = {tie.follower for tie in ties}
-    coordinates = tuple(joint for joint in range(1, model.njoints) if joint not in followers)
-    if not coordinates:
-        why = "".join(f"; {remark}" for remark in description.remarks[:1])
-        raise RobotError(f"robot {description.name!r} has no joint that moves{why}")
-    with_rotors(model, armature, coordinates, tuple(locked))
-    tree = flatten(model, ties, coordinates)
+    whole, (description, locked) = description, _lock(description, _locks(description, lock, keep))
+    model = description.model
+    with_rotors(model, armature, description.ties, tuple(locked))
     robot = Robot(
-        name=description.name,
-        model=tied_model(model, ties),
-        joint_names=tuple(model.names[joint] for joint in coordinates),
-        free_model=model,
-        ties=ties,
-        tree=tree,
+        description.name,
+        model,
+        description.ties,
         locked=MappingProxyType(locked),
         urdf=description.urdf,
         expanded=description.expanded,
         mjcf=description.mjcf,
         package_dirs=description.package_dirs,
-        visuals=visuals,
-        group_states=of_joints(description.postures, description.model.names),
+        visuals=description.visuals,
+        group_states=of_joints(description.postures, whole.model.names),
         loops=_open(description.loops, model),
         equalities=description.equalities,
     )
+    _require_tree(robot, "".join(f"; {remark}" for remark in description.remarks[:1]))
     return robot, description
 
 
@@ -583,13 +582,15 @@ def _locks(
 
 def _lock(
     description: Description, lock: Mapping[str, ArrayLike]
-) -> tuple[pin.Model, tuple[Tie, ...], pin.GeometryModel | None, dict[str, float | tuple[float, ...]]]:
-    """Remove the locked joints, and the followers of locked leaders, from model, ties and geometry."""
-    model, visuals = description.model, description.visuals
+) -> tuple[Description, dict[str, float | tuple[float, ...]]]:
+    """The robot without the locked joints and the followers of locked leaders, and their positions.
+
+    Continuous joints among leaders and followers become revolute joints without limits: a (cos, sin) pair loses whole
+    turns, which matter to a gear, and Pinocchio cannot tie such a joint to one of another kind.
+    """
+    model = description.model
     index = joint_index(model)
     leaders = {tie.follower: tie for tie in description.ties}
-    reference = pin.neutral(model)
-    locked: dict[str, float | tuple[float, ...]] = {}
     positions: dict[int, Floats] = {}
     for name, value in lock.items():
         if name not in index:
@@ -599,43 +600,29 @@ def _lock(
             leader = model.names[leaders[joint].leader]
             raise InputError(f"lock: joint {name!r} mimics {leader!r}; locking {leader!r} locks both")
         positions[joint] = _locked_position(model, joint, value)
-        locked[name] = float(positions[joint][0]) if positions[joint].size == 1 else tuple(positions[joint].tolist())
     for tie in description.ties:
         if tie.leader in positions:
             positions[tie.follower] = tie.ratio * positions[tie.leader] + tie.offset
-            locked[model.names[tie.follower]] = float(positions[tie.follower][0])
-    if not positions:
-        return model, description.ties, visuals, {}
-    for joint, position in positions.items():
-        kind = model.joints[joint]
-        if is_unbounded(model, joint):
-            reference[kind.idx_q : kind.idx_q + 2] = np.cos(position[0]), np.sin(position[0])
-        else:
-            reference[kind.idx_q : kind.idx_q + kind.nq] = position
-    joints = sorted(positions)
-    # pin.buildReducedModel looks frames up by name alone, where a link and a joint may have the same.
-    renamed = model.copy()
-    names: dict[str, str] = {}
-    for k in set(range(1, model.nframes)).difference(joint_frames(model)):
-        frame = renamed.frames[k]
-        names[f"{k} {frame.name}"] = frame.name
-        frame.name = f"{k} {frame.name}"
-    if visuals is None:
-        reduced = pin.buildReducedModel(renamed, joints, reference)
-    else:
-        reduced, visuals = pin.buildReducedModel(renamed, visuals, joints, reference)
-    for frame in reduced.frames:
-        frame.name = names.get(frame.name, frame.name)
-    if visuals is not None:
-        hang_shapes(visuals, reduced, reduced)
-    reduced.gravity = model.gravity
-    left = joint_index(reduced)
-    ties = tuple(
-        Tie(left[model.names[tie.follower]], left[model.names[tie.leader]], tie.ratio, tie.offset)
-        for tie in description.ties
-        if tie.follower not in positions
-    )
-    return reduced, ties, visuals, locked
+    held = {joint: _motion(model, joint, position) for joint, position in positions.items()}
+    geared = {joint for tie in description.ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
+    kinds = {joint: pin.JointModelRevoluteUnaligned(joint_axis(model, joint)[1]) for joint in geared - set(held)}
+    if held or kinds:
+        description = description.rebuilt(held=held, kinds=kinds)
+    locked = {
+        model.names[joint]: float(at[0]) if at.size == 1 else tuple(at.tolist()) for joint, at in positions.items()
+    }
+    return description, locked
+
+
+def _motion(model: pin.Model, joint: int, position: Floats) -> pin.SE3:
+    """The motion of a joint at its position."""
+    kind, q = model.joints[joint], pin.neutral(model)
+    if is_unbounded(model, joint):
+        position = np.array([np.cos(position[0]), np.sin(position[0])])
+    q[kind.idx_q : kind.idx_q + kind.nq] = position
+    data = kind.createData()
+    kind.calc(data, q)
+    return pin.SE3(data.M)
 
 
 def _open(loops: Sequence[tuple[str, str]], model: pin.Model) -> tuple[tuple[str, str], ...]:
@@ -645,24 +632,6 @@ def _open(loops: Sequence[tuple[str, str]], model: pin.Model) -> tuple[tuple[str
         return {frame.parentJoint for frame in model.frames if frame.name == name and frame.type != pin.FrameType.JOINT}
 
     return tuple((a, b) for a, b in loops if carriers(a).isdisjoint(carriers(b)))
-
-
-def _unwound(model: pin.Model, ties: tuple[Tie, ...]) -> pin.Model:
-    """``model`` with the continuous joints among leaders and followers as revolute joints without limits.
-
-    A (cos, sin) pair loses whole turns, which matter to a gear, and Pinocchio cannot tie such a joint to one of another
-    kind.
-    """
-    geared = {joint for tie in ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
-    if not geared:
-        return model
-
-    def joint_of(joint: int) -> pin.JointModel:
-        if joint in geared:
-            return pin.JointModelRevoluteUnaligned(joint_axis(model, joint)[1])
-        return model.joints[joint]
-
-    return rebuild(model, range(1, model.njoints), joint_of)
 
 
 def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
@@ -718,75 +687,51 @@ def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.Geome
         The shapes of the links that can be read, and for each other link by name, its joint in ``free_model`` and its
         fault in words; missing meshes share one message.
     """
+    joints = {frame.name: frame.parentJoint for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
+    together = pin.GeometryModel()
+    faulty: dict[str, tuple[int, str]] = {}
+    for part, prefix, _ in robot.parts:
+        shapes, what = readable_geometry(part, read)
+        faulty |= {prefix + name: (joints[prefix + name], fault) for name, (_, fault) in what.items()}
+        _hang(robot, part.free_model, shapes, prefix)
+        for shape in shapes.geometryObjects:
+            shape.name = prefix + shape.name
+            together.addGeometryObject(shape)
     if robot.parts:
-        found = [readable_geometry(part.robot, read) for part in robot.parts]
-        faults_of_links = {
-            part.prefix + name: (joint + part.shift if joint else 0, what)
-            for part, (_, faulty) in zip(robot.parts, found, strict=True)
-            for name, (joint, what) in faulty.items()
-        }
-        return _of_parts(robot, [shapes for shapes, _ in found]), faults_of_links
-    frames = [frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY]
+        return together, faulty
     try:
         if robot.visuals is not None:
             return with_own_meshes(robot.visuals, read), {}
         if robot.mjcf is not None:
-            return _on_joints(robot, *mjcf_shapes(robot.mjcf)), {}
+            full, shapes = mjcf_shapes(robot.mjcf)
+            return _hang(robot, full, shapes), {}
         if robot.urdf is None:
-            return pin.GeometryModel(), {}
+            return together, {}
         urdf = read_urdf(robot.urdf, robot.expanded)
         full = build_model(urdf)
-        shapes, faulty = build_shapes(urdf, full, robot.package_dirs, read)
+        shapes, unread = build_shapes(urdf, full, robot.package_dirs, read)
     except RobotError as error:
-        return pin.GeometryModel(), {frame.name: (frame.parentJoint, str(error)) for frame in frames}
-    joints = {frame.name: frame.parentJoint for frame in frames}
-    return _on_joints(robot, full, shapes), {link: (joints[link], what) for link, what in faulty.items()}
+        return together, {name: (joint, str(error)) for name, joint in joints.items()}
+    return _hang(robot, full, shapes), {link: (joints[link], what) for link, what in unread.items()}
 
 
-def _of_parts(robot: Robot, shapes: Sequence[pin.GeometryModel]) -> pin.GeometryModel:
-    """The shapes of each part of a combined robot on its joints."""
-    together, model = pin.GeometryModel(), robot.free_model
-    for part, geometry in zip(robot.parts, shapes, strict=True):
-        for given in geometry.geometryObjects:
-            shape = given.copy()
-            link = part.robot.free_model.frames[given.parentFrame]
-            shape.name = part.prefix + given.name
-            shape.parentFrame = model.getFrameId(part.prefix + link.name, link.type) if given.parentFrame else 0
-            if given.parentJoint:
-                shape.parentJoint = given.parentJoint + part.shift
-            else:
-                shape.placement = part.place * given.placement
-            together.addGeometryObject(shape)
-    return together
-
-
-def _on_joints(robot: Robot, full: pin.Model, visuals: pin.GeometryModel) -> pin.GeometryModel:
-    """The shapes of a robot's file on the joints of the robot.
+def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str = "") -> pin.GeometryModel:
+    """Hang shapes of another model, such as that of the file before joints were locked, on the frames of a robot.
 
     Args:
-        robot: The robot; some joints may be locked, or in another order than in the file.
-        full: The model of its file, without locked joints.
-        visuals: Shapes on ``full``.
+        robot: The robot.
+        full: The other model.
+        shapes: Shapes on ``full``.
+        prefix: Prefix of its frames in the robot.
     """
-    # Joints are matched by name, locked joints through their frame.
-    index = joint_index(robot.free_model)
-    for shape in visuals.geometryObjects:
+    model = robot.free_model
+    for shape in shapes.geometryObjects:
         link = full.frames[shape.parentFrame]
-        frame = robot.free_model.getFrameId(link.name, link.type)
-        name = full.names[shape.parentJoint]
-        if name in index:
-            shape.parentJoint = index[name]
-        elif not shape.parentJoint:
-            # Shapes of the file's world belong to the robot's base.
-            joint_frame = robot.free_model.frames[frame]
-            shape.placement = joint_frame.placement * link.placement.inverse() * shape.placement
-            shape.parentJoint = joint_frame.parentJoint
-        else:
-            joint_frame = robot.free_model.frames[robot.free_model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
-            shape.placement = joint_frame.placement * shape.placement
-            shape.parentJoint = joint_frame.parentJoint
-        shape.parentFrame = frame
-    return visuals
+        shape.parentFrame = model.getFrameId(prefix + link.name, link.type) if shape.parentFrame else 0
+        frame = model.frames[shape.parentFrame]
+        shape.placement = frame.placement * link.placement.inverse() * shape.placement
+        shape.parentJoint = frame.parentJoint
+    return shapes
 
 
 def check_inertia(robot: Robot, known: Sequence[str] = ()) -> None:
@@ -800,10 +745,10 @@ def check_inertia(robot: Robot, known: Sequence[str] = ()) -> None:
         SingularMassMatrix: The mass matrix is singular; the message names the joints that move no inertia.
         RobotError: The mass matrix is not finite.
     """
-    rng = np.random.default_rng(0)
+    rng, core = np.random.default_rng(0), mechanism(robot.tree)
     for q in [np.zeros(robot.dof), *rng.uniform(-np.pi, np.pi, (3, robot.dof))]:
         with np.errstate(all="ignore"):
-            M = tree_mass_matrix(robot.tree, q)
+            M = core.jet(q, np.zeros(robot.dof))[-1]
         if not np.isfinite(M).all():
             raise RobotError(
                 f"the mass matrix of robot {robot.name!r} is not finite: masses, inertias, distances or "

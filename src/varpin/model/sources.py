@@ -1,10 +1,13 @@
 """Sources of robots: files, bundled robots, example-robot-data, robot_descriptions, models in memory."""
 
+from __future__ import annotations
+
 import logging
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -12,16 +15,7 @@ import pinocchio as pin
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.model import example_robot_data, robot_descriptions
 from varpin.model.equalities import Closure, Equality
-from varpin.model.mimic import (
-    JOINT_PARAMETERS,
-    Tie,
-    depth_first,
-    joint_frames,
-    reordered,
-    repair_velocity_limits,
-    ties_of,
-    untied_model,
-)
+from varpin.model.mimic import JOINT_PARAMETERS, Tie, depth_first, joint_frames, of_mimics, rebuild, ties_of
 from varpin.model.mjcf import is_mjcf, read_mjcf, root_tag
 from varpin.model.packages import Packages
 from varpin.model.srdf import Posture, beside, read_postures, read_rotors, reference_postures
@@ -70,6 +64,11 @@ class Description:
     loops: tuple[tuple[str, str], ...] = ()
     equalities: tuple[Equality, ...] = ()
 
+    def rebuilt(self, **changes: Any) -> Description:
+        """The robot with its model rebuilt; see :func:`varpin.model.mimic.rebuild`."""
+        new = rebuild(self.model, **changes)
+        return replace(self, model=new.model, ties=new.ties(self.ties), visuals=new.shapes(self.visuals))
+
 
 def models_dir() -> Path:
     """The folder of the bundled robots: in the wheel, or at the top of a source tree."""
@@ -93,6 +92,27 @@ def robot_names() -> tuple[str, ...]:
     return (*bundled_robots(), *example_robot_data.installed())
 
 
+@dataclass(frozen=True)
+class _Request:
+    """What a source is read with: options of :func:`varpin.load_robot`, and folders of packages by name.
+
+    Attributes:
+        folders: Folders in which packages are looked up.
+        xacro_args: Arguments of a xacro file.
+        mimic: Whether mimic joints follow their leaders.
+        srdf: The SRDF file or its xacro file; None to take the one beside the robot's file.
+        srdf_args: Arguments of that xacro file.
+        packages: Folders of packages by name.
+    """
+
+    folders: tuple[str, ...]
+    xacro_args: Mapping[str, object]
+    mimic: bool
+    srdf: Path | None
+    srdf_args: Mapping[str, object]
+    packages: Mapping[str, str] = field(default_factory=dict)
+
+
 def describe(
     source: object,
     package_dirs: Sequence[str | os.PathLike[str]] | None,
@@ -102,29 +122,30 @@ def describe(
     srdf: str | os.PathLike[str] | None = None,
 ) -> Description:
     """Find and parse ``source``; see :func:`varpin.load_robot`."""
-    folders = _folders(package_dirs)
     if xacro_args is not None and not isinstance(xacro_args, Mapping):
         raise InputError(f"xacro_args must be a mapping of names to values, got {xacro_args!r}")
-    description = _found(source, folders, xacro_args or {}, mimic=mimic)
-    if xacro_args and (description.urdf is None or description.expanded is None):
-        raise InputError(f"xacro_args need a xacro file; {description.name!r} does not come from one")
-    if srdf is None:
-        return description
-    if not isinstance(srdf, str | os.PathLike):
+    if not (srdf is None or isinstance(srdf, str | os.PathLike)):
         raise InputError(f"srdf must be the path of a file, got {type(srdf).__name__}")
-    return _with_srdf(description, Path(srdf).expanduser(), folders, xacro_args or {})
-
-
-def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, object], *, mimic: bool) -> Description:
+    file, arguments = None if srdf is None else Path(srdf).expanduser(), xacro_args or {}
+    request = _Request(_folders(package_dirs), arguments, mimic, file, arguments)
     if isinstance(source, pin.Model):
-        return _of_model(source, source.name or "model", None)
-    if isinstance(source, pin.RobotWrapper):
-        return _of_model(source.model, source.model.name or "robot", source.visual_model)
-    if not isinstance(source, str | os.PathLike):
+        description = _of_model(source, source.name or "model", None)
+    elif isinstance(source, pin.RobotWrapper):
+        description = _of_model(source.model, source.model.name or "robot", source.visual_model)
+    elif isinstance(source, str | os.PathLike):
+        description, request = _of_text(source, request)
+    else:
         raise InputError(
             "source must be a URDF path, a robot's name, a pin.Model or a pin.RobotWrapper, "
             f"got {type(source).__name__}"
         )
+    if xacro_args and (description.urdf is None or description.expanded is None):
+        raise InputError(f"xacro_args need a xacro file; {description.name!r} does not come from one")
+    return _with_srdf(description, request)
+
+
+def _of_text(source: str | os.PathLike[str], request: _Request) -> tuple[Description, _Request]:
+    """The robot of a path or a name, and the request with what a package adds to it."""
     text = os.fspath(source)
     if text.lstrip("\ufeff \t\r\n").startswith("<"):
         raise InputError(
@@ -133,12 +154,16 @@ def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, ob
     path = Path(text).expanduser()
     is_path = isinstance(source, os.PathLike) or path.suffix or os.sep in text
     if is_path and _is_file(path):
-        return _of_file(path.resolve(), plain_name(path), folders, xacro_args, mimic=mimic)
+        return _of_file(path.resolve(), plain_name(path), request), request
     bundled = bundled_robots()
     if text in bundled:
-        return _of_urdf(bundled[text], text, folders, mimic=mimic)
+        return _of_urdf(bundled[text], text, request), request
     if text in example_robot_data.FIXED_BASE:
-        return _of_example(text, folders, mimic=mimic)
+        urdf = example_robot_data.locate(example_robot_data.FIXED_BASE[text])
+        request = replace(request, folders=(*request.folders, str(example_robot_data.package_dir(urdf))))
+        if request.srdf is None and text in example_robot_data.SRDF:
+            request = replace(request, srdf=example_robot_data.locate(example_robot_data.SRDF[text]))
+        return _of_urdf(urdf, text, request), request
     if text in example_robot_data.FLOATING_BASE:
         raise RobotError(
             f"{text!r} has a free-flyer base in example-robot-data, and varpin models fixed bases; "
@@ -146,7 +171,16 @@ def _found(source: object, folders: tuple[str, ...], xacro_args: Mapping[str, ob
         )
     downloadable = robot_descriptions.names()
     if text in downloadable or (not downloadable and not is_path and text.endswith(robot_descriptions.SUFFIX)):
-        return _of_downloaded(text, folders, xacro_args, mimic=mimic)
+        found = robot_descriptions.download(text)
+        request = replace(
+            request,
+            folders=(*request.folders, *found.package_dirs),
+            xacro_args={**found.xacro_args, **request.xacro_args},
+            packages=found.packages,
+        )
+        if request.srdf is None and found.srdf is not None:
+            request = replace(request, srdf=found.srdf, srdf_args={**found.srdf_args, **request.srdf_args})
+        return _of_file(found.path, text, request), request
     if is_path and path.is_dir():
         raise RobotError(f"{path} is a folder, not a URDF file; it contains {_urdf_files(path)}")
     if is_path:
@@ -183,30 +217,31 @@ def _urdf_files(folder: Path) -> str:
 def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) -> Description:
     _check_model(model, name)
     # Copies, so that later changes of the user's model do not change the robot.
-    free, ties = untied_model(model.copy())
     shapes = visuals.copy() if visuals is not None else None
     for shape in shapes.geometryObjects if shapes is not None else ():
-        if shape.parentJoint >= free.njoints:
+        if shape.parentJoint >= model.njoints:
             raise RobotError(
                 f"shape {shape.name!r} has the parent joint {shape.parentJoint}, which model {name!r} does not have"
             )
-    order = depth_first(free, ties)
-    in_order = order == sorted(order)
-    if not (in_order and _has_joint_frames(free)):
-        free, ties = reordered(free, ties, order)
-        for shape in shapes.geometryObjects if shapes is not None else ():
-            shape.parentJoint = [0, *order].index(shape.parentJoint)
-    if not in_order:
+    ties, kinds = of_mimics(model)
+    description = Description(name, model.copy(), ties, visuals=shapes, postures=reference_postures(model))
+    order = depth_first(model, ties)
+    if kinds or order != sorted(order) or len(joint_frames(model)) < model.njoints - 1:
+        description = description.rebuilt(order=order, kinds=kinds)
+    if order != sorted(order):
         # Pinocchio accepts joints in any order, but then computes a wrong mass matrix silently.
         logger.warning(
             "the joints of model %r were not added subtree by subtree, as Pinocchio's algorithms need: reordered to %s",
             name,
-            ", ".join(list(free.names)[1:]),
+            ", ".join(list(description.model.names)[1:]),
         )
-    repair_velocity_limits(free)
-    if shapes is not None:
-        hang_shapes(shapes, model, free)
-    return Description(name, free, ties, visuals=shapes, postures=reference_postures(model))
+    frames = description.model.frames
+    for shape in shapes.geometryObjects if (shapes := description.visuals) is not None else ():
+        # Where a shape has no frame of its joint, it has the joint's.
+        if shape.parentFrame >= len(frames) or frames[shape.parentFrame].parentJoint != shape.parentJoint:
+            joint = description.model.names[shape.parentJoint]
+            shape.parentFrame = description.model.getFrameId(joint, pin.FrameType.JOINT) if shape.parentJoint else 0
+    return description
 
 
 def _check_model(model: pin.Model, name: str) -> None:
@@ -222,94 +257,31 @@ def _check_model(model: pin.Model, name: str) -> None:
     for part, size in sizes.items():
         if (found := len(getattr(model, part))) != size:
             raise RobotError(f"model {name!r} is damaged: its {part} has {found} entries instead of {size}")
-    q, v = 0, 0
-    for joint in range(1, n):
-        kind, parent = model.joints[joint], model.parents[joint]
-        if parent >= joint:
+    for joint, parent in enumerate(model.parents):
+        if joint and parent >= joint:
             raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} comes before its parent")
-        # A mimic joint has no coordinates of its own; its indices are those of its leader.
-        if kind.id != joint or (kind.nv and (kind.idx_q, kind.idx_v) != (q, v)) or kind.idx_v >= nv:
-            raise RobotError(f"model {name!r} is damaged: joint {model.names[joint]!r} has wrong indices")
-        q, v = q + kind.nq, v + kind.nv
-    if (q, v) != (nq, nv):
-        raise RobotError(f"model {name!r} is damaged: its joints have {q} and {v} coordinates, not nq and nv")
     for frame in model.frames:
         if frame.parentJoint >= n or frame.parentFrame >= model.nframes:
             raise RobotError(f"model {name!r} is damaged: the parent of frame {frame.name!r} does not exist")
 
 
-def _has_joint_frames(model: pin.Model) -> bool:
-    """Whether every joint has its frame, before other frames on the joint, as pin.buildReducedModel needs.
-
-    pin.buildReducedModel reads out of bounds where a joint frame is missing.
-    """
-    frame_of = {model.frames[index].parentJoint: index for index in joint_frames(model)}
-    if len(frame_of) < model.njoints - 1:
-        return False
-    return all(frame_of.get(frame.parentJoint, 0) <= index for index, frame in enumerate(model.frames))
-
-
-def hang_shapes(shapes: pin.GeometryModel, old: pin.Model, new: pin.Model) -> None:
-    """Reattach shapes from the frames of ``old`` to those of ``new``, or else to their joint's frame."""
-    for shape in shapes.geometryObjects:
-        frame = new.nframes
-        if shape.parentFrame < old.nframes:
-            link = old.frames[shape.parentFrame]
-            frame = new.getFrameId(link.name, link.type)
-        if frame >= new.nframes:
-            frame = new.getFrameId(new.names[shape.parentJoint], pin.FrameType.JOINT) if shape.parentJoint else 0
-        shape.parentFrame = frame
-
-
-def _of_example(name: str, folders: tuple[str, ...], *, mimic: bool) -> Description:
-    urdf = example_robot_data.locate(example_robot_data.FIXED_BASE[name])
-    folders = (*folders, str(example_robot_data.package_dir(urdf)))
-    description = _of_urdf(urdf, name, folders, mimic=mimic)
-    if name in example_robot_data.ROTORS:
-        _add_rotors(description.model, read_rotors(example_robot_data.locate(example_robot_data.ROTORS[name])))
-    return description
-
-
-def _of_downloaded(name: str, folders: tuple[str, ...], arguments: Mapping[str, object], *, mimic: bool) -> Description:
-    found = robot_descriptions.download(name)
-    folders = (*folders, *found.package_dirs)
-    xacro_args = {**found.xacro_args, **arguments}
-    description = _of_file(found.path, name, folders, xacro_args, found.packages, mimic=mimic)
-    if found.srdf is None:
-        return description
-    return _with_srdf(description, found.srdf, folders, {**found.srdf_args, **arguments}, found.packages)
-
-
-def _of_file(
-    path: Path,
-    name: str,
-    folders: tuple[str, ...],
-    arguments: Mapping[str, object],
-    packages: Mapping[str, str] | None = None,
-    *,
-    mimic: bool,
-) -> Description:
+def _of_file(path: Path, name: str, request: _Request) -> Description:
     if is_xacro(path):
-        text = expand(path, arguments, _places(path, folders), packages)
-        return _of_urdf(path, name, folders, mimic=mimic, expanded=text)
+        places = _places(path, request.folders)
+        return _of_urdf(path, name, request, expand(path, request.xacro_args, places, request.packages))
     if is_mjcf(path):
         return _of_mjcf(path, name)
     if path.suffix == ".sdf" or (path.suffix in (".xml", ".world") and root_tag(path) == "sdf"):
         raise RobotError(
             f"{path} is an SDF file, which Pinocchio's package on PyPI cannot read; convert it to a URDF or an MJCF"
         )
-    return _of_urdf(path, name, folders, mimic=mimic)
+    return _of_urdf(path, name, request)
 
 
 def _of_mjcf(path: Path, name: str) -> Description:
-    mjcf = read_mjcf(path)
-    return replace(
-        _of_model(mjcf.model, name, None),
-        mjcf=path,
-        remarks=mjcf.remarks,
-        loops=tuple((each.a.body, each.b.body) for each in mjcf.equalities if isinstance(each, Closure)),
-        equalities=mjcf.equalities,
-    )
+    model, remarks, equalities = read_mjcf(path)
+    loops = tuple((each.a.body, each.b.body) for each in equalities if isinstance(each, Closure))
+    return replace(_of_model(model, name, None), mjcf=path, remarks=remarks, loops=loops, equalities=equalities)
 
 
 def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
@@ -318,52 +290,47 @@ def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*folders, *around, str(path.parent))))
 
 
-def _of_urdf(
-    path: Path, name: str, folders: tuple[str, ...], *, mimic: bool, expanded: str | None = None
-) -> Description:
+def _of_urdf(path: Path, name: str, request: _Request, expanded: str | None = None) -> Description:
     urdf = read_urdf(path, expanded)
     model, differences = compared_model(urdf, expanded)
     inertials, lacks = read_inertials(urdf, model)
-    remarks = (*urdf.remarks, *differences)
+    remarks = (*urdf.remarks, *filter(None, [urdf.unlimited]), *differences)
     for note in urdf.notes:
         logger.info("robot %r: %s", name, note)
-    ties: tuple[Tie, ...] = ()
-    if mimic:
-        ties = ties_of(urdf.mimics, model)
-        order = depth_first(model, ties)
-        if order != sorted(order):
-            model, ties = reordered(model, ties, order)
     description = Description(
         name=name,
         model=model,
-        ties=ties,
+        ties=ties_of(urdf.mimics, model) if request.mimic else (),
         urdf=path,
         expanded=expanded,
-        package_dirs=_places(path, folders),
+        package_dirs=_places(path, request.folders),
         inertials=inertials,
         remarks=remarks,
         faults=lacks,
         loops=urdf.loops,
     )
-    if srdf := beside(path, urdf.root.get("name", "")):
-        try:
-            return _with_srdf(description, srdf, folders, {})
-        except (RobotError, FileError) as error:
-            # Not an error: the user did not ask for this file.
-            return replace(description, remarks=(*remarks, f"the robot has no postures: {error}"))
-    return description
+    order = depth_first(model, description.ties)
+    return description if order == sorted(order) else description.rebuilt(order=order)
 
 
-def _with_srdf(
-    description: Description,
-    path: Path,
-    folders: tuple[str, ...],
-    arguments: Mapping[str, object],
-    packages: Mapping[str, str] | None = None,
-) -> Description:
-    """The postures and rotors in an SRDF file or its xacro file, which need not take all of the robot's arguments."""
-    text = expand(path, arguments, _places(path, folders), packages, strict=False) if is_xacro(path) else None
-    postures, rotors = read_postures(path, text), read_rotors(path, text)
+def _with_srdf(description: Description, request: _Request) -> Description:
+    """The postures and rotors of the SRDF file that was asked for, or of the one beside the robot's file."""
+    path = request.srdf
+    if path is None and description.urdf is not None:
+        path = beside(description.urdf, description.model.name)
+    if path is None:
+        return description
+    try:
+        text = None
+        if is_xacro(path):
+            # It need not take all of the robot's arguments.
+            places = _places(path, request.folders)
+            text = expand(path, request.srdf_args, places, request.packages, strict=False)
+        postures, rotors = read_postures(path, text), read_rotors(path, text)
+    except (RobotError, FileError) as error:
+        if request.srdf is not None:
+            raise
+        return replace(description, remarks=(*description.remarks, f"the robot has no postures: {error}"))
     _add_rotors(description.model, rotors)
     return replace(description, postures=postures)
 

@@ -1,14 +1,15 @@
 """A Pinocchio model as flat arrays, with joint frames turned so that every joint axis is z."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
-import scipy
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
-from varpin.core.arrays import Tree
+from varpin.core import Mechanism
+from varpin.core.arrays import ConstraintRows, Tree
 from varpin.errors import InputError, RobotError, UnknownFrame, UnsupportedJoint
 from varpin.model.mimic import Tie
 
@@ -191,12 +192,12 @@ def coordinate_armature(model: pin.Model, ties: tuple[Tie, ...], coordinates: tu
 
 
 def to_pinocchio(model: pin.Model, positions: Floats) -> Floats:
-    """Joint positions (..., k) as configurations (..., model.nq) of a model without mimic joints.
+    """Joint positions (..., k), of the joints that are no mimic joints, as configurations (..., model.nq) of a model.
 
     The angle of a continuous joint becomes Pinocchio's (cos, sin).
     """
     configuration = np.empty((*positions.shape[:-1], model.nq))
-    for k, joint in enumerate(model.joints[1:]):
+    for k, joint in enumerate(joint for joint in model.joints[1:] if joint.nv):
         if joint.nq == 2:
             configuration[..., joint.idx_q] = np.cos(positions[..., k])
             configuration[..., joint.idx_q + 1] = np.sin(positions[..., k])
@@ -297,86 +298,12 @@ def periodic_coordinates(coordinate: Integers, prismatic: Integers, ratio: Float
     return periodic
 
 
-def require_sound(tree: Tree) -> None:
-    """Refuse a tree of inconsistent arrays or with indices out of range.
-
-    :func:`flatten` returns none; a tree that was changed afterwards may be inconsistent.
-
-    Raises:
-        RobotError: The tree is inconsistent; the message names the array.
-    """
-    b, n = np.size(tree.parent), np.size(tree.armature)
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
-        ("parent", "prismatic", "mass", "coordinate", "ratio", "origin"), (b,)
-    )
-    shapes |= {"offset": (b,), "rotation": (b, 3, 3), "translation": (b, 3), "center": (b, 3), "inertia": (b, 6)}
-    shapes |= {"armature": (n,), "group": (n,), "periodic": (n,)}
-    shapes |= {"loads": (np.size(tree.loads),), "carried": (np.size(tree.loads), n)}
-    whole = ("parent", "prismatic", "coordinate", "group", "origin", "periodic", "loads", "carried")
-    for name, shape in shapes.items():
-        array = getattr(tree, name)
-        kind = np.int64 if name in whole else np.float64
-        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != kind:
-            raise RobotError(f"the robot's tree is damaged: its {name} is no array {shape} of {np.dtype(kind)}")
-        if kind is np.float64 and not np.isfinite(array).all():
-            raise RobotError(f"the robot's tree is damaged: its {name} is not finite")
-    # (name, lowest value, highest value + 1)
-    for name, low, high in (
-        ("parent", -1, np.arange(b)),
-        ("coordinate", 0, n),
-        ("group", 0, min(n, tree.groups)),
-        ("loads", 0, b),
-    ):
-        values = getattr(tree, name)
-        if ((values < low) | (values >= high)).any():
-            raise RobotError(f"the robot's tree is damaged: its {name} has an index out of range")
-    known = block_ends(tree.group)
-    if not isinstance(tree.ends, np.ndarray) or tree.ends.dtype != np.int64 or not np.array_equal(tree.ends, known):
-        raise RobotError("the robot's tree is damaged: its blocks do not end where its groups end")
-
-
-def tree_mass_matrix(tree: Tree, q: Floats) -> Floats:
-    """M(q) (n, n), armature included: M_ij = S_i . Y_j S_j for i an ancestor of j, or j itself; see jet.hpp.
-
-    Plain NumPy needs n^2 memory, Pinocchio's data n^3.
-    """
-    bodies = tree.parent.size
-    rotation, position = np.empty((bodies, 3, 3)), np.empty((bodies, 3))
-    for j, s in enumerate(tree.ratio * q[tree.coordinate] + tree.offset):
-        up = tree.parent[j]
-        R, p = (rotation[up], position[up]) if up >= 0 else (np.eye(3), np.zeros(3))
-        rotation[j], position[j] = R @ tree.rotation[j], p + R @ tree.translation[j]
-        if tree.prismatic[j]:
-            position[j] += s * rotation[j, :, 2]
-        else:
-            rotation[j] = rotation[j] @ _turn(s)
-    turns = (tree.prismatic == 0)[:, None]
-    z = rotation[:, :, 2]
-    axis = np.hstack([np.where(turns, np.cross(position, z), z), np.where(turns, z, 0.0)])
-    center = position + np.einsum("bij,bj->bi", rotation, tree.center)
-    lever = np.zeros((bodies, 3, 3))  # cross product with the centre of mass
-    lever[:, [2, 0, 1], [1, 2, 0]] = center
-    lever -= lever.transpose(0, 2, 1)
-    about_center = tree.inertia[:, [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
-    m = tree.mass[:, None, None]
-    inertia = np.empty((bodies, 6, 6))
-    inertia[:, :3, :3], inertia[:, :3, 3:], inertia[:, 3:, :3] = m * np.eye(3), -m * lever, m * lever
-    inertia[:, 3:, 3:] = rotation @ about_center @ rotation.transpose(0, 2, 1) - m * lever @ lever
-    for j in range(bodies - 1, -1, -1):
-        if tree.parent[j] >= 0:
-            inertia[tree.parent[j]] += inertia[j]
-    dual = np.einsum("bij,bj->bi", inertia, axis)
-    M = np.where(ancestors(tree.parent), dual @ axis.T, 0.0)
-    M += np.tril(M, -1).T
-    G = np.zeros((bodies, tree.armature.size))
-    G[np.arange(bodies), tree.coordinate] = tree.ratio
-    return np.asarray(G.T @ M @ G + np.diag(tree.armature))
-
-
-def _turn(angle: float) -> Floats:
-    """Rotation (3, 3) about z."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def mechanism(tree: Tree, **values: Any) -> Mechanism:
+    """A tree in the compiled core, with other ``values``: forces, for one, of which it has none."""
+    n = tree.armature.size
+    none: dict[str, Any] = dict.fromkeys(("actuation", "constant", "quadratic", "centers"), np.zeros((n, 0)))
+    none |= {"gravity": np.zeros(3), "forces": (), "couplings": (), "constraints": ConstraintRows(), "custom": None}
+    return Mechanism.make(**(tree._asdict() | none | {"control": np.zeros((n, 0, 0))} | values))
 
 
 def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Integers:
@@ -387,12 +314,11 @@ def independent_groups(parent: Integers, coordinate: Integers, dof: int) -> Inte
         coordinate: Coordinate that moves each body (b,).
         dof: n.
     """
-    tied = parent >= 0
-    links = scipy.sparse.coo_array(
-        (np.ones(tied.sum()), (coordinate[tied], coordinate[parent[tied]])), shape=(dof, dof)
-    )
-    _, label = scipy.sparse.csgraph.connected_components(links, directed=False)
-    return np.asarray(label, dtype=np.int64)
+    label = np.arange(dof)
+    for body in np.flatnonzero(parent >= 0):
+        one, other = sorted(label[coordinate[[body, parent[body]]]])
+        label[label == other] = one
+    return np.asarray(np.unique(label, return_inverse=True)[1], dtype=np.int64)
 
 
 def path_coordinates(tree: Tree, body: int) -> Integers:

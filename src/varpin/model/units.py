@@ -29,6 +29,9 @@ NO_LIMIT = 1e6
 AFAR = 50.0
 # Largest plausible clearance, in the same units.
 ASIDE = 2.0
+# Longest plausible travel of a slider, in the same units (an arm on a rail), and least reach that counts for it [m]:
+# sliders alone reach nowhere.
+_TRAVEL, _GANTRY = 20.0, 1.0
 # Least reach that counts [m]: a wheel has none.
 _LEAST = 0.1
 IN_MILLIMETRES = "it may be in millimetres, and lengths are in metres"
@@ -115,18 +118,38 @@ def _typed(values: Floats) -> NDArray[np.bool_]:
     return (np.abs(values) < _DEGREES) & whole
 
 
-def longest_reach(robot: Robot) -> float:
-    """Upper bound on the distance of a centre of mass from the root of its tree [m]; infinite on free rails."""
+def longest_reach(robot: Robot, *, slides: bool = True, centers: bool = True) -> float:
+    """Upper bound on the distance of a centre of mass from the root of its tree [m]; infinite on free rails.
+
+    Args:
+        robot: The robot.
+        slides: Whether sliders extend it.
+        centers: Whether it is that of a centre of mass, not of a joint.
+    """
     tree = robot.tree
     lower, upper = robot.position_limits
     path = np.zeros(len(tree.parent))
     for body, parent in enumerate(tree.parent):
         if parent >= 0:
             path[body] = path[parent] + np.linalg.norm(tree.translation[body])
-        if tree.prismatic[body]:
+        if slides and tree.prismatic[body]:
             ends = np.array([lower[tree.coordinate[body]], upper[tree.coordinate[body]]])
             path[body] += float(np.abs(tree.ratio[body] * ends + tree.offset[body]).max())
-    return float((path + np.linalg.norm(tree.center, axis=1)).max())
+    return float((path + (np.linalg.norm(tree.center, axis=1) if centers else 0.0)).max())
+
+
+def slides_hint(robot: Robot) -> str:
+    """A sentence about the slider with the largest limit that looks like millimetres; empty if none does."""
+    ends = np.abs(np.where(np.isfinite(limits := np.array(robot.position_limits)), limits, 0.0)).max(axis=0)
+    most = int(np.argmax(np.where(robot.slides, ends, 0.0)))
+    reach = longest_reach(robot, slides=False)
+    if not (robot.slides[most] and ends[most] > _TRAVEL * max(reach, _GANTRY)):
+        return ""
+    return f"the limit of slider {robot.joint_names[most]!r} is {ends[most]:g} m, {_beside(robot, reach)}"
+
+
+def _beside(robot: Robot, reach: float) -> str:
+    return f"and the reach of {robot.name} at most {reach:.3g} m: {IN_MILLIMETRES}"
 
 
 def millimetres_hint(robot: Robot, lengths: dict[str, float], plausible: float = AFAR) -> str:
@@ -138,4 +161,4 @@ def millimetres_hint(robot: Robot, lengths: dict[str, float], plausible: float =
     reach = longest_reach(robot)
     if not length > plausible * max(reach, _LEAST):
         return ""
-    return f"{name} is {length:.4g} m, and the reach of {robot.name} at most {reach:.3g} m: {IN_MILLIMETRES}"
+    return f"{name} is {length:.4g} m, {_beside(robot, reach)}"

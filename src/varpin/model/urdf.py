@@ -37,6 +37,9 @@ VERSIONS = ("1.0", "1.1", "1.2")  # of URDF, which Pinocchio reads
 # Most links one after another: its parser ends the process on chains of about 4,000.
 _LONGEST = 3000
 
+# A link with less than this share of the mass of all links on its joint is massless, but for rounding.
+_ROUNDING = 1e-12
+
 # The attributes of a URDF that hold numbers, by element.
 _NUMBERS = {
     "origin": ("xyz", "rpy", "quat_xyzw"),
@@ -52,6 +55,7 @@ _COUNTS = {"xyz": 3, "rpy": 3, "quat_xyzw": 4}
 
 # A bound in words that Pinocchio reads and :class:`varpin.Robot` takes as none.
 _NONE = "1e308"
+_WORDS = ("", "none", "nan")  # by which files say so
 
 _COMMENT = re.compile(rb"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
 
@@ -94,6 +98,7 @@ class Urdf:
         root: The ``<robot>`` element, with prefixes of names as written.
         mimics: Mimic elements by joint.
         remarks: How the file is read where that is not plain, one sentence a kind.
+        unlimited: A sentence about limits that are read as none; empty if there are none.
         notes: What of the file has no effect on purpose, likewise.
         plain: Whether nothing in it was tidied or mended: Pinocchio's own reading is varpin's.
     """
@@ -104,6 +109,7 @@ class Urdf:
     remarks: tuple[str, ...]
     notes: tuple[str, ...]
     plain: bool
+    unlimited: str = ""
 
     @property
     def loops(self) -> tuple[tuple[str, str], ...]:
@@ -158,10 +164,11 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
                 element.set(key, tidy)
                 tidied = True
     remarks = [*([f"its XML is not well-formed, and was mended: {fault}"] if fault else []), *_remarks(root)]
+    unlimited = _unlimited(root)
     mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
     soft = _joints_with(root, "safety_controller")
     notes = (f"soft limits of <safety_controller> have no effect: {listed(soft, 'joints')}",) if soft else ()
-    return Urdf(path, root, mimics, tuple(remarks), notes, plain=not (tidied or remarks))
+    return Urdf(path, root, mimics, tuple(remarks), notes, not (tidied or remarks or unlimited), unlimited)
 
 
 def build_model(urdf: Urdf) -> pin.Model:
@@ -188,28 +195,29 @@ def _require_all_links(urdf: Urdf, model: pin.Model) -> pin.Model:
 def read_inertials(urdf: Urdf, model: pin.Model) -> tuple[tuple[Inertial, ...], tuple[str, ...]]:
     """The inertias of the links that have one, as Pinocchio reads them, and remarks about those it reads in part."""
     given = {link.get("name", ""): link for link in urdf.root.findall("link") if link.find("inertial") is not None}
-    frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given]
-    if len({frame.parentJoint for frame in frames}) < len(frames):
-        # Pinocchio merges links on fixed joints into one body; a joint that moves keeps them apart.
-        small = _part(urdf.root, "link/inertial", "joint/parent", "joint/child")
-        for joint in small.findall("joint"):
-            child = joint.find("child")
-            joint.set("type", "floating" if child is not None and child.get("link") in given else "fixed")
-        apart = _build(small)
-        if isinstance(apart, str):
-            return (), ()
-        model = apart
+    # Pinocchio merges links on fixed joints into one body, whose parts are in the frames of these joints.
+    fixed = [frame for frame in model.frames if frame.type == pin.FrameType.FIXED_JOINT and frame.inertia.mass]
     found, remarks = [], []
     for frame in (frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given):
-        name, link = frame.name, given[frame.name]
-        body = frame.placement.actInv(model.inertias[frame.parentJoint])
+        name, link, up = frame.name, given[frame.name], model.frames[frame.parentFrame]
+        body = up.inertia if up.inertia.mass else frame.inertia
+        if up.type == pin.FrameType.JOINT:
+            body = model.inertias[frame.parentJoint]
+            if parts := [part for part in fixed if part.parentJoint == frame.parentJoint]:
+                body = _without(body, [part.placement.act(part.inertia) for part in parts])
         if fault := next(_faults_of_numbers(link.findall("inertial")[0], required=True), ""):
             effect = "massless" if body.mass == 0.0 else "a point mass"
             remarks.append(f"link {name!r} is {effect}, as Pinocchio reads it: {fault}")
         if body.mass or body.inertia.any():
             found.append(Inertial(name, body.mass, np.array(body.lever), np.array(body.inertia)))
-    more = f" ({len(remarks) - 1} more links are read in part)" if len(remarks) > 1 else ""
+    more = f" (and {len(remarks) - 1} more)" if len(remarks) > 1 else ""
     return tuple(found), tuple(remark + more for remark in remarks[:1])
+
+
+def _without(body: pin.Inertia, parts: Sequence[pin.Inertia]) -> pin.Inertia:
+    """A body without some of its parts; zero if they leave rounding errors alone."""
+    rest = body.toDynamicParameters() - sum(part.toDynamicParameters() for part in parts)
+    return pin.Inertia.FromDynamicParameters(rest) if rest[0] > _ROUNDING * body.mass else pin.Inertia.Zero()
 
 
 def compared_model(urdf: Urdf, text: str | None) -> tuple[pin.Model, tuple[str, ...]]:
@@ -241,6 +249,8 @@ def compared_model(urdf: Urdf, text: str | None) -> tuple[pin.Model, tuple[str, 
         for j, name in enumerate(model.names)
         if model.inertias[j] != own.inertias[j] or model.jointPlacements[j] != own.jointPlacements[j]
     ]
+    if urdf.unlimited and not odd:
+        return model, ()
     what = f"in the masses or places of {listed(odd, 'joints')}" if odd else "in limits or frames"
     return model, (f"Pinocchio's own reading of the file differs {what}: it reads numbers less leniently",)
 
@@ -272,51 +282,46 @@ def build_shapes(
         lines = complaints()
     if lines:
         logger.warning("%s: shapes are read in part: %s", urdf.path, "; ".join(lines)[:120])
-    absent = missing_meshes(urdf, package_dirs)
-    faults = dict.fromkeys(absent, missing_meshes_message(urdf, absent, package_dirs))
+    packages = Packages(urdf.path, tuple(package_dirs))
+    faults = _missing_meshes(urdf, packages)
     for shape in shapes.geometryObjects:
-        look = looks.get(shape.name, _Look(""))
-        if look.texture:
-            texture = _located(look.texture, urdf.path, package_dirs)
-            if texture is None:
-                logger.warning("%s: texture %r is not there", urdf.path, look.texture)
-            shape.meshTexturePath = "" if texture is None else str(texture)
-        if look.mesh and look.link not in faults:
-            scale = [_number(word) for word in look.scale.split()]
+        link, mesh, texture = looks.get(shape.name, ("", None, ""))
+        if texture:
+            image = packages.locate(texture)
+            if image is None:
+                logger.warning("%s: texture %r is not there", urdf.path, texture)
+            shape.meshTexturePath = "" if image is None else str(image)
+        if mesh is not None and link not in faults:
+            file, words = mesh.get("filename", ""), mesh.get("scale", "1 1 1")
+            scale = [_number(word) for word in words.split()]
             try:
                 if len(scale) != 3 or not all(math.isfinite(number) and number for number in scale):
-                    raise FileError(f"mesh {look.mesh} has the scale {look.scale!r}: give three numbers other than 0")
-                put_mesh(shape, str(_located(look.mesh, urdf.path, package_dirs)), scale, read)
+                    raise FileError(f"mesh {file} has the scale {words!r}: give three numbers other than 0")
+                put_mesh(shape, str(packages.locate(file)), scale, read)
             except FileError as error:
-                faults[look.link] = f"link {look.link!r}: {error}"
+                faults[link] = f"link {link!r}: {error}"
     found = pin.GeometryModel()
     for shape in shapes.geometryObjects:
-        if shape.name not in looks or looks[shape.name].link not in faults:
+        if shape.name not in looks or looks[shape.name][0] not in faults:
             found.addGeometryObject(shape)
     return found, faults
 
 
-def missing_meshes(urdf: Urdf, package_dirs: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """The missing visual meshes by link, as the file names them."""
-    missing, packages = {}, Packages(urdf.path, tuple(package_dirs))
-    for element in urdf.root.findall("link"):
-        files = [mesh.get("filename", "") for mesh in element.iterfind("visual/geometry/mesh")]
-        if absent := tuple(file for file in files if packages.locate(file) is None):
-            missing[element.get("name", "")] = absent
-    return missing
-
-
-def missing_meshes_message(urdf: Urdf, missing: Mapping[str, Sequence[str]], package_dirs: Sequence[str]) -> str:
-    """The error message for meshes from :func:`missing_meshes`."""
-    packages = Packages(urdf.path, tuple(package_dirs))
+def _missing_meshes(urdf: Urdf, packages: Packages) -> dict[str, str]:
+    """The links whose visual meshes are missing, each with the message about all of them."""
+    missing: dict[str, list[str]] = {}
+    for link in urdf.root.findall("link"):
+        for mesh in link.iterfind("visual/geometry/mesh"):
+            if packages.locate(file := mesh.get("filename", "")) is None:
+                missing.setdefault(link.get("name", ""), []).append(file)
+    if not missing:
+        return {}
     links = listed((f"link {link!r}: {', '.join(files)}" for link, files in missing.items()), "links")
-    first = next(iter(missing.values()), ("",))[0]
-    if there := packages.in_other_case(first):
-        return f"meshes of {urdf.path} are missing: {links}; {there} is there, in other upper and lower case"
+    message = f"meshes of {urdf.path} are missing: {links}; "
+    if there := packages.in_other_case(next(iter(missing.values()))[0]):
+        return dict.fromkeys(missing, f"{message}{there} is there, in other upper and lower case")
     places = ", ".join(map(str, packages.places)) or "no folder"
-    return (
-        f"meshes of {urdf.path} are missing: {links}; looked beside the file and in {places} (package_dirs=[...] adds)"
-    )
+    return dict.fromkeys(missing, f"{message}looked beside the file and in {places} (package_dirs=[...] adds)")
 
 
 def _mended(content: bytes) -> str:
@@ -404,8 +409,37 @@ def _xacro(root: ET.Element) -> dict[str, None]:
     return dict.fromkeys(f"<{part.tag}>" for part in root.iter() if part.tag.partition(":")[0] in prefixes)
 
 
+def _unlimited(root: ET.Element) -> str:
+    """Replace the limits by which exporters mean none; returns a sentence about them, empty if there are none.
+
+    Two bounds of 0 are none as well, as a URDF before version 1.2 without bounds is read.
+    """
+    stated, told = root.get("version") == "1.2", []
+    for joint in root.findall("joint"):
+        name, limit = joint.get("name", ""), joint.find("limit")
+        if limit is None and joint.get("type") in ("revolute", "prismatic"):
+            limit = ET.SubElement(joint, "limit")
+        if limit is None:
+            continue
+        bounded = bool({"lower", "upper"} & set(limit.keys()))
+        minus_one = _number(limit.get("lower")) == _number(limit.get("upper")) == -1.0
+        for key in ("lower", "upper", "effort", "velocity"):
+            word, drive = limit.get(key), key in ("effort", "velocity")
+            if word is None and (stated if drive else bounded or not stated):
+                continue
+            value = _number(word)
+            none = word is None or word.strip().lower() in _WORDS or math.isinf(value)
+            none |= value < 0.0 if drive else minus_one
+            if joint.get("type") != "fixed" and (none or (not drive and abs(value) > NO_LIMIT)):
+                told.append(f"no {key} of {name!r}" if word is None else f"{key} {word} of {name!r}")
+            if none:
+                limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)
+    what = "limits that are missing, infinite, negative or huge count as none"
+    return f"{what}: {listed(told, 'limits')}" if told else ""
+
+
 def _remarks(root: ET.Element) -> Iterator[str]:
-    """How limits and elements without effect are read, one sentence a kind. Limits that mean none become none."""
+    """How limits and elements without effect are read, one sentence a kind."""
     left = _xacro(root)
     left |= {
         f"<{part.tag} {key}={value!r}>": None
@@ -415,37 +449,14 @@ def _remarks(root: ET.Element) -> Iterator[str]:
     }
     if left:
         yield f"leftover xacro elements have no effect: {listed(left, 'kinds')}"
-    none, degrees, ignored, crossed = [], [], [], []
-    for joint in root.findall("joint"):
-        name, kind = repr(joint.get("name", "")), joint.get("type")
-        limit = joint.find("limit")
-        if limit is None and kind in ("revolute", "prismatic"):
-            limit = ET.SubElement(joint, "limit")
-        if limit is None:
-            continue
+    degrees, ignored = [], []
+    for joint in root.findall("joint[limit]"):
+        name, kind, limit = repr(joint.get("name", "")), joint.get("type"), joint.findall("limit")[0]
         low, high = (_number(limit.get(key)) for key in ("lower", "upper"))
         if kind == "continuous" and low < high and high - low < NO_LIMIT:
             ignored.append(name)
-        if kind != "continuous" and low > high:
-            crossed.append(f"{low:g} to {high:g} of {name}")
         if kind == "revolute" and limits_in_degrees(low, high):
             degrees.append(f"{low:g} to {high:g} of {name}")
-        # Before version 1.2, a bound that is missing is 0, and two bounds of 0 are none.
-        stated = root.get("version") == "1.2"
-        bounds = [key for key in ("lower", "upper") if key in limit.attrib] or (["lower", "upper"] if stated else [])
-        for key in (*bounds, "effort", "velocity"):
-            value, drive = _number(limit.get(key)), key in ("effort", "velocity")
-            unread = key not in limit.attrib or (drive and value < 0.0) or math.isinf(value)
-            if key in limit.attrib and kind != "fixed" and (unread or (not drive and abs(value) > NO_LIMIT)):
-                none.append(f"{key} {limit.attrib[key]} of {name}")
-            elif unread and not (drive and stated) and kind != "fixed":
-                none.append(f"no {key} of {name}")
-            if unread and not (drive and stated and key not in limit.attrib):
-                limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)
-    if none:
-        yield f"limits that are missing, infinite, negative or huge count as none: {listed(none, 'limits')}"
-    if crossed:
-        yield f"limits whose lower bound is above the upper one leave no room: {listed(crossed, 'joints')}"
     if degrees:
         yield f"limits look like degrees, and URDF has radians: {listed(degrees, 'joints')}"
     if ignored:
@@ -532,23 +543,15 @@ def finite_number(word: str, what: str) -> float:
 
 
 def listed(names: Iterable[str], what: str) -> str:
-    """The first three of some names, and how many more there are."""
+    """Some names; of more than four the first three, and how many more there are."""
     names = list(names)
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more {what}" if len(names) > 3 else "")
+    return ", ".join(names[:3]) + f" and {len(names) - 3} more {what}" if len(names) > 4 else ", ".join(names)
 
 
-@dataclass(frozen=True)
-class _Look:
-    """What Pinocchio does not read of a ``<visual>``: names of its mesh and texture, as in the file, or empty."""
+def _looks(root: ET.Element) -> tuple[ET.Element, dict[str, tuple[str, ET.Element | None, str]]]:
+    """The part of a URDF for Pinocchio's shapes: joints, and links with their visuals; and what it does not read.
 
-    link: str
-    texture: str = ""
-    mesh: str = ""
-    scale: str = "1 1 1"
-
-
-def _looks(root: ET.Element) -> tuple[ET.Element, dict[str, _Look]]:
-    """The part of a URDF for Pinocchio's shapes: joints, and links with their visuals; and the rest by shape.
+    That is for each shape, by the name that Pinocchio gives it, its link, its mesh and the file of its texture, or "".
 
     Spheres stand for the meshes, as coal's loader misreads some.
 
@@ -573,14 +576,8 @@ def _looks(root: ET.Element) -> tuple[ET.Element, dict[str, _Look]]:
                     ET.SubElement(ET.SubElement(plain, "geometry"), "sphere", radius="1")
                 else:
                     plain.append(child)
-            # The name that Pinocchio gives to the shape.
-            name = link.get("name", "")
-            looks[f"{name}_{k}"] = _Look(
-                name,
-                "" if texture is None else texture.get("filename", ""),
-                "" if mesh is None else mesh.get("filename", ""),
-                "1 1 1" if mesh is None else mesh.get("scale", "1 1 1"),
-            )
+            image = "" if texture is None else texture.get("filename", "")
+            looks[f"{link.get('name', '')}_{k}"] = link.get("name", ""), mesh, image
     small.extend(root.findall("joint"))
     return small, looks
 
@@ -590,11 +587,6 @@ def _has_color(material: ET.Element) -> bool:
     if color is None:
         return False
     return material.find("texture") is None or any(word.strip("0.") for word in color.get("rgba", "").split()[:3])
-
-
-def _located(name: str, urdf: Path, package_dirs: Sequence[str]) -> Path | None:
-    """The path of a file named in a URDF; None if it does not exist."""
-    return Packages(urdf, tuple(package_dirs)).locate(name)
 
 
 def _head(root: ET.Element) -> dict[str, str]:

@@ -19,9 +19,10 @@ from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, build_robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.additions import Base
-from varpin.model.inertia import fault, one_of_each, principal_moments
+from varpin.model.inertia import fault, inertials_of, one_of_each, principal_moments
 from varpin.model.mimic import joint_index
 from varpin.model.tree import is_unbounded, joint_axis
+from varpin.model.units import NO_LIMIT
 from varpin.model.urdf import Inertial, Urdf, build_model, listed, read_inertials, read_urdf
 from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
 from varpin.support.checks import JointValues, joint_array
@@ -100,13 +101,14 @@ def inspect_robot(
     condition, scaled = _condition_numbers(jet.Lvv)
     urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
     inertials, lacks = ((), ()) if urdf is None else read_inertials(urdf, build_model(urdf))
-    joints, links = _joints(robot), _links(robot, inertials)
+    joints, links, (shapes, unread) = _joints(robot), _links(robot, inertials), readable_geometry(robot)
     warnings = [
         *(() if urdf is None else (*urdf.remarks, *urdf.notes)),
         *lacks,
         *robot.limit_remarks(),
-        *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links), _ratio_warnings(robot))),
-        *_mesh_warnings(robot),
+        *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes), _ratio_warnings(robot))),
+        *_mesh_warnings(robot, shapes),
+        *dict.fromkeys(what for _, what in unread.values()),
         *_matrix_warnings(robot, scaled),
         *one_of_each(_limit_warnings(joints, robot, None if q is None else configuration)),
         *one_of_each(_mimic_warnings(robot, urdf, joints, tied=mimic == "tied")),
@@ -164,8 +166,8 @@ def _joints(robot: Robot) -> tuple[JointReport, ...]:
                 kind=kind,
                 axis=axis,
                 unit="m" if slides else "rad",
-                lower=_limit(lower),
-                upper=_limit(upper),
+                lower=_limit(lower, NO_LIMIT),
+                upper=_limit(upper, NO_LIMIT),
                 velocity=_limit(model.velocityLimit[entry.idx_v]),
                 effort=_limit(model.effortLimit[entry.idx_v]),
                 follows=follows,
@@ -174,18 +176,16 @@ def _joints(robot: Robot) -> tuple[JointReport, ...]:
     return tuple(reports)
 
 
-def _limit(value: float) -> float:
-    """A limit; infinite for the largest double, which is no limit in Pinocchio."""
-    return float(np.copysign(np.inf, value)) if abs(value) >= 1e300 else float(value)
+def _limit(value: float, none: float = 1e300) -> float:
+    """A limit; infinite beyond ``none``: the largest double is no limit in Pinocchio."""
+    return float(np.copysign(np.inf, value)) if abs(value) > none else float(value)
 
 
 def _links(robot: Robot, inertials: Sequence[Inertial]) -> tuple[LinkReport, ...]:
-    if not inertials:
-        bodies = range(1, robot.free_model.njoints)
-        return tuple(_body(robot, joint) for joint in bodies)
     # The links of the URDF: Pinocchio merges links on fixed joints into one body, which can hide a faulty inertia.
     model = robot.free_model
-    joints = {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
+    joints = joint_index(model)
+    joints |= {frame.name: frame.parentJoint for frame in model.frames if frame.type == pin.FrameType.BODY}
     return tuple(
         LinkReport(
             name=link.link,
@@ -195,7 +195,7 @@ def _links(robot: Robot, inertials: Sequence[Inertial]) -> tuple[LinkReport, ...
             inertia=link.inertia,
             moments=principal_moments(link.inertia),
         )
-        for link in inertials
+        for link in inertials or inertials_of(model)
         if link.link in joints
     )
 
@@ -221,18 +221,6 @@ def _frames(robot: Robot) -> tuple[FrameReport, ...]:
     return tuple(reports.values())
 
 
-def _body(robot: Robot, joint: int) -> LinkReport:
-    body, inertia = robot.free_model.inertias[joint], np.array(robot.free_model.inertias[joint].inertia)
-    return LinkReport(
-        name=_body_name(robot, joint),
-        joint=robot.free_model.names[joint],
-        mass=float(body.mass),
-        center=np.array(body.lever),
-        inertia=inertia,
-        moments=np.linalg.eigvalsh(inertia),
-    )
-
-
 def _body_name(robot: Robot, joint: int) -> str:
     """Name of the first link on a joint, or of the joint if the model has no links there."""
     for frame in robot.free_model.frames:
@@ -253,8 +241,10 @@ def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
             yield "point mass", name, f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
 
 
-def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tuple[str, str, str]]:
-    length, corners = LENGTH_RATIO * _reach(robot) or LENGTH, _corners(robot)
+def _inertia_warnings(
+    robot: Robot, links: Sequence[LinkReport], shapes: pin.GeometryModel
+) -> Iterator[tuple[str, str, str]]:
+    length, corners = LENGTH_RATIO * longest_reach(robot, slides=False, centers=False) or LENGTH, _corners(shapes)
     frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
         if not link.joint or not link.inertia.any():
@@ -267,7 +257,7 @@ def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tup
         # A ball has the least inertia of all bodies of a given mass and density.
         radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
         gyration, against, size = float(np.sqrt(link.moments[-1] / link.mass)), _against_reach(robot), np.inf
-        near = [points for _, joint, points in corners if frame is not None and joint == frame.parentJoint]
+        near = [points for joint, points in corners if frame is not None and joint == frame.parentJoint]
         if frame is not None and near:
             size = float(np.linalg.norm(np.vstack(near) - frame.placement.act(link.center), axis=1).max())
         if SIZE_RATIO * size < length:
@@ -291,10 +281,10 @@ def _inertia_warnings(robot: Robot, links: Sequence[LinkReport]) -> Iterator[tup
             yield "away", link.name, f"{far}; are these millimetres?"
 
 
-def _corners(robot: Robot) -> list[tuple[str, int, Floats]]:
-    """The link, the joint and the corners (8, 3) [m], in the joint's frame, of the box around each readable shape."""
+def _corners(shapes: pin.GeometryModel) -> list[tuple[int, Floats]]:
+    """The joint and the corners (8, 3) [m], in the joint's frame, of the box around each shape."""
     found = []
-    for shape in readable_geometry(robot)[0].geometryObjects:
+    for shape in shapes.geometryObjects:
         if isinstance(shape.geometry, pin.coal.BVHModelBase):
             vertices = np.asarray(shape.geometry.vertices(), dtype=np.float64)
             low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -303,21 +293,12 @@ def _corners(robot: Robot) -> list[tuple[str, int, Floats]]:
             low, high = shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_
         corners = np.array(list(product(*zip(low, high, strict=True))))
         placed = corners @ shape.placement.rotation.T + shape.placement.translation
-        found.append((robot.free_model.frames[shape.parentFrame].name, shape.parentJoint, placed))
+        found.append((shape.parentJoint, placed))
     return found
 
 
-def _reach(robot: Robot) -> float:
-    """The longest path from a root of the tree to a joint, along the offsets between joints [m]."""
-    path = np.zeros(len(robot.tree.parent))
-    for body, parent in enumerate(robot.tree.parent):
-        if parent >= 0:
-            path[body] = path[parent] + np.linalg.norm(robot.tree.translation[body])
-    return float(path.max())
-
-
 def _against_reach(robot: Robot) -> str:
-    reach = _reach(robot)
+    reach = longest_reach(robot, slides=False, centers=False)
     return f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
 
 
@@ -344,10 +325,10 @@ def _ratio_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
                 )
 
 
-def _mesh_warnings(robot: Robot) -> Iterator[str]:
+def _mesh_warnings(robot: Robot, shapes: pin.GeometryModel) -> Iterator[str]:
     sizes = {
         shape: float(np.ptp(shape.geometry.vertices(), axis=0).max())
-        for shape in readable_geometry(robot)[0].geometryObjects
+        for shape in shapes.geometryObjects
         if shape.parentJoint and isinstance(shape.geometry, pin.coal.BVHModelBase)
     }
     reach = longest_reach(robot)
@@ -377,28 +358,19 @@ def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
 
 def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[tuple[str, str, str]]:
     bounded = [joint for joint in joints if joint.kind in ("revolute", "prismatic")]
-    driven = [joint for joint in joints if joint.kind != "mimic"]
-    missing = {
-        "position": [joint.name for joint in bounded if np.isinf(joint.lower) or np.isinf(joint.upper)],
-        "velocity": [joint.name for joint in driven if np.isinf(joint.velocity) or joint.velocity == 0.0],
-        "effort": [joint.name for joint in driven if np.isinf(joint.effort) or joint.effort == 0.0],
-    }
-    for what, names in missing.items():
-        if names:
-            yield what, "", f"no {what} limit, or one of 0: {listed(map(repr, names), 'joints')}"
-    for joint in bounded:
-        if joint.lower == joint.upper == 0.0:
-            yield (
-                "zeros",
-                joint.name,
-                (
-                    f"joint {joint.name!r} has the limits 0 and 0, which count as none, as in a URDF without limits; "
-                    "lock a joint to keep it from moving"
-                ),
-            )
-        elif joint.lower >= joint.upper:
-            words = f"limits {joint.lower:g} and {joint.upper:g} {joint.unit}"
-            yield "no room", joint.name, f"joint {joint.name!r} has no room to move: {words}"
+    missing: dict[str, list[str]] = {}
+    for joint in joints:
+        none = {
+            "position": joint in bounded
+            and (joint.lower == joint.upper == 0.0 or not np.isfinite(joint.upper - joint.lower)),
+            "velocity": joint.kind != "mimic" and joint.velocity in (0.0, np.inf),
+            "effort": joint.kind != "mimic" and joint.effort in (0.0, np.inf),
+        }
+        if any(none.values()):
+            missing.setdefault(", ".join(what for what in none if none[what]), []).append(repr(joint.name))
+    if missing:
+        groups = "; ".join(f"{what} of {listed(names, 'joints')}" for what, names in missing.items())
+        yield "unlimited", "", f"limits that are missing, 0, negative or huge count as none: {groups}"
     at_zero = q is None
     for name, at, low, high in zip(
         robot.joint_names, np.zeros(robot.dof) if q is None else q, *robot.position_limits, strict=True

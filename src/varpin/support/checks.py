@@ -7,6 +7,7 @@ import math
 import os
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -221,14 +222,26 @@ def over_time(name: str, function: Callable[[float], ArrayLike], times: Floats, 
     Raises:
         InputError: The function raises, or returns another shape or values that are not finite.
     """
-    rows = []
-    for time in times.tolist():
-        try:
-            value = function(time)
-        except Exception as error:
-            raise InputError(f"{name} raised {error!r} at t = {time:.6g} s") from error
-        rows.append(finite_array(f"{name} at t = {time:.6g} s", value, (size,)))
+    rows = [returned(name, partial(function, t), (size,), f" at t = {t:.6g} s") for t in times.tolist()]
     return np.array(rows).reshape(len(times), size)
+
+
+def returned(
+    name: str, call: Callable[[], object], shape: tuple[int, ...], at: str = "", error: type[InputError] = InputError
+) -> Floats:
+    """What a user's function returns, an array of ``shape``; messages end with ``at``.
+
+    Raises:
+        InputError: It raises, or returns anything else; of the type ``error``.
+    """
+    try:
+        value = call()
+    except Exception as cause:
+        raise error(f"{name} raised {cause!r}{at}") from cause
+    try:
+        return finite_array(name, value, shape)  # type: ignore[arg-type]
+    except InputError as wrong:
+        raise error(f"{wrong}{at}") from None
 
 
 def as_floats(name: str, value: object) -> Floats:

@@ -99,6 +99,7 @@ class SceneFile:
         spec, horizon = self.spec, self.spec.horizon
         if not spec.cost:
             raise spec.where.at("cost").error("is missing; a scene to solve needs at least one [[cost]]")
+        task.require_start()
         most, constraints = task.control_limit, []
         for index, given in enumerate(spec.plan_constraint):
             try:
@@ -153,9 +154,11 @@ class SceneFile:
         """The motion under the controls of ``[simulate]``, with noise if it gives a seed.
 
         Raises:
+            SceneFileError: The start is off the constraints.
             StepFailure, Interrupted: As :func:`varpin.simulate`.
         """
         spec = self.spec
+        self._task.require_start()
         return simulate(
             self.scene,
             self.q0,

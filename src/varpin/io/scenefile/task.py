@@ -22,6 +22,7 @@ from varpin.mechanics.reduction import Required, driving, idle_joints, joints_wi
 from varpin.mechanics.scene import Scene, closest_controls
 from varpin.model import Robot, combine, load_robot, looks_like_degrees
 from varpin.model.tree import frame_index
+from varpin.simulation.start import on_constraints
 
 # Largest number of times at which controls and references are sampled for checks.
 _SAMPLES = 2000
@@ -65,6 +66,18 @@ class Task:
     torque_limit: Floats
     costs: tuple[CostTerm, ...]
     controls: Timeline | str | None
+
+    def require_start(self) -> None:
+        """Refuse a start off the constraints.
+
+        Raises:
+            SceneFileError: It misses them by too much.
+        """
+        if self.scene.constraints:
+            try:
+                on_constraints(self.scene, self.q0, self.v0)
+            except VarpinError as error:
+                raise self.tables.where.at("initial").at("q").error(str(error)) from None
 
     def without(self, joints: Sequence[str]) -> Task:
         """The same task with ``joints`` held at their initial positions, and without what acts on them alone."""
