@@ -300,8 +300,8 @@ def test_a_saved_motion_is_replayed(arm, saved, tmp_path, capsys):
     assert main(["replay", saved, "--robot", arm, "--html", str(page), *words]) == 0
     assert capsys.readouterr().out == f"written: {page}\n"
     paths = [command["path"] for command in commands(page) if command["type"] == "set_object"]
-    assert any("/traces/" in path and path.endswith("motion lower") for path in paths)
-    assert any("frames" in path and "upper" in path for path in paths), paths
+    assert any(path.endswith("motion lower") for path in paths)
+    assert any(path.endswith("frame upper") for path in paths), paths
 
 
 def test_a_motion_of_a_robot_with_a_name_needs_no_other(tmp_path):
@@ -328,7 +328,7 @@ def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     shown = []
-    monkeypatch.setattr("varpin.cli.replay.replay", lambda *words, **options: shown.append(options) or Viewer())
+    monkeypatch.setattr("varpin.show.replay.motion.replay", lambda *words, **options: shown.append(options) or Viewer())
     monkeypatch.setattr("varpin.cli.replay.time.sleep", interrupt)
     assert main(["replay", saved, "--robot", arm, "--once"]) == 0
     assert not unnamed(capsys.readouterr().err, "http://here", "Ctrl-C")
@@ -712,7 +712,7 @@ def test_a_scenes_replay_shows_its_task(scene, tmp_path):
     assert main(["solve", scene, "--html", "motion.html", "--trace", "pip", "--quiet"]) == 0
     paths = [command["path"] for command in commands(tmp_path / "motion.html") if command["type"] == "set_object"]
     assert any(path.startswith("/meshcat/ghost/") for path in paths)
-    traces = {path.split("/")[4] for path in paths if "/traces/" in path}
+    traces = {path.split("/")[3] for path in paths if " motion " in path or " ghost " in path}
     assert traces == {"0 motion pip"}  # and the ghost's joints stay
 
 
@@ -748,7 +748,9 @@ def test_mistakes_about_scenes(arguments, facts, scene, tmp_path, capsys):
 def test_speed_of_a_scene_s_replay(tmp_path, monkeypatch, words, speed):
     """The file's own, 0.5, unless one is asked for."""
     asked = []
-    monkeypatch.setattr("varpin.cli.outputs.replay", lambda *_, speed, html, **__: asked.append(speed) or html.touch())
+    monkeypatch.setattr(
+        "varpin.show.replay.motion.replay", lambda *_, speed, html, **__: asked.append(speed) or html.touch()
+    )
     assert main(["simulate", "ur5_reach", "--html", str(tmp_path / "a.html"), "--quiet", *words]) == 0
     assert asked == [speed]
 

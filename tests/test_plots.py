@@ -148,7 +148,7 @@ def test_torques_of_joints_moved_by_hand_are_no_controls(tmp_path):
     scene = vp.Scene(vp.planar_chain(2), constraints=vp.KinematicInput("joint1"))
     motion = vp.simulate(scene, [0.3, 0.3], [0, 0], dt=0.02, steps=3)
     with refused(vp.InputError, "kinematic inputs"):
-        vp.replay(scene.robot, motion, torques=True, html=tmp_path / "hand.html")
+        vp.replay(scene.robot, motion, marks=vp.Marks(torques=True), html=tmp_path / "hand.html")
 
 
 def test_controls_of_servos_are_commanded_positions():

@@ -11,8 +11,9 @@ from PIL import Image, ImageSequence
 from refusals import refused, unnamed
 
 import varpin as vp
+from varpin import replay
 from varpin.cli import main
-from varpin.show.replay import replay, video
+from varpin.show.replay import video
 
 Q = np.linspace([0.0, 0.0], [1.2, -0.8], 11)
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -16,8 +15,9 @@ from varpin.cli.interrupts import Interrupts
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.io.archive import atomic_file
 from varpin.io.scenefile.tables import FIGURES
+from varpin.marks import Marks
 from varpin.model import Robot
-from varpin.show.replay import check_film, replay
+from varpin.show.replay.video import check_film
 from varpin.support.checks import positive, writable
 from varpin.trajectory import Trajectory
 
@@ -54,15 +54,15 @@ class Output:
     write: Callable[[Robot, Trajectory], None]
 
 
-Marks = Callable[[float], Mapping[str, Any]]
+MarksOf = Callable[[float], Marks]
 
 
-def outputs_of(request: argparse.Namespace, marks: Marks | None = None) -> list[Output]:
+def outputs_of(request: argparse.Namespace, marks: MarksOf | None = None) -> list[Output]:
     """The requested files, the most important first. Their writers are imported now, so that errors precede the run.
 
     Args:
         request: The parsed command line.
-        marks: Function from the duration [s] of a motion to the marks of the task in its replay.
+        marks: Function from the duration [s] of a motion to what its replay shows of the task.
 
     Raises:
         FileError: A file cannot be written.
@@ -77,7 +77,7 @@ def outputs_of(request: argparse.Namespace, marks: Marks | None = None) -> list[
     return _distinct([*outputs, *replays_of(request, marks)])
 
 
-def replays_of(request: argparse.Namespace, marks: Marks | None = None) -> list[Output]:
+def replays_of(request: argparse.Namespace, marks: MarksOf | None = None) -> list[Output]:
     """The requested page and video; errors as for :func:`outputs_of`."""
     outputs = []
     for path, film in ((request.html, False), (request.video, True)):
@@ -86,8 +86,7 @@ def replays_of(request: argparse.Namespace, marks: Marks | None = None) -> list[
                 check_film(path)
             else:
                 _require_ending("--html", path, (".html", ".htm"))
-            speed = positive("--speed", 1.0 if request.speed is None else request.speed, "1")
-            outputs.append(_replay(writable(path), speed, request.trace, film, marks))
+            outputs.append(_replay(writable(path), request, film, marks))
     return _distinct(outputs)
 
 
@@ -125,12 +124,17 @@ def _figure(path: Path) -> Output:
     return Output(path, write)
 
 
-def _replay(path: Path, speed: float, frames: Sequence[str], film: bool, marks: Marks | None) -> Output:
+def _replay(path: Path, request: argparse.Namespace, film: bool, marks: MarksOf | None) -> Output:
+    speed = positive("--speed", 1.0 if request.speed is None else request.speed, "1")
+
     def write(robot: Robot, trajectory: Trajectory) -> None:
+        from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
+
         html, video = (None, path) if film else (path, None)
-        task = {} if marks is None else dict(marks(trajectory.duration))
-        trace = frames or task.pop("trace", ())
-        replay(robot, trajectory, html=html, video=video, speed=speed, **{**task, "trace": trace})
+        task = Marks() if marks is None else marks(trajectory.duration)
+        shown = replace(task, trace=request.trace or task.trace)
+        loop = not getattr(request, "once", False)
+        replay(robot, trajectory, html=html, video=video, speed=speed, loop=loop, marks=shown)
 
     return Output(path, write)
 

@@ -30,7 +30,7 @@ from varpin.cli.exits import INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
 from varpin.errors import InputError
 from varpin.mechanics.scene import Scene
-from varpin.show.replay import frame_names
+from varpin.show.given import frame_names
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.simulate import simulate
 from varpin.support.checks import count, positive

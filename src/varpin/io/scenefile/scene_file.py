@@ -23,6 +23,7 @@ from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.shown import marks_of
 from varpin.io.scenefile.tables import SceneTables, read_scene
 from varpin.io.scenefile.task import Task, required_of, task_of
+from varpin.marks import Marks
 from varpin.mechanics.reduction import Required
 from varpin.mechanics.scene import Scene, closest_controls
 from varpin.model import Robot, models_dir
@@ -200,8 +201,8 @@ class SceneFile:
         saved = self.robot.dof**3 - sum(len(part) ** 3 for part in parts)
         return len(parts) > 1 and self.spec.steps * saved > _SETUP * len(parts)
 
-    def marks(self, duration: float | None = None) -> dict[str, Any]:
-        """Options of :func:`varpin.replay` that mark the task: ``replay(robot, motion, **scene.marks())``.
+    def marks(self, duration: float | None = None) -> Marks:
+        """The task in a replay: ``replay(robot, motion, marks=scene.marks())``.
 
         They are targets, reference paths and traces of the frames in the cost, a ghost of the robot that follows a
         reference of joints, and constraints.
@@ -209,12 +210,8 @@ class SceneFile:
         Args:
             duration: Duration of the motion [s]; the horizon if left out.
         """
-        marks = marks_of(self._task, self.spec.duration if duration is None else duration)
-        if self.spec.plan_constraint:
-            marks["constraints"] = self.problem
-        elif self.scene.constraints:
-            marks["constraints"] = self.scene
-        return marks
+        constraints = self.problem if self.spec.plan_constraint else self.scene
+        return marks_of(self._task, self.spec.duration if duration is None else duration, constraints)
 
     def load_solution(self, path: str | Path) -> Solution:
         """Read a solution of this scene that :meth:`Solution.save` wrote; see :meth:`Solution.load`."""

@@ -1,7 +1,8 @@
-"""Constraints of a scene and a plan for a replay: ties of the mechanism, obstacles, regions, goals."""
+"""Marks of constraints: ties of the mechanism, obstacles, regions and goals of a plan."""
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from varpin.mechanics.forces import point_of
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
 from varpin.model.tree import z_to
-from varpin.show.replay.script import Region, Target, Tie
+from varpin.show.replay.marks import Region, Target, Tie
 
 if TYPE_CHECKING:
     from varpin.control.constraints import PlanConstraint
@@ -40,7 +41,7 @@ def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None,
     scene = source if isinstance(source, Scene) else getattr(source, "scene", None)
     if not isinstance(scene, Scene):
         raise InputError(
-            f"constraints must be True or False, a Scene or an OptimalControlProblem, got {type(given).__name__}"
+            f"constraints must be True or False, a Scene or an OptimalControlProblem, got {reprlib.repr(given)}"
         )
     owner = scene.robot
     if owner.joint_names != robot.joint_names or not owner.built_like(robot):
