@@ -57,10 +57,6 @@ def test_plain_run_prints_a_summary_and_writes_nothing(arm, tmp_path, capsys):
     for words in (
         "arm: Gauss(stages=2)",
         "50, 0.01 s each, 0.5 s in all",
-        "Newton iterations",
-        "split steps                 │ none",
-        "worst residual",
-        "smallest branch margin",
         "energy error",
         "q at the end [rad or m]",
     ):
@@ -132,14 +128,16 @@ def test_quiet_run_prints_nothing(arm, capsys):
 def test_split_steps_are_flagged_in_the_table(arm, capsys):
     assert main(["simulate", arm, "--integrator", "midpoint", "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
     out, err = capsys.readouterr()
-    assert re.search(r"split steps +│ \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", out)
+    assert re.search(
+        r"split steps \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", " ".join(out.split())
+    )
     assert re.search(r"^varpin: warning: q is off by up to \S+ rad, .* Use integrator=", err, re.MULTILINE)
 
 
 def test_all_warnings_are_printed(tmp_path, capsys):
     start = ["--dt", "0.05", "--steps", "20", "--v0", "8", "0", "0", "0", "0", "0", "--save", str(tmp_path / "a.npz")]
     assert main(["simulate", "ur5", "--integrator", "midpoint", *start]) == 0
-    said = " ".join(re.sub(r"[│\s]+", " ", "".join(capsys.readouterr())).replace("warning ", "").split())
+    said = " ".join(re.sub(r"\s+", " ", "".join(capsys.readouterr())).replace("warning ", "").split())
     told = vp.Trajectory.load(tmp_path / "a.npz").warnings
     assert len(told) > 1
     assert not unnamed(said, *(str(finding.joint) for finding in told), *(finding.kind[:-1] for finding in told[1:]))
@@ -148,7 +146,7 @@ def test_all_warnings_are_printed(tmp_path, capsys):
 def test_forced_motion_has_an_energy_change_and_no_error(arm, capsys):
     assert main(["simulate", arm, "--steps", "10", "--torque", "1"]) == 0
     out = capsys.readouterr().out
-    assert re.search(r"energy change +│ \+\S+ J from start to end, \S+ J at most in between", out)
+    assert re.search(r"energy change \+\S+ J from start to end, \S+ J at most in between", " ".join(out.split()))
     assert "energy error" not in out
 
 
@@ -156,7 +154,7 @@ def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
     path = tmp_path / "a.npz"
     assert main(["simulate", arm, "--damping", "0.5", "--no-gravity", "--v0", "1", "--save", str(path)]) == 0
     energy = vp.Trajectory.load(path).energy
-    lost = float(re.search(r"energy change +│ (\S+) J from start to end", capsys.readouterr().out)[1])
+    lost = float(re.search(r"energy change +(\S+) J from start to end", capsys.readouterr().out)[1])
     assert lost == pytest.approx(energy[-1] - energy[0], rel=5e-3)
     assert lost < 0.0
 
@@ -483,18 +481,16 @@ def test_inspect_prints_tables_and_then_warnings(capsys):
     assert err == ""
     for words in (
         "panda: joints",
-        "mimic: 1 * panda_finger_joint1",
         "locked at -1.0",
         "panda: links",
-        "mass [kg]",
         "degrees of freedom",
-        "condition of M(q)",
-        "largest step accepted",
+        "largest step of Midpoint",
     ):
         assert words in out
     lines = out.splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("warning: "))
     assert all(line.startswith("warning: ") for line in lines[first:])
+    assert max(map(len, lines[:first])) <= 80
     assert naming(lines[first:], "'panda_finger_joint2'", "mimic")
 
 
@@ -502,18 +498,18 @@ def test_inspect_takes_a_curvature_of_rounding_for_none(capsys):
     """A UR5 at rest at 0 has gravity along its axes but for 1.5708: seconds by the ten thousand are no advice."""
     assert vp.inspect_robot("ur5").largest_step > 1e4
     assert main(["inspect", "ur5"]) == 0
-    assert "any: nothing is unstable at this q, at rest (" in capsys.readouterr().out
+    assert "any: nothing is unstable at this q, at rest\n" in capsys.readouterr().out
     assert main(["inspect", "ur5", "--q", "-1.2", "--v", "1"]) == 0
     step = vp.inspect_robot("ur5", q=-1.2, v=1.0).largest_step
     assert 0.0 < step < 1.0
-    assert f"{step:.3g} s at this q, and this v (" in capsys.readouterr().out
+    assert f"{step:.3g} s at this q, and this v\n" in capsys.readouterr().out
 
 
 def test_robots_are_listed_with_their_joints(capsys):
     assert main(["robots"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    rows = dict(re.findall(r"^│ (\S+) +│ (\d+) +│$", out, flags=re.MULTILINE))
+    rows = dict(re.findall(r"^  (\S+) +(\d+)$", out, flags=re.MULTILINE))
     assert tuple(rows) == vp.robot_names()
     assert rows["finger"] == "3"
     assert rows["ur5"] == "6"
@@ -636,14 +632,13 @@ def test_advise_says_what_to_take(arm, tmp_path, capsys):
     options = ["--duration", "0.5", "--q0", "0.3", "--damping", "0.1"]
     assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
     out, err = capsys.readouterr()
-    assert err == ""
+    assert "a minute at most" in err
     assert not unnamed(out.splitlines()[0], "dt", "1e-06", "0.5 s")
-    assert out.count("│ Gauss") >= 2
+    assert out.count("  Gauss") >= 2
     assert main(["advise", arm, "--budget", "2e-3", "--out", str(tmp_path / "advice"), *options]) == 0
     assert {path.name for path in (tmp_path / "advice").iterdir()} == {"advice.csv", "advice.png", "advice.html"}
     page = (tmp_path / "advice" / "advice.html").read_text()
     assert not unnamed(page, "0.5 s", "2 ms")
-    assert page.count("<tr class=front>") == 1
     assert 'src="data:image/png;base64,' in page
     assert not unnamed(capsys.readouterr().out.splitlines()[0], "0.5 s", "2 ms")
     assert main(["advise", arm, "--tolerance", "1e-20", *options]) == 3
@@ -722,7 +717,7 @@ def test_scene_is_inspected(scene, capsys):
     for words in ("4 of 16", "nothing touches", "joint_12.0 at 0.0", "98% of a plan"):
         assert words in out
     assert main(["inspect", scene]) == 0
-    assert re.search(r"gravity +│ none", capsys.readouterr().out)
+    assert re.search(r"gravity +none", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(

@@ -282,7 +282,7 @@ def test_figure_and_report(oscillator, tmp_path):
     assert [path.name for path in paths] == ["tradeoff.csv", "tradeoff.png", "tradeoff.html"]
     page = paths[2].read_text()
     assert "<h1>A &lt;spring&gt;</h1>" in page
-    assert page.count("<tr") == 1 + len(oscillator.runs)
+    assert page.count("<tr") == 1 + len(oscillator.runs) + len(oscillator.notes)
 
 
 @pytest.fixture(scope="module")

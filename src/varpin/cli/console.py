@@ -6,7 +6,8 @@ import argparse
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import NoReturn
 
@@ -24,11 +25,14 @@ class Parser(argparse.ArgumentParser):
         self.exit(MISTAKE, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
-def file_size(size: int) -> str:
-    """The size of a file in words."""
-    if size < 1000:
-        return f"{size} B"
-    return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"
+def written_rows(files: Iterable[Path]) -> list[tuple[str, str]]:
+    """A row of a table for each file that was written, with its size."""
+    rows = []
+    for path in files:
+        size = path.stat().st_size
+        unit, one = next(((unit, one) for unit, one in (("MB", 1e6), ("kB", 1e3)) if size >= one), ("B", 1.0))
+        rows.append(("written", f"{path} ({size / one:.3g} {unit})"))
+    return rows
 
 
 class _Bar:
@@ -110,3 +114,8 @@ def say(console: Console, message: str, *, prefix: str = "varpin", style: str | 
     """Print a message as it is, after a prefix."""
     text = f"{prefix}: {message}" if prefix else message
     console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def show(content: object) -> None:
+    """Print a table or a text as the result of a command."""
+    say(Console(), str(content), prefix="")

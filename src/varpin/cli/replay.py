@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -13,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from varpin.cli.arguments import add_robot_options, names_scene, robot_options
-from varpin.cli.console import say
+from varpin.cli.console import say, show
 from varpin.cli.outputs import add_replay_options, replays_of, write_all
 from varpin.control import solution_trajectory
 from varpin.errors import FileError, InputError, RobotNotFound
@@ -23,7 +22,6 @@ from varpin.marks import Marks
 from varpin.model import Robot, load_robot
 from varpin.show.given import frame_names
 from varpin.support.checks import path_like, positive
-from varpin.support.tables import WIDTH
 from varpin.trajectory import Trajectory
 
 
@@ -70,9 +68,8 @@ def _replay(request: argparse.Namespace, errors: Console) -> int:
     writers = {output.path: partial(output.write, robot, motion) for output in outputs}
     with request.interrupts.keeping():
         written, status = write_all(errors, writers, request.interrupts)
-    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
     for path in written:
-        say(console, str(path), prefix="written")
+        show(f"written: {path}")
     return status
 
 

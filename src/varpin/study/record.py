@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Generic, TypeVar, cast
 
 from varpin.io.archive import atomic_file
 from varpin.support import markup
-from varpin.support.tables import csv_text
+from varpin.support.tables import Table, csv_text
 
 Row = TypeVar("Row")
 Made = TypeVar("Made", bound="Study[Any]")
@@ -87,10 +87,19 @@ class Study(Generic[Row]):
         """A run as entries of these columns."""
         return (*(_text(getattr(run, name)) for name in self.shown), self.note(run))
 
-    def _repr_html_(self) -> str:
+    def table(self, title: str = "") -> Table:
+        """The runs as a table; those that nothing beats stand out."""
         front = self.pareto()
-        strong = [k for k, run in enumerate(self.runs) if run in front]
-        table = markup.table(self.columns(), map(self.row, self.runs), strong)
+        strong = frozenset(k for k, run in enumerate(self.runs) if run in front)
+        return Table(title, self.columns(), [self.row(run) for run in self.runs], strong)
+
+    def _repr_html_(self) -> str:
+        return self.html()
+
+    def html(self, **rows: int) -> str:
+        """The runs and what a reader has to know as HTML; ``most=`` runs."""
+        runs = self.table()
+        table = markup.table(runs.columns, runs.rows, runs.strong, **rows)
         return markup.facts(repr(self), [("", note) for note in (*self.notes, *self.failures)], table)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
