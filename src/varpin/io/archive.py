@@ -117,6 +117,9 @@ class Archive(Mapping[str, NDArray[Any]]):
     def __getitem__(self, name: str) -> NDArray[Any]:
         return np.asarray(self.entries[name])
 
+    def __contains__(self, name: object) -> bool:
+        return name in self.entries
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.entries)
 
@@ -248,7 +251,7 @@ class _Builder:
             }
             if is_dataclass(hint) and below:
                 tables[key] = self.tables(hint, members, f"{name}.")
-            elif name in members:
+            elif name in entries:
                 tables[key] = entries[name]
             elif typing.get_origin(hint) is Mapping:
                 tables[key] = below
