@@ -13,7 +13,7 @@ from rich.console import Console
 
 from varpin.cli.arguments import add_robot_options, names_scene, robot_options
 from varpin.cli.console import say, show
-from varpin.cli.outputs import add_replay_options, replays_of, write_all
+from varpin.cli.outputs import add_replay_options, speed_of, write_all, writers_of
 from varpin.control import solution_trajectory
 from varpin.errors import FileError, InputError, RobotNotFound
 from varpin.io.archive import read_format
@@ -21,7 +21,7 @@ from varpin.io.scenefile import SceneFile, load_scene
 from varpin.marks import Marks
 from varpin.model import Robot, load_robot
 from varpin.show.given import frame_names
-from varpin.support.checks import path_like, positive
+from varpin.support.checks import path_like
 from varpin.trajectory import Trajectory
 
 
@@ -64,10 +64,12 @@ def _replay(request: argparse.Namespace, errors: Console) -> int:
     marks = replace(marks, ghost=ghost, trace=trace, frames=request.frames, torques=request.torques)
     if not asked:
         return _window(request, errors, robot, motion, marks)
-    outputs = replays_of(request, lambda _duration: marks)
-    writers = {output.path: partial(output.write, robot, motion) for output in outputs}
+    writers = writers_of(request, lambda _duration: marks)
+    files = {path: partial(write, robot, motion) for path, write in writers.items()}
     with request.interrupts.keeping():
-        written, status = write_all(errors, writers, request.interrupts)
+        written, status = write_all(
+            errors, {path: partial(write, robot, motion) for path, write in writers.items()}, request.interrupts
+        )
     for path in written:
         show(f"written: {path}")
     return status
@@ -75,10 +77,9 @@ def _replay(request: argparse.Namespace, errors: Console) -> int:
 
 def _window(request: argparse.Namespace, errors: Console, robot: Robot, motion: Trajectory, marks: Marks) -> int:
     """Show the motion in a live window, until Ctrl-C."""
-    speed = positive("--speed", 1.0 if request.speed is None else request.speed, "1")
     from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
 
-    viewer = replay(robot, motion, open=True, speed=speed, loop=not request.once, marks=marks)
+    viewer = replay(robot, motion, open=True, speed=speed_of(request), loop=not request.once, marks=marks)
     say(errors, f"{motion!r} at {viewer.url()}; Ctrl-C ends it")  # type: ignore[union-attr]
     try:
         while True:

@@ -18,14 +18,14 @@ from varpin.cli.arguments import (
     add_integrator,
     add_motion,
     add_robot,
-    integrator_asked_for,
+    integrator_of_words,
     motion_of,
     names_scene,
     scene_file,
 )
 from varpin.cli.console import complain, progress_bar, say, show, written_rows
 from varpin.cli.exits import INTERRUPTED, STEP_FAILED
-from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
+from varpin.cli.outputs import Writers, add_outputs, write_all, writers_of
 from varpin.errors import InputError
 from varpin.mechanics.scene import Scene
 from varpin.show.given import frame_names
@@ -41,7 +41,7 @@ MOST_STEPS = 10**9
 DT = 1e-3
 # Options that exclude a scene file.
 _OF_MOTIONS = (
-    *(*ROBOT_OPTIONS, "dt", "tolerance", "duration", "steps", "integrator", "alpha", "stages"),
+    *(*ROBOT_OPTIONS, "dt", "tolerance", "duration", "steps", "integrator"),
     *("q0", "srdf", "v0", "gravity", "damping", "friction", "stiffness", "rest", "constraints", "torque"),
 )
 
@@ -77,12 +77,11 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
     if names_scene(request.robot):
         file = scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
         driven = bool(not file.scene.conservative or file.controls() is not None or file.spec.simulate.seed is not None)
-        outputs = outputs_of(request, file.marks)
+        outputs = writers_of(request, file.marks)
         return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
-    outputs = outputs_of(request)
+    outputs = writers_of(request)
     steps = _steps(request)
-    free = request.integrator is request.stages is request.alpha is None
-    integrator = None if free else integrator_asked_for(request)
+    integrator = None if request.integrator is None else integrator_of_words(request.integrator)
     scene, q0, v0, torque = motion_of(request)
 
     def run(progress: Callable[[int, int], None]) -> Trajectory:
@@ -102,10 +101,9 @@ def _run(
     driven: bool,
     steps: int | None,
     run: Callable[[Callable[[int, int], None]], Trajectory],
-    outputs: list[Output] | None = None,
+    outputs: Writers,
 ) -> int:
     """Simulate; write and print the result, or the part before an interruption or failure."""
-    outputs = outputs_of(request) if outputs is None else outputs
     robot = scene.robot
     frame_names("--trace", [robot], request.trace)
     status, complaint, begin = 0, "", time.perf_counter()
@@ -121,7 +119,7 @@ def _run(
             trajectory, status = failure.trajectory, STEP_FAILED
             complaint = f"{failure.problem}. {failure.advice}. The motion so far is kept"
         wall_time = time.perf_counter() - begin
-        writers = {output.path: partial(output.write, robot, trajectory) for output in outputs}
+        writers = {path: partial(write, robot, trajectory) for path, write in outputs.items()}
         written, trouble = write_all(errors, writers, request.interrupts)
     status = status or trouble
     if not request.quiet:

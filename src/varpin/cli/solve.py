@@ -16,7 +16,7 @@ from rich.console import Console
 from varpin.cli.arguments import scene_file
 from varpin.cli.console import progress_bar, say, show, written_rows
 from varpin.cli.exits import INTERRUPTED, STEP_FAILED
-from varpin.cli.outputs import add_outputs, outputs_of, write_all
+from varpin.cli.outputs import add_outputs, write_all, writers_of
 from varpin.control import Solution, Status
 from varpin.io.scenefile import SceneFile
 from varpin.support.checks import writable
@@ -47,7 +47,7 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
 
 def _solve(request: argparse.Namespace, errors: Console) -> int:
     file = scene_file(request, request.scene, "solve")
-    outputs = outputs_of(request, file.marks)
+    outputs = writers_of(request, file.marks)
     given = {"max_iterations": request.max_iterations, "true_cost": request.true_cost}
     options = {name: value for name, value in given.items() if value is not None}
     resume = None if request.resume is None else file.load_solution(request.resume)
@@ -62,10 +62,8 @@ def _solve(request: argparse.Namespace, errors: Console) -> int:
             status = INTERRUPTED
         saved = None if request.save is None else writable(request.save)
         writers: dict[Path, Callable[[], object]] = {
-            output.path: partial(solution.save, output.path)
-            if output.path == saved
-            else partial(output.write, file.robot, solution.trajectory)
-            for output in outputs
+            path: partial(solution.save, path) if path == saved else partial(write, file.robot, solution.trajectory)
+            for path, write in outputs.items()
         }
         written, trouble = write_all(errors, writers, request.interrupts)
     status = status or trouble
