@@ -67,9 +67,7 @@ def _replay(request: argparse.Namespace, errors: Console) -> int:
     writers = writers_of(request, lambda _duration: marks)
     files = {path: partial(write, robot, motion) for path, write in writers.items()}
     with request.interrupts.keeping():
-        written, status = write_all(
-            errors, {path: partial(write, robot, motion) for path, write in writers.items()}, request.interrupts
-        )
+        written, status = write_all(errors, files, request.interrupts)
     for path in written:
         show(f"written: {path}")
     return status
