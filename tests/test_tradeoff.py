@@ -11,7 +11,7 @@ from findings import about
 from refusals import refused
 
 import varpin as vp
-from varpin.show.plots import plot_optimal_control_tradeoff, plot_work_precision
+from varpin.show.plots import plot_study
 from varpin.show.study_report import write_report
 from varpin.simulation.ladder import INTEGRATORS
 from varpin.study import advice as advising
@@ -272,7 +272,7 @@ def test_noise_is_refused():
 
 def test_figure_and_report(oscillator, tmp_path):
     for quantity in ("q", "end", "energy", "tip"):
-        _, axes = plot_work_precision(oscillator, quantity=quantity)
+        _, axes = plot_study(oscillator, quantity=quantity)
         names = [text.get_text() for text in axes.get_legend().get_texts()]
         reference = [] if quantity == "energy" else ["error of the reference"]
         assert names == [*(str(integrator) for integrator in INTEGRATORS), "Pareto front", *reference]
@@ -301,7 +301,7 @@ def test_true_costs_of_plans(problem, tmp_path):
     assert (np.log2(gaps[1, :-1] / gaps[1, 1:]) > 1.7).all()
     assert (gaps[1] < gaps[0]).all()
     assert record.pareto()
-    plot_optimal_control_tradeoff(record)
+    plot_study(record)
     assert [path.name for path in write_report(tmp_path, "plans", record, "Plans")] == [
         "plans.csv", "plans.png", "plans.html"
     ]  # fmt: skip

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from matplotlib.figure import Figure
 
 from varpin._version import __version__
 from varpin.errors import InputError
 from varpin.io.archive import atomic_file
-from varpin.show.plots import plot_advice, plot_optimal_control_tradeoff, plot_work_precision
+from varpin.show.plots import plot_study
 from varpin.study.record import Study
 from varpin.support.markup import page, picture
-
-# The figure of a study, by its class.
-_FIGURES: dict[str, Callable[..., Any]] = {
-    "WorkPrecision": plot_work_precision,
-    "Advice": plot_advice,
-    "OptimalControlTradeoff": plot_optimal_control_tradeoff,
-}
 
 
 def write_report(folder: Path, name: str, study: Study[Any], title: str) -> list[Path]:
@@ -44,10 +38,11 @@ def write_report(folder: Path, name: str, study: Study[Any], title: str) -> list
 
 def _image(study: Study[Any]) -> bytes:
     """The figure as PNG; empty if there is none."""
-    draw, stream = _FIGURES.get(type(study).__name__), io.BytesIO()
-    if draw is not None:
-        try:
-            draw(study)[0].savefig(stream, format="png", dpi=150)
-        except InputError:  # no run has the numbers
-            return b""
+    stream = io.BytesIO()
+    try:
+        figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+        plot_study(study, figure.subplots())
+        figure.savefig(stream, format="png", dpi=150)
+    except InputError:  # the study has none, or no run has the numbers
+        return b""
     return stream.getvalue()

@@ -11,6 +11,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, cast
 
+from varpin.errors import InputError
 from varpin.io.archive import atomic_file
 from varpin.support import markup
 from varpin.support.tables import Table, csv_text
@@ -31,6 +32,27 @@ _HEADINGS = {
     "open_loop_cost": "true cost, open loop",
     "closed_loop_cost": "true cost, feedback",
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """What a study's figure shows: a quantity over time.
+
+    Attributes:
+        points: Method, wall time [s] and value of each run.
+        front: Wall time [s] and value of the runs that stand out.
+        standing: What these are.
+        labels: Of the two axes.
+        marks: Values to mark, by name: the axis, x or y, and the value.
+        logarithmic: Whether the values are.
+    """
+
+    points: Sequence[tuple[str, float, float]]
+    front: Sequence[tuple[float, float]]
+    labels: tuple[str, str]
+    standing: str = "Pareto front"
+    marks: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    logarithmic: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +96,10 @@ class Study(Generic[Row]):
     def pareto(self) -> tuple[Row, ...]:
         """The runs than which no other is better in both columns, from the fastest up."""
         raise NotImplementedError
+
+    def chart(self) -> Chart:
+        """What the figure shows; raises an InputError if there is none."""
+        raise InputError(f"a {type(self).__name__} has no figure")
 
     def note(self, run: Row) -> str:
         """The last column of a run."""
