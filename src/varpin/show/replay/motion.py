@@ -25,7 +25,7 @@ from varpin.show.replay.marks import Mark, Triad
 from varpin.show.replay.page import Inline, inline_page, open_viewer, write_page
 from varpin.show.replay.script import Actor, Script, rows_at, tree_positions
 from varpin.show.replay.surroundings import goals, parts_of, regions, ties
-from varpin.show.replay.video import Film, frame_size
+from varpin.show.replay.video import check_film, frame_size, frame_times, write_film
 from varpin.support.checks import as_floats, finite_array, flag, positive, require_finite, writable
 from varpin.trajectory import Trajectory
 
@@ -117,7 +117,9 @@ def replay(
     speed, fps = positive("speed", speed, "1"), positive("fps", fps, "1/s")
     step = None if offset is None else finite_array("offset", offset, (3,))
     page = None if html is None else writable(html)
-    film = None if video is None else Film.of(writable(video), size, fps, MOST_FRAMES)
+    film = None if video is None else writable(video)
+    if film is not None:
+        check_film(film, size)
     script = Script(*_keyframes(figures, fps, speed), step, loop, speed, _error(figures))
     if inline:
         return inline_page(script, frame_size(size))
@@ -125,7 +127,10 @@ def replay(
         return open_viewer(script)
     with tempfile.TemporaryDirectory() as folder:
         written = write_page(page or Path(folder, "page.html"), script)
-        return written if film is None else film.take(written, float(script.times[-1]))
+        if film is None:
+            return written
+        times = frame_times(film.suffix.lower(), fps, float(script.times[-1]), MOST_FRAMES)
+        return write_film(film, written, times, frame_size(size))
 
 
 @dataclass(frozen=True, eq=False)
