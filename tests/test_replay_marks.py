@@ -1,13 +1,12 @@
 """What a replay shows beside the robot: traces, targets, frames, torques, other robots."""
 
-import logging
 import re
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from chromium import animation, commands, picture, seek, shape_poses, visit
-from refusals import naming, refused
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 import varpin as vp
@@ -488,50 +487,7 @@ def test_robots_share_one_clock(ur5, sweep, tmp_path):
             assert len(set(late)) == 1
 
 
-ARM = """<robot name="arm">
-  <link name="base"/>
-  <link name="upper"><inertial><mass value="1"/><origin xyz="0.5 0 0"/>
-      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
-    <visual><origin xyz="0.5 0 0"/><geometry><box size="1 0.1 0.1"/></geometry></visual></link>
-  <link name="lower"><inertial><mass value="1"/><origin xyz="0.5 0 0"/>
-      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
-    <visual><geometry><mesh filename="no_such_mesh.stl"/></geometry></visual></link>
-  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
-  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="1 0 0"/>
-    <axis xyz="0 1 0"/></joint>
-</robot>"""
-
-
-def test_a_missing_mesh_costs_its_own_link_only(browser, tmp_path, caplog):
-    urdf = tmp_path / "arm.urdf"
-    urdf.write_text(ARM)
-    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
-        page = replay(vp.load_robot(urdf), [[0.0, 0.5]], dt=1.0, html=tmp_path / "arm.html")
-    assert naming(caplog.messages, "no_such_mesh.stl", "skeleton", "'lower'")
-    drawn = [command for command in commands(page) if command["type"] == "set_object" and "shapes" in command["path"]]
-    upper = [command for command in drawn if "/elbow/" not in command["path"]]
-    assert [command["object"]["geometries"][0]["type"] for command in upper] == ["BoxGeometry"]
-    visit(browser, page)
-    c, s = np.cos(0.5), np.sin(0.5)
-    places = [found[:3, 3] for found in shape_poses(browser).values()]
-    # The box, the elbow, the rod to the centre of mass and that centre.
-    for expected in (
-        [0.5, 0.0, 0.0],
-        [1.0, 0.0, 0.0],
-        [1.0 + 0.25 * c, 0.0, -0.25 * s],
-        [1.0 + 0.5 * c, 0.0, -0.5 * s],
-    ):
-        assert any(np.allclose(place, expected, atol=1e-6) for place in places)
-    assert len(places) == 4
-
-
-def test_refuses_a_look_behind(run, tmp_path):
-    robot = run.plans[0].problem.scene.robot
-    with refused(vp.InputError, "ahead", "-0.1"):
-        replay(robot, run, html=tmp_path / "page.html", marks=vp.Marks(ahead=-0.1))
-
-
-def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
+def test_refuses_marks_it_cannot_show(ur5, sweep, run, tmp_path):
     page = tmp_path / "page.html"
 
     def no(*facts, robot=ur5, motion=sweep, dt=0.05, offset=None, **marks):
@@ -564,6 +520,7 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
         replay(ur5, sweep, dt=0.05, html=page, marks={"trace": True})
     no("torque_limit", "torques", robot=both, motion=None, torques=False, torque_limit=1.0)
     no("ahead", "Mpc", ahead=0.1)
+    no("ahead", "-0.1", robot=run.plans[0].problem.scene.robot, motion=run, dt=None, ahead=-0.1)
     no("motion 2", "(N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
     no("motion", motion=None)
     scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"])

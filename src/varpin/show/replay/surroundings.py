@@ -15,6 +15,7 @@ from varpin.mechanics.forces import point_of
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
 from varpin.model.tree import z_to
+from varpin.show.given import problem_of
 from varpin.show.replay.marks import Region, Target, Tie
 
 if TYPE_CHECKING:
@@ -34,8 +35,7 @@ def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None,
     """
     source = given
     if isinstance(given, bool | np.bool_):
-        plans = getattr(motion, "plans", None)
-        source = getattr(plans[0] if plans else motion, "problem", None) if given else None
+        source = problem_of(motion) if given else None
     if source is None:
         return None, (), 0.0
     scene = source if isinstance(source, Scene) else getattr(source, "scene", None)
