@@ -1,5 +1,6 @@
 """The ``varpin`` command: what it prints, writes and returns."""
 
+import contextlib
 import io
 import logging
 import re
@@ -413,10 +414,10 @@ def test_hopeless_step_is_status_3(arm, tmp_path, capsys):
 
 
 def test_interrupted_run_keeps_its_data(arm, tmp_path, capsys, monkeypatch):
-    def interrupt(self, done, steps):
+    def interrupt(done, steps):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(console._Bar, "__call__", interrupt)
+    monkeypatch.setattr("varpin.cli.simulate.progress_bar", lambda *_, **__: contextlib.nullcontext(interrupt))
     path = tmp_path / "a.npz"
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000", "--save", str(path)]) == 130
     out, err = capsys.readouterr()
@@ -447,7 +448,7 @@ def test_lack_of_memory_is_no_traceback(arm, capsys, monkeypatch):
 
 
 def test_long_run_without_a_terminal_says_how_far_it_is(arm, capsys, monkeypatch):
-    monkeypatch.setattr(console._Bar, "INTERVAL", 0.0)
+    monkeypatch.setattr(console, "INTERVAL", 0.0)
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000"]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert "varpin: 15000 of 40000 steps" in lines
