@@ -330,7 +330,6 @@ def test_advice_meets_the_tolerance_and_takes_the_cheapest():
         assert all(advice.seconds <= 1.3 * other.seconds for other in advice.alternatives)
     assert advice.integrator.order > 2
     assert str(advice).startswith(f"{advice.integrator} at dt = ")
-    assert 0.01 < advice.largest_step < 1.0
 
 
 def test_advice_within_a_budget(monkeypatch):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -248,26 +247,6 @@ class SceneFile:
             u[:, rows], reference[:, x] = plan.u, plan.reference
             gains[:, rows[:, None], x] = plan.gains
         return LinearPolicy(u, gains, reference, hold=plan.hold, on=plan.on, period=plan.period)
-
-    def saving(self, *, steps: int = 200, repeats: int = 5) -> float:
-        """Measured time of a step with all joints that the file does not lock, divided by that of this scene.
-
-        Raises:
-            StepFailure: As :func:`varpin.simulate`.
-        """
-        whole = load_scene(self.spec.path, required_only=False)
-        least = {}
-        for name, scene, q0, v0 in (
-            ("required", self.scene, self.q0, self.v0),
-            ("whole", whole.scene, whole.q0, whole.v0),
-        ):
-            times = []
-            for _ in range(repeats + 1):
-                begin = time.perf_counter()
-                simulate(scene, q0, v0, dt=self.spec.dt, steps=steps, integrator=self.integrator)
-                times.append(time.perf_counter() - begin)
-            least[name] = min(times[1:])
-        return least["whole"] / least["required"]
 
 
 def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:
