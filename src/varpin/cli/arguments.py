@@ -222,7 +222,9 @@ def values_of(option: str, given: Sequence[float | tuple[str, float] | str] | No
     if given is None:
         return None
     if len({float if isinstance(item, int) else type(item) for item in given}) > 1:
-        raise InputError(f"--{option} takes either numbers or JOINT=VALUE or one word, not several at once")
+        words = ", ".join(repr(item) for item in given if isinstance(item, str))
+        told = f" of which {words} is one" if words else ""
+        raise InputError(f"--{option} takes either numbers or JOINT=VALUE or one word{told}, not several at once")
     pairs = [item for item in given if isinstance(item, tuple)]
     names = [name for name, _ in pairs]
     if twice := sorted({name for name in names if names.count(name) > 1}):
