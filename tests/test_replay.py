@@ -34,8 +34,11 @@ def motion(finger):
 
 
 def test_page_plays_offline_and_shows_the_finger_large(browser, finger, motion, tmp_path):
-    visit(browser, replay(finger, motion, html=tmp_path / "finger.html"))
+    page = replay(finger, motion, html=tmp_path / "finger.html")
+    assert ">loading<" in page.read_text()
+    visit(browser, page)
     assert browser.execute_script("return viewer.animator.playing")
+    assert browser.find_elements(By.ID, "loading") == []
 
     seek(browser, 0.0)
     first, again = picture(browser), picture(browser)

@@ -222,9 +222,8 @@ def values_of(option: str, given: Sequence[float | tuple[str, float] | str] | No
     if given is None:
         return None
     if len({float if isinstance(item, int) else type(item) for item in given}) > 1:
-        words = ", ".join(repr(item) for item in given if isinstance(item, str))
-        told = f" of which {words} is one" if words else ""
-        raise InputError(f"--{option} takes either numbers or JOINT=VALUE or one word{told}, not several at once")
+        told = "".join(f", such as {item!r}" for item in given if isinstance(item, str))
+        raise InputError(f"--{option} takes numbers, or JOINT=VALUE, or one word alone{told}; not several of these")
     pairs = [item for item in given if isinstance(item, tuple)]
     names = [name for name, _ in pairs]
     if twice := sorted({name for name in names if names.count(name) > 1}):
