@@ -1,4 +1,4 @@
-"""The trade of speed for accuracy, measured: the table and the figure of the README.
+"""The trade of speed for accuracy, measured: the table and the figure of the page on measurements.
 
 Three links of 1 m and 1 kg, and seven, fall from horizontal rest. Left: error in q after one second against the time
 that one simulated second takes, for steps and tolerances of each method. Right: energy over 1000 s at one step, 1e-2 s.
@@ -116,7 +116,7 @@ def long_run(links: int, dt: float = 1e-2, duration: float = 1000.0) -> dict[str
 
 
 def draw(points: list[Point], curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
-    """The README's figure."""
+    """The figure."""
     figure = Figure(figsize=(10, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     style = {
@@ -153,7 +153,7 @@ def cell(point: Point | None) -> str:
 
 
 def table(chains: dict[int, list[Point]], curves: dict[str, tuple[np.ndarray, np.ndarray]]) -> str:
-    """The README's table."""
+    """The table."""
     lines = ["| links | error [rad] | varpin [us] | others [us] | ratio |", "|---|---|---|---|---|"]
     for links, points in chains.items():
         for level in LEVELS:
@@ -175,7 +175,7 @@ def main() -> None:
     text = table(chains, curves)
     print(text)
     FigureCanvasAgg(draw(chains[CHAINS[0]], curves)).print_png(ROOT / "docs" / "images" / "trade.png")
-    fill(ROOT / "README.md", {"trade": text})
+    fill(ROOT / "docs" / "how-integrators-were-measured.md", {"trade": text})
 
 
 if __name__ == "__main__":

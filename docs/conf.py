@@ -34,7 +34,7 @@ copybutton_selector = "div:not(.output) > div.highlight pre"
 # Pages whose Python is run when the site is built. The others start processes, or need packages beside varpin.
 executed_pages = [
     "tutorial",
-    "your-urdf",
+    "robots",
     "scenes",
     "constraints",
     "noise",

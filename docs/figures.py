@@ -64,12 +64,9 @@ def reach(folder: Path) -> Image.Image:
         robot,
         motion,
         html=folder / "reach.html",
-        ghost=[goal],
-        trace=True,
-        reference={"straight": hand},
-        targets={"goal": hand[1]},
-        frames=True,
-        torques=True,
+        marks=vp.Marks(
+            ghost=[goal], trace=True, reference={"straight": hand}, targets={"goal": hand[1]}, frames=True, torques=True
+        ),
     )
     return Image.open(io.BytesIO(screenshot(page, 5.0, at=0.25)))
 
@@ -102,8 +99,8 @@ def controller(folder: Path) -> Image.Image:
     cost = vp.FramePositionCost(robot, "tool0", target, 1e3) + vp.VelocityCost(0.05) + vp.ControlCost(1e-4, hold)
     problem = vp.OptimalControlProblem(scene, cost, begin, np.zeros(6), dt=1e-2, steps=50)
     run = vp.Mpc(problem, iterations=1).run(duration=3.0)
-    marks = {"targets": {"target": [target(t) for t in np.linspace(0.0, 3.0, 150)]}, "trace": "tool0"}
-    page = vp.replay(robot, run, html=folder / "controller.html", growing=True, **marks)
+    marks = vp.Marks(targets={"target": [target(t) for t in np.linspace(0.0, 3.0, 150)]}, trace="tool0", growing=True)
+    page = vp.replay(robot, run, html=folder / "controller.html", marks=marks)
     (picture,) = film_frames(page, np.array([1.5]), (640, 480))
     return Image.fromarray(picture)
 

@@ -54,7 +54,7 @@ def joints(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     """Angles and their references."""
     axes = figure.subplots()
     plots.plot_joints(plan.trajectory, axes=axes, robot=scene.robot)
-    wanted = scene.marks()["ghost"]
+    wanted = scene.marks().ghost
     times = np.linspace(0.0, plan.trajectory.duration, len(wanted))
     for column in wanted.T:
         axes.plot(times, column, color="0.2", linewidth=0.9, linestyle="--")
@@ -63,7 +63,7 @@ def joints(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
 
 def errors(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     """How far the joints are from their reference."""
-    axes, motion, wanted = _axes(figure), plan.trajectory, scene.marks()["ghost"]
+    axes, motion, wanted = _axes(figure), plan.trajectory, scene.marks().ghost
     reference = CubicSpline(np.linspace(0.0, motion.duration, len(wanted)), wanted)
     for name, error in zip(scene.robot.joint_names, (motion.q - reference(motion.t)).T, strict=True):
         axes.plot(motion.t, 1e3 * error, label=name)
@@ -99,8 +99,8 @@ def torques(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
 def distance(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     """How far the hand is from its target."""
     axes, marks = _axes(figure), scene.marks()
-    (target,) = marks["targets"].values()
-    tip = scene.robot.frame_positions(plan.trajectory.q, marks["trace"][0])
+    (target,) = marks.targets.values()
+    tip = scene.robot.frame_positions(plan.trajectory.q, marks.trace[0])
     axes.plot(plan.trajectory.t, 1e3 * np.linalg.norm(tip - target[-1], axis=1))
     axes.set_title("distance of the hand from its target", fontsize=10)
     _label(axes, "distance [mm]", legend=False)
@@ -109,8 +109,8 @@ def distance(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
 def circle(figure: SubFigure, scene: vp.SceneFile, plan: vp.Solution) -> None:
     """The drawn path from above."""
     axes, marks = _axes(figure), scene.marks()
-    (path,) = marks["reference"].values()
-    tip = scene.robot.frame_positions(plan.trajectory.q, marks["trace"][0])
+    (path,) = marks.reference.values()
+    tip = scene.robot.frame_positions(plan.trajectory.q, marks.trace[0])
     axes.plot(*path[:, :2].T, color="#157a3c", linewidth=4.0, alpha=0.4, label="wanted")
     axes.plot(*tip[:, :2].T, color="#d1480f", linewidth=1.2, label="drawn")
     axes.set_aspect("equal")
@@ -214,7 +214,7 @@ def photograph(name: str, scene: vp.SceneFile, plan: vp.Solution) -> NDArray[np.
     """The replay's picture (height, width, 3)."""
     shot = SHOTS[name]
     with tempfile.TemporaryDirectory() as folder:
-        page = vp.replay(scene.robot, plan.trajectory, html=Path(folder, "page.html"), **scene.marks())
+        page = vp.replay(scene.robot, plan.trajectory, html=Path(folder, "page.html"), marks=scene.marks())
         script = [] if shot.view is None else [(_VIEW, shot.view)]
         (picture,) = film_frames(page, np.array([shot.at]), SIZE, script)
     return picture

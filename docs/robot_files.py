@@ -1,8 +1,8 @@
-"""The table of docs/robot-files.md: every robot file of some packages of PyPI, loaded, inspected, simulated, replayed.
+"""What came of robot files, for docs/robots.md: those of packages of PyPI, loaded, inspected, simulated, replayed.
 
     pip install --no-deps --target robots robosuite dm_control gymnasium-robotics rtb-data
-    python docs/robot_files.py robots                     # the table of the page
-    python docs/robot_files.py robots/robosuite --print   # of one folder, on the terminal
+    python docs/robot_files.py robots                     # what stops them, for the page
+    python docs/robot_files.py robots/robosuite --print   # a row for each file of one folder, on the terminal
 
 example-robot-data is taken where it is installed. Each file has a process of its own, and two minutes.
 """
@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -166,6 +167,26 @@ def table(found: list[tuple[str, Row]]) -> list[str]:
     return lines
 
 
+# What stops a file, by words of its verdict.
+REASONS = (
+    ("no joint that moves", "no joint that moves"),
+    ("FreeFlyer", "a free joint, which `lock` has to hold"),
+    ("mass matrix is singular", "a joint that carries no inertia"),
+    ("has no name|needs a name", "a macro of xacro, which is no robot by itself"),
+    ("cannot be expanded", "a package or a file that is not there"),
+    ("MuJoCo cannot read", "a fragment that other files include"),
+)
+
+
+def summary(found: list[tuple[str, Row]]) -> list[str]:
+    """How many files go all the way, and what stops the others."""
+    stopped = [row.why for _, row in found if row.stage != "all"]
+    known = [next((words for part, words in REASONS if re.search(part, why)), why) for why in stopped]
+    counts = Counter(known).most_common()
+    head = [f"{len(found) - len(stopped)} of {len(found)} files go all the way.", ""]
+    return [*head, "| what stops a file | files |", "|---|---|", *(f"| {words} | {n} |" for words, n in counts)]
+
+
 def main() -> None:
     """Write the table, or print it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -194,12 +215,10 @@ def main() -> None:
             sys.stderr.write(f"{name}: {row.stage} {row.why[:100]}\n")
             if request.record is not None:
                 request.record.write_text(json.dumps({own: asdict(kept) for own, kept in found}), encoding="utf-8")
-    lines = table(found)
     if request.print:
-        sys.stdout.write("\n".join(lines) + "\n")
+        sys.stdout.write("\n".join(table(found)) + "\n")
         return
-    whole = sum(row.stage == "all" for _, row in found)
-    fill(HERE / "robot-files.md", {"files": "\n".join([f"{whole} of {len(found)} files go all the way.", "", *lines])})
+    fill(HERE / "robots.md", {"files": "\n".join(summary(found))})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The measurements behind docs/which-integrator.md: its tables and figures.
+"""The measurements behind docs/how-integrators-were-measured.md: its tables and figures.
 
 Short horizon, long horizon, optimal control, noise, stiffness and real arms, for varpin's integrators and, where they
 are installed (``pip install "varpin[peers]"``), for MuJoCo, Drake and a DOP853 in C++; SciPy's DOP853 on Pinocchio's
@@ -41,7 +41,7 @@ import peers  # noqa: E402
 from pages import fill  # noqa: E402
 from paper import cases  # noqa: E402
 
-PAGE = "which-integrator.md"
+PAGE = "how-integrators-were-measured.md"
 Run = Callable[[], np.ndarray]
 
 # Blocks of a long run whose means tell the trend.

@@ -38,4 +38,4 @@ torque.hlines([-limit, limit], *motion.t[[0, -1]], color="0.7", linewidth=1, lab
 torque.set(xlabel="time [s]", ylabel="elbow torque [N m]")
 torque.legend()
 fig.savefig(out / "double_pendulum_swing_up.png", dpi=150)
-print(vp.replay(robot, motion, ghost=[up], html=out / "double_pendulum_swing_up.html", speed=0.5))
+print(vp.replay(robot, motion, marks=vp.Marks(ghost=[up]), html=out / "double_pendulum_swing_up.html", speed=0.5))

@@ -45,4 +45,4 @@ for joint, torque in zip(("joint1", "joint4"), motion.u.T, strict=True):
 right.set(xlabel="time [s]", ylabel="torque [N m]")
 right.legend()
 fig.savefig(out / "five_bar_circle.png", dpi=150)
-print(vp.replay(robot, plan, trace=["joint3"], html=out / "five_bar_circle.html"))
+print(vp.replay(robot, plan, marks=vp.Marks(trace=["joint3"]), html=out / "five_bar_circle.html"))

@@ -26,4 +26,4 @@ print(
 )
 print(plan.verify(tolerance=1e-6))
 plan.save(out / "gripper_closes.npz")
-print(vp.replay(robot, plan, html=out / "gripper_closes.html", speed=0.25, **task.marks()))
+print(vp.replay(robot, plan, html=out / "gripper_closes.html", speed=0.25, marks=task.marks()))

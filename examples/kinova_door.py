@@ -109,4 +109,4 @@ for axes, label in ((above, "angle [degrees]"), (below, "moment about the hinge 
     axes.legend(fontsize=8)
 below.set_xlabel("time [s]")
 figure.savefig(out / "kinova_door.png", dpi=120)
-print(vp.replay(robot, motion, html=out / "kinova_door.html", trace=[HAND]))
+print(vp.replay(robot, motion, html=out / "kinova_door.html", marks=vp.Marks(trace=[HAND])))

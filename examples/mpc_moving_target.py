@@ -1,5 +1,6 @@
 """A UR5 holds its flange on a moving target, replanning a hundred times a second against a noisy, heavier robot."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ for name, integrator in (("variational", vp.Gauss(4)), ("explicit Euler", vp.Exp
 
 # The arm, where its plan means to be in half a second as a ghost, and the way there as beads.
 goal = {"target": [target(t) for t in np.linspace(0.0, 4.0, 200)]}
-marks = {"trace": "tool0", "growing": True, "targets": goal}
-print(vp.replay(robot, runs["variational"], html=out / "mpc_moving_target.html", **marks))
+marks = vp.Marks(trace="tool0", growing=True, targets=goal)
+print(vp.replay(robot, runs["variational"], html=out / "mpc_moving_target.html", marks=marks))
 both = [(robot, run) for run in runs.values()]
-print(vp.replay(both, html=out / "mpc_integrators.html", ahead=0.1, **marks))
+print(vp.replay(both, html=out / "mpc_integrators.html", marks=replace(marks, ahead=0.1)))

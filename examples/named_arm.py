@@ -28,4 +28,4 @@ print(f"{robot.dof} joints, falling by {np.abs(motion.q[-1] - q0).max():.4f} rad
 energy = motion.energy - motion.energy[0]
 heat = np.trapezoid(motion.v**2 @ scene.damping, motion.t)
 print(f"energy lost {-energy[-1]:.4f} J, heat of the dampers {heat:.4f} J")
-print(vp.replay(robot, motion, html=out / f"{name}.html", trace=True))
+print(vp.replay(robot, motion, html=out / f"{name}.html", marks=vp.Marks(trace=True)))

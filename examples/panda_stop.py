@@ -60,4 +60,4 @@ for axes, label in zip((above, middle, below), labels, strict=True):
     axes.set_ylabel(label)
 below.set_xlabel("time [s]")
 figure.savefig(out / "panda_stop.png", dpi=120)
-print(vp.replay(robot, motion, html=out / "panda_stop.html", trace="panda_hand"))
+print(vp.replay(robot, motion, html=out / "panda_stop.html", marks=vp.Marks(trace="panda_hand")))

@@ -15,4 +15,6 @@ for name in sys.argv[1:] or scenes():
     print(f"{name}: {scene.robot.dof} of {scene.required.described} joints, cost {plan.cost:.4g}, {plan.status.value}")
     plan.save(out / f"{name}.npz")
     marks = scene.marks()  # targets, references and traces of what the cost is about
-    print(vp.replay(scene.robot, plan.trajectory, html=out / f"{name}.html", speed=scene.spec.outputs.speed, **marks))
+    print(
+        vp.replay(scene.robot, plan.trajectory, html=out / f"{name}.html", speed=scene.spec.outputs.speed, marks=marks)
+    )

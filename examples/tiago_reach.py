@@ -39,5 +39,5 @@ x, y, turn = motion.q[-1, :3]
 print(f"the base drives to ({x:.2f}, {y:.2f}) m and turns by {np.degrees(turn):.1f} degrees")
 truth = plan.verify(tolerance=1e-4)
 print(f"planned cost {plan.cost:.4g}; on the continuous robot {truth.closed_loop_cost:.4g} ({truth.integrator})")
-marks = {"trace": HAND, "targets": {"shelf": target}}
-print(vp.replay(robot, motion, html=out / "tiago_reach.html", **marks))
+marks = vp.Marks(trace=HAND, targets={"shelf": target})
+print(vp.replay(robot, motion, html=out / "tiago_reach.html", marks=marks))

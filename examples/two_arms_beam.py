@@ -36,4 +36,4 @@ print(f"the beam is lifted by {lift:.3f} m, and the arms end {off:.1e} rad from 
 print(f"its length changes by {np.ptp(np.linalg.norm(ends[1] - ends[0], axis=1)):.1e} m")
 print(f"the grip takes up to {np.abs(motion.constraint_forces[:, :3]).max():.0f} N")
 print(plan.verify(tolerance=1e-6))
-print(vp.replay(robot, plan, trace=["left_tool0", "right_tool0"], html=out / "two_arms_beam.html"))
+print(vp.replay(robot, plan, marks=vp.Marks(trace=["left_tool0", "right_tool0"]), html=out / "two_arms_beam.html"))

@@ -37,4 +37,4 @@ plan = vp.solve(problem)
 print(plan)
 print(f"{plan.iterations} iterations, violations of {plan.violation:.1e} at most: {plan.status.value}")
 
-print(vp.replay(robot, plan, trace="tool0", html=out / "ur5_around_obstacle.html"))
+print(vp.replay(robot, plan, marks=vp.Marks(trace="tool0"), html=out / "ur5_around_obstacle.html"))

@@ -1,5 +1,6 @@
 """A UR5 reaches a posture in one second, planned with large steps by a variational and by an explicit Euler method."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ for name, integrator in (("variational", vp.Gauss(4)), ("explicit Euler", vp.Exp
 
 motion = plans["variational"].trajectory
 hand = robot.frame_positions([goal])[0]  # where the tool is to be [m]
-marks = {"targets": {"goal": hand}, "trace": True, "frames": True, "torques": True}
-print(vp.replay(robot, motion, ghost=[goal], html=out / "ur5_reach.html", speed=0.5, **marks))
+marks = vp.Marks(targets={"goal": hand}, trace=True, frames=True, torques=True)
+print(vp.replay(robot, motion, html=out / "ur5_reach.html", speed=0.5, marks=replace(marks, ghost=[goal])))
 side_by_side = [(robot, plan.trajectory) for plan in plans.values()]
-print(vp.replay(side_by_side, html=out / "ur5_plans.html", speed=0.5, **marks))
+print(vp.replay(side_by_side, html=out / "ur5_plans.html", speed=0.5, marks=marks))

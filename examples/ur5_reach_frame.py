@@ -48,4 +48,4 @@ for name, torque in zip(robot.joint_names, (motion.u / limits).T, strict=True):
 axis.set(xlabel="time [s]", ylabel="torque [limit]", ylim=(-1.1, 1.1))
 axis.legend(fontsize="small", ncols=2)
 fig.savefig(out / "ur5_reach_frame.png", dpi=150)
-print(vp.replay(robot, motion, ghost=[motion.q[-1]], html=out / "ur5_reach_frame.html", speed=0.5))
+print(vp.replay(robot, motion, marks=vp.Marks(ghost=[motion.q[-1]]), html=out / "ur5_reach_frame.html", speed=0.5))

@@ -68,4 +68,4 @@ for axes, label in ((above, "angle, and command (thin) [rad]"), (below, "off the
 above.legend(fontsize=8)
 below.set_xlabel("time [s]")
 figure.savefig(out / "ur5_servos.png", dpi=120)
-print(vp.replay(robot, paths[0], html=out / "ur5_servos.html", ghost=wanted, trace="tool0"))
+print(vp.replay(robot, paths[0], html=out / "ur5_servos.html", marks=vp.Marks(ghost=wanted, trace="tool0")))

@@ -245,8 +245,8 @@ def test_weights_by_name_are_not_negative():
 
 def test_a_torque_limit_by_name_leaves_the_others_their_own():
     torques = np.full((3, 6), 7.0)
-    shares = torque_shares(UR5, torques, torques, {"elbow_joint": 14.0})
-    own = torque_shares(UR5, torques, torques, None)
+    shares = torque_shares(UR5, torques, vp.Marks(torques=torques, torque_limit={"elbow_joint": 14.0}))
+    own = torque_shares(UR5, torques, vp.Marks(torques=torques))
     assert shares[:, 2].tolist() == [0.5] * 3
     np.testing.assert_array_equal(np.delete(shares, 2, axis=1), np.delete(own, 2, axis=1))
 

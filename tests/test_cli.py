@@ -1,5 +1,6 @@
 """The ``varpin`` command: what it prints, writes and returns."""
 
+import contextlib
 import io
 import logging
 import re
@@ -57,10 +58,6 @@ def test_plain_run_prints_a_summary_and_writes_nothing(arm, tmp_path, capsys):
     for words in (
         "arm: Gauss(stages=2)",
         "50, 0.01 s each, 0.5 s in all",
-        "Newton iterations",
-        "split steps                 │ none",
-        "worst residual",
-        "smallest branch margin",
         "energy error",
         "q at the end [rad or m]",
     ):
@@ -70,10 +67,8 @@ def test_plain_run_prints_a_summary_and_writes_nothing(arm, tmp_path, capsys):
 
 def test_trajectory_is_what_the_options_say(arm, tmp_path):
     path = tmp_path / "motion.npz"
-    options = (
-        "--q0 -0.5 2e-1 --v0 1 --gravity 0 -1e-1 -5 --damping 0.1 0.2 --stiffness 3 --torque -1e-2 0.5 --alpha 0.25"
-    )
-    options += f" --dt 5e-3 --duration 0.5 --quiet --save {path}"
+    options = "--q0 -0.5 2e-1 --v0 1 --gravity 0 -1e-1 -5 --damping 0.1 0.2 --stiffness 3 --torque -1e-2 0.5"
+    options += f" --integrator Midpoint(0.25) --dt 5e-3 --duration 0.5 --quiet --save {path}"
     assert main(["simulate", arm, *options.split()]) == 0
     saved = vp.Trajectory.load(path)
     scene = vp.Scene(load_robot(arm), gravity=[0.0, -0.1, -5.0], damping=[0.1, 0.2], stiffness=3.0)
@@ -132,14 +127,16 @@ def test_quiet_run_prints_nothing(arm, capsys):
 def test_split_steps_are_flagged_in_the_table(arm, capsys):
     assert main(["simulate", arm, "--integrator", "midpoint", "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
     out, err = capsys.readouterr()
-    assert re.search(r"split steps +│ \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", out)
+    assert re.search(
+        r"split steps \d+ of 20, into up to \d+ parts: a smaller dt keeps the structure", " ".join(out.split())
+    )
     assert re.search(r"^varpin: warning: q is off by up to \S+ rad, .* Use integrator=", err, re.MULTILINE)
 
 
 def test_all_warnings_are_printed(tmp_path, capsys):
     start = ["--dt", "0.05", "--steps", "20", "--v0", "8", "0", "0", "0", "0", "0", "--save", str(tmp_path / "a.npz")]
     assert main(["simulate", "ur5", "--integrator", "midpoint", *start]) == 0
-    said = " ".join(re.sub(r"[│\s]+", " ", "".join(capsys.readouterr())).replace("warning ", "").split())
+    said = " ".join(re.sub(r"\s+", " ", "".join(capsys.readouterr())).replace("warning ", "").split())
     told = vp.Trajectory.load(tmp_path / "a.npz").warnings
     assert len(told) > 1
     assert not unnamed(said, *(str(finding.joint) for finding in told), *(finding.kind[:-1] for finding in told[1:]))
@@ -148,7 +145,7 @@ def test_all_warnings_are_printed(tmp_path, capsys):
 def test_forced_motion_has_an_energy_change_and_no_error(arm, capsys):
     assert main(["simulate", arm, "--steps", "10", "--torque", "1"]) == 0
     out = capsys.readouterr().out
-    assert re.search(r"energy change +│ \+\S+ J from start to end, \S+ J at most in between", out)
+    assert re.search(r"energy change \+\S+ J from start to end, \S+ J at most in between", " ".join(out.split()))
     assert "energy error" not in out
 
 
@@ -156,7 +153,7 @@ def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
     path = tmp_path / "a.npz"
     assert main(["simulate", arm, "--damping", "0.5", "--no-gravity", "--v0", "1", "--save", str(path)]) == 0
     energy = vp.Trajectory.load(path).energy
-    lost = float(re.search(r"energy change +│ (\S+) J from start to end", capsys.readouterr().out)[1])
+    lost = float(re.search(r"energy change +(\S+) J from start to end", capsys.readouterr().out)[1])
     assert lost == pytest.approx(energy[-1] - energy[0], rel=5e-3)
     assert lost < 0.0
 
@@ -178,8 +175,7 @@ def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
         (["--steps", "0"], ("--steps", "1", "0")),
         (["--steps", "-3"], ("--steps", "1", "-3")),
         (["--integrator", "gaus"], ("'gaus'", "Gauss", "Midpoint")),
-        (["--integrator", "RungeKutta4", "--stages", "2"], ("--stages", "Gauss", "RungeKutta4")),
-        (["--stages", "2", "--alpha", "0.5"], ("--stages", "Gauss", "Midpoint")),
+        (["--integrator", "RungeKutta4(stages=2)"], ("'stages'", "RungeKutta4")),
         (["--q0", "elbow=1", "2"], ("--q0", "JOINT=VALUE")),
         (["--v0", "elbow=1", "elbow=2"], ("--v0", "'elbow'")),
         (["--save", "a.txt"], ("--save", ".npz", "'a.txt'")),
@@ -246,14 +242,11 @@ def test_joints_are_set_by_name(arm, tmp_path):
     ("words", "integrator"),
     [
         (["--integrator", "gauss"], vp.Gauss()),
-        (["--integrator", "Gauss", "--stages", "3"], vp.Gauss(3)),
         (["--integrator", "Gauss(stages=3)"], vp.Gauss(3)),
         (["--integrator", "gauss(2, kick=split)"], vp.Gauss(2, kick="split")),
         (["--integrator", "runge_kutta_4"], vp.RungeKutta4()),
         (["--integrator", "SemiImplicitEuler"], vp.SemiImplicitEuler()),
-        (["--integrator", "midpoint", "--alpha", "0.3"], vp.Midpoint(alpha=0.3)),
-        (["--alpha", "0.3"], vp.Midpoint(alpha=0.3)),
-        (["--stages", "3"], vp.Gauss(3)),
+        (["--integrator", "midpoint(alpha=0.3)"], vp.Midpoint(alpha=0.3)),
         ([], vp.Gauss(2)),
     ],
 )
@@ -302,8 +295,8 @@ def test_a_saved_motion_is_replayed(arm, saved, tmp_path, capsys):
     assert main(["replay", saved, "--robot", arm, "--html", str(page), *words]) == 0
     assert capsys.readouterr().out == f"written: {page}\n"
     paths = [command["path"] for command in commands(page) if command["type"] == "set_object"]
-    assert any("/traces/" in path and path.endswith("motion lower") for path in paths)
-    assert any("frames" in path and "upper" in path for path in paths), paths
+    assert any(path.endswith("motion lower") for path in paths)
+    assert any(path.endswith("frame upper") for path in paths), paths
 
 
 def test_a_motion_of_a_robot_with_a_name_needs_no_other(tmp_path):
@@ -330,7 +323,7 @@ def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     shown = []
-    monkeypatch.setattr("varpin.cli.replay.replay", lambda *words, **options: shown.append(options) or Viewer())
+    monkeypatch.setattr("varpin.show.replay.motion.replay", lambda *words, **options: shown.append(options) or Viewer())
     monkeypatch.setattr("varpin.cli.replay.time.sleep", interrupt)
     assert main(["replay", saved, "--robot", arm, "--once"]) == 0
     assert not unnamed(capsys.readouterr().err, "http://here", "Ctrl-C")
@@ -423,10 +416,10 @@ def test_hopeless_step_is_status_3(arm, tmp_path, capsys):
 
 
 def test_interrupted_run_keeps_its_data(arm, tmp_path, capsys, monkeypatch):
-    def interrupt(self, done, steps):
+    def interrupt(done, steps):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(console._Bar, "__call__", interrupt)
+    monkeypatch.setattr("varpin.cli.simulate.progress_bar", lambda *_, **__: contextlib.nullcontext(interrupt))
     path = tmp_path / "a.npz"
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000", "--save", str(path)]) == 130
     out, err = capsys.readouterr()
@@ -457,7 +450,7 @@ def test_lack_of_memory_is_no_traceback(arm, capsys, monkeypatch):
 
 
 def test_long_run_without_a_terminal_says_how_far_it_is(arm, capsys, monkeypatch):
-    monkeypatch.setattr(console._Bar, "INTERVAL", 0.0)
+    monkeypatch.setattr(console, "INTERVAL", 0.0)
     assert main(["simulate", arm, "--dt", "1e-4", "--steps", "40000"]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert "varpin: 15000 of 40000 steps" in lines
@@ -485,18 +478,16 @@ def test_inspect_prints_tables_and_then_warnings(capsys):
     assert err == ""
     for words in (
         "panda: joints",
-        "mimic: 1 * panda_finger_joint1",
         "locked at -1.0",
         "panda: links",
-        "mass [kg]",
         "degrees of freedom",
-        "condition of M(q)",
-        "largest step accepted",
+        "largest step of Midpoint",
     ):
         assert words in out
     lines = out.splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("warning: "))
     assert all(line.startswith("warning: ") for line in lines[first:])
+    assert max(map(len, lines[:first])) <= 80
     assert naming(lines[first:], "'panda_finger_joint2'", "mimic")
 
 
@@ -504,18 +495,18 @@ def test_inspect_takes_a_curvature_of_rounding_for_none(capsys):
     """A UR5 at rest at 0 has gravity along its axes but for 1.5708: seconds by the ten thousand are no advice."""
     assert vp.inspect_robot("ur5").largest_step > 1e4
     assert main(["inspect", "ur5"]) == 0
-    assert "any: nothing is unstable at this q, at rest (" in capsys.readouterr().out
+    assert "any: nothing is unstable at this q, at rest\n" in capsys.readouterr().out
     assert main(["inspect", "ur5", "--q", "-1.2", "--v", "1"]) == 0
     step = vp.inspect_robot("ur5", q=-1.2, v=1.0).largest_step
     assert 0.0 < step < 1.0
-    assert f"{step:.3g} s at this q, and this v (" in capsys.readouterr().out
+    assert f"{step:.3g} s at this q, and this v\n" in capsys.readouterr().out
 
 
 def test_robots_are_listed_with_their_joints(capsys):
     assert main(["robots"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    rows = dict(re.findall(r"^│ (\S+) +│ (\d+) +│$", out, flags=re.MULTILINE))
+    rows = dict(re.findall(r"^  (\S+) +(\d+)$", out, flags=re.MULTILINE))
     assert tuple(rows) == vp.robot_names()
     assert rows["finger"] == "3"
     assert rows["ur5"] == "6"
@@ -638,14 +629,13 @@ def test_advise_says_what_to_take(arm, tmp_path, capsys):
     options = ["--duration", "0.5", "--q0", "0.3", "--damping", "0.1"]
     assert main(["advise", arm, "--tolerance", "1e-6", *options]) == 0
     out, err = capsys.readouterr()
-    assert err == ""
+    assert "a minute at most" in err
     assert not unnamed(out.splitlines()[0], "dt", "1e-06", "0.5 s")
-    assert out.count("│ Gauss") >= 2
+    assert out.count("  Gauss") >= 2
     assert main(["advise", arm, "--budget", "2e-3", "--out", str(tmp_path / "advice"), *options]) == 0
     assert {path.name for path in (tmp_path / "advice").iterdir()} == {"advice.csv", "advice.png", "advice.html"}
     page = (tmp_path / "advice" / "advice.html").read_text()
     assert not unnamed(page, "0.5 s", "2 ms")
-    assert page.count("<tr class=front>") == 1
     assert 'src="data:image/png;base64,' in page
     assert not unnamed(capsys.readouterr().out.splitlines()[0], "0.5 s", "2 ms")
     assert main(["advise", arm, "--tolerance", "1e-20", *options]) == 3
@@ -714,7 +704,7 @@ def test_a_scenes_replay_shows_its_task(scene, tmp_path):
     assert main(["solve", scene, "--html", "motion.html", "--trace", "pip", "--quiet"]) == 0
     paths = [command["path"] for command in commands(tmp_path / "motion.html") if command["type"] == "set_object"]
     assert any(path.startswith("/meshcat/ghost/") for path in paths)
-    traces = {path.split("/")[4] for path in paths if "/traces/" in path}
+    traces = {path.split("/")[3] for path in paths if " motion " in path or " ghost " in path}
     assert traces == {"0 motion pip"}  # and the ghost's joints stay
 
 
@@ -724,7 +714,7 @@ def test_scene_is_inspected(scene, capsys):
     for words in ("4 of 16", "nothing touches", "joint_12.0 at 0.0", "98% of a plan"):
         assert words in out
     assert main(["inspect", scene]) == 0
-    assert re.search(r"gravity +│ none", capsys.readouterr().out)
+    assert re.search(r"gravity +none", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
@@ -750,7 +740,9 @@ def test_mistakes_about_scenes(arguments, facts, scene, tmp_path, capsys):
 def test_speed_of_a_scene_s_replay(tmp_path, monkeypatch, words, speed):
     """The file's own, 0.5, unless one is asked for."""
     asked = []
-    monkeypatch.setattr("varpin.cli.outputs.replay", lambda *_, speed, html, **__: asked.append(speed) or html.touch())
+    monkeypatch.setattr(
+        "varpin.show.replay.motion.replay", lambda *_, speed, html, **__: asked.append(speed) or html.touch()
+    )
     assert main(["simulate", "ur5_reach", "--html", str(tmp_path / "a.html"), "--quiet", *words]) == 0
     assert asked == [speed]
 

@@ -12,10 +12,10 @@ from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 import varpin as vp
+from varpin import replay
 from varpin.control.hints import hints
 from varpin.model.clearance import clearance
 from varpin.model.kinematics import frame_kinematics
-from varpin.show.replay import replay
 from varpin.show.replay.surroundings import regions
 
 ARM = {"joint1": ([0, 0, 0], [1, 0, 0], 0.05), "joint2": ([0, 0, 0], [1, 0, 0], 0.05)}
@@ -210,14 +210,18 @@ def test_drawn_where_it_is(tmp_path):
     problem = around(hull)
     (region,) = regions(problem.constraints, np.array([0.0, 1.0]))
     known = WEDGE @ TURN.T + [0.5, 0.1, 0.2]
-    np.testing.assert_allclose(region.corners.min(axis=0), known.min(axis=0), atol=1e-12)
-    np.testing.assert_allclose(region.corners.max(axis=0), known.max(axis=0) + np.eye(3)[0], atol=1e-12)
+    np.testing.assert_allclose(region.around(None).min(axis=0), known.min(axis=0), atol=1e-12)
+    np.testing.assert_allclose(region.around(None).max(axis=0), known.max(axis=0) + np.eye(3)[0], atol=1e-12)
     a, b, c = (region.hull.points[region.hull.faces[:, k]] for k in range(3))
     # The divergence theorem: the volume within the triangles.
     volume = (a * np.cross(b, c)).sum() / 6.0
     assert volume == pytest.approx(0.5 * 0.4 * 0.25 * 0.3, rel=1e-12)
-    page = replay(problem.scene.robot, np.zeros((2, 2)), dt=1.0, constraints=problem, html=tmp_path / "wedge.html")
-    drawn, placed = (command for command in commands(page) if command.get("path", "").endswith("regions/0 convex"))
+    page = replay(
+        problem.scene.robot, np.zeros((2, 2)), dt=1.0, marks=vp.Marks(constraints=problem), html=tmp_path / "wedge.html"
+    )
+    drawn, placed = (
+        command for command in commands(page) if command.get("path", "").endswith("notes/0 obstacle convex")
+    )
     corners = drawn["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
     R, at = np.split(np.array(placed["matrix"]).reshape(4, 4).T[:3], [3], axis=1)
     seen = np.frombuffer(corners, dtype=np.float32).reshape(-1, 3) @ R.T + at[:, 0]

@@ -26,7 +26,6 @@ MADE = {
     "replay.md": ["marks.html", "pair.html", "controller.html", "slider.html"],
     "control-loop.md": ["loop.html"],
     "scenes.md": ["plan.html"],
-    "your-urdf.md": ["arm.html"],
 }
 NEEDS = {
     "crocoddyl.md": "crocoddyl",

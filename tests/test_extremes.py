@@ -425,7 +425,7 @@ def test_the_command_writes_its_files(tmp_path, capsys, monkeypatch):
     assert [row["motion"] for row in rows] == ["falls, dt = 0.5 s"] * 2 + ["no gravity"] * 2
     assert {row["result"] for row in rows} <= {kind.value for kind in Kind}
     page = (tmp_path / "extremes.html").read_text()
-    assert page.count("title=") == len(rows)
+    assert page.count("<td") >= 5 * len(rows)
     assert "<script" not in page
     assert "http" not in page.split("</style>")[1]
 

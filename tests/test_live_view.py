@@ -12,8 +12,7 @@ from refusals import refused
 
 import varpin as vp
 from varpin.model import geometry
-from varpin.show.replay import live
-from varpin.show.replay import viewer as viewer_module
+from varpin.show.replay import live, page
 
 ONLINE = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
 
@@ -82,7 +81,7 @@ def severe(browser):
 def test_the_robot_is_where_the_motion_is_while_it_is_computed(seen, browser):
     finger = vp.load_robot("finger")
     scene = vp.Scene(finger, gravity=False, damping=1e-3)
-    view = seen(scene, trace=True, speed=None, fps=1e6)
+    view = seen(scene, marks=vp.Marks(trace=True), speed=None, fps=1e6)
     looks = []
 
     def progress(done, steps, nodes):
@@ -124,69 +123,6 @@ def test_pictures_come_at_their_rate_and_in_order(opened, scene, monkeypatch):
     assert len(shown) <= 23
     assert shown[0] == 0.0
     assert shown[-1] == motion.t[-1]
-
-
-def test_a_plan_is_seen_at_each_iterate(seen, browser, chain, scene):
-    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost([0.5, -1.0], 1e3) + vp.VelocityCost(10.0))
-    problem = vp.OptimalControlProblem(scene, cost, [0.0, 0.0], [0.0, 0.0], dt=2e-2, steps=40)
-    view = seen(problem, trace=True)
-    paths = []
-
-    def callback(iteration, motion):
-        view.callback(iteration, motion)
-        if iteration.step > 0.0:
-            wait_until(lambda: len(names(browser, "notes", "plans")) == min(len(paths) + 1, 8))
-            paths.append(names(browser, "notes", "plans")[-1])
-
-    plan = vp.solve(problem, callback=callback)
-    assert len(set(paths)) == len(paths) == sum(item.step > 0.0 for item in plan.history)
-    assert browser.execute_script("return viewer.animator.duration") == pytest.approx(0.8, abs=1e-4)
-    # The page plays the last iterate, from where in it the one before was.
-    found = browser.execute_script(
-        """
-        const found = [], joints = [["chain1"], ["chain1", "moving", "chain2"]];
-        viewer.animator.pause();
-        for (let k = 0; k < 8; k++) {
-            viewer.animator.seek(0.1 * k);
-            const row = [];
-            viewer.scene_tree.find(["meshcat", "robot"]).object.traverse(node => {
-                if (node.name == "moving") row.push(node.rotation.z);
-            });
-            found.push(row);
-        }
-        return found;"""
-    )
-    fine = np.linspace(0.0, plan.trajectory.duration, 4001)
-    line = np.column_stack([np.interp(fine, plan.trajectory.t, column) for column in plan.trajectory.q.T])
-    places = [np.linalg.norm(line - row, axis=1) for row in np.array(found)]
-    assert max(distance.min() for distance in places) < 0.02
-    assert len({int(distance.argmin()) // 100 for distance in places}) > 4
-    assert severe(browser) == []
-
-
-def test_a_simulation_after_a_plan_moves_the_robot_again(seen, browser, chain, scene):
-    view = seen(scene, speed=None)
-    motion = vp.simulate(scene, [0.3, 0.0], [0.0, 0.0], dt=1e-2, steps=50)
-    view.show(motion)
-    wait_until(lambda: browser.execute_script("return viewer.animator.duration") > 0.4)
-    wait_until(lambda: browser.execute_script("return viewer.animator.playing"))
-    vp.simulate(scene, [-0.5, 0.2], [0.0, 0.0], dt=1e-2, steps=20, progress=view.progress)
-    end = vp.simulate(scene, [-0.5, 0.2], [0.0, 0.0], dt=1e-2, steps=20).q[-1]
-
-    def there():
-        angles = browser.execute_script(
-            """
-            const row = [];
-            viewer.scene_tree.find(["meshcat", "robot"]).object.traverse(node => {
-                if (node.name == "moving") row.push(node.rotation.z);
-            });
-            return row;"""
-        )
-        return np.allclose(angles, end, atol=1e-5)
-
-    wait_until(there)
-    time.sleep(0.3)
-    assert there()
 
 
 def test_a_controllers_run_is_shown(opened, chain, scene):
@@ -244,7 +180,7 @@ def test_a_server_that_dies_costs_the_picture_alone(opened, scene, caplog, monke
 
 def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
     asked = []
-    monkeypatch.setattr(viewer_module.webbrowser, "open", lambda url, new=0: asked.append(url) or True)
+    monkeypatch.setattr(page.webbrowser, "open", lambda url, new=0: asked.append(url) or True)
     monkeypatch.setattr(live.LiveView.wait, "__defaults__", (0.1,))
     with vp.LiveView(scene) as view:
         assert asked == [view.url]
@@ -258,21 +194,17 @@ def test_a_browser_is_started_and_waited_for(scene, monkeypatch, caplog, capfd):
 
 def test_says_what_does_not_fit(opened, chain, scene):
     view = opened(scene)
-    start = {"q0": [0.3, 0.0], "v0": [0.0, 0.0], "dt": 1e-3, "steps": 10}
-    with refused(vp.InputError, "view.progress"):
-        vp.simulate(scene, **start, progress=view.callback)
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1.0), [0.0, 0.0], [0.0, 0.0], dt=1e-2, steps=5)
-    for name in ("callback", "progress"):
-        with refused(vp.InputError, name):
-            vp.solve(problem, **{name: view.progress})
+    with refused(vp.InputError, "progress"):
+        vp.solve(problem, progress=view.progress)
+    with refused(vp.InputError, "ghost"):
+        vp.LiveView(scene, marks=vp.Marks(ghost=[[0.0, 0.0]]))
     with refused(vp.InputError, "'chain2'", "2", "3"):
         vp.simulate(vp.Scene(vp.planar_chain(3)), np.zeros(3), np.zeros(3), dt=1e-3, steps=10, progress=view.progress)
-    with refused(vp.InputError, "motion", "ndarray"):
-        view.show(np.zeros((3, 2)))
     with refused(vp.InputError, "LiveView", "Robot", "Scene", "OptimalControlProblem"):
         vp.LiveView(chain.model)
     with refused(vp.UnknownFrame, "trace", "'chain2'", "'hand'"):
-        vp.LiveView(scene, trace="hand")
+        vp.LiveView(scene, marks=vp.Marks(trace="hand"))
     with refused(vp.InputError, "speed", "0.0"):
         vp.LiveView(scene, speed=0.0)
 

@@ -277,11 +277,11 @@ def test_a_box_is_a_box_in_every_file(tmp_path, caplog, name):
     shapes = pin.buildGeomFromUrdf(model, str(path), pin.GeometryType.VISUAL, package_dirs=[str(tmp_path)])
     wrapped = vp.load_robot(pin.RobotWrapper(model, visual_model=shapes))
     for shown in (robot, wrapped):
-        for options in ({}, {"torques": np.zeros((1, 2))}, {"ghost": np.zeros((2, 2))}):
-            triangles = drawn(vp.replay(shown, np.zeros((2, 2)), dt=1.0, html=tmp_path / "a.html", **options))
+        for marks in (vp.Marks(), vp.Marks(torques=np.zeros((1, 2))), vp.Marks(ghost=np.zeros((2, 2)))):
+            triangles = drawn(vp.replay(shown, np.zeros((2, 2)), dt=1.0, html=tmp_path / "a.html", marks=marks))
             np.testing.assert_allclose(triangles.min(axis=(0, 1)), np.zeros(3), atol=1e-7)
             np.testing.assert_allclose(triangles.max(axis=(0, 1)), SIDES, rtol=1e-6)
-            figures = 2 if "ghost" in options else 1
+            figures = 1 if marks.ghost is None else 2
             assert volume(triangles) == pytest.approx(0.006 * figures, rel=1e-5)
     assert bool(naming(caplog.messages, "no_material.dae", "colours")) == (name == "no_material.dae")
 

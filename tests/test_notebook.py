@@ -80,7 +80,7 @@ def objects(robot):
     run = vp.Mpc(problem).run(duration=0.02)
     choice = vp.Choice(vp.Gauss(stages=2), 0.02, 50, 1e-6, 2e-3, True)
     other = vp.Choice(vp.Midpoint(), 0.01, 100, np.inf, 1e-3, False)
-    advice = vp.Advice((choice, other), "arm", True, np.inf, 1e-5, None, 0.1, "Take <Gauss>.\nIt is enough.")
+    advice = vp.Advice((choice, other), "arm", True, 1e-5, None, 0.1, "Take <Gauss>.\nIt is enough.")
     runs = [
         vp.WorkPrecisionRun(
             integrator=f"{NAMES[0]} {k}", order=2, dt=0.01 * k, steps=10, seconds=1.0 / k, spread=0.0,

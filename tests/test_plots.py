@@ -148,7 +148,7 @@ def test_torques_of_joints_moved_by_hand_are_no_controls(tmp_path):
     scene = vp.Scene(vp.planar_chain(2), constraints=vp.KinematicInput("joint1"))
     motion = vp.simulate(scene, [0.3, 0.3], [0, 0], dt=0.02, steps=3)
     with refused(vp.InputError, "kinematic inputs"):
-        vp.replay(scene.robot, motion, torques=True, html=tmp_path / "hand.html")
+        vp.replay(scene.robot, motion, marks=vp.Marks(torques=True), html=tmp_path / "hand.html")
 
 
 def test_controls_of_servos_are_commanded_positions():
@@ -241,18 +241,12 @@ def test_robot_of_another_motion_is_refused():
 def test_what_is_no_motion_record_robot_axes_or_label_is_refused():
     robot, trajectory = swing(links=2, steps=3, controls=[0.1, 0.2])
     of_motions = [plots.plot_trajectory, *SINGLE.values()]
-    of_records = {
-        plots.plot_work_precision: "work_precision",
-        plots.plot_advice: "advise",
-        plots.plot_optimal_control_tradeoff: "optimal_control_tradeoff",
-    }
     for value in (None, 3, "motion.npz", robot):
         for draw in of_motions:
             with refused(vp.InputError, "Trajectory", type(value).__name__):
                 draw(value)
-        for draw, maker in of_records.items():
-            with refused(vp.InputError, f"varpin.{maker}", type(value).__name__):
-                draw(value)
+        with refused(vp.InputError, "varpin.work_precision", type(value).__name__):
+            plots.plot_study(value)
         with refused(vp.InputError, "axes", "matplotlib.figure.Figure"):
             plots.apply_style(value)
     for draw in SINGLE.values():

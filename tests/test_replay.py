@@ -14,11 +14,11 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
 import varpin as vp
+from varpin import replay
 from varpin.model import geometry
+from varpin.show.replay import motion as motion_module
 from varpin.show.replay import page as page_module
-from varpin.show.replay import replay
 from varpin.show.replay import shapes as shape_module
-from varpin.show.replay import viewer as viewer_module
 from varpin.show.replay.picture import Picture
 
 
@@ -34,8 +34,11 @@ def motion(finger):
 
 
 def test_page_plays_offline_and_shows_the_finger_large(browser, finger, motion, tmp_path):
-    visit(browser, replay(finger, motion, html=tmp_path / "finger.html"))
+    page = replay(finger, motion, html=tmp_path / "finger.html")
+    assert ">loading<" in page.read_text()
+    visit(browser, page)
     assert browser.execute_script("return viewer.animator.playing")
+    assert browser.find_elements(By.ID, "loading") == []
 
     seek(browser, 0.0)
     first, again = picture(browser), picture(browser)
@@ -172,9 +175,11 @@ def test_a_motion_that_is_over_stays_and_plays_again(browser, finger, tmp_path):
     wait_until(lambda: bar(browser) == [0.3, 0.3, False])
 
 
-def test_a_pose_has_no_bar(browser, finger, tmp_path):
-    visit(browser, replay(finger, [[0.1] * 3], dt=1.0, html=tmp_path / "pose.html"))
+def test_a_pose_has_no_bar_and_does_not_move(browser, finger, tmp_path):
+    page = replay(finger, [[0.1] * 3], dt=1.0, html=tmp_path / "pose.html")
+    visit(browser, page)
     assert browser.find_elements(By.ID, "bar") == []
+    assert all(command["type"] != "set_animation" for command in commands(page))
 
 
 def test_the_key_names_what_has_a_colour_of_its_own(finger, tmp_path):
@@ -182,8 +187,9 @@ def test_the_key_names_what_has_a_colour_of_its_own(finger, tmp_path):
     plain = replay(finger, q, dt=0.1, html=tmp_path / "plain.html").read_text()
     assert re.findall("<li>.*</li>", plain) == []
     marked = replay(
-        finger, q, dt=0.1, html=tmp_path / "key.html", trace=True, ghost=q[::-1], torques=np.zeros((4, 3)),
-        reference={"way": [[0.0, 0.0, 0.1], [0.1, 0.0, 0.1]]}, targets={"cup <1>": [0.1, 0.0, 0.0]},
+        finger, q, dt=0.1, html=tmp_path / "key.html",
+        marks=vp.Marks(trace=True, ghost=q[::-1], torques=np.zeros((4, 3)),
+            reference={"way": [[0.0, 0.0, 0.1], [0.1, 0.0, 0.1]]}, targets={"cup <1>": [0.1, 0.0, 0.0]}),
     ).read_text()  # fmt: skip
     words = [re.sub("<.*?>", "", line) for line in re.findall("<li>.*</li>", marked)]
     frame = finger.end_effector
@@ -225,7 +231,7 @@ def test_ghost_follows_its_own_motion(browser, tmp_path, name):
     robot = vp.load_robot(name)
     rng = np.random.default_rng(7)
     q, ghost = rng.uniform(-1.0, 1.0, (4, robot.dof)), rng.uniform(-1.0, 1.0, (3, robot.dof))
-    visit(browser, replay(robot, q, dt=0.5, ghost=ghost, html=tmp_path / "ghost.html"))
+    visit(browser, replay(robot, q, dt=0.5, marks=vp.Marks(ghost=ghost), html=tmp_path / "ghost.html"))
     assert len(shape_poses(browser)) == geometry(robot).ngeoms
     # Its three rows stand at 0, 0.75 and 1.5 s.
     for seconds, expected in [(0.0, ghost[0]), (0.375, 0.5 * (ghost[0] + ghost[1])), (0.75, ghost[1]), (1.5, ghost[2])]:
@@ -244,8 +250,8 @@ def test_ghost_is_translucent_and_hides_where_the_robot_is(browser, finger, tmp_
 
     q = [[0.3, 0.6, 0.9]]
     alone = blue(replay(finger, q, dt=1.0, html=tmp_path / "alone.html"))
-    same = blue(replay(finger, q, dt=1.0, ghost=q, html=tmp_path / "same.html"))
-    apart = blue(replay(finger, q, dt=1.0, ghost=[[1.2, 0.6, 0.9]], html=tmp_path / "apart.html"))
+    same = blue(replay(finger, q, dt=1.0, marks=vp.Marks(ghost=q), html=tmp_path / "same.html"))
+    apart = blue(replay(finger, q, dt=1.0, marks=vp.Marks(ghost=[[1.2, 0.6, 0.9]]), html=tmp_path / "apart.html"))
     assert alone == same
     assert apart > alone + 0.01
     opacities = browser.execute_script(
@@ -267,7 +273,9 @@ def test_ghost_of_another_time_step_and_length(finger, motion, tmp_path):
     t = np.linspace(0.0, 0.5, 200)
     for dt, steps in [(7e-4, 1000), (1e-2, 20)]:
         ghost = vp.simulate(scene, **start, dt=dt, steps=steps)
-        tracks, _ = animation(replay(finger, motion, ghost=ghost, fps=5000.0, html=tmp_path / "ghost.html"))
+        tracks, _ = animation(
+            replay(finger, motion, marks=vp.Marks(ghost=ghost), fps=5000.0, html=tmp_path / "ghost.html")
+        )
         assert len(tracks) == 6
         assert len({tuple(times) for times, _ in tracks.values()}) == 1
         for shown, q in zip(("robot", "ghost"), (motion, ghost), strict=True):
@@ -280,7 +288,9 @@ def test_ghost_of_another_time_step_and_length(finger, motion, tmp_path):
 
 def test_ghost_keeps_its_corners_between_sparse_nodes_of_the_motion(finger, tmp_path):
     ghost = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    path = replay(finger, np.zeros((3, 3)), dt=1.0, ghost=ghost, speed=0.5, html=tmp_path / "ghost.html")
+    path = replay(
+        finger, np.zeros((3, 3)), dt=1.0, marks=vp.Marks(ghost=ghost), speed=0.5, html=tmp_path / "ghost.html"
+    )
     tracks, _ = animation(path)
     for (node, _), (times, values) in tracks.items():
         np.testing.assert_allclose(times, [0.0, 4.0 / 3.0, 2.0, 8.0 / 3.0, 4.0], rtol=1e-6)
@@ -292,28 +302,20 @@ def test_ghost_costs_less_than_the_robot(tmp_path):
     ur5, q = vp.load_robot("ur5"), np.zeros((2, 6))
     empty = replay(vp.planar_chain(1), [[0.0]], dt=1.0, html=tmp_path / "empty.html").stat().st_size
     alone = replay(ur5, q, dt=1.0, html=tmp_path / "alone.html").stat().st_size
-    both = replay(ur5, q, dt=1.0, ghost=q, html=tmp_path / "both.html").stat().st_size
+    both = replay(ur5, q, dt=1.0, marks=vp.Marks(ghost=q), html=tmp_path / "both.html").stat().st_size
     assert both - alone < 0.5 * (alone - empty)
 
 
 def test_ghost_of_a_robot_without_geometry_is_a_skeleton(browser, tmp_path):
     chain = vp.planar_chain(2)
-    visit(browser, replay(chain, np.zeros((2, 2)), dt=1.0, ghost=[[0.5, 0.0]], html=tmp_path / "chain.html"))
+    visit(
+        browser,
+        replay(chain, np.zeros((2, 2)), dt=1.0, marks=vp.Marks(ghost=[[0.5, 0.0]]), html=tmp_path / "chain.html"),
+    )
     data = chain.model.createData()
     pin.forwardKinematics(chain.model, data, np.array([0.5, 0.0]))
     elbow = data.oMi[2].translation
     assert any(np.allclose(pose[:3, 3], elbow, atol=1e-6) for pose in shape_poses(browser, "ghost").values())
-
-
-def test_a_single_row_shows_a_pose(browser, finger, tmp_path):
-    path = replay(finger, [[0.3, 0.6, 0.9]], dt=1.0, html=tmp_path / "pose.html")
-    visit(browser, path)
-    assert all(command["type"] != "set_animation" for command in commands(path))
-    data, shapes = finger.model.createData(), geometry(finger)
-    placements = shapes.createData()
-    pin.updateGeometryPlacements(finger.model, data, shapes, placements, np.array([0.3, 0.6, 0.9]))
-    for k, pose in shape_poses(browser).items():
-        np.testing.assert_allclose(pose, placements.oMg[k].homogeneous, atol=1e-6)
 
 
 def test_a_model_without_geometry_gets_a_skeleton(browser, tmp_path, caplog):
@@ -379,8 +381,8 @@ def test_a_mesh_the_page_cannot_take_is_left_out(browser, tmp_path, monkeypatch)
 
 def test_live_window(browser, finger, motion, monkeypatch, capfd):
     opened = []
-    monkeypatch.setattr(viewer_module.webbrowser, "open", lambda url, new=0: opened.append(url) or True)
-    viewer = replay(finger, motion, ghost=motion.q[::-1], open=True)
+    monkeypatch.setattr(page_module.webbrowser, "open", lambda url, new=0: opened.append(url) or True)
+    viewer = replay(finger, motion, marks=vp.Marks(ghost=motion.q[::-1]), open=True)
     try:
         assert opened == [viewer.url()]
         assert capfd.readouterr().out == ""
@@ -414,7 +416,7 @@ def test_a_notebook_shows_the_page_in_a_frame(browser, finger, motion, tmp_path)
 
 
 def test_says_where_to_look_when_no_browser_opens(finger, motion, monkeypatch, caplog):
-    monkeypatch.setattr(viewer_module.webbrowser, "open", lambda url, new=0: False)
+    monkeypatch.setattr(page_module.webbrowser, "open", lambda url, new=0: False)
     viewer = replay(finger, motion, open=True)
     viewer.window.server_proc.kill()
     viewer.window.server_proc.wait()
@@ -443,16 +445,15 @@ def test_refuses_what_it_cannot_show(finger, motion, tmp_path):
     no("motion[1, 2]", "nan", motion=q, dt=0.1)
     no("speed", "0", speed=0)
     no("fps", "-1", fps=-1)
-    no("max_frames", "2", "1", max_frames=1)
-    no("ghost", "(K, 3)", "(3, 2)", ghost=np.zeros((3, 2)))
-    no("ghost", "(K, 3)", "(3,)", ghost=np.zeros(3))
-    no("ghost[1, 2]", "nan", ghost=q)
-    no("ghost", "'still'", ghost="still")
-    no("ghost", "4", motion=[[0.0, 0.0, 0.0]], dt=1.0, ghost=motion.q[:4])
+    no("ghost", "(K, 3)", "(3, 2)", marks=vp.Marks(ghost=np.zeros((3, 2))))
+    no("ghost", "(K, 3)", "(3,)", marks=vp.Marks(ghost=np.zeros(3)))
+    no("ghost[1, 2]", "nan", marks=vp.Marks(ghost=q))
+    no("ghost", "'still'", marks=vp.Marks(ghost="still"))
+    no("ghost", "4", motion=[[0.0, 0.0, 0.0]], dt=1.0, marks=vp.Marks(ghost=motion.q[:4]))
     other = vp.simulate(vp.Scene(vp.planar_chain(3)), [0, 0, 0], [0, 0, 0], dt=1e-3, steps=2)
     both = ("'chain3'", "joint1, joint2, joint3", "'finger'", "mcp, pip, dip")
-    no("ghost", *both, ghost=other)
-    no("trajectory", *both, robot=vp.planar_chain(3))
+    no("ghost", *both, marks=vp.Marks(ghost=other))
+    no("motion", *both, robot=vp.planar_chain(3))
     assert not page.exists()
 
 
@@ -488,10 +489,10 @@ def test_titles_are_escaped(tmp_path):
 def test_all_of_the_motion_is_in_view_above_the_bar(browser, tmp_path, size):
     robot = vp.load_robot("talos_arm")
     q = np.linspace(-0.5, 0.5, 5)[:, None] * np.ones(robot.dof)
-    marks = {"targets": {"a place with a long name": [0.3, 0.5, 0.6]}, "frames": True}
+    marks = vp.Marks(targets={"a place with a long name": [0.3, 0.5, 0.6]}, frames=True)
     browser.set_window_size(*size)
     try:
-        visit(browser, replay(robot, q, dt=0.2, html=tmp_path / "view.html", **marks))
+        visit(browser, replay(robot, q, dt=0.2, html=tmp_path / "view.html", marks=marks))
         for seconds in (0.0, 0.4, 0.8):
             seek(browser, seconds)
             canvas, pane, low, high = browser.execute_script(
@@ -536,9 +537,10 @@ def test_all_of_the_motion_is_in_view_above_the_bar(browser, tmp_path, size):
 
 
 @pytest.mark.parametrize(("frequency", "told"), [(1.0, False), (40.0, True)])
-def test_a_long_motion_with_too_few_keyframes_is_said_to_be_one(finger, tmp_path, caplog, frequency, told):
+def test_a_long_motion_with_too_few_keyframes_is_said_to_be_one(finger, tmp_path, caplog, monkeypatch, frequency, told):
+    monkeypatch.setattr(motion_module, "MOST_FRAMES", 200)
     t = np.linspace(0.0, 20.0, 20_001)
     q = 0.5 + 0.3 * np.sin(frequency * t)[:, None] * np.ones(3)
     with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
-        replay(finger, q, dt=1e-3, html=tmp_path / "long.html", max_frames=200)
+        replay(finger, q, dt=1e-3, html=tmp_path / "long.html")
     assert bool(naming(caplog.messages, "20 s", "200 keyframes")) == told

@@ -106,12 +106,12 @@ def test_textures_that_are_not_there_are_named(folder, caplog):
 
 
 def test_every_joint_has_a_node_of_its_own(tmp_path):
-    names = ["a/b", "a_b", "shapes", "base", "frames", "a/b 2"]
+    names = ["a/b", "a_b", "shapes", "base", "notes", "a/b 2"]
     parts = [link(f"l{k}") + joint(name, "base", f"l{k}") for k, name in enumerate(names)]
     robot = vp.load_robot(write_urdf(tmp_path, *parts))
     nodes = Picture.of(robot).moving_nodes("robot")
     assert len(set(nodes)) == len(names)
-    assert not {"robot/shapes/moving", "robot/base/moving", "robot/frames/moving"} & set(nodes)
+    assert not {"robot/shapes/moving", "robot/base/moving", "robot/notes/moving"} & set(nodes)
     page = vp.replay(robot, np.random.default_rng(0).normal(size=(3, 6)), dt=1.0, html=tmp_path / "a.html")
     moved = [part["path"] for part in commands(page)[-1]["animations"]]
     assert len({str(path) for path in moved}) == len(moved) == 6

@@ -1,20 +1,18 @@
 """What a replay shows beside the robot: traces, targets, frames, torques, other robots."""
 
-import logging
 import re
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from chromium import animation, commands, picture, seek, shape_poses, visit
-from refusals import naming, refused
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 import varpin as vp
+from varpin import replay
 from varpin.model import geometry
-from varpin.show.replay import replay
 from varpin.show.replay.annotations import references, torque_shares
-from varpin.show.replay.motion import _shares
 
 TIP = "tool0"
 
@@ -84,7 +82,7 @@ def pose(browser, path):
 
 def along(browser, name, root="notes"):
     """The points (P, 3) that a trace's tube is around: the middles of its rings of six corners."""
-    return vertices(browser, [root, "traces", name]).reshape(-1, 6, 3).mean(axis=1)
+    return vertices(browser, [root, name]).reshape(-1, 6, 3).mean(axis=1)
 
 
 def assert_no_errors(browser):
@@ -99,11 +97,11 @@ def farthest(points, path):
 def test_traces_are_where_pinocchio_puts_the_frame(browser, arm, sweep, tmp_path):
     reference = np.array([[0.5, 0.0, 0.1], [0.5, 0.4, 0.1], [0.5, 0.4, 0.1], [0.5, 0.4, 0.6]])
     ghost = sweep[::-1] + 0.2
-    marks = {"trace": [TIP, "wrist_1_link"], "reference": {"corner": reference}}
-    page = replay(arm, sweep, dt=0.05, ghost=ghost, html=tmp_path / "traces.html", **marks)
+    marks = vp.Marks(trace=[TIP, "wrist_1_link"], reference={"corner": reference}, ghost=ghost)
+    page = replay(arm, sweep, dt=0.05, marks=marks, html=tmp_path / "traces.html")
     visit(browser, page)
     assert_no_errors(browser)
-    assert len(names(browser, ["notes", "traces"])) == 5
+    assert len(names(browser, ["notes"])) == 5
     fine = np.arange(0.0, 20.0 + 1e-9, 0.01)
 
     def path(q, frame):
@@ -128,7 +126,7 @@ def test_traces_are_where_pinocchio_puts_the_frame(browser, arm, sweep, tmp_path
 def test_a_trace_of_a_long_motion_stays_small_and_true(browser, arm, tmp_path):
     t = np.linspace(0.0, 20.0, 4_001)
     q = 0.5 * np.sin(t[:, None] * np.arange(1.0, 7.0) / 5.0)
-    visit(browser, replay(arm, q, dt=5e-3, html=tmp_path / "long.html", trace=True))
+    visit(browser, replay(arm, q, dt=5e-3, html=tmp_path / "long.html", marks=vp.Marks(trace=True)))
     points = along(browser, f"0 motion {arm.end_effector}")
     assert 500 < len(points) <= 1001
     assert farthest(points, placements(arm, q, arm.end_effector)[:, :3, 3]) < 1e-5
@@ -138,7 +136,9 @@ def test_a_growing_trace_is_drawn_as_far_as_the_motion_has_come(browser, arm, sw
     # It rests from 0.5 s to 0.75 s, and its ghost goes the other way.
     q = np.vstack([sweep[:11], np.repeat(sweep[10:11], 5, axis=0), sweep[11:]])
     ghost = q[::-1]
-    page = replay(arm, q, dt=0.05, ghost=ghost, html=tmp_path / "growing.html", trace=TIP, growing=True, fps=100.0)
+    page = replay(
+        arm, q, dt=0.05, marks=vp.Marks(ghost=ghost, trace=TIP, growing=True), html=tmp_path / "growing.html", fps=100.0
+    )
     visit(browser, page)
     for name, rows in (("0 motion tool0", q), ("1 ghost tool0", ghost)):
         points = along(browser, name)
@@ -146,7 +146,7 @@ def test_a_growing_trace_is_drawn_as_far_as_the_motion_has_come(browser, arm, sw
         for seconds in (0.0, 0.21, 0.52, 0.7, 0.93, 1.25):
             seek(browser, seconds)
             drawn = browser.execute_script(
-                "return viewer.scene_tree.find(['meshcat', 'notes', 'traces', arguments[0], '<object>'])"
+                "return viewer.scene_tree.find(['meshcat', 'notes', arguments[0], '<object>'])"
                 ".object.geometry.drawRange.count",
                 name,
             )
@@ -174,10 +174,10 @@ def run():
 def test_a_controllers_run_shows_its_plans(browser, run, tmp_path):
     robot = run.plans[0].problem.scene.robot
     tip = robot.end_effector
-    visit(browser, replay(robot, run, html=tmp_path / "run.html", trace=True, ahead=0.24, fps=1000.0))
+    visit(browser, replay(robot, run, html=tmp_path / "run.html", marks=vp.Marks(trace=True, ahead=0.24), fps=1000.0))
     assert_no_errors(browser)
-    assert names(browser, ["notes", "traces"]) == [f"0 motion {tip}"]
-    root, beads = ["notes", "plans", f"0 {tip}"], 12
+    assert names(browser, ["notes"]) == [f"0 motion {tip}", f"1 plan {tip}"]
+    root, beads = ["notes", f"1 plan {tip}"], 12
     assert len(names(browser, root)) == beads
     for tick in (0, 1, 5):
         seek(browser, tick * 0.02)
@@ -196,12 +196,13 @@ def test_a_controllers_run_shows_its_plans(browser, run, tmp_path):
 
 def test_a_run_may_have_another_ghost(run, tmp_path):
     robot = run.plans[0].problem.scene.robot
-    page = replay(robot, run, html=tmp_path / "other.html", trace=True, ghost=np.array([[0.0, 1.0], [0.5, 0.5]]))
+    page = replay(
+        robot, run, html=tmp_path / "other.html", marks=vp.Marks(trace=True, ghost=np.array([[0.0, 1.0], [0.5, 0.5]]))
+    )
     paths = [command["path"] for command in commands(page) if command["type"] == "set_object"]
-    assert {path.split("/")[4] for path in paths if "/traces/" in path} == {
-        f"0 motion {robot.end_effector}",
-        f"1 ghost {robot.end_effector}",
-    }
+    marks = {path.split("/")[3] for path in paths if "/notes/" in path}
+    kinds = ("0 motion", "1 ghost", "2 plan")
+    assert marks == {f"{kind} {robot.end_effector}" for kind in kinds}
     tracks, _ = animation(page)
     (elbow,) = [path for path, _ in tracks if path.startswith("/meshcat/ghost/") and path.endswith("joint2/moving")]
     assert tracks[elbow, ".rotation[z]"][1][-1] == pytest.approx(0.5)
@@ -209,30 +210,35 @@ def test_a_run_may_have_another_ghost(run, tmp_path):
 
 def test_plans_are_not_shown_where_nobody_wants_them(browser, run, tmp_path):
     robot = run.plans[0].problem.scene.robot
-    visit(browser, replay(robot, run, html=tmp_path / "bare.html", trace=True, ahead=0))
+    visit(browser, replay(robot, run, html=tmp_path / "bare.html", marks=vp.Marks(trace=True, ahead=0)))
     assert sorted(browser.execute_script("return Object.keys(viewer.scene_tree.find(['meshcat']).children)")) == [
         "notes",
         "robot",
     ]
-    assert "plans" not in names(browser, ["notes"])
+    assert names(browser, ["notes"]) == [f"0 motion {robot.end_effector}"]
 
 
 def test_a_frame_that_stays_leaves_no_trace(browser, arm, tmp_path):
     q = np.zeros((5, 6))
     q[:, -1] = np.linspace(0.0, 1.0, 5)
-    visit(browser, replay(arm, q, dt=0.1, html=tmp_path / "still.html", trace=["forearm_link", "base_link"]))
+    visit(
+        browser,
+        replay(arm, q, dt=0.1, html=tmp_path / "still.html", marks=vp.Marks(trace=["forearm_link", "base_link"])),
+    )
     assert names(browser, ["notes"]) == []
 
 
 def test_frames_move_with_the_robot(browser, arm, sweep, tmp_path):
-    visit(browser, replay(arm, sweep, dt=0.05, html=tmp_path / "frames.html", frames=[TIP, "base_link"]))
+    visit(
+        browser, replay(arm, sweep, dt=0.05, html=tmp_path / "frames.html", marks=vp.Marks(frames=[TIP, "base_link"]))
+    )
     found = browser.execute_script(
         """
         const root = viewer.scene_tree.find(["meshcat"]).object, poses = {};
         viewer.animator.pause(); viewer.animator.seek(0.725);
         root.updateMatrixWorld(true);
-        root.traverse(node => { if (node.parent.name == "frames")
-            poses[node.name] = root.matrixWorld.clone().invert().multiply(node.matrixWorld).toArray(); });
+        root.traverse(node => { if (node.name.includes(" frame "))
+            poses[node.name.split(" ")[2]] = root.matrixWorld.clone().invert().multiply(node.matrixWorld).toArray(); });
         return poses;"""
     )
     q = 0.5 * (sweep[14] + sweep[15])
@@ -250,10 +256,11 @@ def test_targets_stand_or_move(browser, arm, sweep, tmp_path):
         "pose": last,
         "turns": [first, last],
     }
-    page = replay(arm, sweep, dt=0.05, speed=0.5, html=tmp_path / "targets.html", targets=targets)
+    page = replay(arm, sweep, dt=0.05, speed=0.5, html=tmp_path / "targets.html", marks=vp.Marks(targets=targets))
     visit(browser, page)
     assert_no_errors(browser)
-    assert sorted(names(browser, ["notes", "targets"])) == sorted(targets)
+    nodes = {name: ["notes", f"{k} target {name}"] for k, name in enumerate(targets)}
+    assert names(browser, ["notes"]) == [path[-1] for path in nodes.values()]
     half = pin.SE3(turn.as_matrix(), np.array([0.3, 0.2, 0.3]))
     half.rotation = Rotation.from_euler("z", 45.0, degrees=True).as_matrix()
     for seconds, moving, turning in [
@@ -263,23 +270,23 @@ def test_targets_stand_or_move(browser, arm, sweep, tmp_path):
         (2.0, [0.3, 0.3, 0.5], last),
     ]:
         seek(browser, seconds)
-        np.testing.assert_allclose(pose(browser, ["notes", "targets", "point"])[:3, 3], [0.3, 0.1, 0.5], atol=1e-6)
-        np.testing.assert_allclose(pose(browser, ["notes", "targets", "moves"])[:3, 3], moving, atol=1e-6)
-        np.testing.assert_allclose(pose(browser, ["notes", "targets", "pose"]), last.homogeneous, atol=1e-6)
+        np.testing.assert_allclose(pose(browser, nodes["point"])[:3, 3], [0.3, 0.1, 0.5], atol=1e-6)
+        np.testing.assert_allclose(pose(browser, nodes["moves"])[:3, 3], moving, atol=1e-6)
+        np.testing.assert_allclose(pose(browser, nodes["pose"]), last.homogeneous, atol=1e-6)
         if turning is not None:
-            np.testing.assert_allclose(pose(browser, ["notes", "targets", "turns"]), turning.homogeneous, atol=1e-4)
+            np.testing.assert_allclose(pose(browser, nodes["turns"]), turning.homogeneous, atol=1e-4)
     kinds = browser.execute_script(
         """
         const kinds = {};
-        for (const name of arguments[0]) {
+        for (const name in arguments[0]) {
             kinds[name] = [];
-            viewer.scene_tree.find(["meshcat", "notes", "targets", name]).object.traverse(node => {
+            viewer.scene_tree.find(["meshcat", ...arguments[0][name]]).object.traverse(node => {
                 if (node.isSprite) kinds[name].push(atob(node.material.map.image.src.split(",")[1]));
                 else if (node.isMesh) kinds[name].push(node.parent.name);
             });
         }
         return kinds;""",
-        list(targets),
+        nodes,
     )
     plates = {name: kind.pop(next(k for k, part in enumerate(kind) if "<svg" in part)) for name, kind in kinds.items()}
     assert sorted(kinds["point"]) == ["ball"]
@@ -290,12 +297,12 @@ def test_targets_stand_or_move(browser, arm, sweep, tmp_path):
 def test_one_target_is_named_in_the_key_and_several_have_labels_below_them(browser, arm, sweep, tmp_path):
     """Nothing is drawn over the tool at its target, and meshcat's own controls are out of view."""
     for targets, labels in (({"cup": [0.3, 0.1, 0.5]}, 0), ({"cup": [0.3, 0.1, 0.5], "shelf": [0.1, 0.1, 0.5]}, 2)):
-        visit(browser, replay(arm, sweep, dt=0.05, html=tmp_path / "page.html", targets=targets))
+        visit(browser, replay(arm, sweep, dt=0.05, html=tmp_path / "page.html", marks=vp.Marks(targets=targets)))
         assert f"target: {', '.join(targets)}" in browser.find_element("id", "about").text
         plates = browser.execute_script(
             """
             const found = [];
-            viewer.scene_tree.find(["meshcat", "notes", "targets"]).object.traverse(node => {
+            viewer.scene_tree.find(["meshcat", "notes"]).object.traverse(node => {
                 if (node.isSprite) found.push(atob(node.material.map.image.src.split(",")[1]));
             });
             return found;"""
@@ -332,7 +339,7 @@ def test_links_take_the_colour_of_their_torque(browser, tmp_path, limit):
     bound = np.where(np.isfinite(own) & (own > 0.0), own, [4.0, 1.0, 2.0]) if limit is None else np.array(limit)
     scene = vp.Scene(finger, gravity=False, damping=1.0)
     motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.01, steps=2, controls=controls)
-    page = replay(finger, motion, html=tmp_path / "torques.html", torques=True, torque_limit=limit)
+    page = replay(finger, motion, html=tmp_path / "torques.html", marks=vp.Marks(torques=True, torque_limit=limit))
     visit(browser, page)
     assert_no_errors(browser)
     shapes = geometry(finger).geometryObjects
@@ -351,7 +358,7 @@ def test_a_joint_without_a_limit_is_held_against_its_own_largest_torque():
     chain = vp.planar_chain(2)
     assert not (np.isfinite(chain.effort_limit) & (chain.effort_limit > 0.0)).any()
     torques = np.array([[1.0, 0.0], [-4.0, 0.0], [2.0, 0.0]])
-    shares = torque_shares(chain, np.zeros((4, 2)), torques, None)
+    shares = torque_shares(chain, np.zeros((4, 2)), vp.Marks(torques=torques))
     np.testing.assert_array_equal(shares, [[0.25, 0.0], [1.0, 0.0], [0.5, 0.0]])
 
 
@@ -366,12 +373,14 @@ def test_torques_of_a_plan_are_held_against_its_control_limits(ur5):
     plan, run = vp.solve(problem, check=False), vp.Mpc(problem, iterations=1).run(duration=0.05)
     for given, motion in ((plan, plan.trajectory), (run, run.motion)):
         bound = np.minimum(limits, ur5.effort_limit)
-        (shares,) = _shares([(ur5, given)], [True], None)
-        np.testing.assert_allclose(shares, np.abs(motion.u) / bound, rtol=1e-12)
-        own = [_shares([(ur5, one)], [torques], None)[0] for one, torques in ((motion, True), (given, motion.u))]
-        np.testing.assert_allclose(own, 2 * [np.minimum(np.abs(motion.u) / ur5.effort_limit, 1.0)], rtol=1e-12)
-        (half,) = _shares([(ur5, given)], [True], 1e3)
-        np.testing.assert_allclose(half, np.abs(motion.u) / 1e3, rtol=1e-12)
+
+        def shares(of, torques=True, limit=None):
+            return torque_shares(ur5, of, vp.Marks(torques=torques, torque_limit=limit))
+
+        np.testing.assert_allclose(shares(given), np.abs(motion.u) / bound, rtol=1e-12)
+        own = np.minimum(np.abs(motion.u) / ur5.effort_limit, 1.0)
+        np.testing.assert_allclose([shares(motion), shares(given, motion.u)], [own, own], rtol=1e-12)
+        np.testing.assert_allclose(shares(given, limit=1e3), np.abs(motion.u) / 1e3, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -384,7 +393,7 @@ def test_torque_colours_are_seen(browser, ur5, tmp_path):
     torques = np.zeros((10, 6))
     torques[5:] = 1e3
     q = np.tile([0.0, -1.0, 1.0, 0.0, 0.0, 0.0], (11, 1))
-    visit(browser, replay(ur5, q, dt=0.1, html=tmp_path / "red.html", torques=torques))
+    visit(browser, replay(ur5, q, dt=0.1, html=tmp_path / "red.html", marks=vp.Marks(torques=torques)))
     assert red(0.0) < 1e-3
     assert red(0.9) > 0.01
 
@@ -395,7 +404,11 @@ def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_pat
     step = np.array([0.0, 1.5, 0.0])
     pairs = [(ur5, sweep), (ur5, sweep[::-1]), (finger, bend)]
     page = replay(
-        pairs, dt=0.05, offset=step, html=tmp_path / "three.html", trace=TIP, targets={"goal": [0.4, 0.0, 0.5]}
+        pairs,
+        dt=0.05,
+        offset=step,
+        html=tmp_path / "three.html",
+        marks=vp.Marks(trace=TIP, targets={"goal": [0.4, 0.0, 0.5]}),
     )
     visit(browser, page)
     assert_no_errors(browser)
@@ -408,7 +421,7 @@ def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_pat
         pin.updateGeometryPlacements(model, data, shapes, at, robot.free_positions(q))
         for index, found in shape_poses(browser, f"robot{number}").items():
             np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + k * step, atol=2e-5)
-        goal = pose(browser, [f"notes{number}", "targets", "goal"])[:3, 3]
+        goal = pose(browser, [f"notes{number}", names(browser, [f"notes{number}"])[-1]])[:3, 3]
         np.testing.assert_allclose(goal, np.array([0.4, 0.0, 0.5]) + k * step, atol=1e-6)
     second = along(browser, "0 motion tool0", "notes 2")
     np.testing.assert_allclose(second[0], placements(ur5, sweep[-1], TIP)[0, :3, 3] + step, atol=1e-5)
@@ -422,11 +435,8 @@ def test_each_of_several_robots_has_its_ghost_and_its_torques(browser, ur5, swee
     torques = np.tile([0.0, 1.0, 2.0], (20, 1))
     step = np.array([0.0, 1.5, 0.0])
     page = replay(
-        [(ur5, sweep), (finger, bend)],
+        [(ur5, sweep), (finger, bend, vp.Marks(ghost=straight, torques=torques, torque_limit=2.0))],
         dt=0.05,
-        ghost=[None, straight],
-        torques=[False, torques],
-        torque_limit=2.0,
         offset=step,
         html=tmp_path / "both.html",
     )
@@ -477,58 +487,15 @@ def test_robots_share_one_clock(ur5, sweep, tmp_path):
             assert len(set(late)) == 1
 
 
-ARM = """<robot name="arm">
-  <link name="base"/>
-  <link name="upper"><inertial><mass value="1"/><origin xyz="0.5 0 0"/>
-      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
-    <visual><origin xyz="0.5 0 0"/><geometry><box size="1 0.1 0.1"/></geometry></visual></link>
-  <link name="lower"><inertial><mass value="1"/><origin xyz="0.5 0 0"/>
-      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
-    <visual><geometry><mesh filename="no_such_mesh.stl"/></geometry></visual></link>
-  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
-  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="1 0 0"/>
-    <axis xyz="0 1 0"/></joint>
-</robot>"""
-
-
-def test_a_missing_mesh_costs_its_own_link_only(browser, tmp_path, caplog):
-    urdf = tmp_path / "arm.urdf"
-    urdf.write_text(ARM)
-    with caplog.at_level(logging.WARNING, logger="varpin.show.replay"):
-        page = replay(vp.load_robot(urdf), [[0.0, 0.5]], dt=1.0, html=tmp_path / "arm.html")
-    assert naming(caplog.messages, "no_such_mesh.stl", "skeleton", "'lower'")
-    drawn = [command for command in commands(page) if command["type"] == "set_object" and "shapes" in command["path"]]
-    upper = [command for command in drawn if "/elbow/" not in command["path"]]
-    assert [command["object"]["geometries"][0]["type"] for command in upper] == ["BoxGeometry"]
-    visit(browser, page)
-    c, s = np.cos(0.5), np.sin(0.5)
-    places = [found[:3, 3] for found in shape_poses(browser).values()]
-    # The box, the elbow, the rod to the centre of mass and that centre.
-    for expected in (
-        [0.5, 0.0, 0.0],
-        [1.0, 0.0, 0.0],
-        [1.0 + 0.25 * c, 0.0, -0.25 * s],
-        [1.0 + 0.5 * c, 0.0, -0.5 * s],
-    ):
-        assert any(np.allclose(place, expected, atol=1e-6) for place in places)
-    assert len(places) == 4
-
-
-def test_refuses_a_look_behind(run, tmp_path):
-    robot = run.plans[0].problem.scene.robot
-    with refused(vp.InputError, "ahead", "-0.1"):
-        replay(robot, run, html=tmp_path / "page.html", ahead=-0.1)
-
-
-def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
+def test_refuses_marks_it_cannot_show(ur5, sweep, run, tmp_path):
     page = tmp_path / "page.html"
 
-    def no(*facts, robot=ur5, motion=sweep, dt=0.05, **options):
+    def no(*facts, robot=ur5, motion=sweep, dt=0.05, offset=None, **marks):
         with refused(vp.InputError, *facts):
-            replay(robot, motion, dt=dt, html=page, **options)
+            replay(robot, motion, dt=dt, html=page, offset=offset, marks=vp.Marks(**marks))
 
     with refused(vp.UnknownFrame, "trace", "'ur5'", "'fore_link'", "'forearm_link'"):
-        replay(ur5, sweep, dt=0.05, html=page, trace="fore_link")
+        replay(ur5, sweep, dt=0.05, html=page, marks=vp.Marks(trace="fore_link"))
     no("frames", "3", frames=[3])
     no("frames", "3", frames=3)
     no("trace", "None", trace=None)
@@ -549,15 +516,16 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, tmp_path):
     no("robots", "pairs", robot=[(ur5, sweep)])
     no("robots", "pairs", robot=[ur5, ur5], motion=None)
     both = [(ur5, sweep), (ur5, sweep)]
-    no("ghost", "2", robot=both, motion=None, ghost=sweep)
-    no("torques", "robots", robot=both, motion=None, torques=[np.ones((20, 6))])
+    with refused(vp.InputError, "marks", "Marks(trace=True)", "{'trace': True}"):
+        replay(ur5, sweep, dt=0.05, html=page, marks={"trace": True})
     no("torque_limit", "torques", robot=both, motion=None, torques=False, torque_limit=1.0)
     no("ahead", "Mpc", ahead=0.1)
+    no("ahead", "-0.1", robot=run.plans[0].problem.scene.robot, motion=run, dt=None, ahead=-0.1)
     no("motion 2", "(N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
     no("motion", motion=None)
     scene = vp.Scene(vp.planar_chain(2), actuation=["joint1"])
     half = vp.simulate(scene, [0, 0], [0, 0], dt=1e-2, steps=2, controls=np.zeros((2, 1)))
-    no("2", "1", "control", robot=scene.robot, motion=half, dt=None, torques=True)
+    no("2", "1", "controls", robot=scene.robot, motion=half, dt=None, torques=True)
     assert not page.exists()
 
 

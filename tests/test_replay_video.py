@@ -11,8 +11,9 @@ from PIL import Image, ImageSequence
 from refusals import refused, unnamed
 
 import varpin as vp
+from varpin import replay
 from varpin.cli import main
-from varpin.show.replay import replay, video
+from varpin.show.replay import video
 
 Q = np.linspace([0.0, 0.0], [1.2, -0.8], 11)
 
@@ -58,16 +59,12 @@ def test_an_mp4_and_its_page(browser, chain, tmp_path):
     assert page.stat().st_size > 10_000
 
 
-def test_frame_times(tmp_path):
-    def times(name, fps, duration, most=10_000):
-        return video.Film(tmp_path / name, (320, 240), 1.0 / fps, most).times(duration)
-
-    np.testing.assert_allclose(times("a.mp4", 30.0, 1.0), np.arange(31) / 30.0)
-    np.testing.assert_allclose(times("a.gif", 30.0, 1.0), 0.03 * np.arange(34))
-    np.testing.assert_allclose(times("a.gif", 1000.0, 0.1), 0.02 * np.arange(6))
-    assert len(times("a.mp4", 30.0, 100.0, most=11)) == 11
-    assert len(times("a.gif", 30.0, 100.0, most=11)) == 11
-    np.testing.assert_array_equal(times("a.gif", 30.0, 0.0), [0.0])
+def test_frame_times():
+    np.testing.assert_allclose(video.frame_times(".mp4", 30.0, 1.0, 99), np.arange(31) / 30.0)
+    np.testing.assert_allclose(video.frame_times(".gif", 30.0, 1.0, 99), 0.03 * np.arange(34))
+    np.testing.assert_allclose(video.frame_times(".gif", 1000.0, 0.1, 99), 0.02 * np.arange(6))
+    assert [len(video.frame_times(kind, 30.0, 100.0, 11)) for kind in video.FORMATS] == [11, 11]
+    np.testing.assert_array_equal(video.frame_times(".gif", 30.0, 0.0, 99), [0.0])
 
 
 def test_says_what_is_missing_and_how_to_get_it(chain, tmp_path, monkeypatch):

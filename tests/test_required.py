@@ -114,11 +114,6 @@ def test_cost_on_the_whole_robot_keeps_fingers_together(tmp_path):
     assert "center_of_mass" in file.required.coupled
 
 
-def test_saving_is_measured(tmp_path):
-    """A quarter of the joints takes far less than two thirds of the time."""
-    assert vp.load_scene(hand(tmp_path, ["joint_1.0"])).saving() > 1.5
-
-
 @pytest.mark.parametrize(
     ("text", "integrator"),
     [

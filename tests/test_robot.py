@@ -378,7 +378,7 @@ class TestLocking:
         np.testing.assert_allclose(robot.frame_positions(own, "gripper"), link, atol=1e-14)
         kinds = sorted(str(frame.type) for frame in robot.model.frames if frame.name == "gripper")
         assert kinds == sorted(["BODY", "FIXED_JOINT" if "gripper" in lock else "JOINT"])
-        vp.replay(robot, own[None], dt=0.1, trace="gripper", html=tmp_path / "gripper.html")
+        vp.replay(robot, own[None], dt=0.1, marks=vp.Marks(trace="gripper"), html=tmp_path / "gripper.html")
 
     def test_of_a_leader_locks_its_followers(self, load):
         robot = vp.load_robot("panda", lock={"panda_finger_joint1": 0.03})

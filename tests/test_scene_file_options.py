@@ -154,12 +154,6 @@ def test_postures_of_a_command(arm, tmp_path, capsys):
         assert not unnamed(capsys.readouterr().err, *facts)
 
 
-def test_a_summary_of_an_explicit_method_has_no_rows_of_a_solver(capsys):
-    for integrator, solver in (("RungeKutta4", False), ("Midpoint", True)):
-        assert main(["simulate", "finger", "--steps", "5", "--q0", "0.3", "--integrator", integrator]) == 0
-        assert ("branch margin" in capsys.readouterr().out) == solver
-
-
 def test_a_joint_with_several_axes_is_locked(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text('[robot]\nsource = "kinova"\nlock = { j2s6s200_joint_1 = 0.3 }' + HORIZON)

@@ -34,4 +34,4 @@ def test_ensembles_and_advice_take_the_same(served):
 def test_commands_are_not_coloured_as_torques(served, tmp_path):
     scene, motion = served
     with refused(vp.InputError, "controls", "servos"):
-        vp.replay(scene.robot, motion, html=tmp_path / "served.html", torques=True)
+        vp.replay(scene.robot, motion, html=tmp_path / "served.html", marks=vp.Marks(torques=True))

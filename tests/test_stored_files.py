@@ -6,6 +6,10 @@ import functools
 import operator
 import os
 import pickle
+import socket
+import subprocess
+import sys
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -221,3 +225,37 @@ def test_pickles_are_not_opened(name, tmp_path):
     with np.load(path, allow_pickle=True) as archive:
         archive["format"]
     assert witness.exists()
+
+
+def test_a_wrong_shape_costs_no_memory(tmp_path):
+    """A file of some kilobytes whose q would take 80 MB is refused by its header."""
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, **{**members_of("trajectory.npz"), "q": np.zeros((10_000_000, 1, 1))})
+    assert path.stat().st_size > 1_000
+    tracemalloc.start()
+    with refused(vp.FileError, "a.npz", "q", "(10000000, 1, 1)"):
+        vp.Trajectory.load(path)
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
+
+
+def test_names_that_are_too_long_are_refused_by_name(tmp_path):
+    motion = vp.Trajectory.load(DATA / "trajectory.npz")
+    longest = tmp_path / f"{'a' * 251}.npz"
+    assert vp.Trajectory.load(motion.save(longest)).steps == motion.steps
+    for call in (motion.save, vp.Trajectory.load, vp.load_scene, vp.load_robot):
+        with pytest.raises(vp.VarpinError, match="aaaa"):
+            call(tmp_path / f"{'a' * 300}.npz")
+
+
+def test_what_a_killed_save_left_is_gone_after_the_next(tmp_path):
+    """And what another process that runs is writing stays."""
+    motion = vp.Trajectory.load(DATA / "trajectory.npz")
+    words = "import os, pathlib, signal, sys\nfrom varpin.io.archive import atomic_file\n"
+    words += "with atomic_file(pathlib.Path(sys.argv[1])): os.kill(os.getpid(), signal.SIGKILL)"
+    subprocess.run([sys.executable, "-c", words, tmp_path / "a.npz"], check=False)
+    assert len(list(tmp_path.iterdir())) == 1
+    running = tmp_path / f".varpin-{socket.gethostname()}-{os.getppid()}-0123456789abcdef"
+    running.touch()
+    motion.save(tmp_path / "a.npz")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [running.name, "a.npz"]

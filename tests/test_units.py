@@ -56,4 +56,4 @@ def test_trajectories_of_another_scene():
 @pytest.mark.parametrize(("seconds", "words"), [(1.004, ", as long"), (1.4, ", 1.4 times as long")])
 def test_times_of_other_choices(seconds, words):
     one, other = (Choice(vp.Gauss(2), 0.01, 100, 1e-6, each, True) for each in (1.0, seconds))
-    assert _reason([one, other], True, np.inf, 1e-5, None, 1.0).splitlines()[1].endswith(words)
+    assert _reason([one, other], True, 1e-5, None, 1.0).splitlines()[1].endswith(words)

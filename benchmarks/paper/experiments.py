@@ -229,7 +229,7 @@ class Store:
         if not path.is_file():
             return None
         try:
-            members = read_npz(path)
+            members = dict(read_npz(path))
             if "facts" in members:  # written by varpin 0.1
                 members |= {name: np.asarray(value) for name, value in json.loads(str(members["facts"])).items()}
             if str(members.get("version")) != __version__:

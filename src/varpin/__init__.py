@@ -39,6 +39,7 @@ from varpin.integrators import Radau as Radau
 from varpin.integrators import Reference as Reference
 from varpin.integrators import RungeKutta4 as RungeKutta4
 from varpin.integrators import SemiImplicitEuler as SemiImplicitEuler
+from varpin.marks import Marks as Marks
 from varpin.mechanics.assembly import assemble as assemble
 from varpin.mechanics.constraints import Constraint as Constraint
 from varpin.mechanics.constraints import CustomConstraint as CustomConstraint
@@ -80,7 +81,6 @@ from varpin.model import combine as combine
 from varpin.model import load_robot as load_robot
 from varpin.model import planar_chain as planar_chain
 from varpin.model import robot_names as robot_names
-from varpin.show.replay import replay as replay
 from varpin.signals.policy import FirstOrderHold as FirstOrderHold
 from varpin.signals.policy import LinearPolicy as LinearPolicy
 from varpin.signals.policy import OpenLoop as OpenLoop
@@ -165,6 +165,7 @@ if TYPE_CHECKING:
     from varpin.show.inspection_report import LinkReport as LinkReport
     from varpin.show.inspection_report import RobotReport as RobotReport
     from varpin.show.replay.live import LiveView as LiveView
+    from varpin.show.replay.motion import replay as replay
     from varpin.study.advice import Advice as Advice
     from varpin.study.advice import Choice as Choice
     from varpin.study.advice import advise as advise
@@ -218,6 +219,7 @@ _LATE: dict[str, tuple[str, ...]] = {
     "varpin.show.inspection": ("inspect_robot",),
     "varpin.show.inspection_report": ("FrameReport", "JointReport", "LinkReport", "RobotReport"),
     "varpin.show.replay.live": ("LiveView",),
+    "varpin.show.replay.motion": ("replay",),
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),
     "varpin.study.extremes": ("check_robot",),
     "varpin.study.linearization_check": ("LinearizationCheck", "check_linearization"),

@@ -7,16 +7,15 @@ import difflib
 import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
-from varpin.integrators import BY_NAME, Integrator, integrator_of, options_of
+from varpin.integrators import BY_NAME, Integrator, integrator_of
 from varpin.io.scenefile import SceneFile, load_scene, scenes
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, load_robot
@@ -107,51 +106,29 @@ def add_vector(
 
 def add_integrator(parser: argparse.ArgumentParser) -> None:
     """Add the choice of the integrator."""
-    group = parser.add_argument_group("integrator")
-    group.add_argument(
+    parser.add_argument(
         "--integrator",
         metavar="NAME",
         help=f"{', '.join(BY_NAME)}; with options as Python writes them, 'Gauss(stages=3)'; default: Gauss(stages=2), "
         "with 4 where springs are fast for the step, Radau(stages=4) where dampers are faster, "
         "Midpoint(kick=held) under noise",
     )
-    group.add_argument(
-        "--stages",
-        type=int,
-        metavar="N",
-        help="stages of Gauss, which it selects: 1 to 6, for an order of twice as many",
-    )
-    group.add_argument(
-        "--alpha", type=float, metavar="A", help="alpha of Midpoint, which it selects, in [0, 1]: second order at 0.5"
-    )
 
 
-def integrator_asked_for(request: argparse.Namespace) -> Integrator:
-    """The integrator of the options that :func:`add_integrator` adds.
+def integrator_of_words(text: str) -> Integrator:
+    """The integrator of a word of :func:`add_integrator`.
 
     Raises:
         InputError: The name is unknown, or the integrator does not have the option.
     """
-    # An option without --integrator selects the integrator that has it.
-    usual = "Gauss" if request.alpha is None else "Midpoint"
-    text = (request.integrator or usual).strip()
-    name, bracket, rest = text.partition("(")
+    name, bracket, rest = text.strip().partition("(")
     # Names are compared by letters and digits alone: runge_kutta_4 and RUNGEKUTTA4 are RungeKutta4.
     plain = {_letters(member): member for member in BY_NAME}
     if _letters(name) not in plain:
         matches = difflib.get_close_matches(_letters(name), plain, n=1)
         hint = f"did you mean {plain[matches[0]]}? " if matches else ""
         raise InputError(f"there is no integrator {name!r}; {hint}integrators: {', '.join(BY_NAME)}")
-    integrator = integrator_of(plain[_letters(name)] + bracket + rest)
-    for option in ("stages", "alpha"):
-        value = getattr(request, option)
-        if value is None:
-            continue
-        if option not in options_of(type(integrator)):
-            owner = next(member for member, kind in BY_NAME.items() if option in options_of(kind))
-            raise InputError(f"--{option} is an option of {owner}, not of {type(integrator).__name__}")
-        integrator = replace(integrator, **{option: value})  # type: ignore[type-var]
-    return integrator
+    return integrator_of(plain[_letters(name)] + bracket + rest)
 
 
 def _letters(name: str) -> str:
@@ -236,75 +213,52 @@ def _number_or_robot(word: str) -> float | tuple[str, float] | str:
     return "robot" if word.strip() == "robot" else _number(word)
 
 
-def values_of(option: str, given: Sequence[float | tuple[str, float] | str] | None) -> JointValues | None:
-    """Value of an option of :func:`add_vector`: None if it was not given, one number, several, or some by name.
+def values_of(option: str, given: Sequence[float | tuple[str, float] | str] | None) -> JointValues | str | None:
+    """Value of an option of :func:`add_vector`: None if it was not given, one number, several, some by name, or a word.
 
     Raises:
-        InputError: Names and numbers are mixed, or a name is given twice.
+        InputError: Names, numbers and words are mixed, or a name is given twice.
     """
     if given is None:
         return None
-    named = [item for item in given if isinstance(item, tuple)]
-    if not named:
-        numbers = [item for item in given if not isinstance(item, tuple)]
-        return numbers[0] if len(numbers) == 1 else numbers
-    if len(named) < len(given):
-        raise InputError(f"--{option} takes either numbers or JOINT=VALUE, not both at once")
-    names = [name for name, _ in named]
+    if len({float if isinstance(item, int) else type(item) for item in given}) > 1:
+        told = "".join(f", such as {item!r}" for item in given if isinstance(item, str))
+        raise InputError(f"--{option} takes numbers, or JOINT=VALUE, or one word alone{told}; not several of these")
+    pairs = [item for item in given if isinstance(item, tuple)]
+    names = [name for name, _ in pairs]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"--{option} names {', '.join(map(repr, twice))} more than once")
-    return dict(named)
+    if pairs:
+        return dict(pairs)
+    numbers: list[Any] = list(given)
+    found: JointValues | str = numbers[0] if len(numbers) == 1 else numbers
+    return found
 
 
-def _vector(option: str, given: Sequence[float | tuple[str, float] | str] | None, robot: Robot) -> NDArray[np.float64]:
-    """The numbers (n,) of an option; zeros if it was not given."""
-    values = values_of(option, given)
-    numbers = np.size(0.0 if values is None or isinstance(values, Mapping) else values)
-    if numbers not in (1, robot.dof):
+def _joints(option: str, request: argparse.Namespace, robot: Robot) -> Floats | str | None:
+    """The numbers (n,) of an option, or its word; None if it was not given."""
+    values = values_of(option, getattr(request, option))
+    if values is None or isinstance(values, str):
+        return values
+    if not isinstance(values, Mapping) and np.size(values) not in (1, robot.dof):
         raise InputError(
             f"--{option} takes one number for all joints or {robot.dof}, for {', '.join(robot.joint_names)}; "
-            f"got {numbers}"
+            f"got {np.size(values)}"
         )
-    return joint_array(option, 0.0 if values is None else values, robot.joint_names, uniform=True)
-
-
-def _resistance(
-    option: str, request: argparse.Namespace, robot: Robot
-) -> NDArray[np.float64] | Literal["robot"] | None:
-    """The value of --damping or --friction."""
-    given = getattr(request, option)
-    if given is None or "robot" not in given:
-        return None if given is None else _vector(option, given, robot)
-    if len(given) > 1:
-        raise InputError(f"--{option} takes either numbers or the word robot, not both at once")
-    return "robot"
-
-
-def _configuration(option: str, given: Sequence[float | tuple[str, float] | str] | None, robot: Robot) -> Floats:
-    """Positions (n,) of an option [rad or m]: numbers, or a posture of the robot."""
-    names = [item for item in given or () if isinstance(item, str)]
-    if not names:
-        return _vector(option, given, robot)
-    if len(given or ()) > 1:
-        raise InputError(f"--{option} takes either numbers or the name of one posture, got {names[0]!r} and others")
-    return robot.posture(names[0])
+    return joint_array(option, values, robot.joint_names, uniform=True)
 
 
 def motion_of(request: argparse.Namespace) -> tuple[Scene, ArrayLike, ArrayLike, NDArray[np.float64] | None]:
     """The scene, q0, v0, and the torque unless it is zero."""
     robot = load_robot(request.robot, **robot_options(request), srdf=request.srdf)
-    scene = Scene(
-        robot,
-        gravity=request.gravity,
-        damping=_resistance("damping", request, robot),
-        friction=_resistance("friction", request, robot),
-        stiffness=_vector("stiffness", request.stiffness, robot),
-        rest=_vector("rest", request.rest, robot),
-        constraints=request.constraints,
-    )
-    q0 = _configuration("q0", request.q0, robot)
-    v0, torque = (_vector(name, getattr(request, name), robot) for name in ("v0", "torque"))
-    return scene, q0, v0, torque if torque.any() else None
+    names = ("damping", "friction", "stiffness", "rest", "q0", "v0", "torque")
+    given: dict[str, Any] = {name: _joints(name, request, robot) for name in names}
+    q0, v0, torque = (given.pop(name) for name in ("q0", "v0", "torque"))
+    forces = {name: value for name, value in given.items() if value is not None}
+    scene = Scene(robot, gravity=request.gravity, constraints=request.constraints, **forces)
+    still = np.zeros(robot.dof)
+    start = robot.posture(q0) if isinstance(q0, str) else still if q0 is None else q0
+    return scene, start, still if v0 is None else v0, torque if np.any(torque) else None
 
 
 def names_scene(word: str) -> bool:

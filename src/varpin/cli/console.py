@@ -6,14 +6,17 @@ import argparse
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterator
-from types import TracebackType
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import NoReturn
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from varpin.cli.exits import MISTAKE
+
+# Shortest time between two lines of progress where there is no terminal [s].
+INTERVAL = 10.0
 
 
 class Parser(argparse.ArgumentParser):
@@ -24,58 +27,38 @@ class Parser(argparse.ArgumentParser):
         self.exit(MISTAKE, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
-def file_size(size: int) -> str:
-    """The size of a file in words."""
-    if size < 1000:
-        return f"{size} B"
-    return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"
-
-
-class _Bar:
-    """A progress callback that draws a bar on a terminal, and prints a line from time to time elsewhere."""
-
-    INTERVAL = 10.0  # shortest time between two lines [s]
-
-    def __init__(self, console: Console, steps: int, unit: str) -> None:
-        self._console = console
-        self._unit = unit
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
-        self._printed = time.monotonic()
-        if console.is_terminal:
-            columns = (TextColumn("varpin"), BarColumn(), TextColumn(f"{{task.completed}}/{{task.total}} {unit}"))
-            self._bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
-            self._task = self._bar.add_task("", total=steps)
-
-    def __enter__(self) -> _Bar:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def __call__(self, done: int, steps: int) -> None:
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=done, total=steps)
-        elif time.monotonic() - self._printed >= self.INTERVAL:
-            self._printed = time.monotonic()
-            say(self._console, f"{done} of {steps} {self._unit}")
+def written_rows(files: Iterable[Path]) -> list[tuple[str, str]]:
+    """A row of a table for each file that was written, with its size."""
+    rows = []
+    for path in files:
+        size = path.stat().st_size
+        unit, one = next(((unit, one) for unit, one in (("MB", 1e6), ("kB", 1e3)) if size >= one), ("B", 1.0))
+        rows.append(("written", f"{path} ({size / one:.3g} {unit})"))
+    return rows
 
 
 @contextlib.contextmanager
 def progress_bar(
     console: Console, steps: int, *, quiet: bool, unit: str = "steps"
 ) -> Iterator[Callable[[int, int], None]]:
-    """A progress callback that shows progress on ``console``, unless ``quiet``."""
+    """A progress callback that draws a bar on a terminal, prints a line now and then elsewhere, or is ``quiet``."""
     if quiet:
         yield lambda _done, _steps: None
-        return
-    with _Bar(console, steps, unit) as bar:
-        yield bar
+    elif console.is_terminal:
+        columns = (TextColumn("varpin"), BarColumn(), TextColumn(f"{{task.completed}}/{{task.total}} {unit}"))
+        with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as bar:
+            task = bar.add_task("", total=steps)
+            yield lambda done, steps: bar.update(task, completed=done, total=steps)
+    else:
+        printed = time.monotonic()
+
+        def tell(done: int, steps: int) -> None:
+            nonlocal printed
+            if time.monotonic() - printed >= INTERVAL:
+                printed = time.monotonic()
+                say(console, f"{done} of {steps} {unit}")
+
+        yield tell
 
 
 class _ConsoleHandler(logging.Handler):
@@ -110,3 +93,8 @@ def say(console: Console, message: str, *, prefix: str = "varpin", style: str | 
     """Print a message as it is, after a prefix."""
     text = f"{prefix}: {message}" if prefix else message
     console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def show(content: object) -> None:
+    """Print a table or a text as the result of a command."""
+    say(Console(), str(content), prefix="")

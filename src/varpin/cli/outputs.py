@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -16,8 +15,9 @@ from varpin.cli.interrupts import Interrupts
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.io.archive import atomic_file
 from varpin.io.scenefile.tables import FIGURES
+from varpin.marks import Marks
 from varpin.model import Robot
-from varpin.show.replay import check_film, replay
+from varpin.show.replay.video import FORMATS, check_film
 from varpin.support.checks import positive, writable
 from varpin.trajectory import Trajectory
 
@@ -46,75 +46,49 @@ def add_replay_options(outputs: argparse._ActionsContainer) -> None:
     )
 
 
-@dataclass(frozen=True)
-class Output:
-    """A file to write from the trajectory."""
-
-    path: Path
-    write: Callable[[Robot, Trajectory], None]
+# Functions that write a motion of a robot, by the path of the file.
+Writers = dict[Path, Callable[[Robot, Trajectory], object]]
+MarksOf = Callable[[float], Marks]
 
 
-Marks = Callable[[float], Mapping[str, Any]]
-
-
-def outputs_of(request: argparse.Namespace, marks: Marks | None = None) -> list[Output]:
-    """The requested files, the most important first. Their writers are imported now, so that errors precede the run.
+def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Writers:
+    """Writers of the requested files, the most important first; what can fail before the run fails here.
 
     Args:
         request: The parsed command line.
-        marks: Function from the duration [s] of a motion to the marks of the task in its replay.
+        marks: Function from the duration [s] of a motion to what its replay shows of the task.
 
     Raises:
         FileError: A file cannot be written.
         InputError: Two files are the same, or a format is unknown.
         MissingDependency: A package or program for videos is not installed.
     """
-    outputs = []
-    if request.save is not None:
-        outputs.append(_record(writable(request.save)))
-    if request.plot is not None:
-        outputs.append(_figure(writable(request.plot)))
-    return _distinct([*outputs, *replays_of(request, marks)])
-
-
-def replays_of(request: argparse.Namespace, marks: Marks | None = None) -> list[Output]:
-    """The requested page and video; errors as for :func:`outputs_of`."""
-    outputs = []
-    for path, film in ((request.html, False), (request.video, True)):
-        if path is not None:
-            if film:
-                check_film(path)
-            else:
-                _require_ending("--html", path, (".html", ".htm"))
-            speed = positive("--speed", 1.0 if request.speed is None else request.speed, "1")
-            outputs.append(_replay(writable(path), speed, request.trace, film, marks))
-    return _distinct(outputs)
-
-
-def _distinct(outputs: list[Output]) -> list[Output]:
-    paths = [output.path.resolve() for output in outputs]
-    for path in paths:
-        if paths.count(path) > 1:
+    found: Writers = {}
+    for option, endings, make in (
+        ("save", (".npz",), _record),
+        ("plot", FIGURES, _figure),
+        ("html", (".html", ".htm"), _replay),
+        ("video", FORMATS, _replay),
+    ):
+        path: Path | None = getattr(request, option, None)
+        if path is None:
+            continue
+        target = writable(path)
+        if path.suffix.lower() not in endings:
+            raise InputError(f"--{option} must end in {', '.join(endings)}, got {path.name!r}")
+        if option == "video":
+            check_film(path)
+        if target.resolve() in (other.resolve() for other in found):
             raise InputError(f"two outputs cannot be one file: {path}")
-    return outputs
+        found[target] = make(target, request, option, marks)
+    return found
 
 
-def _require_ending(option: str, path: Path, endings: Sequence[str]) -> None:
-    if path.suffix.lower() not in endings:
-        raise InputError(f"{option} must end in {', '.join(endings)}, got {path.name!r}")
+def _record(path: Path, *_: object) -> Callable[[Robot, Trajectory], object]:
+    return lambda _robot, trajectory: trajectory.save(path)
 
 
-def _record(path: Path) -> Output:
-    _require_ending("--save", path, (".npz",))
-
-    def write(_robot: Robot, trajectory: Trajectory) -> None:
-        trajectory.save(path)
-
-    return Output(path, write)
-
-
-def _figure(path: Path) -> Output:
-    _require_ending("--plot", path, FIGURES)
+def _figure(path: Path, *_: object) -> Callable[[Robot, Trajectory], object]:
     from varpin.show.plots import plot_trajectory  # noqa: PLC0415 - matplotlib is slow to import
 
     def write(robot: Robot, trajectory: Trajectory) -> None:
@@ -122,17 +96,28 @@ def _figure(path: Path) -> Output:
         with atomic_file(path) as stream:
             figure.savefig(stream, format=path.suffix[1:].lower(), dpi=150)  # type: ignore[union-attr]
 
-    return Output(path, write)
+    return write
 
 
-def _replay(path: Path, speed: float, frames: Sequence[str], film: bool, marks: Marks | None) -> Output:
+def _replay(
+    path: Path, request: argparse.Namespace, option: str, marks: MarksOf | None
+) -> Callable[[Robot, Trajectory], object]:
+    speed = speed_of(request)
+
     def write(robot: Robot, trajectory: Trajectory) -> None:
-        html, video = (None, path) if film else (path, None)
-        task = {} if marks is None else dict(marks(trajectory.duration))
-        trace = frames or task.pop("trace", ())
-        replay(robot, trajectory, html=html, video=video, speed=speed, **{**task, "trace": trace})
+        from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
 
-    return Output(path, write)
+        task = Marks() if marks is None else marks(trajectory.duration)
+        shown, files = replace(task, trace=request.trace or task.trace), {option: path}
+        loop, html, video = not getattr(request, "once", False), files.get("html"), files.get("video")
+        replay(robot, trajectory, html=html, video=video, speed=speed, loop=loop, marks=shown)
+
+    return write
+
+
+def speed_of(request: argparse.Namespace) -> float:
+    """The speed of a replay."""
+    return positive("--speed", 1.0 if request.speed is None else request.speed, "1")
 
 
 def write_all(

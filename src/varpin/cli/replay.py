@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 import time
-from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from varpin.cli.arguments import add_robot_options, names_scene, robot_options
-from varpin.cli.console import say
-from varpin.cli.outputs import Output, add_replay_options, replays_of, write_all
+from varpin.cli.console import say, show
+from varpin.cli.outputs import add_replay_options, speed_of, write_all, writers_of
 from varpin.control import solution_trajectory
 from varpin.errors import FileError, InputError, RobotNotFound
 from varpin.io.archive import read_format
 from varpin.io.scenefile import SceneFile, load_scene
+from varpin.marks import Marks
 from varpin.model import Robot, load_robot
-from varpin.show.replay import frame_names, replay
-from varpin.support.checks import path_like, positive
-from varpin.support.tables import WIDTH
+from varpin.show.given import frame_names
+from varpin.support.checks import path_like
 from varpin.trajectory import Trajectory
 
 
@@ -58,36 +56,28 @@ def _replay(request: argparse.Namespace, errors: Console) -> int:
     first = _motion(request.motion)
     robot, scene = _robot(request, first)
     motion = _motion(request.motion, robot)
-    options: dict[str, Any] = {} if scene is None else dict(scene.marks(motion.duration))
-    if request.ghost is not None:
-        options["ghost"] = _motion(request.ghost, robot)
-    if request.trace:
-        options["trace"] = request.trace
-    options |= {"frames": request.frames, "torques": request.torques, "loop": not request.once}
-    for name in ("trace", "frames"):
-        frame_names(f"--{name}", [robot], options.get(name, ()))
+    marks = Marks() if scene is None else scene.marks(motion.duration)
+    ghost = marks.ghost if request.ghost is None else _motion(request.ghost, robot)
+    trace = request.trace or marks.trace
+    for name, frames in (("trace", trace), ("frames", request.frames)):
+        frame_names(f"--{name}", [robot], frames)
+    marks = replace(marks, ghost=ghost, trace=trace, frames=request.frames, torques=request.torques)
     if not asked:
-        return _window(request, errors, robot, motion, options)
-
-    def marks(_duration: float) -> Mapping[str, Any]:
-        return options
-
-    outputs: list[Output] = replays_of(request, marks)
-    writers = {output.path: partial(output.write, robot, motion) for output in outputs}
+        return _window(request, errors, robot, motion, marks)
+    writers = writers_of(request, lambda _duration: marks)
+    files = {path: partial(write, robot, motion) for path, write in writers.items()}
     with request.interrupts.keeping():
-        written, status = write_all(errors, writers, request.interrupts)
-    console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
+        written, status = write_all(errors, files, request.interrupts)
     for path in written:
-        say(console, str(path), prefix="written")
+        show(f"written: {path}")
     return status
 
 
-def _window(
-    request: argparse.Namespace, errors: Console, robot: Robot, motion: Trajectory, options: Mapping[str, Any]
-) -> int:
+def _window(request: argparse.Namespace, errors: Console, robot: Robot, motion: Trajectory, marks: Marks) -> int:
     """Show the motion in a live window, until Ctrl-C."""
-    speed = positive("--speed", 1.0 if request.speed is None else request.speed, "1")
-    viewer = replay(robot, motion, open=True, speed=speed, **options)
+    from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
+
+    viewer = replay(robot, motion, open=True, speed=speed_of(request), loop=not request.once, marks=marks)
     say(errors, f"{motion!r} at {viewer.url()}; Ctrl-C ends it")  # type: ignore[union-attr]
     try:
         while True:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -12,29 +11,28 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from varpin.cli.arguments import (
     ROBOT_OPTIONS,
     add_integrator,
     add_motion,
     add_robot,
-    integrator_asked_for,
+    integrator_of_words,
     motion_of,
     names_scene,
     scene_file,
 )
-from varpin.cli.console import complain, file_size, progress_bar, say
+from varpin.cli.console import complain, progress_bar, say, show, written_rows
 from varpin.cli.exits import INTERRUPTED, STEP_FAILED
-from varpin.cli.outputs import Output, add_outputs, outputs_of, write_all
+from varpin.cli.outputs import Writers, add_outputs, write_all, writers_of
 from varpin.errors import InputError
 from varpin.mechanics.scene import Scene
-from varpin.show.replay import frame_names
+from varpin.show.given import frame_names
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.simulate import simulate
 from varpin.simulation.time_steps import time_steps
 from varpin.support.checks import count, positive
-from varpin.support.tables import WIDTH, add_row, facts
+from varpin.support.tables import Table
 from varpin.trajectory import Trajectory
 
 # Largest number of steps; more do not fit into memory.
@@ -43,7 +41,7 @@ MOST_STEPS = 10**9
 DT = 1e-3
 # Options that exclude a scene file.
 _OF_MOTIONS = (
-    *(*ROBOT_OPTIONS, "dt", "tolerance", "duration", "steps", "integrator", "alpha", "stages"),
+    *(*ROBOT_OPTIONS, "dt", "tolerance", "duration", "steps", "integrator"),
     *("q0", "srdf", "v0", "gravity", "damping", "friction", "stiffness", "rest", "constraints", "torque"),
 )
 
@@ -79,12 +77,11 @@ def _simulate(request: argparse.Namespace, errors: Console) -> int:
     if names_scene(request.robot):
         file = scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
         driven = bool(not file.scene.conservative or file.controls() is not None or file.spec.simulate.seed is not None)
-        outputs = outputs_of(request, file.marks)
+        outputs = writers_of(request, file.marks)
         return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
-    outputs = outputs_of(request)
+    outputs = writers_of(request)
     steps = _steps(request)
-    free = request.integrator is request.stages is request.alpha is None
-    integrator = None if free else integrator_asked_for(request)
+    integrator = None if request.integrator is None else integrator_of_words(request.integrator)
     scene, q0, v0, torque = motion_of(request)
 
     def run(progress: Callable[[int, int], None]) -> Trajectory:
@@ -104,10 +101,9 @@ def _run(
     driven: bool,
     steps: int | None,
     run: Callable[[Callable[[int, int], None]], Trajectory],
-    outputs: list[Output] | None = None,
+    outputs: Writers,
 ) -> int:
     """Simulate; write and print the result, or the part before an interruption or failure."""
-    outputs = outputs_of(request) if outputs is None else outputs
     robot = scene.robot
     frame_names("--trace", [robot], request.trace)
     status, complaint, begin = 0, "", time.perf_counter()
@@ -123,12 +119,11 @@ def _run(
             trajectory, status = failure.trajectory, STEP_FAILED
             complaint = f"{failure.problem}. {failure.advice}. The motion so far is kept"
         wall_time = time.perf_counter() - begin
-        writers = {output.path: partial(output.write, robot, trajectory) for output in outputs}
+        writers = {path: partial(write, robot, trajectory) for path, write in outputs.items()}
         written, trouble = write_all(errors, writers, request.interrupts)
     status = status or trouble
     if not request.quiet:
-        tables = Console() if sys.stdout.isatty() else Console(width=WIDTH)
-        tables.print(_summary(trajectory, steps, wall_time, driven, written))
+        show(_summary(trajectory, steps, wall_time, driven, written))
     if status == INTERRUPTED:
         say(errors, complaint or "interrupted")
     elif complaint:
@@ -167,53 +162,33 @@ def _steps(request: argparse.Namespace) -> int | None:
 
 def _summary(trajectory: Trajectory, asked: int | None, wall_time: float, driven: bool, files: Iterable[Path]) -> Table:
     """A table of a run: its settings, work, result and files."""
-    table = facts(f"{trajectory.robot}: {trajectory.integrator}")
     statistics, steps = trajectory.statistics, trajectory.steps
     of = f" of {asked}" if asked is not None and steps < asked else ""
-    add_row(table, "steps", f"{steps}{of}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all")
-    add_row(table, "wall time", f"{wall_time:.3g} s")
+    rows = [
+        ("steps", f"{steps}{of}, {trajectory.dt:g} s each, {trajectory.duration:g} s in all"),
+        ("wall time", f"{wall_time:.3g} s"),
+    ]
+    error = "estimated error in q"
     if (accuracy := trajectory.accuracy) is not None:
         met = "" if accuracy.met else ", not"
-        add_row(
-            table,
-            "estimated error in q",
-            f"{accuracy.error:.2g} rad or m{met} within {accuracy.tolerance:g}; "
-            f"the search took {accuracy.search_steps} steps",
-            style="" if accuracy.met else "bold yellow",
-        )
+        took = f"the search took {accuracy.search_steps} steps"
+        rows.append((error, f"{accuracy.error:.2g} rad or m{met} within {accuracy.tolerance:g}; {took}"))
     elif trajectory.error_text:
-        add_row(table, "estimated error in q", f"{trajectory.error_text.removeprefix('error ')} rad or m")
-    # Explicit methods solve no equations and have no branches.
-    if steps and statistics.branch_margin.any():
-        newton, split = statistics.newton_iterations, statistics.split_steps
-        add_row(table, "Newton iterations", f"{newton.mean():.2f} a step, {newton.max()} at most")
-        if split:
-            add_row(
-                table,
-                "split steps",
-                f"{split} of {steps}, into up to {statistics.substeps.max()} parts: a smaller dt keeps the structure",
-                style="bold yellow",
-            )
-        else:
-            add_row(table, "split steps", "none")
-        add_row(table, "worst residual", f"{statistics.residual.max():.3g} rounding units")
-        add_row(table, "smallest branch margin", f"{statistics.branch_margin.min():.3g} (1 for dt -> 0, refused at 0)")
+        rows.append((error, f"{trajectory.error_text.removeprefix('error ')} rad or m"))
+    if split := statistics.split_steps:
+        most = statistics.substeps.max()
+        rows.append(("split steps", f"{split} of {steps}, into up to {most} parts: a smaller dt keeps the structure"))
     drift = np.abs(trajectory.energy - trajectory.energy[0]).max()
-    kinetic = 0.5 * (trajectory.p * trajectory.v).sum(axis=1).max()
     if driven:
         change = trajectory.energy[-1] - trajectory.energy[0]
-        add_row(table, "energy change", f"{change:+.3g} J from start to end, {drift:.3g} J at most in between")
+        rows.append(("energy change", f"{change:+.3g} J from start to end, {drift:.3g} J at most in between"))
     else:
-        part = drift / kinetic if kinetic > 0.0 else 0.0
-        share = f"{part:.2g} of" if part < 1.0 else f"{part:.3g} times"
-        of_kinetic = f", {share} the largest kinetic energy" if part > 0.0 else ""
-        add_row(table, "energy error", f"{drift:.3g} J at most{of_kinetic}")
+        kinetic = 0.5 * (trajectory.p * trajectory.v).sum(axis=1).max()
+        of_kinetic = f", of a kinetic energy of up to {kinetic:.3g} J" if kinetic > 0.0 else ""
+        rows.append(("energy error", f"{drift:.3g} J at most{of_kinetic}"))
     names = "q at the end [rad or m]", "v at the end [rad/s or m/s]"
-    for name, values in zip(names, (trajectory.q[-1], trajectory.v[-1]), strict=True):
-        add_row(table, name, "  ".join(f"{value:.6g}" for value in values))
+    ends = (trajectory.q[-1], trajectory.v[-1])
+    rows += [(name, "  ".join(f"{x:.6g}" for x in values)) for name, values in zip(names, ends, strict=True)]
     # The log has the first.
-    for finding in trajectory.warnings[1:]:
-        add_row(table, "warning", finding, style="bold yellow")
-    for path in files:
-        add_row(table, "written", f"{path} ({file_size(path.stat().st_size)})")
-    return table
+    rows += [("warning", finding) for finding in trajectory.warnings[1:]]
+    return Table(f"{trajectory.robot}: {trajectory.integrator}", (), [*rows, *written_rows(files)])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 import shlex
-import sys
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -13,16 +12,15 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from varpin.cli.arguments import scene_file
-from varpin.cli.console import file_size, say
+from varpin.cli.console import progress_bar, say, show, written_rows
 from varpin.cli.exits import INTERRUPTED, STEP_FAILED
-from varpin.cli.outputs import add_outputs, outputs_of, write_all
+from varpin.cli.outputs import add_outputs, write_all, writers_of
 from varpin.control import Solution, Status
 from varpin.io.scenefile import SceneFile
 from varpin.support.checks import writable
-from varpin.support.tables import WIDTH, add_row, facts
+from varpin.support.tables import Table
 
 
 def add_solve(parser: argparse.ArgumentParser) -> None:
@@ -49,13 +47,14 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
 
 def _solve(request: argparse.Namespace, errors: Console) -> int:
     file = scene_file(request, request.scene, "solve")
-    outputs = outputs_of(request, file.marks)
+    outputs = writers_of(request, file.marks)
     given = {"max_iterations": request.max_iterations, "true_cost": request.true_cost}
     options = {name: value for name, value in given.items() if value is not None}
     resume = None if request.resume is None else file.load_solution(request.resume)
     with request.interrupts.keeping():
         begin = time.perf_counter()
-        solution = file.solve(resume=resume, **options)
+        with progress_bar(errors, 1, quiet=request.quiet, unit="iterations at most") as progress:
+            solution = file.solve(resume=resume, progress=progress, **options)
         wall_time = time.perf_counter() - begin
         unmet = solution.refinement is not None and not solution.refinement.met
         status = 0 if solution.status.converged and not unmet else STEP_FAILED
@@ -63,20 +62,16 @@ def _solve(request: argparse.Namespace, errors: Console) -> int:
             status = INTERRUPTED
         saved = None if request.save is None else writable(request.save)
         writers: dict[Path, Callable[[], object]] = {
-            output.path: partial(solution.save, output.path)
-            if output.path == saved
-            else partial(output.write, file.robot, solution.trajectory)
-            for output in outputs
+            path: partial(solution.save, path) if path == saved else partial(write, file.robot, solution.trajectory)
+            for path, write in outputs.items()
         }
         written, trouble = write_all(errors, writers, request.interrupts)
     status = status or trouble
     told = _status(solution, request.scene, request.save if saved in written else None)
     if not request.quiet:
-        console = Console() if sys.stdout.isatty() else Console(width=WIDTH)
         # The last two lines are the status, which the next table has, and its reason.
-        for line in solution.table().splitlines()[:-2]:
-            say(console, line, prefix="")
-        console.print(_plan_table(file, solution, told, wall_time, written))
+        show("\n".join(solution.table().splitlines()[:-2]))
+        show(_plan_table(file, solution, told, wall_time, written))
     if not solution.status.converged:
         say(errors, told, style="yellow")
     if unmet and solution.refinement is not None:
@@ -99,21 +94,29 @@ def _status(solution: Solution, scene: str, kept: Path | None) -> str:
 
 
 def _plan_table(file: SceneFile, solution: Solution, told: str, wall_time: float, files: Iterable[Path]) -> Table:
-    table, problem = facts(file.spec.title), solution.problem
+    problem, refinement = solution.problem, solution.refinement
     apart = f", planned in {len(file.required.parts)} parts" if len(file.required.parts) > 1 else ""
-    add_row(table, "joints", f"{file.robot.dof} of {file.required.described} computed{apart}")
-    add_row(table, "horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}")
-    add_row(table, "status", told, style="" if solution.status.converged else "bold yellow")
     noise = f", and {solution.noise_cost:.6g} by noise" if solution.noise_cost else ""
-    add_row(table, "cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations")
-    if solution.refinement is not None and solution.refinement.tried:
-        tried = solution.refinement.tried[solution.refinement.chosen]
-        steps = ", ".join(f"{row.dt:g} s" for row in solution.refinement.tried)
-        add_row(table, "true cost", f"{tried.true_cost:.6g}, of the steps {steps}")
-    add_row(table, "wall time", f"{wall_time:.3g} s")
+    rows = [
+        ("joints", f"{file.robot.dof} of {file.required.described} computed{apart}"),
+        ("horizon", f"{problem.steps} steps of {problem.dt:g} s, {problem.integrator}"),
+        ("status", told),
+        ("cost", f"{solution.cost:.6g}{noise}, after {solution.iterations} iterations"),
+    ]
+    if refinement is not None and refinement.tried:
+        steps = ", ".join(f"{row.dt:g} s" for row in refinement.tried)
+        rows.append(("true cost", f"{refinement.tried[refinement.chosen].true_cost:.6g}, of the steps {steps}"))
+    values = solution.trajectory.scene_values
+    unit = "own units" if file.scene.inputs or values["PositionServo"].size else "N m or N"
     most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
-    add_row(table, "largest controls", "  ".join(f"{value:.4g}" for value in most))
-    add_row(table, "q at the end [rad or m]", "  ".join(f"{value:.6g}" for value in solution.trajectory.q[-1]))
-    for path in files:
-        add_row(table, "written", f"{path} ({file_size(path.stat().st_size)})")
-    return table
+    return Table(
+        file.spec.title,
+        (),
+        [
+            *rows,
+            ("wall time", f"{wall_time:.3g} s"),
+            (f"largest controls [{unit}]", "  ".join(f"{value:.4g}" for value in most)),
+            ("q at the end [rad or m]", "  ".join(f"{value:.6g}" for value in solution.trajectory.q[-1])),
+            *written_rows(files),
+        ],
+    )

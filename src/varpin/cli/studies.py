@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -12,14 +11,15 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from rich.console import Console
 
 from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options, simulate_words
-from varpin.cli.console import progress_bar, say
+from varpin.cli.console import progress_bar, say, show
 from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import folder_at
 from varpin.model import load_robot
 from varpin.study.advice import advise
 from varpin.study.precision import work_precision
 from varpin.study.record import Progress, Study, StudyInterrupted
-from varpin.support.tables import WIDTH, add_row, table_of
+from varpin.support.checks import positive
+from varpin.support.tables import Table
 
 if TYPE_CHECKING:
     from varpin.study.extremes import Record
@@ -49,12 +49,11 @@ def _tradeoff(request: argparse.Namespace, errors: Console) -> int:
     scene, q0, v0, torque = motion_of(request)
     options = {"controls": torque, "duration": request.duration, "dts": request.dt, "repeats": request.repeats}
     record = _kept(request, errors, lambda progress: work_precision(scene, q0, v0, progress=progress, **options))
-    title, console = f"{record.robot}: speed against accuracy over {record.duration:g} s", _console()
+    title = f"{record.robot}: speed against accuracy over {record.duration:g} s"
     if not request.quiet:
-        _print_table(console, record, title)
-        for note in (*record.notes, *record.failures):
-            say(console, note, prefix="")
-    _write(console, folder, "tradeoff", record, title, quiet=request.quiet)
+        show(record.table(title))
+        show("\n".join((*record.notes, *record.failures)))
+    _write(folder, "tradeoff", record, title, quiet=request.quiet)
     return INTERRUPTED if record.missing else 0
 
 
@@ -74,19 +73,21 @@ def add_advise(parser: argparse.ArgumentParser) -> None:
     _add_outputs(parser, quiet=None)
 
 
-def _advise(request: argparse.Namespace, _errors: Console) -> int:
+def _advise(request: argparse.Namespace, errors: Console) -> int:
+    for option, unit in (("tolerance", "rad or m"), ("budget", "s")):
+        if getattr(request, option) is not None:
+            positive(f"--{option}", getattr(request, option), unit)
     folder = _folder(request)
+    say(errors, "trying integrators on this motion, for a minute at most")
     scene, q0, v0, torque = motion_of(request)
     options = {"controls": torque, "tolerance": request.tolerance, "budget": request.budget}
     advice = advise(scene, q0, v0, duration=request.duration, **options)
-    console = _console()
-    for note in advice.notes:
-        say(console, note, prefix="")
-    say(console, simulate_words(request, advice.integrator, advice.dt, advice.steps), prefix="run it")
-    _print_table(console, advice, "The best of each method")
-    say(console, f"(found in {advice.calibration:.2g} s)", prefix="")
+    show("\n".join(advice.notes))
+    show(f"run it: {simulate_words(request, advice.integrator, advice.dt, advice.steps)}")
+    show(advice.table("The best of each method"))
+    show(f"(found in {advice.calibration:.2g} s)")
     goal = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"
-    _write(console, folder, "advice", advice, f"{advice.robot}: an integrator for {request.duration:g} s and {goal}")
+    _write(folder, "advice", advice, f"{advice.robot}: an integrator for {request.duration:g} s and {goal}")
     return 0 if advice.reached else STEP_FAILED
 
 
@@ -108,13 +109,17 @@ def _extremes(request: argparse.Namespace, errors: Console) -> int:
 
     robot = load_robot(request.robot, **robot_options(request))
     folder, patience = _folder(request), 900.0 if request.deep else 20.0
-    record = _kept(request, errors, lambda progress: check_robot(robot, patience=patience, progress=progress))
-    console = _console()
     if not request.quiet:
-        _print_kinds(console, record)
-    _write(console, folder, "extremes", record, f"{record.robot} at the extremes", quiet=request.quiet)
+        say(
+            errors,
+            f"each motion takes {patience:g} s at most; all together take {'hours' if request.deep else 'minutes'}",
+        )
+    record = _kept(request, errors, lambda progress: check_robot(robot, patience=patience, progress=progress))
+    if not request.quiet:
+        _show_kinds(record)
+    _write(folder, "extremes", record, f"{record.robot} at the extremes", quiet=request.quiet)
     for cell in record.wrong():
-        say(console, f"{cell.trial}, {cell.integrator}: {'; '.join(cell.found)}", prefix=Kind.WRONG.value, style="red")
+        show(f"{Kind.WRONG.value}: {cell.trial}, {cell.integrator}: {'; '.join(cell.found)}")
     if record.missing:
         return INTERRUPTED
     return FAULTY if record.wrong() else 0
@@ -147,40 +152,23 @@ def _kept(request: argparse.Namespace, errors: Console, study: Callable[[Progres
             return cast("Made", stop.record)
 
 
-def _console() -> Console:
-    return Console() if sys.stdout.isatty() else Console(width=WIDTH)
-
-
-def _print_table(console: Console, study: Study[Any], title: str) -> None:
-    """The runs, those that nothing beats in bold."""
-    table, front = table_of(title, study.columns()), study.pareto()
-    table.columns[0].no_wrap = True
-    for run in study.runs:
-        add_row(table, *study.row(run), style="bold" if run in front else "")
-    console.print(table)
-
-
-def _print_kinds(console: Console, record: Record) -> None:
+def _show_kinds(record: Record) -> None:
     """A letter for each motion and integrator, and how many of each letter an integrator has."""
-    from varpin.show.study_report import MEANING, grid  # noqa: PLC0415 - matplotlib is slow to import
-
-    names, rows = grid(record)
-    letters = table_of(f"{record.robot} at the extremes", ("motion", *(str(k + 1) for k in range(len(names)))))
-    for name, cells in rows.items():
-        add_row(letters, name, *(cell.kind.letter if cell else "" for cell in cells))
-    counts = table_of("", ("", "integrator", *(kind.value for kind in MEANING)))
-    for k, name in enumerate(names):
-        own = [cell.kind for cell in record.runs if cell.integrator == name]
-        add_row(counts, str(k + 1), name, *(str(own.count(kind)) for kind in MEANING))
-    console.print(letters)
-    console.print(counts)
-    for kind, meaning in MEANING.items():
-        say(console, f"{record.counts()[kind]} {kind.value}: {meaning}", prefix=kind.letter)
+    columns = list(dict.fromkeys(cell.integrator for cell in record.runs))
+    letters = {(cell.trial, cell.integrator): cell.kind.letter for cell in record.runs}
+    names = dict.fromkeys(cell.trial for cell in record.runs)
+    rows = [(name, *(letters.get((name, column), "") for column in columns)) for name in names]
+    show(Table(f"{record.robot} at the extremes", ("motion", *(str(k + 1) for k in range(len(columns)))), rows))
+    kinds = list(record.counts())
+    found = [[cell.kind for cell in record.runs if cell.integrator == name] for name in columns]
+    counted = zip(columns, found, strict=True)
+    totals = [(k + 1, name, *map(own.count, kinds)) for k, (name, own) in enumerate(counted)]
+    show(Table("", ("#", "integrator", *(kind.value for kind in kinds)), totals))
+    for kind, count in record.counts().items():
+        show(f"{kind.letter}: {count} {kind.value}: {kind.meaning}")
 
 
-def _write(
-    console: Console, folder: Path | None, name: str, study: Study[Any], title: str, *, quiet: bool = False
-) -> None:
+def _write(folder: Path | None, name: str, study: Study[Any], title: str, *, quiet: bool = False) -> None:
     """Write the files of a study if there is a folder."""
     if folder is None:
         return
@@ -188,4 +176,4 @@ def _write(
 
     for path in write_report(folder, name, study, title):
         if not quiet:
-            say(console, str(path), prefix="written")
+            show(f"written: {path}")

@@ -202,14 +202,15 @@ def _require_problem(source: Path, members: Members, problem: OptimalControlProb
     """Refuse a solution of another problem, by its numbers and its noise."""
     given = {name: getattr(problem, name) for name in (*_PROBLEM, "dt")}
     # Files without these entries are older than linear controls, and than rows between nodes of held ones.
-    members = {"controls": np.array("held"), "between_nodes": np.array(False), **members}
+    usual = {"controls": np.array("held"), "between_nodes": np.array(False)}
     for name, value in given.items():
-        if name not in members or not np.array_equal(members[name], value):
-            raise FileError(f"{source} is of a problem with {name} = {members.get(name, 'unknown')}, not {value}")
+        theirs = members.get(name, usual.get(name, np.array("unknown")))
+        if not np.array_equal(theirs, value):
+            raise FileError(f"{source} is of a problem with {name} = {theirs}, not {value}")
     described, found = problem.described_constraints, str(members.get("problem.constraints", ""))
     if described != found:
-        theirs, ours = _apart(found, described)
-        raise FileError(f"{source} is of a problem with constraints = {theirs}, not {ours}")
+        there, here = _apart(found, described)
+        raise FileError(f"{source} is of a problem with constraints = {there}, not {here}")
     _require_surroundings(source, members, problem, "noise.")
     # After the noise, which decides about the default integrator.
     stored, here = str(members.get("problem.integrator", "unknown")), repr(problem.integrator)
@@ -233,8 +234,8 @@ def _apart(there: str, here: str) -> tuple[str, str]:
 def _require_surroundings(source: Path, members: Members, problem: OptimalControlProblem, kind: str) -> None:
     """Refuse numbers, of those whose names begin with ``kind``, that differ or are on one side alone."""
     known = _surroundings(problem)
-    for name, array in members.items():
-        if name.startswith(kind) and name not in known and array.size:
+    for name in members:
+        if name.startswith(kind) and name not in known and members[name].size:
             raise FileError(
                 f"{source} is of a problem with {name.replace('.', ' ')}, which the given one, or this installation "
                 "of varpin, does not have"

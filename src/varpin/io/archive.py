@@ -13,9 +13,10 @@ import io
 import os
 import reprlib
 import secrets
+import socket
 import typing
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
@@ -65,14 +66,74 @@ def write_npz(path: str | os.PathLike[str], form: str, members: Mapping[str, Any
     return Path(path)
 
 
-def read_npz(source: Path, form: str | None = None) -> dict[str, NDArray[Any]]:
+class Entry:
+    """An array of an npz file, of which the header alone has been read; ``np.asarray`` reads the rest.
+
+    Attributes:
+        source: The file.
+        name: The entry's name.
+        shape: Its shape.
+        dtype: Its type.
+    """
+
+    def __init__(self, source: Path, archive: zipfile.ZipFile, name: str) -> None:
+        self.source, self.name = source, name
+        with archive.open(f"{name}.npy") as stream:
+            try:
+                read = _HEADERS[np.lib.format.read_magic(stream)]
+                self.shape, _, self.dtype = read(stream)
+            except (ValueError, KeyError) as error:
+                raise FileError(f"{source}: {name} is not an array: {error}") from None
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        with _opened(self.source) as archive:
+            # Read the whole entry: zipfile compares the checksum only at its end.
+            content = io.BytesIO(archive.read(f"{self.name}.npy"))
+        try:
+            array = np.asarray(np.lib.format.read_array(content, allow_pickle=False), order="C")
+        except ValueError as error:
+            raise FileError(f"{self.source}: {self.name} is not an array: {error}") from None
+        return array if dtype is None else array.astype(dtype)
+
+
+_HEADERS: Mapping[tuple[int, int], Callable[..., Any]] = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+class Archive(Mapping[str, NDArray[Any]]):
+    """The arrays of an npz file; each is read where it is asked for, so that a wrong shape is found before its data.
+
+    Attributes:
+        entries: The headers of the arrays, by name.
+    """
+
+    def __init__(self, source: Path) -> None:
+        with _opened(source) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+            self.entries = {name: Entry(source, archive, name) for name in names}
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return np.asarray(self.entries[name])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.entries
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+
+def read_npz(source: Path, form: str | None = None) -> Archive:
     """The arrays of an npz file, which must be of the format ``form`` if that is given.
 
     Raises:
         FileError: The file is missing, not npz, truncated or damaged, has pickled objects, or is of another format.
     """
-    with _opened(source) as archive:
-        members = {name.removesuffix(".npy"): _array(archive, name, source) for name in archive.namelist()}
+    members = Archive(source)
     if form is not None:
         _require_format(source, members.get("format"), form)
     return members
@@ -84,13 +145,12 @@ def read_format(source: Path) -> str:
     Raises:
         FileError: As :func:`read_npz`.
     """
-    with _opened(source) as archive:
-        return str(_array(archive, "format.npy", source)) if "format.npy" in archive.namelist() else ""
+    return str(Archive(source).get("format", ""))
 
 
 @contextlib.contextmanager
 def _opened(source: Path) -> Iterator[zipfile.ZipFile]:
-    if source.is_dir():
+    if os.path.isdir(source):  # noqa: PTH112 - pathlib raises an OSError for a path that is too long
         raise FileError(f"{source} is a folder, not an npz file")
     if not is_file(source):
         raise FileError(f"there is no file {source}")
@@ -104,15 +164,6 @@ def _opened(source: Path) -> Iterator[zipfile.ZipFile]:
     # On a damaged archive zipfile, zlib and NumPy raise many kinds of errors.
     except Exception as error:
         raise FileError(f"{source} is not an npz file, or it is truncated or damaged: {error}") from None
-
-
-def _array(archive: zipfile.ZipFile, name: str, source: Path) -> NDArray[Any]:
-    # Read the whole entry: zipfile compares the checksum only at its end.
-    content = io.BytesIO(archive.read(name))
-    try:
-        return np.asarray(np.lib.format.read_array(content, allow_pickle=False), order="C")
-    except ValueError as error:
-        raise FileError(f"{source}: {name.removesuffix('.npy')} is not an array: {error}") from None
 
 
 def _require_format(source: Path, found: object, form: str) -> None:
@@ -192,13 +243,16 @@ class _Builder:
         for item in fields(kind):
             key, hint = _entry(item), _required(hints[item.name])
             name = prefix + key
+            entries: Mapping[str, Any] = members.entries if isinstance(members, Archive) else members
             below = {
-                member.removeprefix(f"{name}."): members[member] for member in members if member.startswith(f"{name}.")
+                member.removeprefix(f"{name}."): entry
+                for member, entry in entries.items()
+                if member.startswith(f"{name}.")
             }
             if is_dataclass(hint) and below:
                 tables[key] = self.tables(hint, members, f"{name}.")
-            elif name in members:
-                tables[key] = members[name]
+            elif name in entries:
+                tables[key] = entries[name]
             elif typing.get_origin(hint) is Mapping:
                 tables[key] = below
         return tables
@@ -213,8 +267,11 @@ class _Builder:
             return None
         if typing.get_origin(hint) in (Annotated, np.ndarray):
             return self._array(hint, value, entry)
-        if isinstance(value, np.ndarray):
-            value = value.tolist()
+        if isinstance(value, np.ndarray | Entry):
+            # A number or a text has no axes, a list has one.
+            if len(value.shape) > 1 or (value.shape and typing.get_origin(hint) is not tuple):
+                raise self.error(entry, f"{value.dtype} {value.shape}", "a single value or a list")
+            value = np.asarray(value).tolist()
         if is_dataclass(hint):
             return self._record(hint, value, entry)
         if typing.get_origin(hint) is tuple:
@@ -226,17 +283,18 @@ class _Builder:
 
     def _array(self, hint: Any, array: Any, entry: str) -> NDArray[Any]:
         kind, axes = _array_type(hint)
-        found = array if isinstance(array, np.ndarray) else np.array(None)
+        found = array if isinstance(array, np.ndarray | Entry) else np.array(None)
         names = axes.axes if axes is not None else found.shape
         expected = tuple(self.sizes.get(name, name) if isinstance(name, str) else name for name in names)
-        fits = found.dtype == kind and found.ndim == len(expected)
+        fits = found.dtype == kind and len(found.shape) == len(expected)
         if not fits or any(isinstance(a, int) and a != b for a, b in zip(expected, found.shape, strict=True)):
             raise self.error(entry, f"{found.dtype} {found.shape}", f"{kind} ({', '.join(map(str, expected))})")
         self.sizes |= {name: size for name, size in zip(names, found.shape, strict=True) if isinstance(name, str)}
-        if axes is not None and axes.finite and not np.isfinite(found).all():
+        whole = np.asarray(found)
+        if axes is not None and axes.finite and not np.isfinite(whole).all():
             raise FileError(f"{self.source}: {entry} holds values that are not finite numbers")
-        found.setflags(write=False)
-        return found
+        whole.setflags(write=False)
+        return whole
 
     def _record(self, kind: Any, value: Any, entry: str) -> Any:
         if not isinstance(value, dict):
@@ -311,13 +369,19 @@ def _array_type(hint: Any) -> tuple[np.dtype[Any], Axes | None]:
 def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A binary stream whose contents replace ``path`` when the block ends without an error, and are deleted otherwise.
 
+    What processes that were killed in such a block have left in the folder is deleted, too.
+
     Raises:
         FileError: The path cannot be written.
     """
     target = writable(path)
+    host = socket.gethostname()
     # Not tempfile, whose files only their owner can read.
-    draft = target.with_name(f".{target.name}.{secrets.token_hex(8)}")
+    draft = target.with_name(f".varpin-{host}-{os.getpid()}-{secrets.token_hex(8)}")
     try:
+        for left in target.parent.glob(f".varpin-{host}-*-*"):
+            if not _runs(left.name.split("-")[-2]):
+                left.unlink(missing_ok=True)
         with draft.open("xb") as stream:
             yield stream
         draft.replace(target)
@@ -326,3 +390,14 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         if isinstance(error, OSError) and not isinstance(error, FileError):
             raise FileError(f"cannot write {target}: {error.strerror or error}") from None
         raise
+
+
+def _runs(process: str) -> bool:
+    """Whether a process of this machine runs."""
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (ValueError, OverflowError, OSError):
+        return True
+    return True

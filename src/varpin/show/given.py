@@ -1,9 +1,14 @@
-"""What figures and replays are given: motions, plans, and runs of controllers."""
+"""What figures and replays are given: motions, plans, runs of controllers, and names of frames."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
+from varpin.errors import InputError, UnknownFrame
+from varpin.model import Robot
 from varpin.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -22,3 +27,27 @@ def problem_of(given: object) -> OptimalControlProblem | None:
     plans = getattr(given, "plans", None)
     plan = plans[0] if isinstance(plans, tuple) and plans else given
     return cast("OptimalControlProblem | None", getattr(plan, "problem", None))
+
+
+def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequence[str]) -> list[tuple[str, ...]]:
+    """The requested frames of each robot.
+
+    Args:
+        option: Name of the option, for messages.
+        robots: The robots.
+        names: One or several names, of which each robot takes those it has; True for its end effector.
+
+    Raises:
+        InputError: They are no names.
+        UnknownFrame: No robot has a frame of that name.
+    """
+    if isinstance(names, bool | np.bool_):
+        return [(robot.end_effector,) if names else () for robot in robots]
+    wanted = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else tuple(names)
+    for name in wanted:
+        if not isinstance(name, str):
+            raise InputError(f"{option} must be names of frames, got {name!r}")
+        if not any(robot.free_model.existFrame(name) for robot in robots):
+            known = dict.fromkeys(frame.name for robot in robots for frame in robot.free_model.frames)
+            raise UnknownFrame(name, known, *(robot.name for robot in robots), option=option)
+    return [tuple(name for name in wanted if robot.free_model.existFrame(name)) for robot in robots]

@@ -1,20 +1,17 @@
-"""The report on a robot, with tables in plain text and in notebooks."""
+"""The report on a robot, with the same tables in plain text and in notebooks."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from rich.console import RenderableType
-from rich.table import Table
-from rich.text import Text
-
 from varpin.arrays import Floats
 from varpin.model import Robot
-from varpin.support import markup, tables
+from varpin.support import markup
 from varpin.support.frozen import Frozen
+from varpin.support.tables import Table
 
 Kind = Literal["revolute", "prismatic", "continuous", "mimic"]
 FrameKind = Literal["link", "joint", "fixed joint", "frame"]
@@ -129,11 +126,53 @@ class RobotReport(Frozen):
         return f"RobotReport({self.robot.name}: {len(self.joints)} joints, {len(self.links)} links{warned})"
 
     def __str__(self) -> str:
-        return tables.plain(parts_of(self))
+        told = [f"warning: {warning}" for warning in self.warnings] or ["nothing looks wrong"]
+        return "\n".join([*(f"{table}\n" for table in self.tables), *told])
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """Tables of joints, links, frames and the whole robot."""
+        moving = iter(range(len(self.joints)))
+        joints: list[tuple[object, ...]] = [
+            (
+                j.name,
+                "-" if j.kind == "mimic" else next(moving),
+                j.kind,
+                _axis(j),
+                "free" if j.kind == "continuous" else f"{j.lower:g} .. {j.upper:g}",
+                "none" if math.isinf(j.velocity) else f"{j.velocity:g}",
+                "none" if math.isinf(j.effort) else f"{j.effort:g}",
+            )
+            for j in self.joints
+        ]
+        joints += [(name, "-", f"locked at {at}", "", "", "", "") for name, at in self.locked.items()]
+        links = [
+            (x.name, f"{x.mass:.4g}", *("  ".join(f"{y:.3g}" for y in part) for part in (x.center, x.moments)))
+            for x in self.links
+        ]
+        frames = [(x.name, x.kind, x.parent or "the world", x.joint or "the base") for x in self.frames]
+        whole = [
+            ("degrees of freedom", self.robot.dof),
+            ("mass that moves [kg]", f"{self.total_mass:.5g}"),
+            ("at q [rad or m]", "  ".join(f"{x:g}" for x in self.q)),
+            ("largest step of Midpoint", self.step_in_words),
+        ]
+        units = {"rad": "[rad]", "m": "[m]"}
+        unit = units.get("".join({j.unit for j in self.joints}), "[rad or m]")
+        per = unit.replace("]", "/s]").replace(" or", "/s or")
+        effort = {"[rad]": "[N m]", "[m]": "[N]"}.get(unit, "[N m or N]")
+        heads = "joint", "q", "kind", "axis", f"limits {unit}", f"speed {per}", f"effort {effort}"
+        name = self.robot.name
+        return (
+            Table(f"{name}: joints", heads, joints),
+            Table(f"{name}: links", ("link", "mass [kg]", "centre of mass [m]", "principal moments [kg m^2]"), links),
+            Table(f"{name}: frames", ("frame", "what it is", "on", "moved by"), frames),
+            Table(f"{name}: as a whole", (), whole),
+        )
 
     @property
     def step_in_words(self) -> str:
-        """The largest step that the guard accepts around (q, v), in words."""
+        """The largest step that the midpoint integrator accepts around (q, v), in words."""
         if self.largest_step is None:
             return "undefined: the mass matrix is singular"
         # Rounded numbers in a description, such as a turn by 1.5708, make neutral directions slightly unstable.
@@ -141,66 +180,11 @@ class RobotReport(Frozen):
         return f"{step} at this q, {'at rest' if not self.v.any() else 'and this v'}"
 
     def _repr_html_(self) -> str:
-        rows: list[tuple[str, object]] = [
-            ("mass that moves [kg]", self.total_mass),
-            ("condition of M(q)", f"{self.condition:.3g}; {self.scaled_condition:.3g} with a unit diagonal"),
-            ("largest step the guard accepts", self.step_in_words),
-            *(("warning", warning) for warning in self.warnings),
-        ]
-        joints = [
-            (j.name, f"mimic: {j.follows}" if j.follows else j.kind, j.lower, j.upper, j.velocity, j.effort)
-            for j in self.joints
-        ]
-        links = [(x.name, x.joint or "the base", x.mass, "  ".join(f"{m:.3g}" for m in x.moments)) for x in self.links]
-        return markup.facts(
-            f"Robot {self.robot.name}",
-            rows,
-            markup.table(("joint", "kind", "lower [rad or m]", "upper", "velocity [1/s]", "effort [N m or N]"), joints),
-            markup.folded(
-                "links", markup.table(("link", "moved by", "mass [kg]", "principal moments [kg m^2]"), links)
-            ),
-            markup.folded(
-                "frames",
-                markup.table(
-                    ("frame", "what it is", "on", "moved by"),
-                    [(x.name, x.kind, x.parent or "the world", x.joint or "the base") for x in self.frames],
-                ),
-            ),
-        )
-
-
-def parts_of(report: RobotReport) -> Iterator[RenderableType]:
-    """Tables of joints, links, frames and the whole robot, then the warnings."""
-    yield _joint_table(report)
-    yield _link_table(report)
-    yield _frame_table(report)
-    yield _report_table(report)
-    for warning in report.warnings:
-        yield Text(f"warning: {warning}", style="yellow")
-    if not report.warnings:
-        yield Text("nothing looks wrong")
-
-
-def _joint_table(report: RobotReport) -> Table:
-    columns = "#", "joint", "kind", "axis", "position", "velocity", "effort"
-    table = tables.table_of(f"{report.robot.name}: joints", columns)
-    number = iter(range(len(report.joints)))
-    for joint in report.joints:
-        slides = joint.unit == "m"
-        kind = joint.kind if joint.kind != "mimic" else f"mimic: {joint.follows}"
-        tables.add_row(
-            table,
-            "" if joint.kind == "mimic" else str(next(number)),
-            joint.name,
-            kind,
-            _axis(joint),
-            "free" if joint.kind == "continuous" else f"{joint.lower:g} .. {joint.upper:g} {joint.unit}",
-            _bound(joint.velocity, "m/s" if slides else "rad/s"),
-            _bound(joint.effort, "N" if slides else "N m"),
-        )
-    for name, at in report.locked.items():
-        tables.add_row(table, "", name, f"locked at {at}", "", "", "", "", style="dim")
-    return table
+        joints, links, frames, whole = self.tables
+        rows = [(str(name), value) for name, value in whole.rows]
+        rows += [("warning", warning) for warning in self.warnings]
+        folded = (markup.folded(part.title, markup.table(part.columns, part.rows)) for part in (links, frames))
+        return markup.facts(f"Robot {self.robot.name}", rows, markup.table(joints.columns, joints.rows), *folded)
 
 
 def _axis(joint: JointReport) -> str:
@@ -208,44 +192,3 @@ def _axis(joint: JointReport) -> str:
         if abs(abs(component) - 1.0) < 1e-9:
             return f"{'+' if component > 0.0 else '-'}{letter}"
     return "(" + ", ".join(f"{component:.3g}" for component in joint.axis) + ")"
-
-
-def _bound(value: float, unit: str) -> str:
-    return "none" if math.isinf(value) else f"{value:g} {unit}"
-
-
-def _link_table(report: RobotReport) -> Table:
-    columns = "link", "moved by", "mass [kg]", "centre of mass [m]", "principal moments [kg m^2]"
-    table = tables.table_of(f"{report.robot.name}: links", columns)
-    for link in report.links:
-        tables.add_row(
-            table,
-            link.name,
-            link.joint or "the base",
-            f"{link.mass:.4g}",
-            "  ".join(f"{x:.3g}" for x in link.center),
-            "  ".join(f"{x:.3g}" for x in link.moments),
-            style="" if link.joint else "dim",
-        )
-    return table
-
-
-def _frame_table(report: RobotReport) -> Table:
-    table = tables.table_of(f"{report.robot.name}: frames", ("frame", "what it is", "on", "moved by"))
-    for frame in report.frames:
-        on, joint = frame.parent or "the world", frame.joint or "the base"
-        tables.add_row(table, frame.name, frame.kind, on, joint, style="" if frame.joint else "dim")
-    return table
-
-
-def _report_table(report: RobotReport) -> Table:
-    table = tables.facts(f"{report.robot.name}: as a whole")
-    tables.add_row(table, "degrees of freedom", str(report.robot.dof))
-    tables.add_row(table, "mass of what moves", f"{report.total_mass:.5g} kg")
-    tables.add_row(table, "at q [rad or m]", "  ".join(f"{x:g}" for x in report.q))
-    tables.add_row(
-        table, "condition of M(q)", f"{report.condition:.3g}; {report.scaled_condition:.3g} with a unit diagonal"
-    )
-    remark = f"(branch margin {report.branch_margin:g}; not a measure of accuracy)"
-    tables.add_row(table, "largest step accepted", f"{report.step_in_words} {remark}")
-    return table

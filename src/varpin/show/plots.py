@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     # Imported for types alone: plotting a joint needs no optimizer.
     from varpin.control import Solution
     from varpin.control.mpc import MpcRun
-    from varpin.study.advice import Advice
-    from varpin.study.plans import OptimalControlTradeoff
-    from varpin.study.precision import Quantity, WorkPrecision
+    from varpin.study.record import Study
+
 Motion: TypeAlias = "Trajectory | Solution | MpcRun"
 
 # Okabe and Ito's palette for colour-blind readers, without its yellow, which is faint on white.
@@ -260,92 +259,46 @@ def plot_trajectory(
     return panels[0].figure, panels
 
 
-def plot_work_precision(
-    record: WorkPrecision, axes: Axes | None = None, *, quantity: Quantity = "q"
-) -> tuple[Figure | SubFigure, Axes]:
-    """Error over wall time: a line for each integrator, a point for each step, circles and a line on the Pareto front.
+def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> tuple[Figure | SubFigure, Axes]:
+    """What a study measured over time: a line for each method, circles and a line on the Pareto front.
 
-    Errors below that of the reference are drawn on the grey line, which marks the reference's error.
+    A grey line marks the error of the reference, or the tolerance or budget that was asked for.
 
     Args:
-        record: From :func:`varpin.work_precision`.
+        study: From :func:`varpin.work_precision`, :func:`varpin.advise` or :func:`varpin.optimal_control_tradeoff`.
         axes: Where to draw; a new figure if left out.
-        quantity: ``"q"``, the largest error in q over the motion; ``"end"``, that at its end; ``"energy"``, the
-            energy error of a conservative motion; ``"tip"``, the error of the end effector.
+        options: For work and precision ``quantity``: ``"q"``, the largest error in q over the motion; ``"end"``, that
+            at its end; ``"energy"``, the energy error of a conservative motion; ``"tip"``, the error of the end
+            effector. Errors below that of the reference are drawn on its line.
 
     Returns:
         The figure and its axes.
 
     Raises:
-        InputError: Another ``record`` or ``quantity``, or no run has such an error.
+        InputError: Another ``study`` or ``quantity``, or no run has such a value.
     """
-    _require_record(record, "WorkPrecision", "work_precision")
-    labels = {
-        "q": "largest error in q [rad or m]",
-        "end": "error in q at the end [rad or m]",
-        "energy": "largest energy error [J]",
-        "tip": "largest error of the end effector [m]",
-    }
-    points = [(run.integrator, run.seconds, record.error_of(run, quantity)) for run in record.runs]
-    front = [(run.seconds, record.error_of(run, quantity)) for run in record.pareto(quantity)]
-    figure, axes = _plot_trade(points, front, axes)
-    axes.set_yscale("log")
-    floor = {"q": record.reference_error, "end": record.reference_error, "tip": record.tip_reference_error}
-    if floor.get(quantity, 0.0) > 0.0:
-        axes.axhline(floor[quantity], label="error of the reference", **_MARK)
-        _legend(axes)
-    axes.set_xlabel(f"wall time for {record.duration:g} s [s]")
-    axes.set_ylabel(labels[quantity])
-    return figure, axes
-
-
-def plot_advice(advice: Advice, axes: Axes | None = None) -> tuple[Figure | SubFigure, Axes]:
-    """Predicted error over predicted time of the advised choice, circled, and of the best of every other method.
-
-    A grey line marks the requested tolerance or budget.
-
-    Args:
-        advice: From :func:`varpin.advise`.
-        axes: Where to draw; a new figure if left out.
-
-    Returns:
-        The figure and its axes.
-
-    Raises:
-        InputError: ``advice`` is none, or no choice has a known error.
-    """
-    _require_record(advice, "Advice", "advise")
-    points = [
-        (f"{choice.integrator}, {choice.dt:.3g} s", choice.seconds, choice.error)
-        for choice in (advice.best, *advice.alternatives)
-        if np.isfinite(choice.error) and choice.error > 0.0
-    ]
-    best = [(seconds, error) for _, seconds, error in points[:1]]
-    figure, axes = _plot_trade(points, best, axes, "advised" if np.isfinite(advice.error) else "the most accurate")
-    axes.set_yscale("log")
-    if advice.tolerance is not None:
-        axes.axhline(advice.tolerance, label="tolerance", **_MARK)
-    if advice.budget is not None:
-        axes.axvline(advice.budget, label="budget", **_MARK)
-    _legend(axes)
-    axes.set_xlabel("predicted wall time [s]")
-    axes.set_ylabel("error in q [rad or m]")
-    return figure, axes
-
-
-def plot_optimal_control_tradeoff(
-    record: OptimalControlTradeoff, axes: Axes | None = None
-) -> tuple[Figure | SubFigure, Axes]:
-    """True cost of plans over their solve time, with the Pareto front; arguments as for :func:`plot_work_precision`.
-
-    Raises:
-        InputError: Another ``record``, or no run has a true cost.
-    """
-    _require_record(record, "OptimalControlTradeoff", "optimal_control_tradeoff")
-    points = [(run.integrator, run.seconds, run.open_loop_cost) for run in record.runs]
-    figure, axes = _plot_trade(points, [(run.seconds, run.open_loop_cost) for run in record.pareto()], axes)
-    axes.set_xlabel("solve time [s]")
-    axes.set_ylabel("true cost of the controls")
+    if not hasattr(study, "chart"):
+        what = "varpin.work_precision, advise or optimal_control_tradeoff"
+        raise InputError(f"this figure is of a study, from {what}, got {type(study).__name__}")
+    chart = study.chart(**options)
+    if not chart.front:
+        raise InputError("no run has such a value, so there is nothing to plot")
+    figure, axes = _axes(axes)
+    names = list(dict.fromkeys(name for name, _, _ in chart.points))
+    for name, style in zip(names, _styles(len(names)), strict=True):
+        curve = [(seconds, value) for label, seconds, value in chart.points if label == name]
+        axes.plot(*zip(*curve, strict=True), label=name, marker="o", markersize=4, **style)
+    ring: dict[str, Any] = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "color": "0.3", "zorder": 1}
+    axes.plot(*zip(*chart.front, strict=True), linestyle="none", **ring)
+    # The line connects only the points whose error is below that of all faster ones.
+    front = [point for k, point in enumerate(chart.front) if all(point[1] < v for _, v in chart.front[:k])]
+    axes.plot(*zip(*front, strict=True), label=chart.standing, linewidth=0.8, **ring)
+    axes.set(xscale="log", yscale="log" if chart.logarithmic else "linear")
+    for name, (axis, value) in chart.marks.items():
+        (axes.axvline if axis == "x" else axes.axhline)(value, label=name, **_MARK)
+    apply_style(axes)
+    axes.legend(frameon=False, fontsize="small")
+    axes.set(xlabel=chart.labels[0], ylabel=chart.labels[1])
     return figure, axes
 
 
@@ -360,36 +313,6 @@ def apply_style(axes: Axes) -> None:
     axes.grid(visible=True, color="0.92", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _plot_trade(
-    points: Sequence[tuple[str, float, float]],
-    front: Sequence[tuple[float, float]],
-    axes: Axes | None,
-    front_name: str = "Pareto front",
-) -> tuple[Figure | SubFigure, Axes]:
-    """Points (integrator, seconds, value) as one line an integrator, and a front, over logarithmic time."""
-    if not front:
-        raise InputError("no run has such a value, so there is nothing to plot")
-    figure, axes = _axes(axes)
-    names = list(dict.fromkeys(name for name, _, _ in points))
-    for name, style in zip(names, _styles(len(names)), strict=True):
-        curve = [(seconds, value) for label, seconds, value in points if label == name]
-        axes.plot(*zip(*curve, strict=True), label=name, marker="o", markersize=4, **style)
-    ring: dict[str, Any] = {"marker": "o", "markersize": 9, "markerfacecolor": "none", "color": "0.3", "zorder": 1}
-    axes.plot(*zip(*front, strict=True), linestyle="none", **ring)
-    # The line connects only the points whose error is below that of all faster ones.
-    best = [(seconds, value) for k, (seconds, value) in enumerate(front) if all(value < v for _, v in front[:k])]
-    axes.plot(*zip(*best, strict=True), label=front_name, linewidth=0.8, **ring)
-    axes.set_xscale("log")
-    apply_style(axes)
-    _legend(axes)
-    return figure, axes
-
-
-def _legend(axes: Axes) -> None:
-    """The legend of a figure of speed against accuracy."""
-    axes.legend(frameon=False, fontsize="small")
 
 
 def _plot_nodes(
@@ -481,12 +404,6 @@ def _require_labels(labels: object, controls: int) -> None:
         raise InputError(f"labels must be a list of {controls} names, one a control, got {labels!r}")
     if len(labels) != controls:
         raise InputError(f"labels must be {controls}, one a control, got {len(labels)}")
-
-
-def _require_record(record: object, kind: str, maker: str) -> None:
-    """Refuse a record of another class than ``kind``; by the class's name, so that no study is imported for it."""
-    if type(record).__name__ != kind:
-        raise InputError(f"this figure is of a varpin.{kind}, from varpin.{maker}, got {type(record).__name__}")
 
 
 def _slides(robot: Robot | None) -> NDArray[np.bool_] | None:

@@ -11,21 +11,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import numpy as np
-
 from varpin.errors import InputError
-from varpin.integrators import Guard, Integrator, Reference, largest_step
-from varpin.mechanics.lagrangian import lagrangian_jet
+from varpin.integrators import Integrator, Reference
 from varpin.mechanics.scene import Scene
-from varpin.simulation.ladder import Ladder, Rung, Trial, first_steps
+from varpin.simulation.ladder import Ladder, Trial, first_steps
 from varpin.study.motion import Setting, integrators_of
-from varpin.study.record import Study
+from varpin.study.record import Chart, Study
 from varpin.support.checks import JointValues, positive
 
 # Total time of the repetitions of a short run [s], and their largest number.
 _TIMING, _REPEATS = 0.02, 5
-# Nodes at which the midpoint integrator's largest step is computed: a bound by samples, for information.
-_NODES = 32
 # Part of a budget that is planned for; the rest is for the scatter of wall times.
 _PLANNED = 0.9
 
@@ -62,8 +57,6 @@ class Advice(Study[Choice]):
     Attributes:
         runs: The best choice of each method, the advised one first, then cheapest (or most accurate) first.
         reached: Whether the first meets the wish, as far as can be predicted.
-        largest_step: The step [s] from which on the midpoint integrator's branch guard splits steps somewhere along
-            this motion; infinite if none is too large, NaN under constraints, whose guard looks at more.
         tolerance: What was asked for [rad or m], or None.
         budget: What was asked for [s], or None.
         calibration: What finding out took [s].
@@ -74,7 +67,6 @@ class Advice(Study[Choice]):
     shown: ClassVar = ("integrator", "dt", "steps", "seconds", "error")
 
     reached: bool
-    largest_step: float
     tolerance: float | None
     budget: float | None
     calibration: float
@@ -97,6 +89,19 @@ class Advice(Study[Choice]):
     def pareto(self) -> tuple[Choice, ...]:
         """The choice, if it meets the wish."""
         return (self.best,) if self.reached else ()
+
+    def chart(self) -> Chart:
+        """Predicted error over predicted time, and what was asked for."""
+        known = [run for run in self.runs if math.isfinite(run.error) and run.error > 0.0]
+        points = [(f"{run.integrator}, {run.dt:.3g} s", run.seconds, run.error) for run in known]
+        wishes = {"tolerance": ("y", self.tolerance), "budget": ("x", self.budget)}
+        return Chart(
+            points,
+            [(seconds, error) for _, seconds, error in points[:1]],
+            ("predicted wall time [s]", "error in q [rad or m]"),
+            "advised" if math.isfinite(self.error) else "the most accurate",
+            {name: (axis, value) for name, (axis, value) in wishes.items() if value is not None},
+        )
 
     @property
     def best(self) -> Choice:
@@ -193,14 +198,13 @@ def advise(
         choices, reached = ladder.for_tolerance(positive("tolerance", tolerance, "rad or m"))
     else:
         choices, reached = ladder.for_budget(_PLANNED * positive("budget", budget, "s"))
-    bound = _largest_step(setting, ladder.rungs)
     runs = tuple(
         Choice(each.integrator, setting.duration / each.steps, each.steps, each.error, each.cost, each.measured)
         for each in choices
     )
-    reason = _reason(runs, reached, bound, tolerance, budget, duration)
+    reason = _reason(runs, reached, tolerance, budget, duration)
     calibration = time.perf_counter() - begin
-    return Advice(runs, scene.robot.name, reached, bound, tolerance, budget, calibration, reason)
+    return Advice(runs, scene.robot.name, reached, tolerance, budget, calibration, reason)
 
 
 def _timed(setting: Setting, integrator: Integrator, steps: int) -> Trial:
@@ -208,24 +212,9 @@ def _timed(setting: Setting, integrator: Integrator, steps: int) -> Trial:
     return setting.trial(integrator, steps, repeats=_REPEATS, within=_TIMING)
 
 
-def _largest_step(setting: Setting, rungs: Sequence[Rung]) -> float:
-    """The smallest of the midpoint guard's largest steps along the best motion there is [s]."""
-    able = [rung for rung in rungs if any(math.isfinite(trial.error) for trial in rung.trials)]
-    if not able or setting.scene.constraints:
-        return math.nan
-    method = max(able, key=lambda rung: (rung.integrator.order, rung.trials[-1].steps))
-    motion = setting.run(method.integrator, method.trials[-1].steps).motion
-    jets = (
-        lagrangian_jet(setting.scene, motion.q[node], motion.v[node])
-        for node in np.linspace(0, motion.steps, _NODES).astype(np.int64)
-    )
-    return min(largest_step(jet.Lvv, jet.Lqq, Guard().branch_margin) for jet in jets)
-
-
 def _reason(
     choices: Sequence[Choice],
     reached: bool,
-    bound: float,
     tolerance: float | None,
     budget: float | None,
     duration: float,
@@ -252,8 +241,6 @@ def _reason(
             "it is no variational integrator: over much longer horizons its energy drifts, and this advice is for "
             f"{duration:g} s"
         )
-    if math.isfinite(bound):
-        lines.append(f"the midpoint integrator's guard splits steps longer than {bound:.3g} s on this motion")
     return "\n".join(lines)
 
 

@@ -55,6 +55,17 @@ class Kind(Enum):
     WRONG = "silent wrong"
 
     @property
+    def meaning(self) -> str:
+        """What it says, in words."""
+        return {
+            Kind.ACCURATE: "every check passes",
+            Kind.DEGRADED: "varpin warns that the result is inaccurate",
+            Kind.REFUSED: "a named error before the first step",
+            Kind.STOPPED: "a named error during the run; the motion up to there is kept",
+            Kind.WRONG: "a check fails, and varpin gives no warning",
+        }[self]
+
+    @property
     def letter(self) -> str:
         """Its letter in tables."""
         return "W" if self is Kind.WRONG else self.value[0].upper()

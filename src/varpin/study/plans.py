@@ -13,7 +13,7 @@ from varpin.errors import InputError
 from varpin.integrators import Integrator
 from varpin.mechanics.scene import refuse_inputs
 from varpin.study.motion import fastest, integrators_of
-from varpin.study.record import Progress, Study, collect, pareto_front
+from varpin.study.record import Chart, Progress, Study, collect, pareto_front
 from varpin.support.checks import count, positive
 
 _COSTS = ("planned_cost", "open_loop_cost", "closed_loop_cost", "accuracy")
@@ -88,6 +88,12 @@ class OptimalControlTradeoff(Study[OptimalControlRun]):
         if run.failure:
             return "failed"
         return "Pareto" if run in self.pareto() else "" if run.status == "converged" else run.status
+
+    def chart(self) -> Chart:
+        """True cost of the controls over solve time."""
+        points = [(run.integrator, run.seconds, run.open_loop_cost) for run in self.runs]
+        front = [(run.seconds, run.open_loop_cost) for run in self.pareto()]
+        return Chart(points, front, ("solve time [s]", "true cost of the controls"), logarithmic=False)
 
     def pareto(self) -> tuple[OptimalControlRun, ...]:
         """The runs than which no other is better in both solve time and true open-loop cost, from the fastest up."""

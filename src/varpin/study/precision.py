@@ -19,7 +19,7 @@ from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.simulation.check import repeated
 from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, first_steps
 from varpin.study.motion import Outcome, Setting, integrators_of
-from varpin.study.record import Progress, Study, collect, pareto_front
+from varpin.study.record import Chart, Progress, Study, collect, pareto_front
 from varpin.support.checks import JointValues, count, positive
 from varpin.support.executors import in_order, require_executor
 
@@ -138,6 +138,20 @@ class WorkPrecision(Study[WorkPrecisionRun]):
             raise InputError(f"quantity must be one of {', '.join(values)}, got {quantity!r}")
         error, floor = values[quantity]
         return max(error, floor) if math.isfinite(error) else math.nan
+
+    def chart(self, quantity: Quantity = "q") -> Chart:
+        """An error over wall time: ``"q"``, ``"end"``, ``"tip"`` or ``"energy"``, of a conservative motion."""
+        names = {
+            "q": "largest error in q [rad or m]",
+            "end": "error in q at the end [rad or m]",
+            "energy": "largest energy error [J]",
+            "tip": "largest error of the end effector [m]",
+        }
+        front = [(run.seconds, self.error_of(run, quantity)) for run in self.pareto(quantity)]
+        points = [(run.integrator, run.seconds, self.error_of(run, quantity)) for run in self.runs]
+        floor = {"tip": self.tip_reference_error, "energy": 0.0}.get(quantity, self.reference_error)
+        marks = {"error of the reference": ("y", floor)} if floor > 0.0 else {}
+        return Chart(points, front, (f"wall time for {self.duration:g} s [s]", names[quantity]), marks=marks)
 
     def at_floor(self, run: WorkPrecisionRun) -> bool:
         """Whether the error of a run in q is too small for the reference to tell."""

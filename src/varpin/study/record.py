@@ -11,9 +11,10 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, cast
 
+from varpin.errors import InputError
 from varpin.io.archive import atomic_file
 from varpin.support import markup
-from varpin.support.tables import csv_text
+from varpin.support.tables import Table, csv_text
 
 Row = TypeVar("Row")
 Made = TypeVar("Made", bound="Study[Any]")
@@ -31,6 +32,27 @@ _HEADINGS = {
     "open_loop_cost": "true cost, open loop",
     "closed_loop_cost": "true cost, feedback",
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """What a study's figure shows: a quantity over time.
+
+    Attributes:
+        points: Method, wall time [s] and value of each run.
+        front: Wall time [s] and value of the runs that stand out.
+        standing: What these are.
+        labels: Of the two axes.
+        marks: Values to mark, by name: the axis, x or y, and the value.
+        logarithmic: Whether the values are.
+    """
+
+    points: Sequence[tuple[str, float, float]]
+    front: Sequence[tuple[float, float]]
+    labels: tuple[str, str]
+    standing: str = "Pareto front"
+    marks: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    logarithmic: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +97,10 @@ class Study(Generic[Row]):
         """The runs than which no other is better in both columns, from the fastest up."""
         raise NotImplementedError
 
+    def chart(self) -> Chart:
+        """What the figure shows; raises an InputError if there is none."""
+        raise InputError(f"a {type(self).__name__} has no figure")
+
     def note(self, run: Row) -> str:
         """The last column of a run."""
         return "failed" if getattr(run, "failure", "") else ""
@@ -87,10 +113,19 @@ class Study(Generic[Row]):
         """A run as entries of these columns."""
         return (*(_text(getattr(run, name)) for name in self.shown), self.note(run))
 
-    def _repr_html_(self) -> str:
+    def table(self, title: str = "") -> Table:
+        """The runs as a table; those that nothing beats stand out."""
         front = self.pareto()
-        strong = [k for k, run in enumerate(self.runs) if run in front]
-        table = markup.table(self.columns(), map(self.row, self.runs), strong)
+        strong = frozenset(k for k, run in enumerate(self.runs) if run in front)
+        return Table(title, self.columns(), [self.row(run) for run in self.runs], strong)
+
+    def _repr_html_(self) -> str:
+        return self.html()
+
+    def html(self, **rows: int) -> str:
+        """The runs and what a reader has to know as HTML; ``most=`` runs."""
+        runs = self.table()
+        table = markup.table(runs.columns, runs.rows, runs.strong, **rows)
         return markup.facts(repr(self), [("", note) for note in (*self.notes, *self.failures)], table)
 
     def to_csv(self, path: str | os.PathLike[str]) -> Path:

@@ -370,6 +370,12 @@ def writable(path: str | os.PathLike[str]) -> Path:
         InputError: It is not a path.
     """
     target = path_like("path", path).resolve()
+    try:
+        target.lstat()
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise FileError(f"cannot write a file of that name, {target.name[:40]!r}: {error.strerror}") from None
     if target.is_dir():
         raise FileError(f"cannot write {target}: it is a folder")
     if target.exists() and not target.is_file():

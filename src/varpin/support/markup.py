@@ -12,8 +12,7 @@ _MOST = 50
 _PAGE_STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 table { border-collapse: collapse; margin: 1rem 0; font-size: 0.85rem; }
-td, th { border: 1px solid #ccc; padding: 0.25rem 0.6rem; text-align: right; vertical-align: top; }
-td.text, th { text-align: left; }
+td, th { border: 1px solid #ccc; padding: 0.25rem 0.6rem; }
 img { max-width: 100%; }
 """
 
@@ -29,19 +28,21 @@ def facts(title: str, rows: Iterable[tuple[str, object]], *parts: str) -> str:
     return f'<div class="varpin"><b>{_text(title)}</b><table>{body}</table>{"".join(parts)}</div>'
 
 
-def table(columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iterable[int] = ()) -> str:
-    """Rows under headings, with text aligned left and numbers right; rows with indices in ``strong`` are bold."""
+def table(
+    columns: Sequence[str], rows: Iterable[Sequence[object]], strong: Iterable[int] = (), *, most: int = _MOST
+) -> str:
+    """The first ``most`` rows under headings, text to the left, numbers to the right; those in ``strong`` are bold."""
     every, bold = list(rows), set(strong)
     head = "".join(f'<th style="{_LEFT}">{_text(name)}</th>' for name in columns)
     body = ""
-    for k, row in enumerate(every[:_MOST]):
+    for k, row in enumerate(every[:most]):
         cells = ""
         for value in row:
             inner = f"<b>{_text(value)}</b>" if k in bold else _text(value)
             cells += f'<td style="{_LEFT if isinstance(value, str) else _RIGHT}">{inner}</td>'
         body += f"<tr>{cells}</tr>"
-    if len(every) > _MOST:
-        body += f'<tr><td colspan="{len(columns)}" style="{_LEFT}">and {len(every) - _MOST} more</td></tr>'
+    if len(every) > most:
+        body += f'<tr><td colspan="{len(columns)}" style="{_LEFT}">and {len(every) - most} more</td></tr>'
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
@@ -67,10 +68,10 @@ def warning_count(warnings: Sequence[str]) -> str:
     return f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if warnings else ""
 
 
-def page(title: str, body: str, style: str = "") -> str:
-    """A complete page with a title, a body (HTML), and additional CSS rules."""
+def page(title: str, body: str) -> str:
+    """A complete page with a title and a body (HTML)."""
     return f"""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}</title><style>{_PAGE_STYLE}{style}</style></head>
+<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}</title><style>{_PAGE_STYLE}</style></head>
 <body><h1>{_text(title)}</h1>
 {body}
 </body></html>

@@ -379,30 +379,9 @@ def toml_of(path: Path) -> dict[str, Any]:
         raise SceneFileError(path.name, "", f"it is not TOML: {error}") from None
 
 
-def inside(text: str, folder: Path, what: str) -> Path:
-    """A path in a file. A relative path must stay below ``folder``, links resolved; an absolute one may be anywhere.
-
-    Raises:
-        InputError: It is not a path, or leads out of the folder.
-    """
-    path = Path(text)
-    if path.is_absolute():
-        return path
-    try:
-        found, root = (folder / path).resolve(), folder.resolve()
-    except (OSError, RuntimeError) as error:
-        raise InputError(f"{text!r} is not a path: {error}") from None
-    if not found.is_relative_to(root):
-        raise InputError(f"{text!r} leads out of {what} {root}; name files below it, or give an absolute path")
-    return found
-
-
 def beside(text: str, where: Where) -> Path:
-    """A path in a scene file; a relative one must be below the folder of the file."""
-    try:
-        return inside(text, where.path.resolve().parent, "the scene's folder")
-    except InputError as error:
-        raise where.error(str(error)) from None
+    """A path in a scene file, relative to the folder of the file."""
+    return where.path.resolve().parent / text
 
 
 def existing(text: str, where: Where) -> Path:

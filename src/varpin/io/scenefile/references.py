@@ -265,16 +265,19 @@ def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
     """The columns of an npz file: arrays of one length, or the joint positions of a saved trajectory."""
     try:
         arrays = read_npz(path)
+        found: dict[str, Any] = dict(arrays.entries)
+        if {"t", "q", "joint_names"} <= found.keys() and len(found["q"].shape) == 2:
+            joints = [str(name) for name in arrays["joint_names"].reshape(-1)]
+            if len(joints) == found["q"].shape[1]:
+                found = {"t": found["t"]} | dict(zip(joints, arrays["q"].T, strict=True))
+        length = found["t"].shape if "t" in found else ()
+        for name, column in found.items():
+            if column.dtype.kind not in "fi" or len(column.shape) != 1 or column.shape != length:
+                raise wrong(f"its array {shown(name)} must have the shape of t, {length}, got {column.shape}")
+        columns = {name: np.asarray(column, dtype=np.float64) for name, column in found.items()}
     except FileError as error:
         raise wrong(f"cannot be read: {error}") from None
-    if {"t", "q", "joint_names"} <= set(arrays) and arrays["q"].ndim == 2:
-        joints = [str(name) for name in arrays["joint_names"].reshape(-1)]
-        if len(joints) == arrays["q"].shape[1]:
-            arrays = {"t": arrays["t"]} | dict(zip(joints, arrays["q"].T, strict=True))
-    length = arrays["t"].shape if "t" in arrays else ()
-    for name, column in arrays.items():
-        if column.dtype.kind not in "fi" or column.ndim != 1 or column.shape != length:
-            raise wrong(f"its array {shown(name)} must have the shape of t, {length}, got {column.shape}")
+    for name, column in columns.items():
         if not np.isfinite(column).all():
             raise wrong(f"its array {shown(name)} is not finite")
-    return {name: np.asarray(column, dtype=np.float64) for name, column in arrays.items()}
+    return columns

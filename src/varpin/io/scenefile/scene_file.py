@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -23,6 +22,7 @@ from varpin.io.scenefile.references import Timeline
 from varpin.io.scenefile.shown import marks_of
 from varpin.io.scenefile.tables import SceneTables, read_scene
 from varpin.io.scenefile.task import Task, required_of, task_of
+from varpin.marks import Marks
 from varpin.mechanics.reduction import Required
 from varpin.mechanics.scene import Scene, closest_controls
 from varpin.model import Robot, models_dir
@@ -203,8 +203,8 @@ class SceneFile:
         saved = self.robot.dof**3 - sum(len(part) ** 3 for part in parts)
         return len(parts) > 1 and self.spec.steps * saved > _SETUP * len(parts)
 
-    def marks(self, duration: float | None = None) -> dict[str, Any]:
-        """Options of :func:`varpin.replay` that mark the task: ``replay(robot, motion, **scene.marks())``.
+    def marks(self, duration: float | None = None) -> Marks:
+        """The task in a replay: ``replay(robot, motion, marks=scene.marks())``.
 
         They are targets, reference paths and traces of the frames in the cost, a ghost of the robot that follows a
         reference of joints, and constraints.
@@ -212,12 +212,8 @@ class SceneFile:
         Args:
             duration: Duration of the motion [s]; the horizon if left out.
         """
-        marks = marks_of(self._task, self.spec.duration if duration is None else duration)
-        if self.spec.plan_constraint:
-            marks["constraints"] = self.problem
-        elif self.scene.constraints:
-            marks["constraints"] = self.scene
-        return marks
+        constraints = self.problem if self.spec.plan_constraint else self.scene
+        return marks_of(self._task, self.spec.duration if duration is None else duration, constraints)
 
     def load_solution(self, path: str | Path) -> Solution:
         """Read a solution of this scene that :meth:`Solution.save` wrote; see :meth:`Solution.load`."""
@@ -254,26 +250,6 @@ class SceneFile:
             u[:, rows], reference[:, x] = plan.u, plan.reference
             gains[:, rows[:, None], x] = plan.gains
         return LinearPolicy(u, gains, reference, hold=plan.hold, on=plan.on, period=plan.period)
-
-    def saving(self, *, steps: int = 200, repeats: int = 5) -> float:
-        """Measured time of a step with all joints that the file does not lock, divided by that of this scene.
-
-        Raises:
-            StepFailure: As :func:`varpin.simulate`.
-        """
-        whole = load_scene(self.spec.path, required_only=False)
-        least = {}
-        for name, scene, q0, v0 in (
-            ("required", self.scene, self.q0, self.v0),
-            ("whole", whole.scene, whole.q0, whole.v0),
-        ):
-            times = []
-            for _ in range(repeats + 1):
-                begin = time.perf_counter()
-                simulate(scene, q0, v0, dt=self.spec.dt, steps=steps, integrator=self.integrator)
-                times.append(time.perf_counter() - begin)
-            least[name] = min(times[1:])
-        return least["whole"] / least["required"]
 
 
 def load_scene(source: str | Path, *, required_only: bool = True) -> SceneFile:

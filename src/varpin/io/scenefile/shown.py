@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from varpin.arrays import Floats
 from varpin.io.scenefile.task import CostTerm, Task
+from varpin.marks import Marks
+
+if TYPE_CHECKING:
+    from varpin.control import OptimalControlProblem
+    from varpin.mechanics.scene import Scene
 
 # Points of a path.
 _POINTS = 400
 
 
-def marks_of(task: Task, duration: float) -> dict[str, Any]:
-    """Options of :func:`varpin.replay` from the cost: traces, targets, references and a ghost.
+def marks_of(task: Task, duration: float, constraints: bool | Scene | OptimalControlProblem) -> Marks:
+    """Marks from the cost: traces, targets, references and a ghost.
 
     Args:
         task: The scene.
         duration: Duration of the motion [s].
+        constraints: What draws its constraints.
     """
     wanted = [term for term in task.costs if term.target is not None and term.weight.all()]
     positions = [term for term in wanted if term.table.kind == "frame_position"]
     orientations = [term for term in wanted if term.table.kind == "frame_orientation"]
-    marks: dict[str, Any] = {}
-    if positions:
-        marks["trace"] = list(dict.fromkeys(term.table.frame for term in positions))
     targets: dict[str, Floats] = {}
     references: dict[str, Floats] = {}
     for term in positions:
@@ -38,14 +41,10 @@ def marks_of(task: Task, duration: float) -> dict[str, Any]:
         path = _values(term, duration)
         if len(path) > 1 and np.ptp(path, axis=0).any():
             references[f"path of {name}"] = path
-    if targets:
-        marks["targets"] = targets
-    if references:
-        marks["reference"] = references
-    if (ghost := _ghost(task, duration)) is not None:
-        marks["ghost"] = ghost
-        marks.setdefault("trace", True)
-    return marks
+    ghost = _ghost(task, duration)
+    frames = list(dict.fromkeys(term.table.frame for term in positions))
+    trace = frames or ghost is not None
+    return Marks(trace=trace, targets=targets, reference=references or None, ghost=ghost, constraints=constraints)
 
 
 def _of_one_frame(position: CostTerm, orientation: CostTerm) -> bool:

@@ -27,7 +27,6 @@ from varpin.io.scenefile.reading import (
     either,
     entries,
     existing,
-    inside,
     keys,
     number,
     rules_of,
@@ -296,10 +295,7 @@ class SolveTable:
 
 def _output(*endings: str) -> Rule:
     def written(text: str, where: Where) -> Path:
-        try:
-            path = inside(text, Path.cwd(), "the working directory")
-        except InputError as error:
-            raise where.error(str(error)) from None
+        path = Path.cwd() / text
         if path.suffix.lower() not in endings:
             raise where.error(f"must end in {', '.join(endings)}, got {path.name!r}")
         return path

@@ -1,9 +1,10 @@
-"""Annotations of a replay, validated and sampled at its keyframes: traces, targets, frames, torques."""
+"""Marks from what a user gives, checked and sampled at the keyframes: paths, targets, torques."""
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -12,14 +13,16 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from varpin.arrays import Floats
-from varpin.errors import InputError, UnknownFrame
+from varpin.errors import InputError
+from varpin.marks import Marks
 from varpin.model import Robot
-from varpin.show.replay.script import Outlook, Target, Trace
-from varpin.support.checks import JointValues, as_floats, joint_array, require_finite
+from varpin.show.given import motion_of, problem_of
+from varpin.show.replay.marks import Beads, Path, Target
+from varpin.show.replay.script import rows_at
+from varpin.support.checks import as_floats, joint_array, require_finite
 from varpin.trajectory import Trajectory, kinematic_input_rows
 
 if TYPE_CHECKING:
-    from varpin.control import OptimalControlProblem
     from varpin.control.mpc import MpcRun
 
 
@@ -30,39 +33,15 @@ _FEWEST, _MOST = 200, 1000
 _BEADS = 12
 
 
-def frame_names(option: str, robots: Sequence[Robot], names: bool | str | Sequence[str]) -> list[tuple[str, ...]]:
-    """The requested frames of each robot.
-
-    Args:
-        option: Name of the option, for messages.
-        robots: The robots.
-        names: One or several names, of which each robot takes those it has; True for its end effector.
-
-    Raises:
-        InputError: They are no names.
-        UnknownFrame: No robot has a frame of that name.
-    """
-    if isinstance(names, bool | np.bool_):
-        return [(robot.end_effector,) if names else () for robot in robots]
-    wanted = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else tuple(names)
-    for name in wanted:
-        if not isinstance(name, str):
-            raise InputError(f"{option} must be names of frames, got {name!r}")
-        if not any(robot.free_model.existFrame(name) for robot in robots):
-            known = dict.fromkeys(frame.name for robot in robots for frame in robot.free_model.frames)
-            raise UnknownFrame(name, known, *(robot.name for robot in robots), option=option)
-    return [tuple(name for name in wanted if robot.free_model.existFrame(name)) for robot in robots]
-
-
-def traces(
+def paths(
     kind: Literal["motion", "ghost"],
     robot: Robot,
     names: Sequence[str],
     t: Floats,
     q: Floats,
     end: float,
-    growing: Floats | None = None,
-) -> list[Trace]:
+    growing: Floats | None,
+) -> list[Path]:
     """The paths of frames along a motion up to a time, without those of frames that do not move.
 
     Args:
@@ -75,12 +54,12 @@ def traces(
         growing: Times of the keyframes (K,) [s], to let paths grow with the motion; None for whole paths.
     """
     times = np.append(t[t < end], min(end, t[-1]))
-    if len(times) - 1 > _MOST:
-        times = np.linspace(0.0, times[-1], _MOST + 1)
-    elif 1 < len(times) < _FEWEST:
-        parts = math.ceil(_FEWEST / (len(times) - 1))
-        fine = np.arange((len(times) - 1) * parts + 1) / parts
-        times = np.interp(fine, np.arange(len(times)), times)
+    pieces = len(times) - 1
+    if pieces:
+        # Points between the nodes, or fewer points than nodes.
+        parts = max(1, math.ceil(_FEWEST / pieces))
+        fine = np.linspace(0.0, pieces, min(pieces * parts, _MOST) + 1)
+        times = np.interp(fine, np.arange(pieces + 1), times)
     rows = rows_at(times, t, q)
     found = []
     for name in names:
@@ -88,44 +67,25 @@ def traces(
         kept = _moves(points)
         if kept.sum() > 1:
             reached = None if growing is None else np.interp(growing, times, np.cumsum(kept) - 1.0)
-            found.append(Trace(kind, name, points[kept], reached))
+            found.append(Path(kind, name, points[kept], reached))
     return found
 
 
-def outlooks(robot: Robot, names: Sequence[str], run: MpcRun, ahead: float, times: Floats) -> list[Outlook]:
-    """The planned paths of frames at each keyframe.
-
-    Args:
-        robot: The robot.
-        names: Names of its frames.
-        run: The run of the controller.
-        ahead: Time from now to the end of the path [s].
-        times: Times of the keyframes (K,) [s].
-    """
+def beads(robot: Robot, names: Sequence[str], run: MpcRun, ahead: float, times: Floats) -> list[Beads]:
+    """The planned paths of frames up to a time ``ahead`` [s], at each keyframe (K,) [s]."""
     ticks = run.period * np.arange(len(run.plans) + 1, dtype=np.float64)
-    found = []
-    for name in names:
-        beads = [
-            robot.frame_positions(rows_at(times, ticks, run.planned(ahead * part)), name)
-            for part in np.arange(1, _BEADS + 1) / _BEADS
-        ]
-        found.append(Outlook(name, np.stack(beads, axis=1)))
-    return found
+    plans = [rows_at(times, ticks, run.planned(ahead * part)) for part in np.arange(1, _BEADS + 1) / _BEADS]
+    return [Beads(name, np.stack([robot.frame_positions(q, name) for q in plans], axis=1)) for name in names]
 
 
-def rows_at(times: Floats, t: Floats, rows: Floats) -> Floats:
-    """Rows (N, n) at times ``t`` (N,), interpolated linearly at ``times`` (K,)."""
-    return np.column_stack([np.interp(times, t, column) for column in rows.T])
-
-
-def references(given: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Trace, ...]:
+def references(given: ArrayLike | Mapping[str, ArrayLike] | None) -> list[Path]:
     """Paths in the world, by name.
 
     Raises:
         InputError: A path is not (K, 3), is not finite, or stays in one place.
     """
     if given is None:
-        return ()
+        return []
     named = given if isinstance(given, Mapping) else {"reference": given}
     found = []
     for name, value in named.items():
@@ -136,8 +96,8 @@ def references(given: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Trace
         points = points[_moves(require_finite(what, points))]
         if len(points) < 2:
             raise InputError(f"{what} stays in one place; give a single point as a target")
-        found.append(Trace("reference", str(name), points))
-    return tuple(found)
+        found.append(Path("reference", str(name), points))
+    return found
 
 
 def _moves(points: Floats) -> NDArray[np.bool_]:
@@ -211,66 +171,50 @@ def target(name: str, track: tuple[Floats, Floats, Floats | None], times: Floats
     return Target(name, at, between(np.minimum(times, t[-1])).as_quat())
 
 
-def torque_shares(
-    robot: Robot,
-    motion: Trajectory | ArrayLike,
-    torques: bool | ArrayLike,
-    limit: JointValues | None,
-    problem: OptimalControlProblem | None = None,
-) -> Floats | None:
+def torque_shares(robot: Robot, given: object, marks: Marks) -> Floats | None:
     """Torque of each joint in each step as a share of its limit (N, n), in [0, 1]; None if torques are not shown.
 
     Args:
         robot: The robot.
-        motion: The motion whose controls are the torques, if ``torques`` is True.
-        torques: Whether to show torques; or the torques (N, n) themselves [N m or N].
-        limit: One number, (n,) or by name [N m or N]; if left out, those of the plan's controls if ``torques`` is True,
-            else the robot's limits, and where there are none the joint's largest torque.
-        problem: The problem of the motion, if it is a plan's.
+        given: The motion, whose controls are the torques if ``marks.torques`` is True.
+        marks: What to show.
 
     Raises:
         InputError: The motion does not have torques of all joints, they are not (N, n), or a limit is not positive.
     """
-    if isinstance(torques, bool | np.bool_):
-        if not torques:
-            if limit is not None:
-                raise InputError("torque_limit needs torques")
-            return None
+    torques, limit, own = marks.torques, marks.torque_limit, isinstance(marks.torques, bool | np.bool_)
+    if own and not torques:
+        if limit is not None:
+            raise InputError("torque_limit needs torques")
+        return None
+    if own:
+        motion = motion_of(given)
         if not isinstance(motion, Trajectory):
             raise InputError("torques=True takes the controls of a trajectory; for an array, give the torques (N, n)")
-        values = require_finite("motion.u", motion.u)
+        values, wrong = motion.u, ""
         if values.shape[1] != robot.dof:
+            wrong = f"{values.shape[1]} controls for {robot.dof} joints"
+        elif motion.scene_values.get("PositionServo", np.zeros(0)).size or len(kinematic_input_rows(motion)):
+            wrong = "positions of servos or kinematic inputs"
+        if wrong:
             raise InputError(
-                f"torques=True takes one control for each of the {robot.dof} joints, this trajectory has "
-                f"{values.shape[1]}; give the torques (N, {robot.dof}) themselves"
-            )
-        if motion.scene_values.get("PositionServo", np.zeros(0)).size:
-            raise InputError(
-                "torques=True takes controls for torques, but controls of this trajectory are positions of servos; "
-                f"give the torques (N, {robot.dof}) themselves"
-            )
-        if len(kinematic_input_rows(motion)):
-            raise InputError(
-                "torques=True takes controls for torques, but controls of this trajectory are positions of kinematic "
-                f"inputs; give the torques (N, {robot.dof}) themselves"
+                f"torques=True takes controls for torques, but this trajectory has {wrong}: give the torques "
+                f"(N, {robot.dof}) themselves"
             )
     else:
         values = as_floats("torques", torques)
         if values.ndim != 2 or values.shape[1] != robot.dof:
             raise InputError(f"torques must have shape (N, {robot.dof}), one row a step, got {values.shape}")
-        values = require_finite("torques", values)
-    size = np.abs(values)
-    largest = size.max(axis=0, initial=0.0)
-    effort = robot.effort_limit
-    bound = np.where(np.isfinite(effort), effort, largest)
-    if problem is not None and isinstance(torques, bool | np.bool_):
-        own = np.abs(problem.control_limits).max(axis=0)
-        bound = np.where(np.isfinite(own), own, bound)
+    size = np.abs(require_finite("torques", values))
+    bounds, problem = [size.max(axis=0, initial=0.0), robot.effort_limit], problem_of(given)
+    if own and problem is not None:
+        bounds.append(np.abs(problem.control_limits).max(axis=0))
+    bound = functools.reduce(lambda before, more: np.where(np.isfinite(more), more, before), bounds)
     if limit is not None:
-        given = joint_array("torque_limit", limit, robot.joint_names, uniform=True)
+        numbers = joint_array("torque_limit", limit, robot.joint_names, uniform=True)
         # Joints that are not named keep the limit of the robot.
         named = [not isinstance(limit, Mapping) or name in limit for name in robot.joint_names]
-        bound = np.where(named, given, bound)
+        bound = np.where(named, numbers, bound)
         if not (bound > 0.0).all():
             raise InputError(f"torque_limit must be positive [N m or N], got {limit}")
     return np.minimum(size / np.where(bound > 0.0, bound, 1.0), 1.0)

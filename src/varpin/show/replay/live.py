@@ -1,4 +1,4 @@
-"""Live view of motions and plans in meshcat while they are computed."""
+"""Live view of motions in meshcat while they are computed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
+from dataclasses import replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -17,31 +18,29 @@ import meshcat
 import numpy as np
 import umsgpack
 import zmq
-from meshcat.animation import Animation, AnimationClip, AnimationTrack
 from meshcat.visualizer import ViewerWindow
-from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
+from varpin.marks import Marks
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
-from varpin.model.tree import z_to
-from varpin.show.replay import marks
-from varpin.show.replay.annotations import frame_names, references, rows_at, target, target_tracks
-from varpin.show.replay.drawing import draw, joint_motion, joint_track
-from varpin.show.replay.legend import TRACE_COLORS
-from varpin.show.replay.page import lowered
-from varpin.show.replay.script import Actor, Script
+from varpin.show.given import frame_names
+from varpin.show.replay import forms
+from varpin.show.replay.annotations import references, target, target_tracks
+from varpin.show.replay.drawing import draw, joint_motion, mark_name, mark_node
+from varpin.show.replay.marks import KINDS, LABEL, TUBE, Mark, Tie, Triad, translation
+from varpin.show.replay.motion import require_marks
+from varpin.show.replay.page import lowered, open_browser
+from varpin.show.replay.picture import label
+from varpin.show.replay.script import Actor, Script, rows_at, tree_positions
 from varpin.show.replay.surroundings import goals, parts_of, regions, ties
 from varpin.show.replay.view import set_view
-from varpin.show.replay.viewer import open_browser
 from varpin.support.checks import flag, positive
-from varpin.trajectory import Nodes, Trajectory
+from varpin.trajectory import Nodes
 
 if TYPE_CHECKING:
-    from varpin.control import Iteration, OptimalControlProblem, Solution
-    from varpin.control.mpc import MpcRun
-
+    from varpin.control import OptimalControlProblem
 
 logger = logging.getLogger(__name__)
 
@@ -51,33 +50,25 @@ _ANSWER_LIMIT, _BROWSER_LIMIT = 20.0, 20.0
 _SLACK = 0.1
 # Shortest time between two changes of the text beside the robot [s].
 _TEXT_INTERVAL = 0.1
-# Height of the text, relative to the size of the robot.
-_LABEL = 0.045
-# A path is sent in pieces, as meshcat sends a changed object whole: points of a piece, largest number of pieces, and
+# A path is sent in pieces, as meshcat sends a changed object whole: points of a piece, number of pieces that stay, and
 # largest number of points between two pictures.
 _PIECE, _PIECES, _BETWEEN = 60, 100, 50
-# Shortest distance of points of a path, and its thickness, relative to the size of the robot.
-_APART, _TUBE = 0.004, 0.003
-# Number of iterates of a plan whose paths stay in view, points of such a path, and keyframes of all joints together.
-_ITERATES, _PATH, _KEYS = 8, 200, 3000
+# Shortest distance of points of a path, and how far bodies may leave the view, relative to the size of the robot.
+_APART, _EDGE = 0.004, 0.1
 # Random postures that give the reach of a robot for the view, and their largest angle from the start [rad].
 _POSTURES, _TURN = 40, np.pi
-# Opacity of the paths of earlier iterates.
-_PALE = 0.25
 
 
 class LiveView:
-    """A window that shows motions and plans while they are computed.
+    """A window that shows motions while they are computed.
 
-        with vp.LiveView(scene, trace=True) as view:
+        with vp.LiveView(scene, marks=vp.Marks(trace=True)) as view:
             motion = vp.simulate(scene, q0, v0, dt=1e-3, steps=5000, progress=view.progress)
-            plan = vp.solve(problem, callback=view.callback)
 
     ``progress`` shows the motion of :func:`varpin.simulate` or :meth:`varpin.Mpc.run` up to the present, at most at
-    true speed: where computing is faster, it waits. ``callback`` plays the motion of each iterate of
-    :func:`varpin.solve` in a loop, with the paths of earlier iterates in a pale colour. Nothing waits while no browser
-    is connected. At first the robot is in its initial configuration and the camera shows all that it can reach; the
-    camera moves back if that is not enough.
+    true speed: where computing is faster, it waits. Nothing waits while no browser is connected. At first the robot is
+    in its initial configuration and the camera shows all that it can reach; the camera moves back if that is not
+    enough.
 
     The server belongs to this process. It ends with :meth:`close`, with the ``with`` block or with the process; the
     browser keeps its last picture. The server listens on every network interface of the machine, as meshcat's always
@@ -92,82 +83,80 @@ class LiveView:
         self,
         source: Robot | Scene | OptimalControlProblem,
         *,
-        trace: bool | str | Sequence[str] = False,
-        reference: ArrayLike | Mapping[str, ArrayLike] | None = None,
-        targets: Mapping[str, object] | None = None,
-        frames: bool | str | Sequence[str] = False,
-        constraints: bool = True,
+        marks: Marks | None = None,
         speed: float | None = 1.0,
         fps: float = 30.0,
-        hold: float = 0.1,
         open: bool = True,
     ) -> None:
         """Open the window, and wait for the browser up to 20 s.
 
         Main args:
             source: A robot, its scene, or a problem.
-            trace: Frames whose paths are drawn; ``True`` for the end effector. A long motion keeps the last part.
+            marks: Traces, of which a long motion keeps the last part; frames, a reference and standing targets. With
+                ``constraints=True`` those of the scene or the problem.
             speed: Largest playback speed; 1 is true speed, None as fast as the motion is computed.
 
         Other Args:
-            reference: A path (K, 3) in the world [m] to draw, or several by name.
-            targets: Targets by name: a point (3,) [m], a pose (4, 4) or ``pin.SE3``.
-            frames: Frames to draw as triads; ``True`` for the end effector.
-            constraints: Draw the constraints of the scene or the problem.
             fps: Largest number of pictures a second.
-            hold: Shortest time for which each iterate of a plan is shown [s].
             open: Start a web browser. Otherwise open :attr:`url` in one.
 
         Raises:
-            InputError: ``source`` is none of these, a frame does not exist, or a reference or a target is invalid.
+            InputError: ``source`` is none of these, a frame does not exist, or another mark is invalid or is for
+                replays only.
         """
         robot = source if isinstance(source, Robot) else getattr(getattr(source, "scene", source), "robot", None)
         if not isinstance(robot, Robot):
             raise InputError(
                 f"a LiveView takes a Robot, a Scene or an OptimalControlProblem, got {type(source).__name__}"
             )
+        marks = require_marks(marks)
+        if marks.ghost is not None or marks.ahead is not None or marks.torques is not False:
+            raise InputError("a LiveView has neither a ghost nor torques: give trace, frames, reference or targets")
         self.robot = robot
-        constraints, open = flag("constraints", constraints), flag("open", open)
         self._speed = None if speed is None else positive("speed", speed, "1")
         self._interval = 1.0 / positive("fps", fps, "1/s")
-        self._hold = max(positive("hold", hold, "s"), self._interval)
-        self._traced = frame_names("trace", [robot], trace)[0]
-        held = False if source is robot or not constraints else source
-        scene, wanted, begin = parts_of(held, None, robot)
-        marked = tuple(target(name, track, np.zeros(1)) for name, track in target_tracks(targets, 0.0).items())
         lower, upper = robot.position_limits
         start = np.clip(np.zeros(robot.dof), lower, upper)
-        start = np.asarray(getattr(source, "q0", start), dtype=np.float64)
-        self._ties = ties(scene)
-        standing = regions(wanted, np.array([begin]))
-        if moving := [region.name for region in standing if region.moves]:
-            logger.warning("a LiveView shows %s where it is at t = %g s; replays move it", " and ".join(moving), begin)
-        actor = Actor(
-            robot,
-            {"robot": _positions(robot, start[None])},
-            frames=frame_names("frames", [robot], frames)[0],
-            ties=self._ties,
-            regions=standing,
-            goals=goals(wanted, marked),
-            reach=None if self._ties else _positions(robot, _postures(robot, start)),
-        )
-        script = Script(np.zeros(1), (actor,), references(reference), marked)
-        self._q = start
-        self._begin_run()
+        self._q = np.asarray(getattr(source, "q0", start), dtype=np.float64)
+        self._path: dict[str, list[Floats]] = {name: [] for name in frame_names("trace", [robot], marks.trace)[0]}
+        actor = self._actor(source, marks)
+        open = flag("open", open)
         self._text, self._text_time = "", -math.inf
-        self._iterates: list[tuple[str, ...]] = []
-        self._plans = 0
-        self._animated = self._closed = False
-        self._loop_began = self._drawn = self._planned = -math.inf
+        self._closed = False
+        self._drawn = -math.inf
         self._window = _Window()
         self.url: str = self._window.web_url
         self._viewer = meshcat.Visualizer(window=self._window)
-        self._stage = draw(self._viewer, script)
-        self._picture = self._stage.pictures[0]
-        self._nodes = self._picture.moving_nodes("robot")
+        self._stage = draw(self._viewer, Script(np.zeros(1), (actor,)))
+        (self._figure,) = self._stage.figures
+        self._nodes = self._figure.picture.moving_nodes("robot")
+        self._ties = {mark_name(k, tie): tie for k, tie in enumerate(actor.marks) if isinstance(tie, Tie)}
         self._in_view = self._stage.points
+        self._begin_run()
         if open and open_browser(self.url):
             self.wait()
+
+    def _actor(self, source: object, marks: Marks) -> Actor:
+        """The robot at its start, with its marks."""
+        robot = self.robot
+        given = marks.constraints
+        scene, wanted, begin = parts_of(source if given is True and source is not robot else given, None, robot)
+        standing = regions(wanted, np.array([begin]))
+        if moving := [region.name for region in standing if region.way is not None]:
+            logger.warning("a LiveView shows %s where it is at t = %g s; replays move it", " and ".join(moving), begin)
+        targets = [target(name, track, np.zeros(1)) for name, track in target_tracks(marks.targets, 0.0).items()]
+        frames = map(Triad, frame_names("frames", [robot], marks.frames)[0])
+        held = ties(scene)
+        every: tuple[Mark, ...] = (
+            *held,
+            *references(marks.reference),
+            *frames,
+            *standing,
+            *targets,
+            *goals(wanted, targets),
+        )
+        reach = None if held else tree_positions(robot, _postures(robot, self._q))
+        return Actor(robot, {"robot": tree_positions(robot, self._q[None])}, every, reach=reach)
 
     def __enter__(self) -> Self:
         return self
@@ -189,7 +178,7 @@ class LiveView:
         return False
 
     def close(self) -> None:
-        """End the server. The browser keeps its last picture, and continues to play a plan."""
+        """End the server. The browser keeps its last picture."""
         self._closed = True
         self._window.close()
 
@@ -212,70 +201,25 @@ class LiveView:
             InputError: They are of another robot.
         """
         if not isinstance(nodes, Nodes):
-            raise InputError("view.progress is for the progress of simulate and Mpc.run; of solve, give view.callback")
-        self._require(nodes.q)
+            raise InputError("view.progress is for the progress of simulate and Mpc.run")
+        t, q = nodes.t, nodes.q
+        if q.shape[1] != self.robot.dof:
+            raise InputError(
+                f"the view is of robot {self.robot.name!r} with {self.robot.dof} joints, and the motion of one with "
+                f"{q.shape[1]}"
+            )
         if self._silent:
             return
         with self._sending():
-            t, q = nodes.t, nodes.q
             if t[0] == 0.0:
                 self._begin_run()
-                self._clear_plans()
-            of = f" of {t[-1] * steps / done:.4g} s" if done else ""
-            if self._speed is None or not self._window.watched:
-                if done == steps or time.monotonic() - self._drawn >= self._interval:
-                    self._move(t, q, float(t[-1]), of)
-            else:
+            of = f" of {t[-1] * steps / done:.4g} s" if done else " s"
+            if self._speed is not None and self._window.watched:
                 self._play(t, q, self._speed, of)
+            elif time.monotonic() - self._drawn >= self._interval:
+                self._move(t, q, float(t[-1]), of)
             if done == steps:
                 self._move(t, q, float(t[-1]), of, last=True)
-
-    def callback(self, iteration: Iteration, motion: Trajectory) -> None:
-        """Show an iterate of a plan, for ``solve(..., callback=view.callback)``.
-
-        Args:
-            iteration: Record of the iteration.
-            motion: Its motion.
-
-        Raises:
-            InputError: The motion is of another robot.
-        """
-        if not isinstance(motion, Trajectory) or not hasattr(iteration, "cost"):
-            raise InputError("view.callback is for the callback of solve; of simulate and Mpc.run, give view.progress")
-        self._require(motion.q)
-        if self._silent:
-            return
-        with self._sending():
-            if self._window.watched:
-                time.sleep(max(0.0, self._planned + self._hold - time.monotonic()))
-            elif time.monotonic() - self._planned < self._interval and self._plans:
-                return
-            if iteration.index == 0:
-                self._begin_run()
-                self._clear_plans()
-            if iteration.step > 0.0 or not self._plans:
-                self._draw_plan(motion.t - motion.t[0], motion.q)
-            self._set_caption(f"iteration {iteration.index}, cost {iteration.cost:.5g}", last=True)
-            self._planned = time.monotonic()
-
-    def show(self, motion: Trajectory | Solution | MpcRun) -> None:
-        """Play a motion, a plan or a run in a loop, from its beginning.
-
-        Raises:
-            InputError: It is none of these, or of another robot.
-        """
-        played = getattr(motion, "trajectory", getattr(motion, "motion", motion))
-        if not isinstance(played, Trajectory):
-            raise InputError(f"motion must be a trajectory, a plan or a run of an Mpc, got {type(motion).__name__}")
-        self._require(played.q)
-        if self._silent:
-            return
-        with self._sending():
-            self._begin_run()
-            self._clear_plans()
-            self._loop_began = -math.inf
-            self._draw_plan(played.t - played.t[0], played.q)
-            self._set_caption(f"{played.duration:.4g} s", last=True)
 
     @property
     def _silent(self) -> bool:
@@ -290,22 +234,14 @@ class LiveView:
             self._window.lost = True
             logger.warning("the server of the live view has ended (%s); the computation continues without it", error)
 
-    def _require(self, q: Floats) -> None:
-        if q.shape[1] != self.robot.dof:
-            raise InputError(
-                f"the view is of robot {self.robot.name!r} with {self.robot.dof} joints, and the motion of one with "
-                f"{q.shape[1]}"
-            )
-
     def _begin_run(self) -> None:
         """Reset the view to the start of a motion."""
         self._shown = -math.inf  # time of the last picture [s of motion]
         self._anchor = time.monotonic()  # wall time at which playback of the motion began [s]
-        for piece in getattr(self, "_pieces", []):
-            self._viewer[piece].delete()
-        self._pieces: list[str] = []
-        self._count = 0
-        self._path: dict[str, list[Floats]] = {name: [] for name in self._traced}
+        self._pieces = dict.fromkeys(self._path, 0)
+        for path in self._path.values():
+            path.clear()
+        self._viewer["notes/live"].delete()
 
     def _play(self, t: Floats, q: Floats, speed: float, of: str) -> None:
         """Show the motion over new nodes, each picture at its time; late pictures are skipped, except for the last."""
@@ -327,138 +263,63 @@ class LiveView:
         """Show the robot at a time ``now`` [s] of the motion over new nodes."""
         if now == self._shown and not last:
             return
-        rows = rows_at(np.array([now]), t, q)
+        row = rows_at(np.array([now]), t, q)
         between = t[(t > self._shown) & (t < now)]
         if len(between) > _BETWEEN:
             between = between[np.linspace(0, len(between) - 1, _BETWEEN).astype(int)]
         if now > self._shown:
-            self._draw_path(np.concatenate([rows_at(between, t, q), rows]))
-        self._pose(rows[0])
-        self._set_caption(f"t = {now:.2f}{of or ' s'}", last=last)
+            self._draw_path(np.concatenate([rows_at(between, t, q), row]))
+        self._pose(row)
+        self._set_caption(f"t = {now:.2f}{of}", last=last)
         self._shown, self._drawn = now, time.monotonic()
 
-    def _pose(self, q: Floats) -> None:
-        """Update the joints that have moved, the rods between bodies and, if necessary, the camera."""
-        self._stop_loop()
+    def _pose(self, row: Floats) -> None:
+        """Update the joints that have moved, the rods between bodies and, if necessary, the camera, for q (1, n)."""
         tree = self.robot.tree
-        before, positions = _positions(self.robot, self._q[None])[0], _positions(self.robot, q[None])[0]
+        before, (positions,) = tree_positions(self.robot, self._q[None])[0], tree_positions(self.robot, row)
         for j, node in enumerate(self._nodes):
             if positions[j] != before[j] or self._shown == -math.inf:
                 self._viewer[node].set_transform(joint_motion(bool(tree.prismatic[j]), positions[j]))
-        self._q = q
-        R, p = self._picture.body_poses(positions[None])
-        for k, tie in enumerate(self._ties):
-            if tie.axis is None:
-                a, b = (end[1] if end[0] < 0 else R[0, end[0]] @ end[1] + p[0, end[0]] for end in (tie.a, tie.b))
-                self._viewer[f"notes/ties/{k}"].set_transform(_rod(a, b))
-        self._keep_in_view(p[0])
+        self._q = row[0]
+        figure = replace(self._figure, positions=positions[None])
+        for name, tie in self._ties.items():
+            for rod in tie.rod(figure):
+                self._viewer[mark_node(figure.picture, name, rod.node)].set_transform(rod.pose)
+        self._keep_in_view(figure.poses[1][0])
 
     def _keep_in_view(self, points: Floats) -> None:
         """Move the camera back if points (P, 3) are outside its view."""
         low, high = self._in_view.min(axis=0), self._in_view.max(axis=0)
-        edge = 0.1 * self._stage.size
+        edge = _EDGE * self._stage.size
         if (points >= low - edge).all() and (points <= high + edge).all():
             return
         # Twice as far as necessary, so that the camera does not move with every picture.
         out = points + np.where(points > high, points - high, 0.0) - np.where(points < low, low - points, 0.0)
         self._in_view = np.concatenate([self._in_view, points, out])
-        set_view(self._viewer, self._in_view, self._stage.toward, self._stage.floor, self._stage.size)
+        set_view(self._viewer, self._in_view, self._stage.toward, self._stage.size)
 
     def _draw_path(self, q: Floats) -> None:
-        """Extend the paths of the traced frames over configurations (k, n)."""
-        for name in self._traced:
-            path = self._path[name]
-            path += list(self.robot.frame_positions(q, name))
-            points = _apart(np.array(path), _APART * self._stage.size)
-            if len(points) < 2:
-                continue
-            color = TRACE_COLORS["motion"]
-            if len(path) == len(q) or not self._pieces:
-                self._pieces.append(f"notes/live/{self._count} {name}")
-                self._count += 1
-            node = next(piece for piece in reversed(self._pieces) if piece.endswith(f" {name}"))
-            self._viewer[node].set_object(marks.tube(points, _TUBE * self._stage.size, color))
+        """Extend the paths of the traced frames over configurations (k, n); the oldest piece gives way to a new one."""
+        size = self._stage.size
+        for name, path in self._path.items():
+            for point in self.robot.frame_positions(q, name):
+                if not path or np.linalg.norm(point - path[-1]) > _APART * size:
+                    path.append(point)
+            if len(path) > 1:
+                node = f"notes/live/{self._pieces[name] % _PIECES} {label(name)}"
+                self._viewer[node].set_object(forms.tube(np.array(path), TUBE * size, KINDS["motion"][1]))
             if len(path) > _PIECE:
-                self._path[name] = [points[-1]]
-                self._pieces.append(f"notes/live/{self._count} {name}")
-                self._count += 1
-        while len(self._pieces) > _PIECES * len(self._traced):
-            self._viewer[self._pieces.pop(0)].delete()
-
-    def _draw_plan(self, t: Floats, q: Floats) -> None:
-        """Play a motion in a loop, from the phase of the previous one, and draw its paths."""
-        if self._iterates:
-            for node in self._iterates[-1]:
-                pale = [*(channel / 255.0 for channel in TRACE_COLORS["motion"].to_bytes(3, "big")), _PALE]
-                self._viewer[f"{node}/<object>"].set_property("color", pale)
-        rows = q[np.linspace(0, len(q) - 1, min(len(q), _PATH)).astype(int)]
-        nodes = []
-        for name in self._traced:
-            points = _apart(self.robot.frame_positions(rows, name), _APART * self._stage.size)
-            if len(points) > 1:
-                node = f"notes/plans/{self._plans} {name}"
-                color = TRACE_COLORS["motion"]
-                self._viewer[node].set_object(marks.tube(points, _TUBE * self._stage.size, color))
-                nodes.append(node)
-        self._iterates.append(tuple(nodes))
-        self._plans += 1
-        while len(self._iterates) > _ITERATES:
-            for node in self._iterates.pop(0):
-                self._viewer[node].delete()
-        positions = _positions(self.robot, rows)
-        self._keep_in_view(self._picture.body_poses(positions)[1].reshape(-1, 3))
-        if t[-1] > 0.0:
-            self._loop(t, q)
-        else:
-            self._pose(q[-1])
-
-    def _loop(self, t: Floats, q: Floats) -> None:
-        """Let the page play a motion in a loop, from the phase of the previous one."""
-        now, speed, tree = time.monotonic(), self._speed or 1.0, self.robot.tree
-        end = float(t[-1]) / speed
-        if self._loop_began == -math.inf:
-            self._loop_began = now
-        phase = (now - self._loop_began) % end
-        keys = int(np.clip(_KEYS // len(tree.parent), 10, max(10.0, min(300.0, 30.0 * end))))
-        times = np.linspace(0.0, end, keys + 1)
-        # From the phase to the end, then from the start to the phase, with a jump in between.
-        first, second = np.append(phase, times[times > phase]), np.append(times[times < phase], phase)
-        clock = np.concatenate([first - phase, second + (end - phase) + 1e-6])
-        rows = _positions(self.robot, rows_at(speed * np.concatenate([first, second]), t, q))
-        clips = {}
-        for j, node in enumerate(self._nodes):
-            name = joint_track(bool(tree.prismatic[j]))
-            track = AnimationTrack(name, "number", clock.tolist(), rows[:, j].tolist())
-            clips[self._viewer[node].path] = AnimationClip({name: track}, fps=1)
-        self._viewer.set_animation(Animation(clips), play=True, repetitions=math.inf)
-        self._animated, self._q = True, q[0]
-
-    def _stop_loop(self) -> None:
-        """End the page's animation, which would continue to move the robot."""
-        if not self._animated:
-            return
-        path = self._viewer[self._nodes[0]].path
-        name = joint_track(bool(self.robot.tree.prismatic[0]))
-        still = AnimationTrack(name, "number", [0.0], [float(_positions(self.robot, self._q[None])[0, 0])])
-        self._viewer.set_animation(Animation({path: AnimationClip({name: still}, fps=1)}), play=False, repetitions=1)
-        self._animated, self._loop_began, self._shown = False, -math.inf, -math.inf
-
-    def _clear_plans(self) -> None:
-        for node in [node for nodes in self._iterates for node in nodes]:
-            self._viewer[node].delete()
-        self._iterates, self._planned = [], -math.inf
+                del path[:-1]
+                self._pieces[name] += 1
 
     def _set_caption(self, words: str, *, last: bool = False) -> None:
         """Show a text above the robot, not more often than every ``_TEXT_INTERVAL`` unless it is the last."""
         now = time.monotonic()
         if words == self._text or (now - self._text_time < _TEXT_INTERVAL and not last):
             return
-        size = self._stage.size
         low, high = self._in_view.min(axis=0), self._in_view.max(axis=0)
-        pose = np.eye(4)
-        pose[:3, 3] = [*(0.5 * (low + high))[:2], low[2]]
-        self._viewer["notes/words"].set_transform(pose)
-        self._viewer["notes/words"].set_object(marks.Label(words, _LABEL * size, 0.0))
+        self._viewer["notes/words"].set_transform(translation(np.array([*(0.5 * (low + high))[:2], low[2]])))
+        self._viewer["notes/words"].set_object(forms.Label(words, LABEL * self._stage.size, 0.0))
         self._text, self._text_time = words, now
 
 
@@ -467,7 +328,6 @@ class _Window(ViewerWindow):
 
     Attributes:
         connected: Set once a browser has connected.
-        watched: Whether a browser is connected now.
         lost: Whether the server has ended.
     """
 
@@ -534,29 +394,3 @@ def _postures(robot: Robot, start: Floats) -> Floats:
     high = np.where(robot.slides & np.isfinite(upper), upper, np.minimum(upper, start + turn))
     shares = np.random.default_rng(0).random((_POSTURES, robot.dof))
     return np.asarray(low + shares * (high - low))
-
-
-def _positions(robot: Robot, q: Floats) -> Floats:
-    """Positions (K, b) of all joints of the tree."""
-    tree = robot.tree
-    return np.asarray(q[:, tree.coordinate] * tree.ratio + tree.offset)
-
-
-def _apart(points: Floats, least: float) -> Floats:
-    """Points of a path (P, 3) at least ``least`` [m] from the previous one kept, the first and the last among them."""
-    kept = [0]
-    for k in range(1, len(points)):
-        if np.linalg.norm(points[k] - points[kept[-1]]) > least:
-            kept.append(k)
-    if len(kept) > 1:
-        kept[-1] = len(points) - 1
-    return points[kept]
-
-
-def _rod(a: Floats, b: Floats) -> Floats:
-    """Transform (4, 4), scaling included, that puts a rod of length 1 along z between two points."""
-    span, pose = b - a, np.eye(4)
-    length = float(np.linalg.norm(span))
-    pose[:3, :3] = (z_to(span / length) if length > 0.0 else np.eye(3)) @ np.diag([1.0, 1.0, length])
-    pose[:3, 3] = 0.5 * (a + b)
-    return pose

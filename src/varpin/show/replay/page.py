@@ -1,20 +1,30 @@
-"""A motion as one self-contained HTML file: meshcat's viewer and its commands."""
+"""A script in meshcat: as one HTML file that needs no server, or in a live browser window."""
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import gzip
 import html as markup
+import io
+import logging
+import webbrowser
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import meshcat
+import numpy as np
 import umsgpack
 
 from varpin.errors import InputError
-from varpin.show.replay.legend import Entry, legend
+from varpin.io.archive import atomic_file
+from varpin.show.replay.drawing import EFFORT_COLORS, draw
+from varpin.show.replay.marks import GHOST_COLOR, legend
 from varpin.show.replay.script import Script
+
+logger = logging.getLogger(__name__)
 
 # Playback speeds in the menu of the page; 1 is true speed.
 _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
@@ -39,9 +49,7 @@ class Page:
         viewer = Path(meshcat.viewer_assets_path(), "dist", "main.min.js").read_text(encoding="utf-8")
         stream = b"".join(len(command).to_bytes(4, "little") + command for command in self.commands)
         packed = base64.b64encode(gzip.compress(stream, 6, mtime=0)).decode()
-        title, key = markup.escape(script.title), "\n".join(map(_line, legend(script)))
-        if script.error:
-            key += f"\n<li>{markup.escape(script.error)}</li>"
+        title, key = markup.escape(script.title), "\n".join(_legend(script))
         return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -51,7 +59,8 @@ class Page:
 <style>{_part("player.css")}</style>
 </head>
 <body>
-<div id="stage"><div id="meshcat-pane"></div><div id="about"><h1>{title}</h1><ul>{key}</ul></div></div>
+<div id="stage"><div id="meshcat-pane"></div><p id="loading">loading</p>
+<div id="about"><h1>{title}</h1><ul>{key}</ul></div></div>
 {_bar(script)}
 <script>{viewer}</script>
 <script id="commands" type="text/plain">{packed}</script>
@@ -74,10 +83,22 @@ def _part(name: str) -> str:
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
-def _line(entry: Entry) -> str:
-    colors = entry.colors if len(entry.colors) > 1 else entry.colors * 2
-    swatch = f'<span class="swatch" style="background: linear-gradient(to right, {", ".join(colors)})"></span>'
-    return f"<li>{swatch}{markup.escape(entry.text)}</li>"
+def _legend(script: Script) -> Iterator[str]:
+    """The lines of the legend, one for each kind of mark, and the error of the motion."""
+    lines: list[tuple[str, list[int]]] = []
+    if any(actor.effort is not None for actor in script.actors):
+        scale = [int.from_bytes(np.rint(255.0 * color).astype(np.uint8).tobytes()) for color in EFFORT_COLORS]
+        lines.append(("torque: none, half, all of the limit", scale))
+    if any("ghost" in actor.positions for actor in script.actors):
+        planned = any(mark.kind == "plan" for mark in script.marks)
+        lines.append(("plan" if planned else "ghost", [GHOST_COLOR]))
+    lines += [(text, [color]) for text, color in legend(script.marks)]
+    for text, colors in lines:
+        ramp = ", ".join(f"#{color:06x}" for color in (colors if len(colors) > 1 else colors * 2))
+        swatch = f'<span class="swatch" style="background: linear-gradient(to right, {ramp})"></span>'
+        yield f"<li>{swatch}{markup.escape(text)}</li>"
+    if script.error:
+        yield f"<li>{markup.escape(script.error)}</li>"
 
 
 def _bar(script: Script) -> str:
@@ -119,3 +140,39 @@ class Inline:
             f'<iframe srcdoc="{markup.escape(self.html)}" title="{markup.escape(self.title)}" sandbox="allow-scripts" '
             f'style="width: 100%; max-width: {width}px; height: {height}px; border: 0"></iframe>'
         )
+
+
+def write_page(path: Path, script: Script) -> Path:
+    """Write a script as one self-contained HTML file."""
+    with atomic_file(path) as stream:
+        stream.write(_page(script).encode())
+    return path
+
+
+def inline_page(script: Script, size: tuple[int, int]) -> Inline:
+    """A script's page for a notebook, with a width and a height [pixels]."""
+    return Inline(_page(script), script.title, size)
+
+
+def _page(script: Script) -> str:
+    page = Page()
+    draw(meshcat.Visualizer(window=page), script, legend=True)
+    return page.html(script)
+
+
+def open_viewer(script: Script) -> meshcat.Visualizer:
+    """Draw a script in a new meshcat server, and open it in a web browser."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        viewer = meshcat.Visualizer()
+    draw(viewer, script)
+    open_browser(viewer.url())
+    return viewer
+
+
+def open_browser(url: str) -> bool:
+    """Open an address in a web browser; returns whether one could be started."""
+    logger.info("meshcat serves the motion at %s", url)
+    if webbrowser.open(url, new=2):
+        return True
+    logger.warning("no web browser could be started; open %s in one", url)
+    return False

@@ -14,7 +14,8 @@ import pinocchio as pin
 from varpin.arrays import Floats
 from varpin.model import Robot, readable_geometry
 from varpin.model.meshes import MeshPart, parts_of, read_mesh
-from varpin.model.tree import frame_index, joint_axis, z_to
+from varpin.model.tree import joint_axis, z_to
+from varpin.show.replay.marks import corners_of
 
 logger = logging.getLogger(__name__)
 
@@ -66,12 +67,6 @@ class Picture:
             [turns[shape.parentJoint] * shape.placement for shape in shapes],
         )
 
-    def frame(self, name: str) -> tuple[int, pin.SE3]:
-        """The body of a frame, -1 for the base, and the frame's placement on it."""
-        model = self.robot.free_model
-        frame = model.frames[frame_index(model, name, self.robot.name)]
-        return frame.parentJoint - 1, _turns(self.robot)[frame.parentJoint] * frame.placement
-
     def moving_nodes(self, root: str) -> list[str]:
         """Scene path below ``root`` of each body (b,)."""
         names = labels(self.robot.free_model.names[1:])
@@ -107,8 +102,7 @@ class Picture:
             if on == body:
                 shape.geometry.computeLocalAABB()
                 box = np.array([shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_])
-                corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
-                boxes.append(corners @ placement.rotation.T + placement.translation)
+                boxes.append(corners_of(box) @ placement.rotation.T + placement.translation)
         return np.concatenate(boxes)
 
     def swept(self, positions: Floats) -> Floats:
@@ -133,7 +127,7 @@ def label(name: str) -> str:
 
 
 # Steps of scene paths that no joint may have.
-_TAKEN = ("base", "shapes", "frames", "<object>")
+_TAKEN = ("base", "shapes", "notes", "<object>")
 
 
 def labels(names: Iterable[str]) -> list[str]:

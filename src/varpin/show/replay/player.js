@@ -120,8 +120,9 @@ load().then(() => {
     joinBar();
     // The bar has its height now.
     viewer.set_3d_pane_size();
+    document.getElementById("loading").remove();
     document.documentElement.dataset.loaded = "true";
 }).catch(error => {
     console.error(error);
-    document.getElementById("meshcat-pane").textContent = "This motion cannot be shown here: " + error.message;
+    document.getElementById("loading").textContent = "This motion cannot be shown here: " + error.message;
 });

@@ -17,7 +17,7 @@ from pinocchio.visualize.meshcat_visualizer import MeshcatVisualizer
 
 from varpin.arrays import Floats
 from varpin.model.meshes import MeshPart, joined
-from varpin.show.replay.legend import GHOST_COLOR
+from varpin.show.replay.marks import GHOST_COLOR
 
 logger = logging.getLogger(__name__)
 

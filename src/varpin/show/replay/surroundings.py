@@ -1,7 +1,8 @@
-"""Constraints of a scene and a plan for a replay: ties of the mechanism, obstacles, regions, goals."""
+"""Marks of constraints: ties of the mechanism, obstacles, regions and goals of a plan."""
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,8 @@ from varpin.mechanics.forces import point_of
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot
 from varpin.model.tree import z_to
-from varpin.show.replay.script import Region, Target, Tie
+from varpin.show.given import problem_of
+from varpin.show.replay.marks import Region, Target, Tie
 
 if TYPE_CHECKING:
     from varpin.control.constraints import PlanConstraint
@@ -33,14 +35,13 @@ def parts_of(given: object, motion: object, robot: Robot) -> tuple[Scene | None,
     """
     source = given
     if isinstance(given, bool | np.bool_):
-        plans = getattr(motion, "plans", None)
-        source = getattr(plans[0] if plans else motion, "problem", None) if given else None
+        source = problem_of(motion) if given else None
     if source is None:
         return None, (), 0.0
     scene = source if isinstance(source, Scene) else getattr(source, "scene", None)
     if not isinstance(scene, Scene):
         raise InputError(
-            f"constraints must be True or False, a Scene or an OptimalControlProblem, got {type(given).__name__}"
+            f"constraints must be True or False, a Scene or an OptimalControlProblem, got {reprlib.repr(given)}"
         )
     owner = scene.robot
     if owner.joint_names != robot.joint_names or not owner.built_like(robot):

@@ -10,7 +10,6 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,91 +78,61 @@ def frame_size(size: tuple[int, int]) -> tuple[int, int]:
     return width, height
 
 
-@dataclass(frozen=True)
-class Film:
-    """Settings of a film.
-
-    Attributes:
-        path: Path of the file.
-        size: Width and height [pixels].
-        period: Time between frames [s].
-        max_frames: Largest number of frames; a longer film gets fewer a second.
-    """
-
-    path: Path
-    size: tuple[int, int]
-    period: float
-    max_frames: int
-
-    @classmethod
-    def of(cls, path: Path, size: tuple[int, int], fps: float, max_frames: int) -> Film:
-        """Settings of a film, checked before any work.
-
-        Raises:
-            InputError: The format is neither gif nor mp4, or the size is invalid.
-            MissingDependency: A package or a program is not installed.
-        """
-        check_film(path)
-        width, height = frame_size(size)
-        if width % 2 or height % 2:
-            raise InputError(f"size must be even numbers of pixels, as video formats need, got {width} x {height}")
-        return cls(path, (width, height), 1.0 / fps, max_frames)
-
-    def times(self, duration: float) -> Floats:
-        """Times of the frames (F,) [s], from 0 to a duration."""
-        period = max(self.period, duration / (self.max_frames - 1))
-        if self.path.suffix.lower() == ".gif":
-            # GIF times are in hundredths of a second, and viewers do not follow periods below two.
-            period = 0.01 * max(2, round(100.0 * period), math.ceil(100.0 * duration / (self.max_frames - 1) - 1e-9))
-        frames = math.floor(duration / period * (1.0 + 1e-9)) + 1
-        return np.arange(frames, dtype=np.float64) * period
-
-    def take(self, page: Path, duration: float) -> Path:
-        """Write the film of a page.
-
-        Raises:
-            VarpinError: The browser cannot show the page.
-            FileError: The file cannot be written.
-        """
-        import imageio_ffmpeg  # noqa: PLC0415 - of an extra
-
-        times = self.times(duration)
-        suffix = self.path.suffix.lower()
-        rate = 1.0 / (times[1] - times[0]) if len(times) > 1 else 1.0
-        options = _GIF if suffix == ".gif" else {}
-        with tempfile.TemporaryDirectory() as folder:
-            draft = Path(folder, f"film{suffix}")
-            writer = imageio_ffmpeg.write_frames(
-                str(draft), self.size, fps=rate, macro_block_size=2, ffmpeg_log_level="error", **options
-            )
-            writer.send(None)
-            with contextlib.closing(writer):
-                for frame in film_frames(page, times, self.size):
-                    writer.send(np.ascontiguousarray(frame))
-            with atomic_file(self.path) as stream:
-                stream.write(draft.read_bytes())
-        return self.path
+def frame_times(suffix: str, fps: float, duration: float, most: int) -> Floats:
+    """Times of the frames (F,) of a film [s], from 0 to a duration; a longer film than ``most`` has fewer a second."""
+    period = max(1.0 / fps, duration / (most - 1))
+    if suffix == ".gif":
+        # GIF times are in hundredths of a second, and viewers do not follow periods below two.
+        period = 0.01 * max(2, round(100.0 * period), math.ceil(100.0 * duration / (most - 1) - 1e-9))
+    return np.arange(math.floor(duration / period * (1.0 + 1e-9)) + 1, dtype=np.float64) * period
 
 
-def check_film(path: Path) -> None:
-    """Check the format of a film, and that the necessary packages and programs are installed.
+def write_film(path: Path, page: Path, times: Floats, size: tuple[int, int]) -> Path:
+    """Write the film of a page, whose frames are at ``times`` (F,) [s].
 
     Raises:
-        InputError: The format is neither gif nor mp4.
+        VarpinError: The browser cannot show the page.
+        FileError: The file cannot be written.
+    """
+    import imageio_ffmpeg  # noqa: PLC0415 - of an extra
+
+    suffix = path.suffix.lower()
+    rate = 1.0 / (times[1] - times[0]) if len(times) > 1 else 1.0
+    options = _GIF if suffix == ".gif" else {}
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Path(folder, f"film{suffix}")
+        writer = imageio_ffmpeg.write_frames(
+            str(draft), size, fps=rate, macro_block_size=2, ffmpeg_log_level="error", **options
+        )
+        writer.send(None)
+        with contextlib.closing(writer):
+            for frame in film_frames(page, times, size):
+                writer.send(np.ascontiguousarray(frame))
+        with atomic_file(path) as stream:
+            stream.write(draft.read_bytes())
+    return path
+
+
+def check_film(path: Path, size: tuple[int, int] = (16, 16)) -> None:
+    """Check the format and the size of a film, and that the necessary packages and programs are installed.
+
+    Raises:
+        InputError: The format is neither gif nor mp4, or the size is invalid.
         MissingDependency: A package or a program is not installed.
     """
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"video must end in {' or '.join(FORMATS)}, got {path.name!r}")
+    width, height = frame_size(size)
+    if width % 2 or height % 2:
+        raise InputError(f"size must be even numbers of pixels, as video formats need, got {width} x {height}")
     packages = [name for module, name in _PACKAGES.items() if importlib.util.find_spec(module) is None]
-    if packages:
-        raise MissingDependency("video", packages, 'pip install "varpin[video]"')
-    programs = []
-    if _chromium() is None:
-        programs.append("chromium")
-    if shutil.which(_DRIVER) is None:
-        programs.append(_DRIVER)
-    if programs:
-        raise MissingDependency("video", programs, "apt install chromium chromium-driver")
+    programs = [name for name, found in (("chromium", _chromium()), (_DRIVER, shutil.which(_DRIVER))) if not found]
+    for missing, command in (
+        (packages, 'pip install "varpin[video]"'),
+        (programs, "apt install chromium chromium-driver"),
+    ):
+        if missing:
+            raise MissingDependency("video", missing, command)
 
 
 def _chromium() -> str | None:
@@ -177,23 +146,19 @@ def _browser(size: tuple[int, int]) -> Iterator[Chrome]:
     from selenium.common.exceptions import WebDriverException  # noqa: PLC0415
     from selenium.webdriver.chrome.service import Service  # noqa: PLC0415
 
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile, contextlib.ExitStack() as stack:
         options = webdriver.ChromeOptions()
         options.binary_location = _chromium() or ""
         for flag in (*_FLAGS, f"--user-data-dir={profile}"):
             options.add_argument(flag)
         try:
             browser = webdriver.Chrome(options=options, service=Service(shutil.which(_DRIVER)))
-        except WebDriverException as error:
-            raise VarpinError(f"Chromium does not start: {(error.msg or '').splitlines()[0]}") from None
-        try:
+            stack.callback(browser.quit)
             metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
             browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
             yield browser
         except WebDriverException as error:
             raise VarpinError(f"Chromium cannot show the motion: {(error.msg or '').splitlines()[0]}") from None
-        finally:
-            browser.quit()
 
 
 def film_frames(
@@ -210,25 +175,19 @@ def film_frames(
     Raises:
         VarpinError: The browser cannot show the page.
     """
-    with _browser(size) as browser:
-        yield from _frames(browser, page, times, size, scripts)
-
-
-def _frames(
-    browser: Chrome, page: Path, times: Floats, size: tuple[int, int], scripts: Sequence[tuple[str, Sequence[float]]]
-) -> Iterator[NDArray[np.uint8]]:
     import imageio.v3 as imageio  # noqa: PLC0415 - of an extra
 
-    browser.get(page.resolve().as_uri())
-    give_up = time.monotonic() + _LOAD_LIMIT
-    while not browser.execute_script(_COMPLETE):
-        if time.monotonic() > give_up:
-            raise VarpinError(f"Chromium did not finish loading the motion within {_LOAD_LIMIT:g} s")
-        time.sleep(0.05)
-    browser.execute_script(_STOP, *size)
-    for script, arguments in scripts:
-        browser.execute_script(script, *arguments)
-    for seconds in times:
-        address = browser.execute_script(_DRAW, float(seconds))
-        picture = base64.b64decode(address.partition(",")[2])
-        yield np.asarray(imageio.imread(picture, extension=".png"))[..., :3]
+    with _browser(size) as browser:
+        browser.get(page.resolve().as_uri())
+        give_up = time.monotonic() + _LOAD_LIMIT
+        while not browser.execute_script(_COMPLETE):
+            if time.monotonic() > give_up:
+                raise VarpinError(f"Chromium did not finish loading the motion within {_LOAD_LIMIT:g} s")
+            time.sleep(0.05)
+        for script, arguments in ((_STOP, size), *scripts):
+            browser.execute_script(script, *arguments)
+        # In single precision, as the page has the times of its keyframes.
+        for seconds in times.astype(np.float32):
+            address = browser.execute_script(_DRAW, float(seconds))
+            picture = base64.b64decode(address.partition(",")[2])
+            yield np.asarray(imageio.imread(picture, extension=".png"))[..., :3]

@@ -19,14 +19,13 @@ _GAP = 0.15
 _GRID_CELL = 0.5
 
 
-def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, floor: float, size: float) -> None:
-    """Set camera, grid, axes and background.
+def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, size: float) -> None:
+    """Set camera, grid, axes and background; the grid is at z = 0.
 
     Args:
         viewer: The viewer.
         points: Points that have to be visible (P, 3) [m].
         toward: Unit vector (3,) from the points to the camera.
-        floor: Height of the grid [m].
         size: Size of one robot's motion [m].
     """
     right = across(toward)
@@ -55,7 +54,7 @@ def set_view(viewer: meshcat.Visualizer, points: Floats, toward: Floats, floor: 
     scale = [cell / _GRID_CELL] * 3
     viewer["/Grid"].set_property("color", [1.0, 1.0, 1.0, 0.3])
     viewer["/Grid"].set_property("scale", scale)
-    viewer["/Grid"].set_property("position", [shift[0], shift[1], shift[2] + floor])
+    viewer["/Grid"].set_property("position", shift.tolist())
     viewer["/Axes"].set_property("scale", scale)
     viewer["/Axes"].set_property("position", shift.tolist())
     viewer["/Background"].set_property("top_color", [0.97, 0.98, 1.0])
