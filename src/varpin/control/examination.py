@@ -96,7 +96,7 @@ def findings(solution: Solution, before: Sequence[Finding] | None = None) -> tup
         warnings.append(Finding("true cost", solution.refinement.reason))
     warnings += (
         _unfinished(solution)
-        + _noise_left_out(solution)
+        + _margin_without_noise(solution)
         + _margins_of_velocities(solution)
         + too_small(solution)
         + _friction_under_noise(solution)
@@ -291,31 +291,13 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
     ]
 
 
-def _noise_left_out(solution: Solution) -> list[Finding]:
-    """Findings about noise in plans with constraints: a search that leaves it out, or a margin without noise.
-
-    Noise of constant strength adds the same cost to all motions.
-    """
+def _margin_without_noise(solution: Solution) -> list[Finding]:
+    """A finding about a margin without noise."""
     problem = solution.problem
-    if not problem.scene.processes:
-        if not any(constraint.margin > 0.0 for constraint in problem.constraints):
-            return []
-        return [
-            Finding(
-                "margin without noise",
-                "a constraint has a margin=, but the scene has no noise: the margin is zero",
-            )
-        ]
-    if not (problem.constraints and problem.steered.any()):
+    if problem.scene.processes or not any(constraint.margin > 0.0 for constraint in problem.constraints):
         return []
-    return [
-        Finding(
-            "noise left out",
-            f"with constraints the noise cost, {solution.noise_cost:.4g}, is left out of the search: the motion is "
-            "that of least cost without noise. Without constraints=, solve lowers it, too",
-            value=solution.noise_cost,
-        )
-    ]
+    text = "a constraint has a margin=, but the scene has no noise: the margin is zero"
+    return [Finding("margin without noise", text)]
 
 
 def _margins_of_velocities(solution: Solution) -> list[Finding]:

@@ -92,6 +92,8 @@ _EARLY, _EXTENSION = 0.85, 4.0
 _AS_FORESEEN, _LENGTHS, _FAR, _FOLLOWS = 0.7, (1.0, 0.75, 0.5), 2.0, 0.8
 # Greatest number of substeps of a trial, relative to the motion.
 _SUBSTEPS = 4.0
+# Multipliers that are no more than that, relative to the largest, are of rows that are not active.
+_TRACE = 1e-6
 # Distance from a limit, relative to it, at which a control is at it: quadratic programs end inside their bounds.
 _AT_LIMIT = 1e-6
 # Relative rounding error of Quu above which the gains are reported as unreliable.
@@ -414,8 +416,10 @@ class Search:
         most = max((float(np.abs(part).max(initial=0.0)) for part in found.multipliers), default=0.0)
         if not self._elastic:
             self.weight = max(self.weight, _ABOVE * most)
+        # Interior points leave a trace of a multiplier at each row that is not active.
         self.multipliers = [
-            (part / item.scale).reshape(item.shape) for part, item in zip(found.multipliers, self.bound, strict=True)
+            (np.where(np.abs(part) > _TRACE * most, part, 0.0) / item.scale).reshape(item.shape)
+            for part, item in zip(found.multipliers, self.bound, strict=True)
         ]
         linear, whole = self.stages.change(found.z)
         lower = self.weight * (bad - found.slack)
@@ -485,7 +489,7 @@ class Search:
         if problem.linear:
             # A control reacts to the state where its line begins.
             x = np.vstack([np.zeros((1, x.shape[1])), x])
-        found = u - np.einsum("rmx,rx->rm", plan.feedback, x)
+        found: Floats = u - np.einsum("rmx,rx->rm", plan.feedback, x)
         if plan.previous is not None:
             found -= np.einsum("rmx,rx->rm", plan.previous, before)
         return found
@@ -506,8 +510,8 @@ class Search:
             if push.any() and not item.of_controls:
                 row = stages.rows(plain, self.trajectory, item, margin)
                 np.add.at(total, row.at, (push.ravel() * item.scale)[:, None] * row.slopes)
-        own = total[layout.state(np.arange(1, layout.stages + 1))]
-        found = np.empty_like(own)
+        own: Floats = total[layout.state(np.arange(1, layout.stages + 1))]
+        found = np.empty(own.shape)
         found[-1] = own[-1]
         for k in range(layout.stages - 1, 0, -1):
             found[k - 1] = own[k - 1] + stages.J[k, :, : layout.states].T @ found[k]

@@ -94,8 +94,8 @@ def solve(
         regularization: Initial value, relative to the diagonal of Quu; it increases and decreases as needed.
         time_limit: No iteration begins after this time since the call [s]. The result then depends on the machine.
         callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table`. The
-            log has them at level INFO, preceded by the robot and the horizon. A function of two arguments, such as a
-            :class:`varpin.LiveView`, is also given the motion after the iteration, a :class:`varpin.Trajectory`.
+            log has them at level INFO, preceded by the robot and the horizon. A function of two arguments is also given
+            the motion after the iteration, a :class:`varpin.Trajectory`.
         progress: Called after each iteration with (iterations done, max_iterations); few searches need them all.
         resume: A solution of the same problem, as solve returned it or as read from a file: the search continues where
             it stopped, for at most ``max_iterations`` more, as if it had not been interrupted. Give the other options
@@ -198,9 +198,8 @@ def solve(
                 given, on = (controls, path) if start is None else (start, None)
                 return searched(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
 
-            before = None
             solution = refine(problem, once, wish, lambda: deadline - time.perf_counter())
-    return looked_at(solution, before)[0] if check else solution
+    return looked_at(solution, before if true_cost is None else None)[0] if check else solution
 
 
 def _require_resumable(problem: OptimalControlProblem, controls: object, resume: Solution) -> None:
