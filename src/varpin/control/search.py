@@ -384,8 +384,10 @@ class Search:
 
     def _pass(self, regularization: float, curvature: Floats | None = None, held: Mask | None = None) -> Plan | None:
         """A backward pass of the costs, in which some controls (R, m) may be ``held`` as they are."""
-        along = copy(self.along)
-        along.held = held
+        along = self.along
+        if held is not None:
+            along = copy(along)
+            along.held = held
         return single_pass(along, regularization, curvature=self._wide(curvature))[0]
 
     def _at_limits(self) -> Mask | None:
@@ -497,6 +499,8 @@ class Search:
     def _costates(self) -> Floats:
         """Derivatives (N, 2n) of the Lagrangian in the state after each step, with the known multipliers."""
         problem = self.problem
+        # Derivatives are made once: copies share those that are there.
+        self.along.linearized(0, problem.steps)
         along, plain = copy(self.along), object.__new__(type(problem))
         # As if controls were held over one step: the dataclass is frozen.
         vars(plain).update(vars(problem) | {"hold": 1})
