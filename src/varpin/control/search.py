@@ -7,9 +7,10 @@ program over the horizon. Merit is the expected cost plus an l1 penalty of the r
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from functools import cached_property
 from typing import NamedTuple
@@ -66,6 +67,8 @@ _NOTHING = 1e-9
 # Weight of the rows in the merit: this many times the largest multiplier; where rows cannot all be met, this many times
 # what the cost is per violation.
 _ABOVE, _ELASTIC = 1.5, 10.0
+# Share of the violations from which on a step that leaves it makes the rows heavier.
+_APPROACHED = 0.9
 # A violation has not fallen where a step removes no more than this share of it.
 _STAYS = 1e-6
 # Share of the violations that a search expects to remove at the end, up to which the constraints are to blame.
@@ -253,6 +256,7 @@ class Search:
                 continue
             ended = ended or self._out_of(last, deadline)
             if ended is not None:
+                self._calm()
                 self._note(report, started)
                 self.reason = self.reason or self._numbers(tolerance)
                 return ended
@@ -270,6 +274,7 @@ class Search:
                 self.reason = f"{self._expected()} before the last step"
                 return out
             if not self._regularize():
+                self._calm()
                 if self._elastic and step.decrease <= _LITTLE_LESS * self.weight * self._badness:
                     return self._infeasible()
                 self.reason = f"no step lowers the cost, whatever the regularization; {self._numbers(tolerance)}"
@@ -405,17 +410,23 @@ class Search:
     def _solve_program(self) -> bool:
         program, rows = self.program, self.rows
         values = [row.values for row in rows]
-        bad = self._badness
+        bad, dear = self._badness, _ELASTIC * max(abs(self.cost), self.first)
         # Regularization shortens steps only where rows may be missed.
         self._elastic = bool(rows) and self.regularization > _LITTLE
         found = None if self._elastic else program.minimum(values)
-        if found is None and rows:
+        if found is not None and rows:
+            # Rows that cost far more than what is at stake are approached step by step.
+            self._elastic = _ABOVE * _largest(found.multipliers) > max(self.weight, dear) > 0.0
+        if rows and (found is None or self._elastic):
             self._elastic = True
-            self.weight = max(self.weight, _ELASTIC * max(abs(self.cost), self.first))
-            found = program.minimum(values, weight=self.weight)
+            self.weight = max(self.weight, dear)
+            missed = program.minimum(values, weight=self.weight)
+            if found is not None and missed is not None and missed.slack > _APPROACHED * bad:
+                self.weight *= _ELASTIC
+            found = missed or found
         if found is None:
             return False
-        most = max((float(np.abs(part).max(initial=0.0)) for part in found.multipliers), default=0.0)
+        most = _largest(found.multipliers)
         if not self._elastic:
             self.weight = max(self.weight, _ABOVE * most)
         # Interior points leave a trace of a multiplier at each row that is not active.
@@ -566,6 +577,17 @@ class Search:
                 return Status.STALLED
         return None
 
+    def _calm(self) -> None:
+        """Make the last feedback and step without regularization, where the model has a minimum."""
+        kept = self.regularization
+        if kept > 0.0 and not self.tick:
+            self.regularization = 0.0
+            with contextlib.suppress(*TRIAL_ERRORS):
+                if self._made():
+                    return
+            self.regularization = kept
+            self._made()
+
     def _gains_more(self, share: float) -> bool:
         """Whether the step without regularization gains more than that; if not, it becomes the step."""
         kept = self.regularization, self.growth
@@ -697,7 +719,7 @@ class Search:
         if z is not None and problem.limited:
             aim = problem.decided(self.trajectory) + length * self.stages.layout.controls_of(z)
             for limit, sign in zip(problem.control_limits, (-1.0, 1.0), strict=True):
-                there = sign * (aim - limit) >= -_AT_LIMIT * np.abs(limit)
+                there = np.isfinite(limit) & (sign * (aim - limit) >= -_AT_LIMIT * np.abs(limit))
                 u = np.where(there, limit, u)
                 gains = commands.gains if not problem.linear else np.concatenate([commands.gains[:1], commands.gains])
                 gains = np.where(there[:, :, None], 0.0, gains)
@@ -923,6 +945,10 @@ class Search:
             search=self.state,
             multipliers=known,
         )
+
+
+def _largest(multipliers: Sequence[Floats]) -> float:
+    return max((float(np.abs(part).max(initial=0.0)) for part in multipliers), default=0.0)
 
 
 def _excess(values: Floats, *, equality: bool) -> Floats:
