@@ -136,7 +136,9 @@ SMALL: dict[str, Case] = {
     "held, change of controls": Case(
         lambda: reach(speeds(2.2), more=vp.ControlRateCost(1e-4, before=[14.0, 4.0])), 3.7537843
     ),
-    "held over 3 steps": Case(lambda: reach(speeds(2.2), dt=0.03, steps=24, hold=3, **LIMITS), 9.465277, scipy=True),
+    "held over 3 steps": Case(
+        lambda: reach(speeds(2.2), dt=0.03, steps=24, hold=3, **LIMITS), 9.465277, kkt=1e-4, scipy=True
+    ),
     "held over 2 steps, rates": Case(lambda: reach(vp.WithinControlRate(110.0), dt=0.03, steps=24, hold=2), 2.1258071),
     "held, between nodes": Case(
         lambda: reach(speeds(1.8), between_nodes=True, dt=0.09, steps=8), 3.5974214, kkt=None, within=3.6e-4
@@ -191,7 +193,8 @@ SMALL: dict[str, Case] = {
     "noise of the controls": Case(lambda: reach(scene=noisy(vp.ControlNoise(0.03))), 2.7760496, kkt=None),
     "noise of the controls, torques": Case(
         lambda: reach(scene=noisy(vp.ControlNoise(0.03)), control_limits=([-24.0, -8.0], [24.0, 8.0])),
-        3.5740886,
+        # Noise counts by the present cost to go: a swing that costs less without it. Another one costs 3.574 in all.
+        3.7558,
         kkt=None,
     ),
 }

@@ -180,7 +180,7 @@ IMPOSSIBLE = {
     "a goal off the plane": ([vp.ReachFrame(TWO, "tip", position=[1.0, 0.5, -0.5])], {}, 250),
     "two goals": ([vp.ReachFrame(TWO, "tip", position=[1.5, 0.0, z]) for z in (-0.5, 0.9)], {}, 250),
     "a goal too far for the speed": ([speeds(0.3), tip(-1.2)], {}, 250),
-    "a start in an obstacle": ([clear([1.5, 0.0, 0.0], 0.3)], STRONG, 6),
+    "a start in an obstacle": ([clear([1.5, 0.0, 0.0], 0.3)], STRONG, 8),
     "half-spaces that exclude each other": (
         [vp.KeepInHalfSpace(TWO, "tip", [0, 0, up], 0.5) for up in (1.0, -1.0)], {}, 250
     ),

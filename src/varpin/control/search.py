@@ -67,6 +67,8 @@ _NOTHING = 1e-9
 # Weight of the rows in the merit: this many times the largest multiplier; where rows cannot all be met, this many times
 # what the cost is per violation.
 _ABOVE, _ELASTIC = 1.5, 10.0
+# Least weight of rows where nothing is at stake, relative to that of rows that are met.
+_LIGHTEST = 1e-6
 # Share of the violations from which on a step that leaves it makes the rows heavier.
 _APPROACHED = 0.9
 # A violation has not fallen where a step removes no more than this share of it.
@@ -414,15 +416,16 @@ class Search:
         # Regularization shortens steps only where rows may be missed.
         self._elastic = bool(rows) and self.regularization > _LITTLE
         found = None if self._elastic else program.minimum(values)
-        if found is not None and rows:
-            # Rows that cost far more than what is at stake are approached step by step.
-            self._elastic = _ABOVE * _largest(found.multipliers) > max(self.weight, dear) > 0.0
-        if rows and (found is None or self._elastic):
+        # Rows that cost far more than what is at stake are approached step by step.
+        needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
+        dear = max(dear, _LIGHTEST * needed) if needed < np.inf else dear
+        if rows and needed > max(self.weight, dear):
             self._elastic = True
             self.weight = max(self.weight, dear)
             missed = program.minimum(values, weight=self.weight)
-            if found is not None and missed is not None and missed.slack > _APPROACHED * bad:
+            while missed is not None and missed.slack > _APPROACHED * bad and self.weight < needed < np.inf:
                 self.weight *= _ELASTIC
+                missed = program.minimum(values, weight=self.weight)
             found = missed or found
         if found is None:
             return False
