@@ -75,6 +75,8 @@ _APPROACHED = 0.9
 _STAYS = 1e-6
 # Share of the violations that a search expects to remove at the end, up to which the constraints are to blame.
 _LITTLE_LESS = 1e-2
+# Regularization from which on rows may be missed: it shortens steps only then.
+_YIELDING = 1e-2
 # Corrections of a full step for the curvature of rows and dynamics.
 _CORRECTIONS = 2
 # Decrease, as a share of the cost at stake, from which on rows between nodes and margins are looked at.
@@ -413,8 +415,8 @@ class Search:
         program, rows = self.program, self.rows
         values = [row.values for row in rows]
         bad, dear = self._badness, _ELASTIC * max(abs(self.cost), self.first)
-        # Regularization shortens steps only where rows may be missed.
-        self._elastic = bool(rows) and self.regularization > _LITTLE
+
+        self._elastic = bool(rows) and self.regularization > _YIELDING
         found = None if self._elastic else program.minimum(values)
         # Rows that cost far more than what is at stake are approached step by step.
         needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
@@ -573,7 +575,7 @@ class Search:
             return Status.CONVERGED
         if len(self.history) > _PATIENCE:
             recent = sum(item.decrease for item in self.history[-_PATIENCE:])
-            if recent <= share and all(item.step < 1.0 for item in self.history[-_PATIENCE:]):
+            if recent <= share:
                 self.reason = (
                     f"{_PATIENCE} iterations have lowered the merit by {recent:.1e}; {self._numbers(tolerance)}"
                 )
