@@ -67,6 +67,10 @@ _NOTHING = 1e-9
 # Weight of the rows in the merit: this many times the largest multiplier; where rows cannot all be met, this many times
 # what the cost is per violation.
 _ABOVE, _ELASTIC = 1.5, 10.0
+# The weight is no more than that many times the largest multiplier, where rows are met: heavy rows shorten steps.
+_HEAVY = 10.0
+# Slack of rows that are met, relative to the violations.
+_MET = 1e-6
 # Least weight of rows where nothing is at stake, relative to that of rows that are met.
 _LIGHTEST = 1e-6
 # Share of the violations from which on a step that leaves it makes the rows heavier.
@@ -184,6 +188,7 @@ class Search:
         self.shares: Floats
         self.cost = np.inf
         self.reason = ""
+        self.best: tuple[tuple[float, float], Trajectory, Floats] | None = None
         self.state: SearchState | None = None
         self.plan: Plan | None = None
         self.noise: Plan | None = None  # the pass whose value function tells what noise costs
@@ -253,6 +258,7 @@ class Search:
             if self.first < 0.0:
                 stake = self.along.stake
                 self.first = stake.free if np.isfinite(stake.free) else stake.moved
+            self._keep_best()
             ended = self._ended(tolerance)
             if ended is Status.CONVERGED and self._goes_on():
                 continue
@@ -260,6 +266,7 @@ class Search:
                 continue
             ended = ended or self._out_of(last, deadline)
             if ended is not None:
+                self._go_to_best(ended)
                 self._calm()
                 self._note(report, started)
                 self.reason = self.reason or self._numbers(tolerance)
@@ -432,8 +439,8 @@ class Search:
         if found is None:
             return False
         most = _largest(found.multipliers)
-        if not self._elastic:
-            self.weight = max(self.weight, _ABOVE * most)
+        if not self._elastic or found.slack <= _MET * max(bad, 1.0):
+            self.weight = max(min(self.weight, _HEAVY * most), _ABOVE * most)
         # Interior points leave a trace of a multiplier at each row that is not active.
         self.multipliers = [
             (np.where(np.abs(part) > _TRACE * most, part, 0.0) / item.scale).reshape(item.shape)
@@ -581,6 +588,22 @@ class Search:
                 )
                 return Status.STALLED
         return None
+
+    def _keep_best(self) -> None:
+        """Remember the motion that violates rows least, or costs least within them, where margins move with it."""
+        if not any(item.source.margin > 0.0 for item in self.bound) or not self.problem.processes:
+            return
+        assert self.noise is not None
+        rank = max(self.violation, FEASIBLE), self.cost + self.noise.noise
+        if self.best is None or rank < self.best[0]:
+            self.best = rank, self.trajectory, self.shares
+
+    def _go_to_best(self, ended: Status) -> None:
+        """Return to the best motion of a search that has not converged."""
+        if self.best is not None and not ended.converged and self.best[1] is not self.trajectory:
+            self._move(*self.best[1:])
+            with contextlib.suppress(*TRIAL_ERRORS):
+                self._made()
 
     def _calm(self) -> None:
         """Make the last feedback and step without regularization, where the model has a minimum."""
