@@ -260,3 +260,22 @@ def test_a_control_with_equal_limits_within_constraints():
     assert (equal.controls[:, 1] == -3.0).all()
     assert equal.violation <= 1e-8
     assert equal.cost == pytest.approx(close.cost, rel=1e-5)
+
+
+def test_limits_below_the_weight_are_told():
+    """Of an arm that lies horizontal: it takes half of its weight times its length."""
+    robot = vp.planar_chain(1)
+    weight = abs(vp.Scene(robot).holding_torque([0.0])[0])
+    cost = vp.ControlCost(0.1) + vp.Terminal(vp.TrackingCost([0.0]))
+
+    def kinds(share, begin=0.0, speed=0.0):
+        limits = (-share * weight, share * weight)
+        problem = vp.OptimalControlProblem(
+            vp.Scene(robot), cost, [begin], [speed], dt=0.05, steps=10, control_limits=limits
+        )
+        return [finding.kind for finding in vp.solve(problem, max_iterations=0).warnings]
+
+    assert kinds(0.8).count("limits below the weight") == 2
+    assert kinds(0.8, begin=-np.pi / 2).count("limits below the weight") == 1
+    assert kinds(0.8, speed=1.0).count("limits below the weight") == 1
+    assert "limits below the weight" not in kinds(1.05)

@@ -24,6 +24,7 @@ from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
 from varpin.control.costs.base import Scaled, weight_matrix
 from varpin.control.problem import OptimalControlProblem
 from varpin.finding import Finding
+from varpin.mechanics.scene import closest_controls
 from varpin.model import (
     ADVICE,
     AFAR,
@@ -54,6 +55,8 @@ _MILLIMETRES = f": {IN_MILLIMETRES}"
 _POSTURES = 64
 # A joint limit of at least _ENDLESS [rad or m] is none: postures are then within a turn, or _RAIL [m], to either side.
 _ENDLESS, _RAIL = 1e4, 100.0
+# Share of the torque that holds a posture which limits may be short of without a word.
+_SHARE_OF_WEIGHT = 0.01
 # Tolerance on positions and joint limits [m or rad].
 _SAME = 1e-6
 
@@ -62,6 +65,7 @@ def hints(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about constraints that no motion satisfies, and about values that look like degrees or millimetres."""
     found = [*in_other_units(problem.scene, problem.q0, problem.v0)]
     found += [*_goals(problem), *_targets(problem), *_limits(problem), *_ends(problem), *_places(problem)]
+    found += _weights(problem)
     for bound in problem.bound_constraints:
         found += _overlaps(problem, bound)
     return found
@@ -252,6 +256,30 @@ def _ends(problem: OptimalControlProblem) -> Iterator[Finding]:
                     f"the terminal TrackingCost has its goal for {robot.joint_names[joint]} {beyond[joint]:.4g} "
                     f"{joint_unit(robot, joint)} outside {limits.label}, where the plan will not end",
                 )
+
+
+def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
+    """Limits of joint torques that cannot hold the arm at rest where it starts, or where it is to end."""
+    scene, names = problem.scene, problem.scene.robot.joint_names
+    if not problem.limited or scene.constraints or not (scene.direct and scene.direct_efforts):
+        return
+    postures: list[tuple[str, Floats]] = [] if problem.v0.any() else [("the start", problem.q0)]
+    for term in _last(problem.cost):
+        end = term.reference if isinstance(term, TrackingCost) else None
+        if isinstance(end, np.ndarray) and end.shape == problem.q0.shape:
+            postures.append(("the goal of the terminal TrackingCost", end))
+    for where, q in postures:
+        needed, (lower, upper) = closest_controls(scene, q), problem.control_limits
+        beyond = np.maximum(needed - upper, lower - needed)
+        joint = int(np.argmax(beyond))
+        if beyond[joint] > _SHARE_OF_WEIGHT * abs(needed[joint]):
+            yield Finding(
+                "limits below the weight",
+                f"control limits cannot hold the arm at rest at {where}: joint {names[joint]!r} needs "
+                f"{needed[joint]:.3g}, and its limits are {lower[joint]:.3g} and {upper[joint]:.3g}",
+                joint=names[joint],
+                value=float(needed[joint]),
+            )
 
 
 def _overlaps(problem: OptimalControlProblem, bound: BoundConstraint) -> Iterator[Finding]:

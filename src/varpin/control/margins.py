@@ -221,11 +221,16 @@ def _told(solution: Solution, row: _Row, counted: _Counted) -> Finding | None:
         advice = f"margin={enough:g} is about enough there"
     else:
         narrower = needed - row.margin[place, r]
-        advice = f"a bound narrower by {narrower:.2g} {bound.unit} may do"
+        unit = bound.unit
+        advice = (
+            f"a bound narrower by {narrower:.2g} {unit} may do"
+            if narrower > 0.0
+            else "less noise or a wider bound may do"
+        )
     return Finding(
         "small margin",
         f"{solution.problem.label_of(bound.source)}: margin={margin:g} is too small for this noise: {bound.rows[r]} at "
-        f"t = {bound.times[place]:.4g} s is violated by {100.0 * often:.2g} +- {100.0 * error:.1g} % of "
+        f"t = {bound.times[place]:.4g} s is violated by {100.0 * often:.3g} +- {100.0 * error:.1g} % of "
         f"{len(counted.values)} motions, not {100.0 * row.promised:.2g} %; {advice}",
         time=float(bound.times[place]),
         value=float(often),

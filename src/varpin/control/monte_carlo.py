@@ -68,7 +68,7 @@ class Broken:
     def __str__(self) -> str:
         where = f" ({self.row} at t = {self.time:.4g} s)" if self.count else ""
         return (
-            f"{self.label} is violated by {100.0 * self.share:.2g} +- {100.0 * self.standard_error:.1g} % of all paths"
+            f"{self.label} is violated by {100.0 * self.share:.3g} +- {100.0 * self.standard_error:.1g} % of all paths"
             f"{where}, {self.count} of {self.paths}; its margin allows {100.0 * self.promised:.2g} %"
         )
 

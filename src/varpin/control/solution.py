@@ -175,8 +175,9 @@ class Solution(Frozen):
         return f"Solution(cost {self.cost:.6g}{noise}, {ended})"
 
     def __str__(self) -> str:
+        told = [] if self.status.converged or not self.reason else [f"why: {self.reason}"]
         return "\n".join(
-            [repr(self), *map(str, self.constraints), *(f"warning: {sentence}" for sentence in self.warnings)]
+            [repr(self), *told, *map(str, self.constraints), *(f"warning: {sentence}" for sentence in self.warnings)]
         )
 
     def _repr_html_(self) -> str:
