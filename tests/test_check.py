@@ -268,7 +268,7 @@ def test_unknown_error():
 
 
 def test_interruption():
-    options = {"dt": 0.3, "steps": 100_000, "progress": lambda done, steps: signal.raise_signal(signal.SIGINT)}
+    options = {"dt": 0.3, "steps": 1_000_000, "progress": lambda done, steps: signal.raise_signal(signal.SIGINT)}
     with pytest.raises(vp.Interrupted) as caught:
         moved(vp.Scene(vp.planar_chain(1)), EULER, start=([0.0], [0.0]), **options)
     assert about(caught.value.trajectory.warnings, "error")
