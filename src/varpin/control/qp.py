@@ -68,6 +68,8 @@ class Program:
         own = np.arange(-Quu.shape[1], 0)
         hessian[:, own, own] += regularization * np.diagonal(Quu, axis1=1, axis2=2)
         self._P = _matrix([_square(at, hessian)], (size, size))
+        # Largest cost of a control's change by one.
+        self.stiffness = float(np.diagonal(Quu, axis1=1, axis2=2).max())
         gradient = -(pull @ plan.feedforward[:, :, None])[:, :, 0]
         self._gradient = np.zeros(size)
         np.add.at(self._gradient, at[at >= 0], gradient[at >= 0])

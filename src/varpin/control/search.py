@@ -35,7 +35,7 @@ from varpin.control.qp import Minimum, Program
 from varpin.control.second_order import curvature_along
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, deviations, state_slopes
-from varpin.control.stages import Stages
+from varpin.control.stages import Rows, Stages
 from varpin.control.starts import holding_gains, joint_forces, states_on
 from varpin.control.trials import Attempt, Trials
 from varpin.core.arrays import Commands
@@ -75,6 +75,8 @@ _MET = 1e-6
 _LIGHTEST = 1e-6
 # Share of the violations from which on a step that leaves it makes the rows heavier.
 _APPROACHED = 0.9
+# How often rows are made heavier in an iteration.
+_RAISES = 6
 # A violation has not fallen where a step removes no more than this share of it.
 _STAYS = 1e-6
 # Share of the violations that a search expects to remove at the end, up to which the constraints are to blame.
@@ -118,6 +120,8 @@ class Step(NamedTuple):
     slope: float  # of the merit
     decrease: float  # of the merit by a full step, foreseen
     minimum: Minimum | None  # of the program; None without limits and rows in reach
+    stages: Stages | None = None  # those of the program, and its rows
+    rows: Sequence[Rows] = ()
 
 
 class Taken(NamedTuple):
@@ -180,14 +184,14 @@ class Search:
         self.added: list[Floats] | None = None  # to margins at the nodes
         self.counts = 0
         self._looks, self._near = 0, False
-        self._elastic = self.exact = False
+        self._elastic = self.exact = self.unsolved = False
         self.backoff: list[Floats] = []  # margins of all rows
         self.multipliers: list[Floats] = []
         self.history: list[Iteration] = []
         self.trajectory: Trajectory
         self.shares: Floats
         self.cost = np.inf
-        self.reason = ""
+        self.reason, self.deadline = "", np.inf
         self.best: tuple[tuple[float, float], Trajectory, Floats] | None = None
         self.state: SearchState | None = None
         self.plan: Plan | None = None
@@ -240,7 +244,7 @@ class Search:
 
     def run(self, tolerance: float, max_iterations: int, deadline: float, report: Report) -> Status:
         """Iterate to the end."""
-        last, longest = len(self.history) + max_iterations, 0.0
+        last, longest, self.deadline = len(self.history) + max_iterations, 0.0, deadline
         while True:
             self.state = self._state()
             started = time.perf_counter()
@@ -254,7 +258,9 @@ class Search:
                 return Status.NOT_DIFFERENTIABLE
             if not found:
                 self.reason = f"the regularization has reached {self.regularization:.1e} of the diagonal of Quu"
-                return Status.INDEFINITE
+                if self.unsolved:
+                    self.reason = "the quadratic program within limits and constraints cannot be solved accurately"
+                return Status.STALLED if self.unsolved else Status.INDEFINITE
             if self.first < 0.0:
                 stake = self.along.stake
                 self.first = stake.free if np.isfinite(stake.free) else stake.moved
@@ -277,6 +283,8 @@ class Search:
             self._note(report, started, taken)
             longest = max(longest, time.perf_counter() - started)
             if taken.length == 0.0 and step.decrease <= taken.hidden and self.violation <= FEASIBLE:
+                if self._goes_on():
+                    continue
                 self.reason = f"{self._expected()}, and rounding hides {taken.hidden:.1e} of the cost"
                 return Status.CONVERGED
             if self.tick and taken.length > 0.0 and (out := self._out_of(last, deadline - longest)) is not None:
@@ -363,10 +371,8 @@ class Search:
         self.plan = self.noise = plan
         self.exact = curvature is not None
         if problem.processes:
-            # Noise grows under regularized gains, and controls at their limits do not react to it.
-            self.noise = self._pass(0.0, held=self._at_limits()) or plan
-            if problem.limited:
-                self.plan = self.noise
+            # Noise grows under regularized gains.
+            self.noise = (self._pass(0.0) if self.regularization > 0.0 else plan) or plan
         if self._has_goals:
             self.plan = single_pass(self._with_goals(along), 0.0)[0] or plan
         if problem.processes and not self.tick:
@@ -427,15 +433,18 @@ class Search:
         found = None if self._elastic else program.minimum(values)
         # Rows that cost far more than what is at stake are approached step by step.
         needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
-        dear = max(dear, _LIGHTEST * needed) if needed < np.inf else dear
+        dear = max(dear, _LIGHTEST * needed if needed < np.inf else _ELASTIC * program.stiffness)
         if rows and needed > max(self.weight, dear):
             self._elastic = True
             self.weight = max(self.weight, dear)
             missed = program.minimum(values, weight=self.weight)
-            while missed is not None and missed.slack > _APPROACHED * bad and self.weight < needed < np.inf:
+            for _ in range(_RAISES):
+                if missed is None or missed.slack <= _APPROACHED * bad or self.weight >= needed:
+                    break
                 self.weight *= _ELASTIC
                 missed = program.minimum(values, weight=self.weight)
             found = missed or found
+        self.unsolved = found is None
         if found is None:
             return False
         most = _largest(found.multipliers)
@@ -448,7 +457,7 @@ class Search:
         ]
         linear, whole = self.stages.change(found.z)
         lower = self.weight * (bad - found.slack)
-        self.step = Step(self._feedforward(found.z), linear - lower, lower - whole, found)
+        self.step = Step(self._feedforward(found.z), linear - lower, lower - whole, found, self.stages, rows)
         return True
 
     @property
@@ -611,10 +620,14 @@ class Search:
         if kept > 0.0 and not self.tick:
             self.regularization = 0.0
             with contextlib.suppress(*TRIAL_ERRORS):
-                if self._made():
-                    return
-            self.regularization = kept
-            self._made()
+                if not self._made():
+                    self.regularization = kept
+                    self._made()
+        margins = any(item.source.margin > 0.0 for item in self.bound)
+        if self.problem.processes and self.problem.limited and not (margins or self._has_goals or self.tick):
+            # Controls at their limits do not react to noise, and the plan tells what it costs then.
+            held = self._pass(0.0, held=self._at_limits())
+            self.plan, self.noise = held or self.plan, held or self.noise
 
     def _gains_more(self, share: float) -> bool:
         """Whether the step without regularization gains more than that; if not, it becomes the step."""
@@ -670,7 +683,7 @@ class Search:
             return False
         self.counts += 1
         try:
-            more = widened(self.solution(Status.CONVERGED))
+            more = widened(self.solution(Status.CONVERGED), self.deadline)
         except VarpinError:
             return False
         if more is None:
@@ -912,9 +925,9 @@ class Search:
         """The gradient of the Lagrangian in the controls (R, m), by the costates of the program."""
         step, plan = self._known, self.plan
         assert plan is not None
-        if step.minimum is None:
+        if step.minimum is None or step.stages is None:
             return plan.gradient
-        return self.stages.slopes(self.rows, step.minimum.multipliers)
+        return step.stages.slopes(step.rows, step.minimum.multipliers)
 
     def _regularize(self) -> bool:
         """Adapt the regularization to the last step; False if no more of it helps."""
