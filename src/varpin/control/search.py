@@ -75,8 +75,6 @@ _MET = 1e-6
 _LIGHTEST = 1e-6
 # Share of the violations from which on a step that leaves it makes the rows heavier.
 _APPROACHED = 0.9
-# How often rows are made heavier in an iteration.
-_RAISES = 6
 # A violation has not fallen where a step removes no more than this share of it.
 _STAYS = 1e-6
 # Share of the violations that a search expects to remove at the end, up to which the constraints are to blame.
@@ -438,9 +436,7 @@ class Search:
             self._elastic = True
             self.weight = max(self.weight, dear)
             missed = program.minimum(values, weight=self.weight)
-            for _ in range(_RAISES):
-                if missed is None or missed.slack <= _APPROACHED * bad or self.weight >= needed:
-                    break
+            while missed is not None and missed.slack > _APPROACHED * bad and self.weight < needed < np.inf:
                 self.weight *= _ELASTIC
                 missed = program.minimum(values, weight=self.weight)
             found = missed or found
