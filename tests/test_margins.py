@@ -96,6 +96,6 @@ def test_a_warning_of_a_small_margin_counts():
     often = 100.0 * (c > 0.0).mean()
     assert abs(often - share) < 3.5 * error
     planned = bound.value(plan.trajectory.q, plan.trajectory.v, plan.controls)[place, 0]
-    own = deviations(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains), bound)[place, 0]
+    own = deviations(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains), [bound])[0][place, 0]
     # Farther away by as much as the margin is larger, as if motions about the plan stayed the same.
     assert (c - planned > margin * own).mean() < 0.03

@@ -70,14 +70,6 @@ class Along:
         """The running cost at its samples."""
         return self._finite(self.problem.expand_running(self.trajectory))
 
-    def expanded(self, running: Expansion) -> None:
-        """Take over the expansion of the running cost from who has it.
-
-        Raises:
-            CostError: It is not finite.
-        """
-        self.running = self._finite(running)
-
     def _finite(self, running: Expansion) -> Expansion:
         """The expansion of a running cost, if it is finite.
 
@@ -97,7 +89,7 @@ class Along:
 
     @cached_property
     def _within(self) -> Floats | None:
-        problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.model_rule)
+        problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.rule)
         found: list[Floats] = []
         n = problem.scene.robot.dof
         for begin, end in [(0, problem.steps)] if problem.linear else self.blocks:
@@ -148,7 +140,7 @@ class Along:
         steps = linear_steps(problem, lines, self.sampled, found, self.rate, self.pull)
         if self.processes:
             x = lines.A.shape[1]
-            kicked = after_impulse(problem.model_rule, found.hessian, lines.velocity, problem.steps, x, problem.dt)
+            kicked = after_impulse(problem.rule, found.hessian, lines.velocity, problem.steps, x, problem.dt)
             if self.within is not None:
                 kicked = kicked + self.within
             steps = noisy(steps, lines, kicked)
@@ -189,7 +181,7 @@ class Along:
         """The expansions of a block of steps for the core."""
         if self.problem.linear:
             return self._on_lines(curvature)
-        problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.model_rule)
+        problem, hessian, samples = self.problem, self.running.hessian, len(self.problem.rule)
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
         lin, velocity = self.linearized(begin, end)
@@ -203,7 +195,7 @@ class Along:
             G=G,
             Gx=Gx,
             Gu=Gu,
-            rule=problem.model_rule,
+            rule=problem.rule,
             gradient=self.running.gradient[points],
             hessian=hessian[points] if len(hessian) > 1 else hessian,
             velocity=velocity,

@@ -91,5 +91,5 @@ def at_stake(problem: OptimalControlProblem, trajectory: Trajectory, model: Mode
 
 def _variables(problem: OptimalControlProblem, trajectory: Trajectory) -> tuple[Floats, Floats]:
     """(q, v, u) at the samples of a motion, and (q, v) at its end."""
-    along = np.concatenate(problem.model_samples(trajectory.q, trajectory.v, problem.control_rows(trajectory)), axis=1)
+    along = np.concatenate(problem.samples(trajectory.q, trajectory.v, problem.control_rows(trajectory)), axis=1)
     return along, np.concatenate([trajectory.q[-1:], trajectory.v[-1:]], axis=1)

@@ -5,20 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.along import states
-from varpin.control.passes import Plan
 from varpin.control.problem import OptimalControlProblem
 from varpin.core.arrays import Commands
 from varpin.signals.commands import open_line, open_loop
-from varpin.trajectory import Trajectory
-
-
-def with_feedback(problem: OptimalControlProblem, here: Trajectory, plan: Plan, *, closed: bool) -> Commands:
-    """The controls of a motion, with a plan's feedback around it if ``closed``, without its feed-forward part."""
-    u = problem.decided(here)
-    if not closed:
-        return held(u, problem)
-    return around(problem, u, states(problem, here)[: -1 : problem.hold], plan.feedback, plan.previous)
 
 
 def around(problem: OptimalControlProblem, u: Floats, x: Floats, gains: Floats, previous: Floats | None) -> Commands:

@@ -93,7 +93,7 @@ def size(problem: OptimalControlProblem) -> int:
 def sample_slopes(problem: OptimalControlProblem, found: Derivatives) -> list[Floats]:
     """Derivatives (N, 2n + m, 2n + 2m) of (q, v, u) in (x, w, u), for each sample of the model in a step."""
     after = np.concatenate([found.A, found.begin, found.end], axis=2)
-    return on_lines(problem.model_rule, problem.model_places, after, found.velocity, problem.scene.controls)
+    return on_lines(problem.rule, problem.places, after, found.velocity, problem.scene.controls)
 
 
 def linear_steps(
@@ -123,17 +123,10 @@ def linear_steps(
     # In (x, w, u); X may have a zero state between w and u.
     g, H = np.zeros((N + 1, x + 2 * m)), np.zeros((N + 1, x + 2 * m, x + 2 * m))
     samples = len(sampled)
-    for s, (D, weight) in enumerate(zip(sampled, problem.model_rule[:, 0], strict=True)):
+    for s, (D, weight) in enumerate(zip(sampled, problem.rule[:, 0], strict=True)):
         across = weight * np.swapaxes(D, 1, 2)
         g[1:] += (across @ running.gradient[s::samples, :, None])[:, :, 0]
         H[1:] += across @ (of_samples(running.hessian, samples, s) @ D)
-    if running.begun is not None:
-        D = np.tile(np.eye(x + 2 * m), (N, 1, 1))
-        if len(found.velocity):
-            D[:, n:x, :x] = found.velocity[:-1]
-        across = np.swapaxes(D, 1, 2)
-        g[1:] += (across @ running.begun.gradient[:, :, None])[:, :, 0]
-        H[1:] += across @ running.begun.hessian @ D
     if len(rate):
         change = np.concatenate([np.zeros((m, x)), -np.eye(m), np.eye(m)], axis=1)
         change = np.stack([np.where(np.arange(x + 2 * m) < x + m, 0.0, change), *[change] * N])
@@ -206,15 +199,6 @@ def widened(curvature: Floats, m: int) -> Floats:
     wide = np.zeros((N + 1, X + m, X + m))
     wide[1:, kept[:, None], kept] = curvature
     return wide
-
-
-def with_pull(steps: LinearSteps, pull: Floats, dt: float) -> LinearSteps:
-    """The steps with a further gradient (N, 2n + 2m) of each step's cost in (x, w, u)."""
-    X, m = steps.B.shape[1:]
-    x = pull.shape[1] - 2 * m
-    gradient = steps.gradient.copy()
-    gradient[1:, np.r_[0 : x + m, X : X + m]] += pull / dt
-    return steps._replace(gradient=gradient)
 
 
 def of_samples(hessian: Floats, samples: int, s: int) -> Floats:

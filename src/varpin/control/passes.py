@@ -182,7 +182,7 @@ def one_pass(
         by_roots = _ByRoots(
             core.RootPass(m, final.after(along.terminal.slopes).core, by_state), squares, change, within
         )
-    samples = len(problem.model_rule)
+    samples = len(problem.rule)
     for begin, end in reversed(along.blocks):
         steps, points = slice(begin, end), slice(begin * samples, end * samples)
         rows = slice(begin // problem.hold, end // problem.hold)

@@ -504,24 +504,10 @@ class OptimalControlProblem(Frozen):
             found[: self.scene.processes] = fields.control.any(axis=(0, 2)) | fields.quadratic.any(axis=0)
         return found
 
-    @property
-    def model_places(self) -> Floats:
-        """Where the sample points :attr:`model_rule` are in a step of unit length (s,)."""
-        return self.places
-
-    @property
-    def model_rule(self) -> Floats:
-        """Sample points of the cost's quadratic model in a step, as :attr:`rule`."""
-        return self.rule
-
     @cached_property
     def at_velocities(self) -> bool:
-        """Whether sample points of :attr:`model_rule` depend on the velocities of nodes."""
+        """Whether sample points of :attr:`rule` depend on the velocities of nodes."""
         return bool(self.rule[:, 2::2].any())
-
-    def model_samples(self, q: Floats, v: Floats, u: Floats) -> tuple[Floats, Floats, Floats]:
-        """States and controls at the sample points :attr:`model_rule`, in the form of :meth:`samples`."""
-        return self.samples(q, v, u)
 
     @cached_property
     def limited(self) -> bool:

@@ -60,7 +60,6 @@ class Program:
         """
         self.rows, layout = tuple(rows), stages.layout
         self.layout, size = layout, layout.size
-        self._stages = stages
         at, beside = layout.decisions(plan.feedback, plan.previous)
         Quu = _products(plan.factors)
         pull = np.swapaxes(beside, 1, 2) @ Quu

@@ -35,7 +35,7 @@ from varpin.control.qp import Minimum, Program
 from varpin.control.second_order import curvature_along
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, deviations, state_slopes
-from varpin.control.stages import Rows, Stages
+from varpin.control.stages import Layout, Rows, Stages
 from varpin.control.starts import holding_gains, joint_forces, states_on
 from varpin.control.trials import Attempt, Trials
 from varpin.core.arrays import Commands
@@ -129,8 +129,6 @@ class Taken(NamedTuple):
     trials: int = 0
     decrease: float = 0.0  # of the merit
     hidden: float = 0.0  # rounding error of a difference of costs; 0 if a step was taken
-    attempt: Attempt | None = None
-    shares: Floats | None = None
 
 
 class Here(NamedTuple):
@@ -378,12 +376,16 @@ class Search:
         if free:
             self.step = Step(plan.feedforward, plan.slope, plan.expected_decrease, None)
             return True
+        calm = self.regularization == 0.0 and not self._has_goals
+        if calm and not self.bound and self._is_free(plan, ()):
+            self.step = Step(plan.feedforward, plan.slope, plan.expected_decrease, None)
+            return True
         spread = self.noise.spread if problem.processes else None
         stages = Stages.along(along, spread, curvature)
         rows = [stages.rows(problem, self.trajectory, *pair) for pair in zip(self.bound, self.backoff, strict=True)]
         self._excess = [_excess(row.values, equality=row.equality) for row in rows]
         self.stages, self.rows = stages, rows
-        if not any(row.equality for row in rows) and self.regularization == 0.0 and self._is_free(plan):
+        if calm and self.bound and self._is_free(plan, rows):
             self.step = Step(plan.feedforward, plan.slope, plan.expected_decrease, None)
             self.multipliers = [np.zeros(item.shape) for item in self.bound]
             return True
@@ -491,12 +493,12 @@ class Search:
             change = (slopes @ change[:, :, None])[:, :, 0]
         return change
 
-    def _is_free(self, plan: Plan) -> bool:
+    def _is_free(self, plan: Plan, rows: Sequence[Rows]) -> bool:
         """Whether the full step of a backward pass keeps to all limits and rows, by the linear model."""
         along, problem = self.along, self.problem
         if len(along.blocks) > 1:
             return False
-        layout = self.stages.layout
+        layout = Layout.of(problem)
         after = np.empty((problem.decisions if problem.linear else problem.steps, along.states))
         found = foreseen(along, plan, after=after)
         if found.limited:
@@ -504,7 +506,7 @@ class Search:
         x = np.vstack([np.zeros((1, layout.states)), after[problem.hold - 1 :: problem.hold, : layout.states]])
         z = layout.joined(x[1:] if problem.linear else x, found.moves)
         padded = np.append(z, 0.0)
-        for row in self.rows:
+        for row in rows:
             moved = np.where(row.at >= 0, padded[row.at], 0.0)
             if (row.values + (row.slopes * moved).sum(axis=1) > 0.0).any():
                 return False
@@ -551,13 +553,14 @@ class Search:
 
     def _take_margins(self, plan: Plan) -> None:
         """Margins of all rows, in their units: standard deviations under the plan's feedback, and what is added."""
-        if not any(item.source.margin > 0.0 for item in self.bound):
+        kept = [item for item in self.bound if item.source.margin > 0.0]
+        if not kept:
             return
         feedback, problem = Feedback(plan.feedback, plan.previous), self.problem
+        lin, _ = self.along.linearized(0, problem.steps)
+        spreads = iter(deviations(problem, self.trajectory, feedback, kept, lin))
         own = [
-            item.source.margin * deviations(problem, self.trajectory, feedback, item)
-            if item.source.margin > 0.0
-            else np.zeros(item.shape)
+            item.source.margin * next(spreads) if item.source.margin > 0.0 else np.zeros(item.shape)
             for item in self.bound
         ]
         if self.added is not None:
@@ -739,7 +742,7 @@ class Search:
         assert best.attempt is not None
         assert best.shares is not None
         self._move(best.attempt.trajectory(), best.shares)
-        return Taken(length, trials, -best.merit, 0.0, best.attempt, best.shares)
+        return Taken(length, trials, -best.merit)
 
     def _merit_here(self) -> Here:
         assert self.noise is not None

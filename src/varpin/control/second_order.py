@@ -21,7 +21,7 @@ def curvature_along(along: Along, costate: Floats, plan: Plan | None = None) -> 
     """
     problem, trajectory = along.problem, along.trajectory
     scene, n, h = problem.scene, problem.scene.robot.dof, problem.dt
-    N, samples, rule = problem.steps, len(problem.model_rule), problem.model_rule
+    N, samples, rule = problem.steps, len(problem.rule), problem.rule
     gradient = problem.expand_running(trajectory).gradient.reshape(N, samples, -1)
     by_q, by_v = gradient[:, :, :n], gradient[:, :, n : 2 * n]
     # The running cost's gradient in q0, v0, q1 and v1 of each step.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from varpin.arrays import Floats
 from varpin.control.constraints import BoundConstraint
 from varpin.control.linear_controls import in_step
 from varpin.control.problem import OptimalControlProblem
-from varpin.linearization import linearize_steps, velocity_at_nodes
+from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
 from varpin.trajectory import Trajectory
 
 
@@ -88,20 +89,31 @@ def propagated(J: Floats, g: Floats, gz: Floats, problem: OptimalControlProblem,
     return C
 
 
-def covariances(problem: OptimalControlProblem, motion: Trajectory, feedback: Feedback) -> Floats:
-    """Covariances of the state at the nodes of a motion under feedback (N + 1, 2n, 2n), see :func:`propagated`."""
-    lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0, ramps=problem.linear)
+def covariances(
+    problem: OptimalControlProblem, motion: Trajectory, feedback: Feedback, lin: Linearization | None = None
+) -> Floats:
+    """Covariances of the state at the nodes of a motion under feedback (N + 1, 2n, 2n), see :func:`propagated`.
+
+    ``lin`` are its linearized steps, if they are known.
+    """
+    if lin is None:
+        lin = linearize_steps(problem.scene, motion, problem.integrator, problem.q0, ramps=problem.linear)
     (J, gz), x = in_step(lin), lin.A.shape[1]
     return propagated(J, lin.G, gz, problem, feedback)[:, :x, :x]
 
 
 def deviations(
-    problem: OptimalControlProblem, motion: Trajectory, feedback: Feedback, bound: BoundConstraint
-) -> Floats:
-    """Standard deviations (K, rows) of a state constraint about a motion under feedback and the scene's noise."""
-    found = covariances(problem, motion, feedback)
-    J = bound.jacobian(motion.q, motion.v) @ state_slopes(problem, motion)[bound.places]
-    return of_values(J, found[bound.places])
+    problem: OptimalControlProblem,
+    motion: Trajectory,
+    feedback: Feedback,
+    bounds: Sequence[BoundConstraint],
+    lin: Linearization | None = None,
+) -> list[Floats]:
+    """Standard deviations (K, rows) of state constraints about a motion under feedback and the scene's noise."""
+    found, slopes = covariances(problem, motion, feedback, lin), state_slopes(problem, motion)
+    return [
+        of_values(bound.jacobian(motion.q, motion.v) @ slopes[bound.places], found[bound.places]) for bound in bounds
+    ]
 
 
 def of_values(J: Floats, covariance: Floats) -> Floats:

@@ -6,8 +6,6 @@ any step of the search would accept.
 
 from __future__ import annotations
 
-import functools
-from dataclasses import is_dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,14 +16,10 @@ from varpin.core import Watch
 from varpin.core.arrays import Bytes, Commands, RolloutArrays
 from varpin.integrators import Integrator
 from varpin.integrators.base import Failure, statistics_of
-from varpin.integrators.variational import Variational
 from varpin.signals.commands import Lines, lines
 from varpin.signals.inputs import with_ends
 from varpin.trajectory import Trajectory
 
-# Halvings that a step of a trial may take, if the motion it is near has no more, and further ones where it may take
-# more.
-HALVINGS, MORE_HALVINGS = 2, 3
 # Arrays that are the same for all whole motions of a problem under held controls, without constraints.
 _SHARED = ("t", "dw", "masses", "u_stages", "u_nodes", "constraint_forces")
 
@@ -211,19 +205,3 @@ class Trials:
             Watch.Verdict.going,
             line,
         )
-
-
-def few_halvings(motion: Trajectory) -> int:
-    """How many halvings a step of a trial near a motion takes at most."""
-    # A step cut into s substeps has taken at most s - 1 halvings.
-    deepest = int(motion.statistics.substeps.max()) - 1 if motion.statistics.halvings.size else 0
-    return max(HALVINGS, deepest)
-
-
-@functools.lru_cache(maxsize=256)
-def cut_less(integrator: Integrator, halvings: int) -> Integrator:
-    """The integrator with at most ``halvings`` halvings of a step; itself where it halves none."""
-    guard = integrator.guard if isinstance(integrator, Variational) else None
-    if guard is None or not is_dataclass(integrator):
-        return integrator
-    return replace(integrator, guard=replace(guard, max_halvings=min(halvings, guard.max_halvings)))

@@ -53,15 +53,6 @@ class Collocation(Variational):
         found: Floats = np.eye(len(Z)) - Z @ np.tensordot(self._coefficients()[1], inner, axes=1)
         return found
 
-    def after_held_slopes(self, Z: Floats, pull: Floats) -> Floats:
-        """Derivatives (n, n) in Z of the sum of ``pull`` (n, n) times :meth:`after_held`."""
-        (a, b, _), n = self._coefficients(), len(Z)
-        matrix, inner = self._held(Z)
-        to_stages = -np.multiply.outer(b, Z.T @ pull)
-        back = np.linalg.solve(matrix.T, to_stages.reshape(-1, n)).reshape(-1, n, n)
-        found: Floats = -pull @ np.tensordot(b, inner, axes=1).T - np.einsum("ij,iac,jbc->ab", a, back, inner)
-        return found
-
     def _held(self, Z: Floats) -> tuple[Floats, Floats]:
         """The matrix (s n, s n) of the stages' momenta, and these (s, n, n) for an impulse of one."""
         (a, _, c), n = self._coefficients(), len(Z)

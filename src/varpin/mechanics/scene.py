@@ -640,11 +640,6 @@ def quiet(scene: Scene) -> Scene:
     return _driven(scene, scene.actuation) if scene.processes else scene
 
 
-def assisted(scene: Scene) -> Scene:
-    """The scene without noise, with additional controls, a force on each joint without a kinematic input."""
-    return _driven(scene, np.hstack([scene.actuation, np.eye(scene.robot.dof)[:, scene.unprescribed]]))
-
-
 def _driven(scene: Scene, actuation: Floats) -> Scene:
     """The scene with another actuation matrix (n, m) and without noise."""
     actuation = actuation.copy()

@@ -90,13 +90,10 @@ class Expansion:
     Attributes:
         gradient: (N, 2n + m).
         hessian: (N, 2n + m, 2n + m), or (1, 2n + m, 2n + m) where it is the same everywhere.
-        begun: Expansion (N, 2n + 2m) of a further cost per time of N steps, in (q, v) at their begin and the controls
-            at both their ends; None without one.
     """
 
     gradient: Floats
     hessian: Floats
-    begun: Expansion | None = None
 
 
 class BoundCost(Frozen, ABC):
