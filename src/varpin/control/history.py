@@ -55,8 +55,8 @@ class Iteration:
         step: Length of the accepted step, 0 if there is none; 4 or more of one that was extended as the cost fell on
             beyond. Of a step along foreseen states it is the share of their changes.
         regularization: Relative to the diagonal of Quu.
-        gradient: Largest entry of the cost's gradient in the controls.
-        backward_passes: Number of backward passes with different regularizations.
+        gradient: Largest entry of the gradient in the controls, with the multipliers of constraints.
+        backward_passes: Number of backward passes: with different regularizations, and for goals and noise.
         rollouts: Number of trials of the line search, one along foreseen states included.
         seconds: Time of the iteration [s].
         second_order: Whether second derivatives of the dynamics were used.

@@ -30,9 +30,8 @@ class Refined:
         status: How the search ended.
         seconds: Time of the search and the verification [s].
         share: Share in the time of all steps tried.
-        excess: Excess of the true cost over the optimum of finer controls, relative to the latter: an estimate from a
-            few iterations with half the step; with constraints, from the plan with half the step. Infinite where it is
-            not known.
+        excess: Excess of the true cost over the optimum of finer controls, relative to the latter: an estimate
+            from the plan with half the step. Infinite where it is not known.
         violation: Largest violation of a constraint on the continuous system with feedback, relative to the
             constraint's range (for frames and clearance 1 m or 3 rad); NaN where that motion diverges.
     """

@@ -180,6 +180,7 @@ class Search:
         self.added: list[Floats] | None = None  # to margins at the nodes
         self.counts = 0
         self._looks, self._near = 0, False
+        self._passes = 0  # backward passes since the last entry of the history
         self._elastic = self.exact = self.unsolved = False
         self.backoff: list[Floats] = []  # margins of all rows
         self.multipliers: list[Floats] = []
@@ -370,6 +371,7 @@ class Search:
             # Noise grows under regularized gains.
             self.noise = (self._pass(0.0) if self.regularization > 0.0 else plan) or plan
         if self._has_goals:
+            self._passes += 1
             self.plan = single_pass(self._with_goals(along), 0.0)[0] or plan
         if problem.processes and not self.tick:
             self._take_margins(self.plan)
@@ -410,6 +412,7 @@ class Search:
         if held is not None:
             along = copy(along)
             along.held = held
+        self._passes += 1
         return single_pass(along, regularization, curvature=self._wide(curvature))[0]
 
     def _at_limits(self) -> Mask | None:
@@ -911,12 +914,13 @@ class Search:
             step=0.0 if taken is None else taken.length,
             regularization=self.regularization,
             gradient=float(np.abs(self._gradient()).max()),
-            backward_passes=1,
+            backward_passes=self._passes,
             rollouts=0 if taken is None else taken.trials,
             seconds=time.perf_counter() - started,
             second_order=self.exact,
         )
         self.history.append(item)
+        self._passes = 0
         logger.info("%s: %s", self.label, item)
         report(item, self.trajectory)
 

@@ -105,9 +105,9 @@ def solve(
             search.
         true_cost: Greatest difference between the plan's cost and its cost with feedback on the continuous system,
             relative to the former: 0.01 for a percent; and greatest excess of the latter over the optimum of finer
-            controls, as estimated from a few iterations with half the step, or with constraints from the plan of half
-            the step. Constraints must then hold on the continuous system to a thousandth of their range. The problem's
-            step is the coarsest; it is halved, each search starting from the plan before, until all that is so.
+            controls, as estimated from the plan of half the step. Constraints must then hold on the continuous system
+            to a thousandth of their range. The problem's step is the coarsest; it is halved, each search starting from
+            the plan before, until all that is so.
             ``Solution.problem`` has the plan's step. ``Solution.refinement`` lists the steps tried, or why the accuracy
             cannot be reached; a warning reports that, too. Controls that are held over several steps keep their period,
             and their optimum is that of the period. ``max_iterations`` is for each step, ``time_limit`` for all;
