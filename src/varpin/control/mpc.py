@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control import Kept, OptimalControlProblem, Solution, kept, looked_at, replan, solve
-from varpin.control.chatter import alternation
+from varpin.control.checks import restlessness
 from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import ITERATIONS, Status
@@ -411,7 +411,7 @@ class Mpc:
             *unstable_loop(plant.scene, motion, plant.substeps),
             *motion.warnings,
         )
-        found = (*found, *_alternating(motion, plant.substeps))
+        found = (*found, *_restless(motion, plant.substeps))
         found = (*found, *_behind(seconds, self.period), *_late(late, self.budget))
         found = (*found, *_failed(failed, reasons, self.period))
         found = (*found, *_whole_ticks(duration, ticks, self.period), *_at_nodes_alone(problem))
@@ -555,17 +555,17 @@ def _failed(failed: NDArray[np.bool_], reasons: Sequence[str], period: float) ->
     return (Finding("failed ticks", sentence),)
 
 
-def _alternating(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
-    """A finding if the plant's velocities alternate from tick to tick."""
-    found = None if motion.dw.any() else alternation(motion.v[::substeps])
+def _restless(motion: Trajectory, substeps: int) -> tuple[Finding, ...]:
+    """A finding if a velocity of the plant goes up and down from tick to tick."""
+    found = None if motion.dw.any() else restlessness(motion.v[::substeps])
     if found is None:
         return ()
-    seen = found.sentence(motion.joint_names, motion.t[::substeps], "tick")
+    joint, changes = found
     sentence = (
-        f"under the controller {seen}: the feedback is too fast for the period; a smaller dt, or a greater weight on "
-        "the controls or on their changes, calms it"
+        f"under the controller the velocity of {motion.joint_names[joint]} goes up and down {changes} times in "
+        f"{motion.steps // substeps} ticks: a smaller dt, or a greater weight on the controls, calms it"
     )
-    return (Finding("alternating ticks", sentence),)
+    return (Finding("restless ticks", sentence),)
 
 
 def _blown_up(plans: Sequence[Solution], motion: Trajectory) -> tuple[Finding, ...]:

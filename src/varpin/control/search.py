@@ -90,8 +90,8 @@ _CLOSE = 1e-3
 _BETWEEN, _SHARE = 1e-6, 1e-3
 # How often margins are widened by counting motions.
 _COUNTS = 3
-# How often rows between nodes may follow the motion at its end.
-_LOOKS = 30
+# How often rows between nodes, or margins, may follow the motion at its end, and the share by which margins move.
+_LOOKS, _MOVES = 30, 1e-3
 # A goal's weight in the feedback: a violation of a tenth of its range costs this many times the cost.
 _GOAL = 1.0
 # Least share of the foreseen decrease below which shorter steps are tried while they are better.
@@ -189,7 +189,7 @@ class Search:
         self.shares: Floats
         self.cost = np.inf
         self.reason, self.deadline = "", np.inf
-        self.best: tuple[tuple[float, float], Trajectory, Floats] | None = None
+        self._due, self._rounds = False, 0  # margins are to be taken; how often they have been taken
         self.state: SearchState | None = None
         self.plan: Plan | None = None
         self.noise: Plan | None = None  # the pass whose value function tells what noise costs
@@ -236,6 +236,7 @@ class Search:
         """Take over rows between nodes, multipliers and margins."""
         self._enforce(known.between)
         self.multipliers, self.backoff = split(self.bound, known.values), split(self.bound, known.backoff)
+        self._due = False
         if known.added is not None:
             self.added = split(self.problem.bound_constraints, known.added)
 
@@ -261,15 +262,15 @@ class Search:
             if self.first < 0.0:
                 stake = self.along.stake
                 self.first = stake.free if np.isfinite(stake.free) else stake.moved
-            self._keep_best()
             ended = self._ended(tolerance)
+            if ended in (Status.CONVERGED, Status.INFEASIBLE) and self._margins_move():
+                continue
             if ended is Status.CONVERGED and self._goes_on():
                 continue
             if ended is None and self._near and self._looks_between():
                 continue
             ended = ended or self._out_of(last, deadline)
             if ended is not None:
-                self._go_to_best(ended)
                 self._calm()
                 self._note(report, started)
                 self.reason = self.reason or self._numbers(tolerance)
@@ -280,7 +281,7 @@ class Search:
             self._note(report, started, taken)
             longest = max(longest, time.perf_counter() - started)
             if taken.length == 0.0 and step.decrease <= taken.hidden and self.violation <= FEASIBLE:
-                if self._goes_on():
+                if self._margins_move() or self._goes_on():
                     continue
                 self.reason = f"{self._expected()}, and rounding hides {taken.hidden:.1e} of the cost"
                 return Status.CONVERGED
@@ -373,7 +374,7 @@ class Search:
         if self._has_goals:
             self._passes += 1
             self.plan = single_pass(self._with_goals(along), 0.0)[0] or plan
-        if problem.processes and not self.tick:
+        if self._due and problem.processes and not self.tick:
             self._take_margins(self.plan)
         if free:
             self.step = Step(plan.feedforward, plan.slope, plan.expected_decrease, None)
@@ -556,6 +557,7 @@ class Search:
 
     def _take_margins(self, plan: Plan) -> None:
         """Margins of all rows, in their units: standard deviations under the plan's feedback, and what is added."""
+        self._due = False
         kept = [item for item in self.bound if item.source.margin > 0.0]
         if not kept:
             return
@@ -600,22 +602,6 @@ class Search:
                 return Status.STALLED
         return None
 
-    def _keep_best(self) -> None:
-        """Remember the motion that violates rows least, or costs least within them, where margins move with it."""
-        if not any(item.source.margin > 0.0 for item in self.bound) or not self.problem.processes:
-            return
-        assert self.noise is not None
-        rank = max(self.violation, FEASIBLE), self.cost + self.noise.noise
-        if self.best is None or rank < self.best[0]:
-            self.best = rank, self.trajectory, self.shares
-
-    def _go_to_best(self, ended: Status) -> None:
-        """Return to the best motion of a search that has not converged."""
-        if self.best is not None and not ended.converged and self.best[1] is not self.trajectory:
-            self._move(*self.best[1:])
-            with contextlib.suppress(*TRIAL_ERRORS):
-                self._made()
-
     def _calm(self) -> None:
         """Make the last feedback and step without regularization, where the model has a minimum."""
         kept = self.regularization
@@ -649,6 +635,22 @@ class Search:
             return True
         return self._counts_motions()
 
+    def _margins_move(self) -> bool:
+        """Whether the margins of the motion are others than those that it was found with; they are taken then.
+
+        In between they stay: a merit whose rows move with the motion would have no minimum. The first search is
+        without them.
+        """
+        if self.tick or self.plan is None or not self.problem.processes or self._rounds >= _LOOKS:
+            return False
+        before = self.backoff
+        self._take_margins(self.plan)
+        if all((np.abs(b - a) <= _MOVES * a).all() for a, b in zip(before, self.backoff, strict=True)):
+            self.backoff = before
+            return False
+        self._rounds += 1
+        return True
+
     def _looks_between(self) -> bool:
         """Whether there are other rows between nodes, at the peaks of the motion."""
         problem = self.problem
@@ -672,7 +674,7 @@ class Search:
         if len(made.rows):
             kept = self.multipliers[:count]
             self._enforce(made)
-            self.multipliers[:count] = kept
+            self._due, self.multipliers[:count] = self._rounds > 0, kept
             self.backoff[:count] = backoff
         return len(made.rows) > 0
 
@@ -685,12 +687,12 @@ class Search:
             return False
         self.counts += 1
         try:
-            more = widened(self.solution(Status.CONVERGED), self.deadline)
+            more = widened(self.solution(Status.CONVERGED))
         except VarpinError:
             return False
         if more is None:
             return False
-        self.added = more
+        self.added, self._due = more, True
         return True
 
     def _line_search(self) -> Taken:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from varpin.control.problem import default_integrator
+from varpin.control.problem import STAGES
 from varpin.errors import InputError
 from varpin.integrators import BY_NAME, Integrator
 from varpin.io.scenefile.plan_constraints import PLAN_CONSTRAINTS, PlanTable
@@ -324,7 +324,7 @@ INTEGRATOR_RULES = {word: of_api(kind) for word, kind in INTEGRATORS.items()}
 
 def _integrator(given: Any, where: Where) -> Integrator:
     kind = given.get("type", "gauss") if isinstance(given, dict) else ""
-    stages = {"stages": default_integrator().stages} if kind == "gauss" else {}
+    stages = {"stages": STAGES} if kind == "gauss" else {}
     made: Integrator = typed(INTEGRATOR_RULES, "gauss").read(stages | given if stages else given, where)
     return made
 
