@@ -77,11 +77,10 @@ def test_a_plan_with_margins_that_is_cut_is_resumed_as_if_it_had_not_been():
 
 
 def test_noise_that_leaves_no_room_is_told_of():
-    """With the linear model's margins, one motion in twelve was above the lid."""
-    plan = vp.solve(under_a_lid(vp.AdditiveNoise(0.6)), check=False)
-    assert plan.status is vp.Status.INFEASIBLE
-    assert "its margin of" in plan.reason
-    assert plan.search.counts > 0
+    """It is above the lid in almost every second motion, whatever the margin."""
+    plan = vp.solve(under_a_lid(vp.AdditiveNoise(1.5)), max_iterations=60)
+    assert not plan.status.converged
+    assert about(plan.warnings, "small margin")
 
 
 def test_a_warning_of_a_small_margin_counts():

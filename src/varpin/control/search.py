@@ -648,7 +648,10 @@ class Search:
         if all((np.abs(b - a) <= _MOVES * a).all() for a, b in zip(before, self.backoff, strict=True)):
             self.backoff = before
             return False
-        self._rounds += 1
+        if any(part.any() for part in before):
+            # Half of the way: a motion far from its rows has small margins, which let it come near again.
+            self.backoff = [0.5 * (a + b) for a, b in zip(before, self.backoff, strict=True)]
+        self._rounds, self.reason = self._rounds + 1, ""
         return True
 
     def _looks_between(self) -> bool:
