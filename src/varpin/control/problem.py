@@ -22,12 +22,11 @@ from varpin.control.constraints import BoundConstraint, BoundRate, Horizon, Plan
 from varpin.control.costs import (
     BoundSum,
     ControlRate,
+    ControlRateCost,
     Cost,
     Expansion,
     Points,
-    Terminal,
     control_rate,
-    is_control_rate,
     with_control_before,
 )
 from varpin.core import sample_steps
@@ -664,7 +663,7 @@ class OptimalControlProblem(Frozen):
         found = [weight * compiled.ravel()]
         if self.running.others:
             at = self.samples(q, v, u)
-            found += [weight * part.value(*at) for part in self.running.others]
+            found += [weight * (factor * part.value(*at)) for factor, part in self.running.others]
         found += [values.ravel() for values in self.terminal.shares(q[-1:], v[-1:], np.zeros((1, u.shape[1])))]
         if self.rate is not None:
             found.append(self.rate.shares(u[:: self.hold], self.period))
@@ -674,12 +673,10 @@ class OptimalControlProblem(Frozen):
         """The cost terms that are not finite on a motion; those of the controls' rate are not tested."""
         q, v, u = trajectory.q, trajectory.v, self.control_rows(trajectory)
         along, end = self.samples(q, v, u), (q[-1:], v[-1:], np.zeros((1, u.shape[1])))
-        terms = [term for term in self.cost.terms if not is_control_rate(term)]
         # The parts of both sums are in the order of the cost's terms.
-        found = []
-        for total, at, at_end in ((self.running, along, False), (self.terminal, end, True)):
-            placed = [term for term in terms if isinstance(term, Terminal) == at_end]
-            for term, part in zip(placed, total.parts, strict=True):
+        found: list[Cost] = []
+        for at_end, (total, at) in enumerate(((self.running, along), (self.terminal, end))):
+            for term, (_, part) in zip(_placed(self.cost, at_end), total.parts, strict=True):
                 if not np.isfinite(part.value(*at)).all():
                     found.append(term)
         return tuple(found)
@@ -838,13 +835,18 @@ def bind_cost(
     ``known`` are the bound costs of another horizon on the same grid; parts that do not depend on time are reused.
     """
     at, end = (replace(horizon, t=t) for t in (times, np.array([horizon.t0 + horizon.duration])))
-    terms = [term for term in cost.terms if not is_control_rate(term)]
     sums = []
     for at_end, points in enumerate((at, end)):
-        chosen = [term for term in terms if isinstance(term, Terminal) == bool(at_end)]
-        before = (None,) * len(chosen) if known is None else known[at_end].parts
+        chosen = _placed(cost, at_end)
+        before = (None,) * len(chosen) if known is None else (old for _, old in known[at_end].parts)
         parts = (
-            term.bind(points) if old is None or term.timed else old for term, old in zip(chosen, before, strict=True)
+            (term.factor, term.bind(points) if old is None or term.timed else old)
+            for term, old in zip(chosen, before, strict=True)
         )
         sums.append(BoundSum(tuple(parts), points))
     return sums[0], sums[1]
+
+
+def _placed(cost: Cost, at_end: int) -> list[Cost]:
+    """The terms along the motion, or at its end, but those of the controls' rate."""
+    return [term for term in cost.terms if term.at_end == at_end and not isinstance(term, ControlRateCost)]
