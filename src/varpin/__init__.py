@@ -99,7 +99,6 @@ from varpin.trajectory import Trajectory as Trajectory
 if TYPE_CHECKING:
     from varpin.control import ConstraintReport as ConstraintReport
     from varpin.control import Iteration as Iteration
-    from varpin.control import Kept as Kept
     from varpin.control import MonteCarlo as MonteCarlo
     from varpin.control import MonteCarloInterrupted as MonteCarloInterrupted
     from varpin.control import Multipliers as Multipliers
@@ -141,6 +140,7 @@ if TYPE_CHECKING:
     from varpin.control.costs import TrackingCost as TrackingCost
     from varpin.control.costs import VelocityCost as VelocityCost
     from varpin.control.costs import VelocityLimitBarrier as VelocityLimitBarrier
+    from varpin.control.mpc import Kept as Kept
     from varpin.control.mpc import Mpc as Mpc
     from varpin.control.mpc import MpcRun as MpcRun
     from varpin.control.mpc import Plant as Plant
@@ -223,11 +223,10 @@ _LATE: dict[str, tuple[str, ...]] = {
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),
     "varpin.study.extremes": ("check_robot",),
     "varpin.study.linearization_check": ("LinearizationCheck", "check_linearization"),
-    "varpin.control.mpc": ("Mpc", "MpcRun", "Plant"),
+    "varpin.control.mpc": ("Kept", "Mpc", "MpcRun", "Plant"),
     "varpin.io.scenefile": ("SceneFile", "SceneFileError", "load_scene"),
     "varpin.control": (
         "ConstraintReport",
-        "Kept",
         "Iteration",
         "MonteCarlo",
         "MonteCarloInterrupted",

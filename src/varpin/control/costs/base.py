@@ -164,7 +164,8 @@ class Cost(Frozen, ABC):
         return type(self).__name__
 
     def _repr_html_(self) -> str:
-        rows = [("at the end" if term.at_end else "along the motion", term) for term in self.terms]
+        places = ("along the motion", "at the end")
+        rows = [(places[term.at_end], term.changed(at_end=False)) for term in self.terms]
         return facts("Cost", rows)
 
 
