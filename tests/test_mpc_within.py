@@ -80,8 +80,7 @@ def test_ways_of_obstacles_are_checked():
 def test_ticks_that_find_no_plan_are_told_of():
     """A goal that no horizon reaches: multipliers stay bounded, and the goal is kept again once it can be."""
     far = vp.Mpc(tracking([vp.ReachFrame(ROBOT, "tip", position=[2.2, 0.0, 0.0])])).run(duration=0.3)
-    assert far.infeasible > 3
-    assert far.constraints[0].infeasible.sum() == far.infeasible
+    assert far.infeasible.sum() > 3
     assert naming(far.warnings, "no plan", "ReachFrame('tip')")
     assert not unnamed(str(far), "ReachFrame('tip')")
     assert np.isfinite(far.plans[-1].multipliers.values).all()
@@ -91,7 +90,7 @@ def test_what_the_plant_violates_is_told_of():
     """A plant that is pushed harder than the model knows."""
     noisy = vp.Plant(vp.Scene(ROBOT, damping=0.3, noise=vp.AdditiveNoise(0.1)))
     run = vp.Mpc(tracking(FAMILIES["speeds"])).run(noisy, duration=0.6, rng=1)
-    assert 0.05 < run.constraints[0].worst < 0.4
+    assert 0.05 < run.constraints[0].violation < 0.4
     assert naming(run.warnings, "motion violates", "WithinVelocityLimits", "margin=", "narrower")
 
 
@@ -156,7 +155,7 @@ def test_loops_of_linear_controls_do_not_run_away(build, duration, most, iterati
         plans = max(np.abs(plan.trajectory.v).max() for plan in run.plans)
         fastest[controls] = max(plans, np.abs(run.motion.v).max())
         costs[controls] = np.mean([plan.cost for plan in run.plans])
-        assert run.constraints[0].worst <= most
+        assert run.constraints[0].violation <= most
         assert max(item.rollouts for plan in run.plans[1:] for item in plan.history) <= 8
     # Beside the ball, with one iteration a tick, 1.2 and 1.28.
     assert fastest["linear"] <= 1.4 * fastest["held"]
@@ -189,4 +188,4 @@ def test_ticks_within_speeds_are_close_to_their_optimum():
     one, three = (vp.Mpc(problem, iterations=count).run(duration=0.6) for count in (1, 3))
     costs = [np.mean([plan.cost for plan in run.plans]) for run in (one, three)]
     assert costs[0] <= 1.05 * costs[1]
-    assert one.constraints[0].worst <= 3e-3
+    assert one.constraints[0].violation <= 3e-3

@@ -140,7 +140,6 @@ if TYPE_CHECKING:
     from varpin.control.costs import TrackingCost as TrackingCost
     from varpin.control.costs import VelocityCost as VelocityCost
     from varpin.control.costs import VelocityLimitBarrier as VelocityLimitBarrier
-    from varpin.control.mpc import Kept as Kept
     from varpin.control.mpc import Mpc as Mpc
     from varpin.control.mpc import MpcRun as MpcRun
     from varpin.control.mpc import Plant as Plant
@@ -223,7 +222,7 @@ _LATE: dict[str, tuple[str, ...]] = {
     "varpin.linearization": ("Curvature", "Linearization", "Moments", "linearize", "propagate_moments", "second_order"),
     "varpin.study.extremes": ("check_robot",),
     "varpin.study.linearization_check": ("LinearizationCheck", "check_linearization"),
-    "varpin.control.mpc": ("Kept", "Mpc", "MpcRun", "Plant"),
+    "varpin.control.mpc": ("Mpc", "MpcRun", "Plant"),
     "varpin.io.scenefile": ("SceneFile", "SceneFileError", "load_scene"),
     "varpin.control": (
         "ConstraintReport",

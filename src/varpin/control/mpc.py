@@ -18,7 +18,7 @@ from varpin.control.commands import shifted_commands
 from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
 from varpin.control.history import ITERATIONS, Status
-from varpin.control.multipliers import REPORTED, Multipliers, at_nodes, flat
+from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, at_nodes, flat
 from varpin.control.search import Search
 from varpin.control.solution import rest_of
 from varpin.errors import InputError, LinearizationError
@@ -72,64 +72,6 @@ class Plant:
 
 
 @dataclass(frozen=True, eq=False)
-class Kept(Frozen):
-    """How well a controller and its plant satisfied a constraint.
-
-    Attributes:
-        label: The constraint.
-        unit: Unit of its values.
-        tolerance: Violation above which there is a warning: a thousandth of its range.
-        planned: Largest violation in the plan that acts in each tick (K,), margin included, along its own horizon.
-        moved: Violation by the plant's motion at each of its nodes after the first (T,), without the margin; empty for
-            goals, which apply to the end of each plan.
-        t: Times of these nodes (T,) [s].
-    """
-
-    label: str
-    unit: str
-    tolerance: float
-    planned: Floats
-    moved: Floats
-    t: Floats
-
-    @property
-    def worst(self) -> float:
-        """Largest violation by the plant's motion; 0 for goals."""
-        return float(self.moved.max(initial=0.0))
-
-    @property
-    def infeasible(self) -> NDArray[np.bool_]:
-        """Ticks whose plan violates the constraint by more than the tolerance (K,)."""
-        return np.asarray(self.planned > self.tolerance)
-
-    def __repr__(self) -> str:
-        text = f"{self.label}: violated by at most {self.planned.max():.1e} {self.unit} in plans"
-        if self.infeasible.any():
-            text += f" (by more than {self.tolerance:.1g} in {int(self.infeasible.sum())} of {len(self.planned)} ticks)"
-        return text + (f", by {self.worst:.1e} in the plant's motion" if self.moved.size else "")
-
-    def findings(self) -> list[Finding]:
-        """Warnings about ticks without a feasible plan, and about a motion that violates the constraint."""
-        found = []
-        if self.infeasible.any():
-            tick = int(np.argmax(self.planned))
-            text = (
-                f"in {int(self.infeasible.sum())} of {len(self.planned)} ticks no plan was found that keeps to "
-                f"{self.label}; in tick {tick} it is violated by {self.planned[tick]:.2g} {self.unit}. Use a longer "
-                "horizon, wider limits or more iterations"
-            )
-            found.append(Finding("infeasible ticks", text))
-        if self.worst > self.tolerance:
-            when = float(self.t[int(np.argmax(self.moved))])
-            text = (
-                f"the plant's motion violates {self.label} by {self.worst:.2g} {self.unit} at t = {when:.4g} s. Use a "
-                "narrower bound, margin= against noise, a smaller dt or more iterations"
-            )
-            found.append(Finding("motion outside constraints", text, time=when, value=self.worst, unit=self.unit))
-        return found
-
-
-@dataclass(frozen=True, eq=False)
 class MpcRun(Frozen):
     """The result of a controller's run on a plant.
 
@@ -142,7 +84,8 @@ class MpcRun(Frozen):
         failed: Ticks whose search ended within the budget without a plan (K,); the previous plan acted instead.
         period: Time of a tick [s].
         budget: Time for planning in a tick [s]; infinite without a budget.
-        constraints: How well plans and motion satisfied each of the problem's constraints.
+        constraints: How well the plant's motion satisfied each of the problem's constraints at its nodes, without
+            margins; goals, which apply to the end of each plan, are left out.
         warnings: Warnings about the first plan that do not recur in the plant's motion; about the motion, as in
             :attr:`Trajectory.warnings`, and its velocities from tick to tick; about planning that took longer than the
             budget, or without one than the period, in more than one tick of twenty; about failed ticks; and about
@@ -157,23 +100,13 @@ class MpcRun(Frozen):
     failed: NDArray[np.bool_]
     period: float
     budget: float
-    constraints: tuple[Kept, ...] = ()
+    constraints: tuple[ConstraintReport, ...] = ()
     warnings: tuple[Finding, ...] = ()
 
     @property
-    def infeasible(self) -> int:
-        """Number of ticks whose plan violates a constraint by more than a thousandth of its range."""
-        return int(np.any([item.infeasible for item in self.constraints], axis=0).sum())
-
-    @property
-    def misses(self) -> int:
-        """Number of late plans."""
-        return int(self.late.sum())
-
-    @property
-    def failures(self) -> int:
-        """Number of ticks whose search failed."""
-        return int(self.failed.sum())
+    def infeasible(self) -> NDArray[np.bool_]:
+        """Ticks whose plan violates a constraint by more than a thousandth of its range (K,)."""
+        return np.array([any(_violated(plan)) for plan in self.plans])
 
     def planned(self, ahead: float | None = None) -> Floats:
         """Planned configurations ``ahead`` seconds later (K + 1, n) [rad or m].
@@ -211,8 +144,8 @@ class MpcRun(Frozen):
                 f"95%, {milliseconds.max():.2f} at most, for {self.iterations[1:].mean():.2f} iterations a tick"
             )
         if self.budget < np.inf:
-            text += f"; {self.misses} later than {1e3 * self.budget:.3g} ms"
-        return text + (f"; {self.failures} failed" if self.failures else "")
+            text += f"; {int(self.late.sum())} later than {1e3 * self.budget:.3g} ms"
+        return text + (f"; {int(self.failed.sum())} failed" if self.failed.any() else "")
 
     def _repr_html_(self) -> str:
         rows = [("ticks", self._summary), ("plant", self.motion)]
@@ -238,10 +171,10 @@ class Mpc:
     :class:`ControlRateCost` makes the jump between the two small.
 
     Constraints hold along every horizon, and moving obstacles are predicted. Each iteration of a tick meets their
-    linearization, so a plan satisfies them to the accuracy of few iterations: ``Solution.violation`` has it, and
-    ``MpcRun.constraints`` for every tick. A goal (:class:`ReachFrame`) applies to the end of every horizon. The size of
-    a margin is that of the first plan. Held controls keep to constraints at the nodes alone after the first plan,
-    whatever ``between_nodes`` says, linear ones at the middles of steps, too.
+    linearization, so a plan satisfies them to the accuracy of few iterations, which ``Solution.violation`` has. A goal
+    (:class:`ReachFrame`) applies to the end of every horizon. The size of a margin is that of the first plan. After the
+    first plan held controls keep to constraints at the nodes alone, whatever ``between_nodes`` says, linear ones at the
+    middles of steps, too.
 
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
@@ -400,14 +333,14 @@ class Mpc:
             raise Interrupted(loop.motion()) from None
         # The controller corrects the errors of a tick in the next.
         motion = check(plant.scene, loop.method, chained(loop.parts), restart=plant.substeps)
-        kept = loop.kept(motion)
+        constraints, violated = loop.constraints(motion)
         found = (
             *noise_forgotten(plant.scene, rng),
             *unstable_loop(plant.scene, motion, plant.substeps),
             *motion.warnings,
             *_alternating(motion, plant.substeps),
             *loop.findings(),
-            *(finding for item in kept for finding in item.findings()),
+            *violated,
         )
         announce(logger, plant.scene.announced, loop.dt, found)
         again = {(finding.kind, finding.joint) for finding in found}
@@ -421,7 +354,7 @@ class Mpc:
             np.array(loop.failed),
             self.period,
             self.budget,
-            constraints=kept,
+            constraints=constraints,
             warnings=(*(finding.about("the first plan: ") for finding in first), *found),
         )
 
@@ -536,21 +469,40 @@ class _Loop:
             found.append(Finding("failed ticks", text))
         return found
 
-    def kept(self, motion: Trajectory) -> tuple[Kept, ...]:
-        """Violations of each constraint by the plans and by the plant's motion."""
-        problem = self.problem
-        if not problem.constraints:
-            return ()
+    def constraints(self, motion: Trajectory) -> tuple[tuple[ConstraintReport, ...], list[Finding]]:
+        """How well the plant's motion satisfied each constraint, and warnings about it and about plans."""
+        problem, reports, found = self.problem, [], []
         # A plant's motion has the means of lines over its steps.
         hold = 1 if problem.linear else self.plant.substeps
-        found = []
+        violated = np.array([_violated(plan) for plan in self.plans])
         for i, bound in enumerate(problem.constraints_on(motion.dt, motion.steps, hold, linear=False)):
-            planned = np.array([plan.constraints[i].violation for plan in self.plans])
-            moved, t = np.zeros(0), np.zeros(0)
-            if not bound.source.equality:
-                moved, t = np.maximum(bound.value(motion.q, motion.v, motion.u), 0.0).max(axis=1), bound.times
-            found.append(Kept(bound.source.label, bound.unit, REPORTED * bound.scale, planned, moved, t))
-        return tuple(found)
+            label = problem.label_of(bound.source)
+            if violated[:, i].any():
+                planned = [plan.constraints[i].violation for plan in self.plans]
+                tick = int(np.argmax(planned))
+                text = (
+                    f"in {int(violated[:, i].sum())} of {len(planned)} ticks no plan was found that keeps to {label}; "
+                    f"in tick {tick} it is violated by {planned[tick]:.2g} {bound.unit}. Use a longer horizon, wider "
+                    "limits or more iterations"
+                )
+                found.append(Finding("infeasible ticks", text))
+            if bound.source.equality:
+                continue
+            c = bound.value(motion.q, motion.v, motion.u)
+            reports.append(ConstraintReport(label, bound.rows, bound.unit, bound.times, c, np.zeros_like(c), False))
+            if (worst := reports[-1].violation) > REPORTED * bound.scale:
+                text = (
+                    f"the plant's motion violates {label} by {worst:.2g} {bound.unit}, {reports[-1].where}. Use a "
+                    "narrower bound, margin= against noise, a smaller dt or more iterations"
+                )
+                found.append(Finding("motion outside constraints", text, value=worst, unit=bound.unit))
+        return tuple(reports), found
+
+
+def _violated(plan: Solution) -> list[bool]:
+    """Whether a plan violates each of its constraints by more than a thousandth of its range."""
+    bounds = plan.problem.bound_constraints
+    return [told.violation > REPORTED * bound.scale for told, bound in zip(plan.constraints, bounds, strict=True)]
 
 
 def _require_fit(plant: Scene, planned: Scene) -> None:
