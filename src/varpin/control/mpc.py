@@ -17,7 +17,7 @@ from varpin.control.chatter import alternation
 from varpin.control.commands import shifted_commands
 from varpin.control.constraints import BoundRate
 from varpin.control.costs import CostError
-from varpin.control.history import ITERATIONS, Status
+from varpin.control.history import Status
 from varpin.control.multipliers import REPORTED, ConstraintReport, Multipliers, at_nodes, flat
 from varpin.control.search import Search
 from varpin.control.solution import rest_of
@@ -179,11 +179,10 @@ class Mpc:
     Main args:
         problem: The problem. Its horizon, discretization, noise, limits and constraints apply to every tick, its
             initial state and ``t0`` to the first.
-        iterations: Greatest number of iterations in a tick.
+        iterations: Greatest number of iterations in a tick after the first, which is :func:`varpin.solve`'s.
 
     Other Args:
         tolerance: Tolerance of the search; see :func:`varpin.solve`.
-        first_iterations: Greatest number of iterations in the first tick, which has no plan to start from.
         budget: Time for planning in a tick [s]. No iteration begins that would exceed it if it took as long as the
             longest one of the tick. A late plan is discarded, and so is a failure to find one by then: the previous
             plan acts with its feedback, and ``MpcRun.late`` marks the tick. Beyond that plan's horizon the robot is
@@ -194,14 +193,12 @@ class Mpc:
     problem: OptimalControlProblem
     iterations: int = 2
     tolerance: float = 1e-6
-    first_iterations: int = ITERATIONS
     budget: float = np.inf
 
     def __post_init__(self) -> None:
         if not isinstance(self.problem, OptimalControlProblem):
             raise InputError(f"problem must be an OptimalControlProblem, got {type(self.problem).__name__}")
         count("iterations", self.iterations, least=1)
-        count("first_iterations", self.first_iterations, least=1)
         positive("tolerance", self.tolerance, "1")
         if self.budget != np.inf:
             positive("budget", self.budget, "s")
@@ -209,7 +206,7 @@ class Mpc:
     def _repr_html_(self) -> str:
         rows = [
             ("period", f"{1e3 * self.period:.3g} ms"),
-            ("iterations", f"{self.iterations} a tick, {self.first_iterations} in the first"),
+            ("iterations", f"{self.iterations} a tick"),
             ("budget", "any time" if self.budget == np.inf else f"{1e3 * self.budget:.3g} ms"),
         ]
         return facts("Model predictive control", rows, self.problem._repr_html_())
@@ -276,8 +273,7 @@ class Mpc:
 
     def _first_plan(self, problem: OptimalControlProblem) -> tuple[Solution, tuple[Finding, ...]]:
         """The first plan of a run and the findings about it."""
-        plan = solve(problem, tolerance=self.tolerance, max_iterations=self.first_iterations, check=False)
-        return looked_at(plan)
+        return looked_at(solve(problem, tolerance=self.tolerance, check=False))
 
     @one_thread()
     def run(

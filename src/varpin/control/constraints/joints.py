@@ -128,10 +128,7 @@ class BoundRate(BoundConstraint):
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
         """See :meth:`BoundConstraint.value`."""
-        return self.of_decisions(u[..., :: self.hold, :])
-
-    def of_decisions(self, u: Floats) -> Floats:
-        """The values c (..., K, rows) for decisions u (..., R, m)."""
+        u = u[..., :: self.hold, :]
         first = u[..., :1, :] if self.before is None else np.broadcast_to(self.before, (*u.shape[:-2], 1, u.shape[-1]))
         rate = np.diff(u, axis=-2, prepend=first)[..., self.places, :] / self.period
         rates, most = rate[..., self.limited], self.limit[self.limited]
