@@ -102,11 +102,12 @@ class FrameOrientationCost(_FrameCost):
     def bind(self, points: Points) -> BoundTerm:
         """See :meth:`Cost.bind`."""
         bound = super().bind(points)
-        if callable(self.target):
-            try:
-                _require_rotations(bound.target)
-            except InputError as error:
+        try:
+            _require_rotations(bound.target)
+        except InputError as error:
+            if callable(self.target):
                 raise CostError("FrameOrientationCost", str(error)) from error
+            raise
         return replace(bound, target=bound.target.reshape(-1, 9))
 
     def _take(self, robot: Robot, frame: str | None, target: ReferenceValues, weight: ArrayLike) -> None:
