@@ -39,7 +39,7 @@ from varpin.mechanics.scene import Scene, closest_controls, differences, require
 from varpin.signals.commands import cubics
 from varpin.signals.inputs import as_moved
 from varpin.signals.policy import LinearPolicy, OpenLoop
-from varpin.simulation.choice import usual_kick
+from varpin.simulation.choice import usual_integrator, usual_kick
 from varpin.simulation.simulate import simulate
 from varpin.simulation.spectrum import damping_matrices, rate_at_rest
 from varpin.simulation.start import on_constraints
@@ -107,9 +107,10 @@ class OptimalControlProblem(Frozen):
         v0: Initial velocity (n,) [rad/s or m/s]; also by joint name, and corrected in the same way.
         dt: Time step [s].
         steps: N. ``duration=``, steps * dt [s], may be given instead of one of the two.
-        integrator: Any of varpin's. If left out, ``Gauss(stages=4)``; ``Radau(stages=4)`` where dry friction or dampers
-            are more than 10 times as fast as the step at ``q0`` and rest, and the scene has no constraints. Both with
-            ``kick="held"`` where the scene has noise.
+        integrator: Any of varpin's. If left out, ``Gauss(stages=3)`` where no swing, damper or friction is fast in a
+            step at ``q0`` and rest, so that :func:`varpin.simulate` takes two stages; ``Radau(stages=4)`` where dry
+            friction or dampers are more than 10 times as fast as the step, and the scene has no constraints; else
+            ``Gauss(stages=4)``. All with ``kick="held"`` where the scene has noise.
         sampling: Where in each step running costs are sampled. ``"gauss"``, the default: at its two Gauss points, with
             a cubic motion between the nodes, of fourth order; at four points where a :class:`varpin.KinematicInput` is
             cubic. ``"midpoint"``: at ((q + q')/2, (q' - q)/dt, u), of
@@ -740,18 +741,23 @@ def default_integrator() -> Gauss:
 
 
 def integrator_for(scene: Scene, q0: Floats, dt: float) -> Gauss | Radau:
-    """The integrator of a problem that gives none: the default, or the L-stable one of as many stages.
+    """The integrator of a problem that gives none: the default, with three stages in calm steps, or the L-stable one.
+
+    Three stages where no swing or damper of the start is fast in a step, so that :func:`varpin.simulate` takes two: in
+    reaches of four arms their plans lost at most 4e-5 more than those of four, in three quarters of the time.
 
     A mode z times as fast as the step decays by the factor 1 - 40 / z in a step of Gauss(4), and rings after each jump
     of a held control. In reaches of damped arms, plans of the L-stable method lose less from z = 10 on, and those of
     the default up to 5. With constraints of the scene it is always the default, since Radau's methods do not support
     them. Noise is held over the step: in the long steps of plans an impulse costs two to five times as much.
     """
-    stages: int = default_integrator().stages
-    kick = usual_kick(scene)
-    if scene.constraints or not dt * rate_at_rest(scene, q0) > _STIFF:
-        return Gauss(stages=stages, kick=kick)
-    return Radau(stages=stages, kick=kick)
+    kick, stages = usual_kick(scene), default_integrator().stages
+    if not scene.constraints and dt * rate_at_rest(scene, q0) > _STIFF:
+        return Radau(stages, kick=kick)
+    if scene.constraints or scene.custom is not None:
+        return Gauss(stages, kick=kick)
+    usual = usual_integrator(scene, q0, np.zeros_like(q0), dt, noisy=False)
+    return Gauss(3 if usual == Gauss(2, kick=kick) else stages, kick=kick)
 
 
 def _control_limits(given: tuple[JointValues, JointValues] | None, scene: Scene) -> Floats:
