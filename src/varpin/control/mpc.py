@@ -88,7 +88,7 @@ class MpcRun(Frozen):
             margins; goals, which apply to the end of each plan, are left out.
         warnings: Warnings about the first plan that do not recur in the plant's motion; about the motion, as in
             :attr:`Trajectory.warnings`, and its velocities from tick to tick; about planning that took longer than the
-            budget, or without one than the period, in more than one tick of twenty; about failed ticks; and about
+            budget or the period in more than one tick of twenty; about failed ticks; and about
             constraints that plans or the motion violated.
     """
 
@@ -335,7 +335,8 @@ class Mpc:
             *unstable_loop(plant.scene, motion, plant.substeps),
             *motion.warnings,
             *_alternating(motion, plant.substeps),
-            *loop.findings(),
+            *loop.late_ticks(),
+            *loop.failed_ticks(),
             *violated,
         )
         announce(logger, plant.scene.announced, loop.dt, found)
@@ -441,29 +442,30 @@ class _Loop:
     def motion(self) -> Trajectory:
         """The plant's motion so far, with its warnings and that of failed ticks."""
         motion = chained(self.parts)
-        found = beyond_limits(self.plant.scene, motion), self.findings(failed=True)
-        return motion.changed(warnings=(*found[0], *found[1]))
+        return motion.changed(warnings=(*beyond_limits(self.plant.scene, motion), *self.failed_ticks()))
 
-    def findings(self, *, failed: bool = False) -> list[Finding]:
-        """Warnings about late ticks and failed ones, or about those that ``failed`` alone."""
-        found, planned = [], len(self.seconds) - 1
-        limit = self.controller.period if self.controller.budget == np.inf else self.controller.budget
-        seconds = np.array(self.seconds[1:])
+    def late_ticks(self) -> tuple[Finding, ...]:
+        """A warning if more than a few plans took longer than the budget or the period."""
+        seconds, limit = np.array(self.seconds[1:]), min(self.controller.period, self.controller.budget)
         slow = int((seconds > limit).sum())
-        if slow > _FEW * planned and not failed:
-            mean = 1e3 * seconds.mean()
-            text = (
-                f"planning took longer than {1e3 * limit:.3g} ms in {slow} of {planned} ticks ({mean:.3g} ms in the "
-                "mean). Use fewer steps, fewer iterations, a longer period (hold=) or a larger budget"
-            )
-            found.append(Finding("late plans", text))
-        if any(self.failed):
-            text = (
-                f"in {sum(self.failed)} of {planned} ticks no plan was found and an older one acted, at t = "
-                f"{self.failed.index(True) * self.controller.period:.4g} s for the first time: {self.reasons[0]}"
-            )
-            found.append(Finding("failed ticks", text))
-        return found
+        if not slow > _FEW * len(seconds):
+            return ()
+        text = (
+            f"planning took longer than {1e3 * limit:.3g} ms in {slow} of {len(seconds)} ticks "
+            f"({1e3 * seconds.mean():.3g} ms in the mean). Use fewer steps, fewer iterations, a larger budget or a "
+            "longer period (hold=)"
+        )
+        return (Finding("late plans", text),)
+
+    def failed_ticks(self) -> tuple[Finding, ...]:
+        """A warning if searches found no plan."""
+        if not self.reasons:
+            return ()
+        text = (
+            f"in {sum(self.failed)} of {len(self.failed) - 1} ticks no plan was found and an older one acted, at t = "
+            f"{self.failed.index(True) * self.controller.period:.4g} s for the first time: {self.reasons[0]}"
+        )
+        return (Finding("failed ticks", text),)
 
     def constraints(self, motion: Trajectory) -> tuple[tuple[ConstraintReport, ...], list[Finding]]:
         """How well the plant's motion satisfied each constraint, and warnings about it and about plans."""
