@@ -368,14 +368,6 @@ class Robot(Frozen):
         return limit
 
 
-def require_robot(robot: object, taker: str = "") -> Robot:
-    """``robot`` itself; an InputError if it is no Robot, which names the taker, if there is one."""
-    if not isinstance(robot, Robot):
-        where = f"{taker}: " if taker else ""
-        raise InputError(f"{where}robot must come from load_robot, got {type(robot).__name__}")
-    return robot
-
-
 def require_same(name: str, made_for: Robot, robot: Robot | None) -> None:
     """Raise an InputError for something, ``name``, that was made for another robot than a problem's."""
     if robot is not None and not made_for.built_like(robot):
@@ -383,6 +375,14 @@ def require_same(name: str, made_for: Robot, robot: Robot | None) -> None:
             f"{name} is for robot {made_for.name!r} with {made_for.dof} coordinates, another one than the problem's "
             f"{robot.name!r} with {robot.dof}, or one of other lengths; make it with scene.robot"
         )
+
+
+def require_robot(robot: object, taker: str = "") -> Robot:
+    """``robot`` itself; an InputError if it is no Robot, which names the taker, if there is one."""
+    if not isinstance(robot, Robot):
+        where = f"{taker}: " if taker else ""
+        raise InputError(f"{where}robot must come from load_robot, got {type(robot).__name__}")
+    return robot
 
 
 def load_robot(
