@@ -10,7 +10,6 @@ from varpin.model.robot import geometry as geometry
 from varpin.model.robot import load_robot as load_robot
 from varpin.model.robot import readable_geometry as readable_geometry
 from varpin.model.robot import require_robot as require_robot
-from varpin.model.robot import require_same as require_same
 from varpin.model.sources import bundled_robots as bundled_robots
 from varpin.model.sources import models_dir as models_dir
 from varpin.model.sources import robot_names as robot_names

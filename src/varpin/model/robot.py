@@ -368,15 +368,6 @@ class Robot(Frozen):
         return limit
 
 
-def require_same(name: str, made_for: Robot, robot: Robot | None) -> None:
-    """Raise an InputError for something, ``name``, that was made for another robot than a problem's."""
-    if robot is not None and not made_for.built_like(robot):
-        raise InputError(
-            f"{name} is for robot {made_for.name!r} with {made_for.dof} coordinates, another one than the problem's "
-            f"{robot.name!r} with {robot.dof}, or one of other lengths; make it with scene.robot"
-        )
-
-
 def require_robot(robot: object, taker: str = "") -> Robot:
     """``robot`` itself; an InputError if it is no Robot, which names the taker, if there is one."""
     if not isinstance(robot, Robot):

@@ -18,8 +18,9 @@ from varpin.control.constraints.base import (
     checked_margin,
 )
 from varpin.errors import InputError
-from varpin.model import Robot, require_robot, require_same
+from varpin.model import Robot, require_robot
 from varpin.model.clearance import Clearance, Obstacle, clearance
+from varpin.model.kinematics import require_same
 from varpin.support.checks import finite, flag, path_like
 
 

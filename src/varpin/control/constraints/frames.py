@@ -19,8 +19,8 @@ from varpin.control.constraints.base import (
     checked_margin,
 )
 from varpin.errors import InputError
-from varpin.model import Robot, require_robot, require_same
-from varpin.model.kinematics import frame_kinematics
+from varpin.model import Robot, require_robot
+from varpin.model.kinematics import frame_kinematics, require_same
 from varpin.support.checks import checked_limits, finite, finite_array, over_time, positive, rotation_matrix
 
 _XYZ = ("x", "y", "z")

@@ -10,7 +10,8 @@ import numpy as np
 from varpin.arrays import Floats, Integers
 from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, PlanConstraint, checked_margin
 from varpin.errors import InputError
-from varpin.model import Robot, joint_unit, require_robot, require_same
+from varpin.model import Robot, joint_unit, require_robot
+from varpin.model.kinematics import require_same
 from varpin.support.checks import JointValues, as_floats, control_array, control_values, real, some_limits
 
 # Scale of velocities without a finite range [rad/s or m/s].

@@ -18,7 +18,8 @@ from varpin.control.costs.least_squares import (
 )
 from varpin.core import Subject
 from varpin.errors import InputError
-from varpin.model import Robot, require_robot, require_same
+from varpin.model import Robot, require_robot
+from varpin.model.kinematics import require_same
 from varpin.support.checks import JointValues, control_array, joint_array, some_limits
 
 

@@ -20,8 +20,8 @@ from varpin.control.costs.least_squares import (
 )
 from varpin.core import Subject
 from varpin.errors import InputError
-from varpin.model import Robot, require_robot, require_same
-from varpin.model.kinematics import FrameKinematics, Links, frame_kinematics, mass_carriers
+from varpin.model import Robot, require_robot
+from varpin.model.kinematics import FrameKinematics, Links, frame_kinematics, mass_carriers, require_same
 from varpin.support.checks import positive, rotation_matrix
 
 
