@@ -34,17 +34,24 @@ class Minimum(NamedTuple):
 
 
 class Program:
-    """The program (O10) of one motion; :meth:`minimum` solves it, with other values of its rows for corrections."""
+    """The program (O10) of motions with the same rows: its structure is set up once, its values change."""
 
-    def __init__(
-        self,
-        stages: Stages,
-        rows: Sequence[Rows],
-        limits: tuple[Floats, Floats],
-        plan: Plan,
-        regularization: float,
+    def __init__(self, rows: Sequence[Rows]) -> None:
+        self._places = [row.at for row in rows]
+        self._equal = [i for i, row in enumerate(rows) if row.equality]
+        self._other = [i for i, row in enumerate(rows) if not row.equality]
+        self._forms: dict[bool, _Form] = {}
+
+    def fits(self, rows: Sequence[Rows]) -> bool:
+        """Whether the structure is that of these rows."""
+        return len(rows) == len(self._places) and all(
+            row.at is at or np.array_equal(row.at, at) for row, at in zip(rows, self._places, strict=True)
+        )
+
+    def fill(
+        self, stages: Stages, rows: Sequence[Rows], limits: tuple[Floats, Floats], plan: Plan, regularization: float
     ) -> None:
-        """Assemble the matrices.
+        """Fill in the values of a motion.
 
         The cost is that of the changes v = u - K x of the controls beside a backward pass's feedback: half of
         (v - k)' Quu (v - k) for each decision, with k the feed-forward part. That is the cost of the stages up to a
@@ -58,47 +65,24 @@ class Program:
             regularization: A further cost of half the squares of the controls' changes, relative to the diagonal of
                 Quu.
         """
-        self.rows, layout = tuple(rows), stages.layout
-        self.layout, size = layout, layout.size
-        at, beside = layout.decisions(plan.feedback, plan.previous)
+        self.stages, self.rows, layout = stages, tuple(rows), stages.layout
+        self.at, beside = layout.decisions(plan.feedback, plan.previous)
         Quu = _products(plan.factors)
+        diagonal = np.diagonal(Quu, axis1=1, axis2=2)
         pull = np.swapaxes(beside, 1, 2) @ Quu
-        hessian = pull @ beside
+        self.hessian = pull @ beside
         own = np.arange(-Quu.shape[1], 0)
-        hessian[:, own, own] += regularization * np.diagonal(Quu, axis1=1, axis2=2)
-        self._P = _matrix([_square(at, hessian)], (size, size))
+        self.hessian[:, own, own] += regularization * diagonal
         # Largest cost of a control's change by one.
-        self.stiffness = float(np.diagonal(Quu, axis1=1, axis2=2).max())
+        self.stiffness = float(diagonal.max())
         gradient = -(pull @ plan.feedforward[:, :, None])[:, :, 0]
-        self._gradient = np.zeros(size)
-        np.add.at(self._gradient, at[at >= 0], gradient[at >= 0])
+        self.gradient = np.zeros(layout.size)
+        np.add.at(self.gradient, self.at[self.at >= 0], gradient[self.at >= 0])
         # The scale of the cost, to which the solver's residuals are relative.
-        self._scale = float(np.abs(gradient).max()) or float(np.abs(hessian).max()) or 1.0
-        k = np.arange(layout.stages)
-        after, controls = layout.state(k + 1), layout.control(np.arange(len(plan.feedforward)))
-        numbers = np.arange(after.size).reshape(after.shape)
-        self._dynamics = _matrix(
-            [_rectangle(numbers, layout.in_stage(k), stages.J), (numbers.ravel(), after.ravel(), -np.ones(after.size))],
-            (after.size, size),
-        )
-        self._lower, self._upper = np.full(size, -np.inf), np.full(size, np.inf)
-        self._lower[controls], self._upper[controls] = limits
-        self._blocks = [self._of_rows(row, size) for row in self.rows]
-
-    @staticmethod
-    def _of_rows(rows: Rows, size: int) -> sp.csc_matrix:
-        count, width = rows.at.shape
-        numbers = np.repeat(np.arange(count), width)
-        return _matrix([(numbers, rows.at.ravel(), rows.slopes.ravel())], (count, size))
-
-    def _slacks(self, equal: Sequence[int], other: Sequence[int]) -> list[Floats]:
-        """Where the slacks of rows belong among the variables: the two of each equality, then those of other rows."""
-        last = [self.rows[i].at.max(axis=1).astype(float) for i in (*equal, *other)]
-        return [*last[: len(equal)], *last[: len(equal)], *last[len(equal) :]]
-
-    def after_rows(self, z: Floats) -> list[Floats]:
-        """Changes (P,) of the values of all rows at z."""
-        return [block @ z for block in self._blocks]
+        self.scale = float(np.abs(gradient).max()) or float(np.abs(self.hessian).max()) or 1.0
+        self.lower, self.upper = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
+        controls = layout.control(np.arange(len(plan.feedforward)))
+        self.lower[controls], self.upper[controls] = limits
 
     def minimum(
         self, values: Sequence[Floats], gaps: Floats | None = None, weight: float | None = None
@@ -110,72 +94,118 @@ class Program:
             gaps: What the stages miss the states by at z = 0 (R, 2n); zero by default.
             weight: Cost of a violation of each row by one; by default rows are hard.
         """
-        equal = [i for i, rows in enumerate(self.rows) if rows.equality]
-        other = [i for i, rows in enumerate(self.rows) if not rows.equality]
-        A = sp.vstack([self._dynamics, *(self._blocks[i] for i in equal)], format="csc")
-        b = np.concatenate(
-            [np.zeros(self._dynamics.shape[0]) if gaps is None else gaps.ravel(), *(-values[i] for i in equal)]
-        )
-        P, c, lower, upper = self._P / self._scale, self._gradient / self._scale, self._lower, self._upper
-        G = sp.vstack([self._blocks[i] for i in other], format="csc") if other else None
-        h = np.concatenate([-values[i] for i in other]) if other else None
-        size = len(c)
-        if weight is not None:
-            of_equal, of_other = len(b) - self._dynamics.shape[0], 0 if h is None else len(h)
-            slack = 2 * of_equal + of_other
-            cost = weight / self._scale
-            P = sp.block_diag([P, _UNIQUE * cost * sp.eye(slack)], format="csc")
-            c, lower = np.append(c, np.full(slack, cost)), np.append(lower, np.zeros(slack))
-            upper = np.append(upper, np.full(slack, np.inf))
-            one, other_one = sp.eye(of_equal), sp.eye(of_other)
-            both = sp.hstack([one, -one, sp.csc_matrix((of_equal, of_other))])
-            none = sp.csc_matrix((self._dynamics.shape[0], slack))
-            A = sp.hstack([A, sp.vstack([none, both])], format="csc")
-            if G is not None:
-                G = sp.hstack([G, sp.csc_matrix((of_other, 2 * of_equal)), -other_one], format="csc")
-        # The solver factors stage by stage, if the slacks of rows are where their stages are.
-        order = np.argsort(
-            np.concatenate([np.arange(size), *self._slacks(equal, other)]) if weight is not None else np.arange(size),
-            kind="stable",
-        )
-        P, A, G = P[order][:, order], A[:, order], None if G is None else G[:, order]
-        found = _solved(P, c[order], A, b, G, h, lower[order], upper[order])
+        elastic = weight is not None
+        if elastic not in self._forms:
+            self._forms[elastic] = _Form(self, self._equal, self._other, elastic=elastic)
+        layout = self.stages.layout
+        still = np.zeros(layout.stages * layout.states) if gaps is None else gaps.ravel()
+        b = np.concatenate([still, *(-values[i] for i in self._equal)])
+        h = np.concatenate([-values[i] for i in self._other]) if self._other else None
+        found = self._forms[elastic].solve(b, h, (weight or 0.0) / self.scale)
         if found is None:
             return None
-        z = np.empty(len(order))
-        z[order] = found.x
-        y = self._scale * found.y
-        own = iter(np.split(y[self._dynamics.shape[0] :], np.cumsum([len(values[i]) for i in equal])[:-1]))
-        push = iter(np.split(self._scale * found.z_u, np.cumsum([len(values[i]) for i in other])[:-1]) if other else ())
-        multipliers = tuple(next(own) if rows.equality else next(push) for rows in self.rows)
-        return Minimum(z[:size], multipliers, float(z[size:].sum()))
+        z, y, push = found
+        ends = [np.cumsum([len(values[i]) for i in some])[:-1] for some in (self._equal, self._other)]
+        own = iter(np.split(self.scale * y[len(still) :], ends[0]))
+        others = iter(np.split(self.scale * push, ends[1]))
+        multipliers = tuple(next(own) if row.equality else next(others) for row in self.rows)
+        return Minimum(z[: layout.size], multipliers, float(z[layout.size :].sum()))
 
 
-def _solved(
-    P: sp.csc_matrix,
-    c: Floats,
-    A: sp.csc_matrix,
-    b: Floats,
-    G: sp.csc_matrix | None,
-    h: Floats | None,
-    lower: Floats,
-    upper: Floats,
-) -> Any:
-    """PIQP's result; None where there is no minimum or the solver fails."""
-    # Stage by stage is faster, the factors of the whole matrix are more accurate.
-    for kind in (piqp.KKTSolver.sparse_multistage, piqp.KKTSolver.sparse_ldlt):
-        solver = piqp.SparseSolver()
-        settings = solver.settings
-        settings.kkt_solver = kind
-        settings.eps_abs, settings.eps_rel, settings.max_iter = _ABSOLUTE, _RELATIVE, _STEPS
-        solver.setup(P, c, A, b, G, None, h, lower, upper)
-        status, known = solver.solve(), solver.result.info
-        rounded = status == piqp.PIQP_MAX_ITER_REACHED and max(known.primal_res, known.dual_res) <= _ROUNDED
-        if status == piqp.PIQP_SOLVED or rounded:
-            return solver.result
-        if status == piqp.PIQP_PRIMAL_INFEASIBLE:
-            return None
-    return None
+class _Form:
+    """A program with hard or with elastic rows, and its solvers.
+
+    Each row gets a slack, an equality two. The solver factors stage by stage, if these are where their stages are.
+    """
+
+    def __init__(self, program: Program, equal: Sequence[int], other: Sequence[int], *, elastic: bool) -> None:
+        self.program, self.equal, self.other = program, equal, other
+        layout, rows = program.stages.layout, program.rows
+        last = {i: rows[i].at.max(axis=1) for i in (*equal, *other)} if elastic else {}
+        ends = [[last[i] for i in some if i in last] for some in (equal, equal, other)]
+        places = [np.arange(layout.size), *(part for some in ends for part in some)]
+        self.order = np.argsort(np.concatenate(places), kind="stable")
+        size = len(self.order)
+        self.slacks = size - layout.size
+        rank = np.empty(size + 1, dtype=np.int64)
+        rank[self.order], rank[-1] = np.arange(size), -1  # of no variable: the last
+        k = np.arange(layout.stages)
+        after, at, decisions = rank[layout.state(k + 1)], rank[layout.in_stage(k)], rank[program.at]
+        numbers = np.arange(after.size).reshape(after.shape)
+        slack = rank[layout.size : size]
+        pairs = sum(len(rows[i].at) for i in equal)
+        own = after.size + np.arange(pairs)
+        A = [_rectangle(numbers, at), (numbers, after), *_of_rows([rank[rows[i].at] for i in equal], after.size)]
+        G = _of_rows([rank[rows[i].at] for i in other], 0)
+        if elastic:
+            A.append((np.concatenate([own, own]), slack[: 2 * pairs]))
+            G.append((np.arange(self.slacks - 2 * pairs), slack[2 * pairs :]))
+        self.P = _Pattern([_rectangle(decisions, decisions), (slack, slack)], (size, size))
+        self.A = _Pattern(A, (after.size + pairs, size))
+        self.G = _Pattern(G, (sum(len(rows[i].at) for i in other), size)) if other else None
+        self.halves = np.concatenate([np.ones(pairs), -np.ones(pairs)]) if elastic else np.zeros(0)
+        self.solvers: dict[Any, Any] = {}
+
+    def solve(self, b: Floats, h: Floats | None, cost: float) -> tuple[Floats, Floats, Floats] | None:
+        """The variables and the multipliers of equalities and rows; None where there is no minimum."""
+        program, S, rows = self.program, self.slacks, self.program.rows
+        c = np.append(program.gradient / program.scale, np.full(S, cost))[self.order]
+        lower = np.append(program.lower, np.zeros(S))[self.order]
+        upper = np.append(program.upper, np.full(S, np.inf))[self.order]
+        J = program.stages.J
+        P = self.P.filled([program.hessian / program.scale, np.full(S, _UNIQUE * cost)])
+        A = self.A.filled([J, -np.ones(J[:, :, 0].size), *(rows[i].slopes for i in self.equal), self.halves])
+        G = None
+        if self.G is not None:
+            G = self.G.filled([*(rows[i].slopes for i in self.other), -np.ones(S - len(self.halves))])
+        # Stage by stage is faster, the factors of the whole matrix are more accurate.
+        for kind in (piqp.KKTSolver.sparse_multistage, piqp.KKTSolver.sparse_ldlt):
+            solver = self.solvers.get(kind)
+            if solver is None:
+                solver = self.solvers[kind] = piqp.SparseSolver()
+                settings = solver.settings
+                settings.kkt_solver = kind
+                settings.eps_abs, settings.eps_rel, settings.max_iter = _ABSOLUTE, _RELATIVE, _STEPS
+                solver.setup(P, c, A, b, G, None, h, lower, upper)
+            else:
+                solver.update(P, c, A, b, G, None, h, lower, upper)
+            status, found = solver.solve(), solver.result
+            known = found.info
+            rounded = status == piqp.PIQP_MAX_ITER_REACHED and max(known.primal_res, known.dual_res) <= _ROUNDED
+            if status == piqp.PIQP_SOLVED or rounded:
+                z = np.empty(len(self.order))
+                z[self.order] = found.x
+                return z, found.y.copy(), found.z_u.copy()
+            if status == piqp.PIQP_PRIMAL_INFEASIBLE:
+                return None
+        return None
+
+
+_Entries = tuple[Integers, Integers]
+
+
+class _Pattern:
+    """A sparse matrix whose entries change: those of variables that are given are left out, those at one place add."""
+
+    def __init__(self, entries: Sequence[_Entries], shape: tuple[int, int]) -> None:
+        i, j = (np.concatenate([np.ravel(part) for part in parts]) for parts in zip(*entries, strict=True))
+        self._kept = (i >= 0) & (j >= 0)
+        i, j = i[self._kept], j[self._kept]
+        places, self._at = np.unique(j * shape[0] + i, return_inverse=True)
+        begins = np.searchsorted(places, np.arange(shape[1] + 1) * shape[0])
+        self._matrix = sp.csc_matrix((np.zeros(len(places)), places % shape[0], begins), shape)
+
+    def filled(self, values: Sequence[Floats]) -> sp.csc_matrix:
+        """The matrix with the values of all entries."""
+        given = np.concatenate([np.ravel(part) for part in values])[self._kept]
+        self._matrix.data[:] = np.bincount(self._at, given, len(self._matrix.data))
+        return self._matrix
+
+
+def changes(rows: Sequence[Rows], z: Floats) -> list[Floats]:
+    """Changes (P,) of the values of all rows at z."""
+    padded = np.append(z, 0.0)
+    return [(row.slopes * np.where(row.at >= 0, padded[row.at], 0.0)).sum(axis=1) for row in rows]
 
 
 def _products(factors: Floats) -> Floats:
@@ -185,23 +215,17 @@ def _products(factors: Floats) -> Floats:
     return found
 
 
-_Entries = tuple[Integers, Integers, Floats]
-
-
-def _square(at: Integers, blocks: Floats) -> _Entries:
-    """The entries of blocks (K, Z, Z) at variables (K, Z)."""
-    return _rectangle(at, at, blocks)
-
-
-def _rectangle(rows: Integers, columns: Integers, blocks: Floats) -> _Entries:
-    """The entries of blocks (K, A, B) at rows (K, A) and columns (K, B)."""
-    shape = blocks.shape
+def _rectangle(rows: Integers, columns: Integers) -> _Entries:
+    """The places of blocks (K, A, B) at rows (K, A) and columns (K, B)."""
+    shape = (*rows.shape, columns.shape[1])
     i, j = np.broadcast_to(rows[:, :, None], shape), np.broadcast_to(columns[:, None, :], shape)
-    return i.ravel(), j.ravel(), blocks.ravel()
+    return i.ravel(), j.ravel()
 
 
-def _matrix(entries: Sequence[_Entries], shape: tuple[int, int]) -> sp.csc_matrix:
-    """A sparse matrix of entries, those of variables that are given left out."""
-    i, j, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
-    kept = (i >= 0) & (j >= 0) & (values != 0.0)
-    return sp.csc_matrix((values[kept], (i[kept], j[kept])), shape=shape)
+def _of_rows(columns: Sequence[Integers], first: int) -> list[_Entries]:
+    """The places of rows with entries in columns (P, Z), numbered from ``first`` on."""
+    found = []
+    for at in columns:
+        found.append((np.repeat(first + np.arange(len(at)), at.shape[1]), at))
+        first += len(at)
+    return found

@@ -31,7 +31,7 @@ from varpin.control.margins import widened
 from varpin.control.multipliers import FEASIBLE, Multipliers, flat, split
 from varpin.control.passes import Plan, foreseen, noise_shares, single_pass
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.qp import Minimum, Program
+from varpin.control.qp import Minimum, Program, changes
 from varpin.control.second_order import curvature_along
 from varpin.control.solution import Solution
 from varpin.control.spread import Feedback, deviations, state_slopes
@@ -198,6 +198,7 @@ class Search:
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
         self._expansions: Along | None = None
         self._enforce(NOWHERE)
+        self.program = None
 
     def begin(self, commands: Commands) -> None:
         """Begin with the motion under commands.
@@ -396,7 +397,9 @@ class Search:
         given = problem.begin
         if given is not None:
             least[0], most[0] = (np.where(np.isnan(given), part[0], 0.0) for part in (least, most))
-        self.program = Program(stages, rows, (least, most), plan, self.regularization)
+        if self.program is None or not self.program.fits(rows):
+            self.program = Program(rows)
+        self.program.fill(stages, rows, (least, most), plan, self.regularization)
         return self._solve_program()
 
     def _is_saturated(self) -> bool:
@@ -870,7 +873,7 @@ class Search:
         moved = (states(problem, motion) - states(problem, self.trajectory))[:: problem.hold]
         z = layout.joined(moved, problem.decided(motion) - problem.decided(self.trajectory))
         values = [
-            there - change for there, change in zip(self._values(motion), self.program.after_rows(z), strict=True)
+            there - change for there, change in zip(self._values(motion), changes(self.rows, z), strict=True)
         ]
         weight = self.weight if self._elastic else None
         found = self.program.minimum(values, self.stages.gaps_of(z), weight)
