@@ -196,7 +196,7 @@ def reach(robot, goal, limits, **options):
         scene, cost, begin, np.zeros(6), dt=1e-2, steps=100, control_limits=(-limits, limits),
         integrator=vp.Midpoint(), sampling="midpoint",
     )  # fmt: skip
-    return vp.solve(problem, backtracking=0.5, max_iterations=20, **options), R, p
+    return vp.solve(problem, max_iterations=20, **options), R, p
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
@@ -232,7 +232,7 @@ def test_a_double_pendulum_swings_up_by_its_elbow():
     problem = vp.OptimalControlProblem(
         scene, cost, [np.pi / 2, 0.0], [0.0, 0.0], dt=0.02, steps=200, control_limits=(-8.0, 8.0)
     )
-    sol = vp.solve(problem, backtracking=0.5, max_iterations=300)
+    sol = vp.solve(problem, max_iterations=300)
     assert sol.status.converged
     assert np.abs(sol.controls).max() == 8.0
     np.testing.assert_allclose(sol.trajectory.q[-1], up, atol=5e-3)

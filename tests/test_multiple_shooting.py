@@ -1,7 +1,6 @@
 """Searches that start on states: where they end, in how many iterations, and what they refuse."""
 
 import contextlib
-import logging
 
 import numpy as np
 import pinocchio as pin
@@ -125,17 +124,6 @@ def test_interrupted_while_gaps_are_closed():
     assert len(found.history) == 1
     assert problem.cost_of(problem.simulate(found.controls)) < np.inf
     assert vp.solve(problem, resume=found, check=False).status.converged
-
-
-def test_paths_beyond_limits_are_told_of(caplog):
-    robot = vp.load_robot("ur5")
-    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(np.zeros(6), 10.0))
-    problem = vp.OptimalControlProblem(vp.Scene(robot), cost, np.zeros(6), np.zeros(6), dt=0.02, steps=10)
-    path = np.zeros((11, 6))
-    path[5, 2] = 9.0
-    with caplog.at_level(logging.WARNING):
-        vp.solve(problem, states=path, max_iterations=0, check=False)
-    assert naming(caplog.messages, "'elbow_joint'", "node 5")
 
 
 @pytest.mark.parametrize(
