@@ -69,8 +69,8 @@ _NOTHING = 1e-9
 _ABOVE, _HEAVY = 1.5, 10.0
 # Regularization from which on rows may be missed: it shortens steps only then; from 1e-4 to 1.
 _YIELDING = 1e-2
-# Slack of rows that are met, relative to the violations.
-_MET = 1e-6
+# Slack of rows that are met, and of rows that a step approaches, relative to the violations; the latter from 0.5 on.
+_MET, _APPROACHED = 1e-6, 0.9
 # Decrease, as a share of the cost at stake, from which on motions are looked at between nodes; from 1e-4 to 1e-2.
 _CLOSE = 1e-3
 # How often margins are widened by counting motions.
@@ -339,23 +339,15 @@ class Search:
         program = Program(stages, rows, (least, most), plan, self.regularization if rows else 0.0)
         self.program = program
         values, bad = [row.values for row in rows], self._badness
-        elastic = bool(rows) and self.regularization > _YIELDING
-        found = None if elastic else program.minimum(values)
+        found = None if rows and self.regularization > _YIELDING else program.minimum(values)
         needed = np.inf if found is None else _ABOVE * _largest(found.multipliers)
         # Rows that cost far more than what is at stake are approached step by step.
-        dear = max(
-            self.weight,
-            _HEAVY * max(abs(self.cost), self.first),
-            1e-6 * needed if needed < np.inf else _HEAVY * program.stiffness,
-        )
+        dear = max(self.weight, _HEAVY * (max(abs(self.cost), self.first) or program.stiffness))
         elastic = bool(rows) and needed > dear
         if elastic:
-            self.weight = dear
-            missed = program.minimum(values, weight=self.weight)
-            while missed is not None and missed.slack > 0.9 * bad and self.weight < needed < np.inf:
-                self.weight *= _HEAVY
-                missed = program.minimum(values, weight=self.weight)
-            found = missed or found
+            missed = program.minimum(values, weight=dear)
+            elastic = missed is not None and (found is None or missed.slack <= _APPROACHED * bad)
+            found, self.weight = (missed, dear) if elastic else (found, self.weight)
         self.unsolved = found is None
         if found is None:
             return False
