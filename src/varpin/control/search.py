@@ -59,7 +59,7 @@ _LONG, _SHORT, _VERY_SHORT = 0.25, 0.1, 0.01
 # Greatest regularization with which a search may end; from 1e-6 to 1e-2.
 _LITTLE = 1e-4
 # Iterations that together gain no more than the tolerance, or hardly lower violations, before a search ends.
-_PATIENCE = 15
+_PATIENCE = 10
 # Share of the violations that a search has to remove, at its end or in that many iterations; from 1e-3 to 1e-1.
 _REMOVED = 1e-2
 # Share of the first motion's cost at stake that counts beside that of the present one.
