@@ -313,7 +313,7 @@ def test_quadratic_convergence(sampling, hold):
     linear = np.log([item.expected_decrease / gauss.cost for item in gauss.history])
     assert linear[-1] / linear[-2] < 1.1
     # Far from the optimum both go alike; it is near it that Newton's method takes fewer iterations.
-    near = np.log(1e-3)
+    near = np.log(1e-5)
     assert (promised < near).sum() <= 0.6 * (linear < near).sum()
     np.testing.assert_allclose(newton.controls, gauss.controls, rtol=0, atol=1e-5 * np.abs(gauss.controls).max())
 
@@ -597,10 +597,6 @@ def test_warm_starts_that_do_not_fit():
 @pytest.mark.parametrize(
     ("options", "facts"),
     [
-        ({"forward": "sideways"}, "forward"),
-        ({"backtracking": 1.0}, "backtracking"),
-        ({"backtracking": "a"}, "backtracking"),
-        ({"armijo": 2.0}, "armijo"),
         ({"tolerance": 0.0}, "tolerance"),
         ({"tolerance": np.nan}, "tolerance"),
         ({"regularization": -1.0}, "regularization"),
@@ -666,12 +662,6 @@ def test_the_same_problem_otherwise():
     rows = vp.TrackingCost(np.zeros((21, 2)))
     with refused(vp.InputError, "(41, 2)"):
         small(rows).at(dt=0.025)
-
-
-@pytest.mark.parametrize("forward", ["closed", "open"])
-def test_forward_passes_agree(forward):
-    best = vp.solve(reach_problem(0.02), tolerance=1e-12)
-    assert vp.solve(reach_problem(0.02), tolerance=1e-12, forward=forward).cost == pytest.approx(best.cost, rel=1e-11)
 
 
 @pytest.mark.parametrize("noise", [None, vp.ControlNoise(0.05)], ids=["quiet", "noisy"])
