@@ -160,7 +160,6 @@ def calls():
     guess = np.zeros((N, 2, n))
     yield "derivatives", core.variational_derivatives, {**steps(own), "guess": guess}
     yield "curvatures", core.variational_curvatures, {**steps(own), "guess": guess, "z": draw(N, 2 * n)}
-    yield "bends", core.variational_bends, {**steps(own), "guess": guess, "weights": draw(N, 2 * n, 3 * n)}
     yield "ends", core.variational_ends, steps(own)
     yield "inverse dynamics", core.inverse_dynamics, {"mechanism": own.core, **states, "a": draw(N, n)}
     yield "accelerations", core.accelerations, {"mechanism": own.core, **many}
@@ -189,8 +188,6 @@ def calls():
     yield "expanded changes", core.expand_changes, {**changes, "u": draw(N, m)}
     models = {"gradient": draw(N, m), "hessian": draw(N, m, m), "displacement": draw(N, m)}
     yield "stake", core.stake_of, models
-    box = {"H": np.eye(m), "g": draw(m), "limits": np.array([[-0.1] * m, [0.1] * m]), "guess": np.zeros(m)}
-    yield "box", core.box_minimum, box
 
 
 # Sizes that are the caller's to choose: rows of what is done one by one, a control before that may be left out.
@@ -198,7 +195,7 @@ FREE = {("place a frame", "q", 0), ("changes", "u", 0), ("changes", "u", 1), ("e
 FREE |= {("constraints", "q", 0)}
 FREE |= {("changes", "before", 0), ("expanded changes", "before", 0)}
 # Of two stages: a force for each.
-FREE |= {(name, "force", 1) for name in ("derivatives", "curvatures", "bends", "ends", "derivatives under constraints")}
+FREE |= {(name, "force", 1) for name in ("derivatives", "curvatures", "ends", "derivatives under constraints")}
 
 
 @pytest.fixture(scope="module")

@@ -136,8 +136,6 @@ def planned():
             hessian=hessian[None],
             velocity=np.zeros((0, n, 2 * n)),
             curvature=np.zeros((0, 2 * n + m, 2 * n + m)),
-            slack=np.zeros((0, 2, m)),
-            expected=np.zeros((0, 2 * n + m)),
             rate=np.zeros((0, m, m)),
             pull=np.zeros((0, m)),
         )

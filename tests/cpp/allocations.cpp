@@ -12,7 +12,6 @@
 #include "varpin/constrained.hpp"
 #include "varpin/costs.hpp"
 #include "varpin/explicit.hpp"
-#include "varpin/gradient_pass.hpp"
 #include "varpin/linearization.hpp"
 #include "varpin/variational.hpp"
 
@@ -170,11 +169,6 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
                          .feedback = K.data(),
                          .control_gradient = slopes.data(),
                          .factors = factors.data()}) < 0;
-    });
-    varpin::GradientPass gradients(n, n, terminal.data());
-    right &= without_allocation("the pass with gradients alone", [&] {
-        gradients.run(h, 1, 0.0, steps, {.feedforward = k.data(), .feedback = K.data(), .factors = factors.data()});
-        return true;
     });
     const varpin::Links links{mechanism.tree.bodies, n};
     const varpin::Placement tip{{{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}}, {1.0, 0.0, 0.0}};

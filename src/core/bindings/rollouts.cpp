@@ -46,9 +46,9 @@ Guards guards_of(bool active, double branch_margin, double energy_balance, doubl
 class VariationalRollout : public Rollout<VariationalStepper, PathState> {
   public:
     VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left, std::size_t paths, Solver solver, bool held)
+                       double left, std::size_t paths, bool held)
         : Rollout(mechanism, tableau, guards, paths, held,
-                  std::make_shared<VariationalStepper>(mechanism, tableau, tolerance, guards, left, solver,
+                  std::make_shared<VariationalStepper>(mechanism, tableau, tolerance, guards, left,
                                                        kernels_of(mechanism))) {}
 
     VariationalRollout fork(const Guards& guards) const { return forked(*this, guards); }
@@ -67,9 +67,9 @@ class VariationalRollout : public Rollout<VariationalStepper, PathState> {
 
 std::tuple<Out, Out, Out, std::int64_t, std::size_t> variational_derivatives(
     const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double h, In<2> q,
-    In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, bool external, Solver solver) {
+    In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, bool external) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, kernels_of(mechanism));
     work.varies = at.varies;
     if (external) work.take_external();
     double* in_ramps = nullptr;
@@ -86,14 +86,14 @@ std::tuple<Out, Out, Out, std::int64_t, std::size_t> variational_derivatives(
 std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanism& mechanism, const Tableau& tableau,
                                                                   double tolerance, const Guards& guards, double h,
                                                                   In<2> q, In<2> p, In<3> force, Integers<1> substeps,
-                                                                  Bytes halvings, In<3> guess, In<2> z, Solver solver) {
+                                                                  Bytes halvings, In<3> guess, In<2> z) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
     require(guess, "guess", {N, stages, n});
     require(z, "z", {N, 2 * n});
     double* H = nullptr;
     const Out curvatures = array_for(H, {N, 3 * n, 3 * n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, kernels_of(mechanism));
     work.varies = at.varies;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.second(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
@@ -102,37 +102,16 @@ std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanis
     return {curvatures, static_cast<std::int64_t>(outcome), done};
 }
 
-// Derivatives in (q0, p0, f) of the sum of weights times d(q1, p1)/d(q0, p0, f) of each step (N, 3n), for weights
-// (N, 2n, 3n).
-std::tuple<Out, std::int64_t, std::size_t> variational_bends(const Mechanism& mechanism, const Tableau& tableau,
-                                                             double tolerance, const Guards& guards, double h, In<2> q,
-                                                             In<2> p, In<3> force, Integers<1> substeps, Bytes halvings,
-                                                             In<3> guess, In<3> weights, Solver solver) {
-    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
-    require(guess, "guess", {N, stages, n});
-    require(weights, "weights", {N, 2 * n, 3 * n});
-    double* slopes = nullptr;
-    const Out found = array_for(slopes, {N, 3 * n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
-    work.varies = at.varies;
-    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work.bend(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
-                         weights.data() + s * 6 * n * n, slopes + s * 3 * n, at.past(s));
-    });
-    return {found, static_cast<std::int64_t>(outcome), done};
-}
-
 // Configurations and velocities (N, n) at the end of each step.
 std::tuple<Out, Out, std::int64_t, std::size_t> variational_ends(const Mechanism& mechanism, const Tableau& tableau,
                                                                  double tolerance, const Guards& guards, double h,
                                                                  In<2> q, In<2> p, In<3> force, Integers<1> substeps,
-                                                                 Bytes halvings, Solver solver) {
+                                                                 Bytes halvings) {
     const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
     const std::size_t N = at.N, n = at.n;
     double *q1 = nullptr, *v1 = nullptr;
     const Out Q = array_for(q1, {N, n}), V = array_for(v1, {N, n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
+    VariationalLinearization work(mechanism, tableau, tolerance, guards, kernels_of(mechanism));
     work.varies = at.varies;
     const auto [outcome, done] = each_step(N, [&](std::size_t s) {
         return work.end(h, at.q(s), at.p(s), at.force(s), at.halvings(s), q1 + s * n, v1 + s * n);
@@ -150,9 +129,9 @@ void register_rollouts(nb::module_& m) {
         .def_static("make", &guards_of, nb::kw_only(), "active"_a, "branch_margin"_a, "energy_balance"_a,
                     "energy_budget"_a, "most_halvings"_a);
     nb::class_<VariationalRollout>(m, "VariationalRollout")
-        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t, Solver, bool>(),
-             "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "left"_a, "paths"_a, "solver"_a = Solver::automatic,
-             "held"_a = false, nb::keep_alive<1, 2>())
+        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t, bool>(),
+             "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "left"_a, "paths"_a, "held"_a = false,
+             nb::keep_alive<1, 2>())
         .def("fork", &VariationalRollout::fork, "guards"_a, nb::keep_alive<0, 1>())
         .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
         .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,
@@ -162,15 +141,11 @@ void register_rollouts(nb::module_& m) {
         .def("halvings", &VariationalRollout::halvings, "path"_a);
     m.def("variational_derivatives", &variational_derivatives, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
           "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "ramp"_a = false,
-          "external"_a = false, "solver"_a = Solver::automatic);
+          "external"_a = false);
     m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "z"_a,
-          "solver"_a = Solver::automatic);
-    m.def("variational_bends", &variational_bends, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a,
-          "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "weights"_a,
-          "solver"_a = Solver::automatic);
+          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "z"_a);
     m.def("variational_ends", &variational_ends, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a,
-          "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "solver"_a = Solver::automatic);
+          "p"_a, "force"_a, "substeps"_a, "halvings"_a);
 }
 
 }  // namespace varpin::border

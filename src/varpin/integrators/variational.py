@@ -17,7 +17,6 @@ from varpin.core import (
     Tableau,
     VariationalRollout,
     constrained_derivatives,
-    variational_bends,
     variational_curvatures,
     variational_derivatives,
     variational_ends,
@@ -346,20 +345,6 @@ class Variational(Compiled):
         )
         _require_solved(trajectory, outcome, done)
         return H
-
-    def bend(self, scene: Scene, trajectory: Trajectory, weights: Floats) -> Floats:
-        """Derivatives (N, 3n) in (q, p, force) of sums of ``weights`` (N, 2n, 3n) times first derivatives of steps.
-
-        These are :meth:`contract`'s second derivatives times a matrix, for scenes without custom forces, constraints
-        and kinematic inputs.
-        """
-        found, outcome, done = variational_bends(
-            **self._steps(scene, trajectory),
-            guess=np.ascontiguousarray(self._guess(trajectory)),
-            weights=np.ascontiguousarray(weights),
-        )
-        _require_solved(trajectory, outcome, done)
-        return found
 
     def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.quiet_ends`; the steps are those that :meth:`linearize` differentiates."""

@@ -61,8 +61,7 @@ struct Start {
 // The step equation: (D3) with the forces (D4), the paper's (1.8) and (1.9).
 class Collocation {
   public:
-    Collocation(const Mechanism& mechanism, const Tableau& tableau, Solver solver,
-                const Kernels& kernels = kernels_for<>)
+    Collocation(const Mechanism& mechanism, const Tableau& tableau, bool dense, const Kernels& kernels = kernels_for<>)
         : mechanism(mechanism),
           tableau(tableau),
           kernels(kernels),
@@ -84,7 +83,7 @@ class Collocation {
             coupled_q.resize(entries(stages * n, n));
             coupled_v.resize(stages * n * n);
         }
-        if (stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
+        if (dense || stages > StageElimination::most_stages || !eliminates(mechanism, stages)) {
             allocate();
             return;
         }
@@ -95,7 +94,6 @@ class Collocation {
         } else {
             stage_elimination.emplace(mechanism, tableau);
         }
-        eliminated_columns = solver == Solver::elimination;
         for (const Block& block : blocks_of(mechanism.tree, n))
             eliminated_columns = eliminated_columns || block.end - block.begin >= few_columns;
     }

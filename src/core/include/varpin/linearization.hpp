@@ -13,7 +13,6 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <numeric>
 #include <span>
 #include <vector>
 
@@ -27,8 +26,8 @@ class VariationalLinearization {
     // With active guards, a part that they refuse is halved, since a step may need other parts without its noise.
     // Without them, the parts are exactly those given.
     VariationalLinearization(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                             Solver solver = Solver::automatic, const Kernels& kernels = kernels_for<>)
-        : stepper(mechanism, tableau, tolerance, guards, 1.0, solver, kernels),
+                             const Kernels& kernels = kernels_for<>)
+        : stepper(mechanism, tableau, tolerance, guards, 1.0, kernels),
           n(mechanism.dof()),
           stages(tableau.stages),
           state(mechanism, stages),
@@ -119,35 +118,6 @@ class VariationalLinearization {
         return Outcome::solved;
     }
 
-    // Derivatives (3n) in (q0, p0, f) of the sum of `weights` (2n, 3n) times d(q1, p1)/d(q0, p0, f) of one step, into
-    // `found`. As `second`, with row a of the weights times the second derivatives of entry a of (q1, p1).
-    Outcome bend(double h, const double* q, const double* p, const double* guess, const double* force,
-                 std::span<const std::uint8_t> halvings, const double* weights, double* found, int past = 0) {
-        std::fill(found, found + 3 * n, 0.0);
-        std::vector<double> rows(entries(2 * n, 2 * n), 0.0);
-        for (int a = 0; a < 2 * n; ++a) rows[a * 2 * n + a] = 1.0;
-        if (halvings.empty() && !stepper.guards.active) {
-            const Outcome outcome = root(h, q, p, guess, force, past);
-            if (outcome != Outcome::solved) return outcome;
-            part_derivatives(h);
-            add_bends(h, rows, nullptr, weights, found);
-            return Outcome::solved;
-        }
-        std::vector<Substep> trail;
-        const Outcome outcome = follow(h, q, p, force, halvings, trail);
-        if (outcome != Outcome::solved) return outcome;
-        std::vector<double> before(rows.size());
-        for (std::size_t k = trail.size(); k-- > 0;) {
-            const Outcome again = root_of(h, trail[k]);
-            if (again != Outcome::solved) return again;
-            part_derivatives(trail[k].length);
-            add_bends(trail[k].length, rows, trail[k].start.data(), weights, found);
-            for (int a = 0; a < 2 * n; ++a) back(&rows[a * 2 * n], &before[a * 2 * n]);
-            std::swap(before, rows);
-        }
-        return Outcome::solved;
-    }
-
   private:
     // Factor of the tolerance for derivatives, which need a root to about 1e-10 only.
     static constexpr double loose = 1e6;
@@ -175,10 +145,8 @@ class VariationalLinearization {
     std::vector<double> multiplier, slope;  // (s, n)
     Jet<Dual> direction;
     std::vector<Dual> at_q, at_v;
-    std::vector<double> inner;         // (2n, 3n)
-    std::vector<double> df;            // (n, 3n) of the force
-    std::vector<double> multipliers;   // (2n, s n)
-    std::vector<double> moves, pulls;  // (2n)
+    std::vector<double> inner;  // (2n, 3n)
+    std::vector<double> df;     // (n, 3n) of the force
     std::vector<Dual> at_f;
     std::vector<Dual> coupled_q, coupled_v;                   // (n, n) of couplings, along a direction
     std::vector<JointForce<Dual>> along_q, along_v, along_f;  // (n) of the elements, with derivatives in q, in v, in f
@@ -321,44 +289,6 @@ class VariationalLinearization {
         }
         for (int r = 0; r < w; ++r) {
             for (int k = 0; k < r; ++k) H[r * w + k] = H[k * w + r] = 0.5 * (H[r * w + k] + H[k * w + r]);
-        }
-    }
-
-    // Add the derivatives of `bend` through one part at the stepper's root, after part_derivatives; the rows (2n, 2n)
-    // are those of the end of the step at the part's end.
-    void add_bends(double h, const std::vector<double>& rows, const double* start, const double* weights,
-                   double* found) {
-        const Collocation& equation = stepper.step_equation;
-        const int w = 3 * n;
-        multipliers.resize(entries(2 * n, stages * n));
-        moves.resize(2 * n);
-        pulls.resize(2 * n);
-        for (int a = 0; a < 2 * n; ++a) {
-            write_slopes(h, &rows[a * 2 * n]);
-            stepper.step_equation.solve_transposed(h, slope.data(), &multipliers[a * stages * n]);
-        }
-        if (start != nullptr) bring_to_start(start);
-        for (int i = 0; i < stages; ++i) {
-            move_stage(h, i, start);
-            if (stepper.mechanism.forces.any()) differentiate_elements(i);
-            std::fill(pulls.begin(), pulls.end(), 0.0);
-            const Pulled pulled{pulls.data(), &pulls[n], found + 2 * n};
-            for (int a = 0; a < 2 * n; ++a) {
-                const double *z = &rows[a * 2 * n], *along = weights + a * w, *by = &multipliers[a * stages * n];
-                for (int c = 0; c < n; ++c) {
-                    moves[c] = std::inner_product(along, along + w, &dQ[c * w], 0.0);
-                    moves[n + c] = std::inner_product(along, along + w, &dV[(i * n + c) * w], 0.0);
-                }
-                const Moved moved{moves.data(), &moves[n], along + 2 * n, 1};
-                differentiate_along(h, i, z, by);
-                bend_stage(moved, pulled);
-                if (stepper.mechanism.forces.any()) add_elements(h, i, z, by, moved, pulled);
-                if (equation.coupled()) add_couplings(h, i, z, by, moved, pulled);
-            }
-            for (int c = 0; c < n; ++c) {
-                const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
-                for (int k = 0; k < w; ++k) found[k] += dq[k] * pulls[c] + dv[k] * pulls[n + c];
-            }
         }
     }
 

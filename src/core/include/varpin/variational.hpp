@@ -96,14 +96,14 @@ inline void record_node(const PathState& state, int n, const Nodes& nodes, std::
 class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left, Solver solver = Solver::automatic, const Kernels& kernels = kernels_for<>)
+                       double left, const Kernels& kernels = kernels_for<>)
         : guards(guards),
           mechanism(mechanism),
           tableau(tableau),
           tolerance(tolerance),
           left(left),
-          step_equation(mechanism, this->tableau, solver, kernels),
-          energy_guard(mechanism, solver, !step_equation.eliminated(), kernels),
+          step_equation(mechanism, this->tableau, false, kernels),
+          energy_guard(mechanism, false, !step_equation.eliminated(), kernels),
           n(mechanism.dof()),
           force(step_equation.stages * n),
           trial(n),
