@@ -209,7 +209,7 @@ bool constrained_steps_allocate_nothing() {
     mechanism.constraints = {
         {{{tip}}, {{across}}}, {{.x = 0, .y = 1, .constant = height}}, {}, {}, mechanism.tree.bodies, n};
     varpin::ConstrainedStepper stepper(mechanism, midpoint, {0.0, 1.0}, 0.5, {});
-    varpin::ConstrainedState state(mechanism, 1);
+    varpin::PathState state(mechanism, 1);
     const std::vector<double> force(n);
     const auto steps = [&] {
         for (int s = 0; s < N; ++s) {

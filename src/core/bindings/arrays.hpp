@@ -59,6 +59,12 @@ inline Out array_for(double*& values, std::initializer_list<std::size_t> shape) 
     return Out(values, shape, owner);
 }
 
+// The numbers of an array.
+template <class Array>
+std::vector<double> copied(const Array& array) {
+    return {array.data(), array.data() + array.size()};
+}
+
 // A NumPy array that owns a copy of some bytes.
 inline BytesOut array_of(const std::vector<std::uint8_t>& bytes) {
     auto* copy = new std::vector<std::uint8_t>(bytes);

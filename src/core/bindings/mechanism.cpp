@@ -29,11 +29,6 @@ namespace {
 
 using namespace nanobind::literals;
 
-template <class Array>
-std::vector<double> copied(const Array& array) {
-    return {array.data(), array.data() + array.size()};
-}
-
 // Numbers of a member of an element or a coupling.
 template <class Member>
 constexpr std::size_t width = 1;

@@ -131,26 +131,12 @@ class Watch:
     @property
     def verdict(self) -> Verdict: ...
 
-class _Rollout:
-    """Common interface of the rollouts of variational integrators; it exists in this file only.
+class Rollout:
+    """Paths of a variational integrator, under constraints where ``places`` are given.
 
-    A rollout has paths and the work arrays of a step. Forks share the work arrays: only one of them advances at a time.
+    A rollout has paths and the work arrays of a step. Forks share the work arrays: one thread at a time advances one of
+    them, and another raises RuntimeError.
     """
-
-    def begin(self, q: Floats, v: Floats) -> bool:
-        """Start each path at its row of q and v (P, n); False if an M(q) is not positive definite."""
-
-    def kick(self, impulse: Floats) -> None:
-        """Add an impulse (P, n) to the momenta; constraints absorb its normal component."""
-
-    def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Configurations, momenta and velocities (P, n), and energies (P,)."""
-
-    def halvings(self, path: int) -> Bytes:
-        """The halvings of each part of every divided step in the last roll of a path, in order."""
-
-class VariationalRollout(_Rollout):
-    """Paths without constraints."""
 
     def __init__(
         self,
@@ -161,9 +147,13 @@ class VariationalRollout(_Rollout):
         left: float,
         paths: int,
         held: bool = False,
+        places: Floats | None = None,
     ) -> None: ...
-    def fork(self, guards: Guards) -> VariationalRollout:
+    def fork(self, guards: Guards) -> Rollout:
         """An independent copy of the paths."""
+
+    def begin(self, q: Floats, v: Floats) -> bool:
+        """Start each path at its row of q and v (P, n); False if an M(q) is not positive definite."""
 
     def roll(
         self,
@@ -178,38 +168,17 @@ class VariationalRollout(_Rollout):
         """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays.
 
         A watch may stop a single path. ``impulses`` (P, N, 2, n), in addition to noise, are added to the momenta before
-        and after each step, or held over it as the noise.
+        and after each step, or held over it as the noise; under constraints they have to be held.
         """
 
-class ConstrainedRollout(_Rollout):
-    """Paths under constraints."""
+    def kick(self, impulse: Floats) -> None:
+        """Add an impulse (P, n) to the momenta; constraints absorb its normal component."""
 
-    def __init__(
-        self,
-        mechanism: Mechanism,
-        tableau: Tableau,
-        places: Floats,
-        tolerance: float,
-        guards: Guards,
-        paths: int,
-        held: bool = False,
-    ) -> None: ...
-    def fork(self, guards: Guards) -> ConstrainedRollout:
-        """An independent copy of the paths."""
+    def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Configurations, momenta and velocities (P, n), and energies (P,)."""
 
-    def roll(
-        self,
-        dt: float,
-        commands: Commands,
-        increments: Floats,
-        drift: Floats,
-        nodes: RolloutArrays,
-        impulses: Floats | None = None,
-    ) -> None:
-        """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays.
-
-        ``impulses`` (P, N, 2, n), in addition to noise, have to be held over the steps.
-        """
+    def halvings(self, path: int) -> Bytes:
+        """The halvings of each part of every divided step in the last roll of a path, in order."""
 
     def impulses(self, path: int) -> Floats:
         """Constraint impulses (steps, c) in each step of the last roll of a path; joints feel dg/dq' times them."""
@@ -217,87 +186,51 @@ class ConstrainedRollout(_Rollout):
     def weakest(self, path: int) -> int:
         """The constraint row that was closest to dependence on the others at the end of a path."""
 
+class Steps:
+    """The steps of a trajectory, to be repeated at dw = 0.
+
+    ``force`` is (N, 1, n), constant over each step, or (N, s, n) at its stages. ``halvings`` are those of the parts of
+    all steps with more than one of ``substeps``. The same parts are repeated; parts that active ``guards`` refuse are
+    halved. ``guess`` (N, s, n) are stage velocities close to those of each step.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        tableau: Tableau,
+        tolerance: float,
+        guards: Guards,
+        dt: float,
+        q: Floats,
+        p: Floats,
+        force: Floats,
+        substeps: Integers,
+        halvings: Bytes,
+        guess: Floats,
+    ) -> None:
+        """Raises ValueError for arrays that do not fit each other."""
+
+    def derivatives(self, ramp: bool = False, external: bool = False) -> tuple[Floats, Floats, Floats, int, int]:
+        """Derivatives of steps, the outcome, and the number of steps done.
+
+        They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), and with ``ramp`` in one
+        that grows linearly from 0 at the start of a step to f at its end (N, 2n, n), else (N, 2n, 0). ``external``: f
+        is not the force of the controls, which drives limit, but acts beside it.
+        """
+
+    def curvatures(self, z: Floats) -> tuple[Floats, int, int]:
+        """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n), the outcome, and the number of steps done."""
+
+    def ends(self) -> tuple[Floats, Floats, int, int]:
+        """Configurations and velocities (N, n) at the end of each step, the outcome, and the number of steps done."""
+
 def constrained_derivatives(
-    mechanism: Mechanism,
-    tableau: Tableau,
-    places: Floats,
-    tolerance: float,
-    guards: Guards,
-    dt: float,
-    q: Floats,
-    p: Floats,
-    force: Floats,
-    rates: Floats,
-    substeps: Integers,
-    halvings: Bytes,
-    *,
-    guess: Floats,
-    ramp: bool = False,
-    external: bool = False,
+    steps: Steps, *, places: Floats, rates: Floats, ramp: bool = False, external: bool = False
 ) -> tuple[Floats, Floats, Floats, int, int]:
-    """Derivatives as of variational_derivatives, and (N, 2n, i) in the rates (N, i) of driven joints.
+    """Derivatives as of :meth:`Steps.derivatives`, and (N, 2n, i) in the rates (N, i) of driven joints.
 
     With ``ramp`` those in the force are those in the one that grows.
     """
-
-def variational_derivatives(
-    mechanism: Mechanism,
-    tableau: Tableau,
-    tolerance: float,
-    guards: Guards,
-    dt: float,
-    q: Floats,
-    p: Floats,
-    force: Floats,
-    substeps: Integers,
-    halvings: Bytes,
-    *,
-    guess: Floats,
-    ramp: bool = False,
-    external: bool = False,
-) -> tuple[Floats, Floats, Floats, int, int]:
-    """Derivatives of steps, the outcome, and the number of steps done.
-
-    They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), and with ``ramp`` in one that
-    grows linearly from 0 at the start of a step to f at its end (N, 2n, n), else (0, 2n, n).
-
-    ``force`` is (N, 1, n), constant over each step, or (N, s, n) at its stages. ``external``: f is not the force of the
-    controls, which drives limit, but acts beside it.
-
-    ``halvings`` are those of the parts of all steps with more than one of ``substeps``. The same parts are repeated;
-    parts that active ``guards`` refuse are halved.
-    """
-
-def variational_curvatures(
-    mechanism: Mechanism,
-    tableau: Tableau,
-    tolerance: float,
-    guards: Guards,
-    dt: float,
-    q: Floats,
-    p: Floats,
-    force: Floats,
-    substeps: Integers,
-    halvings: Bytes,
-    *,
-    guess: Floats,
-    z: Floats,
-) -> tuple[Floats, int, int]:
-    """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n), the outcome, and the number of steps done."""
-
-def variational_ends(
-    mechanism: Mechanism,
-    tableau: Tableau,
-    tolerance: float,
-    guards: Guards,
-    dt: float,
-    q: Floats,
-    p: Floats,
-    force: Floats,
-    substeps: Integers,
-    halvings: Bytes,
-) -> tuple[Floats, Floats, int, int]:
-    """Configurations and velocities (N, n) at the end of each step, the outcome, and the number of steps done."""
 
 class ExpandedSteps:
     """The linearized dynamics and the expanded costs of N steps; optional arrays may be empty.

@@ -264,7 +264,9 @@ class Collocation {
   private:
     template <class>
     friend struct Sized;
-    friend class ConstrainedStepper;  // adds rows and columns of constraints to the matrix
+    // Those add rows and columns of constraints to the matrix.
+    friend class ConstrainedStepper;
+    friend class ConstrainedLinearization;
 
     template <class Solve>
     void solve_blocks(const double* right, double* x, const Solve& solve_block) {

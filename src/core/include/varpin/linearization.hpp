@@ -54,7 +54,7 @@ class VariationalLinearization {
     bool varies = false;  // each step has forces (s, n) at its stages instead of a constant force (n)
 
     // Take derivatives in an external force in the place of f, which drives limit.
-    void take_external() { stepper.step_equation.by_external = true; }
+    void take_external() { stepper.equation.by_external = true; }
 
     // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f, and unless null
     // Jr (2n, n) in a force that grows linearly from 0 at the start of the step to f at its end. An undivided step
@@ -65,7 +65,7 @@ class VariationalLinearization {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome == Outcome::solved) {
-                stepper.step_equation.derivatives(h, dV, Jx, Jf);
+                stepper.equation.derivatives(h, dV, Jx, Jf);
                 if (Jr) ramp_derivatives(h, 0.0, 1.0, Jr);
             }
             return outcome;
@@ -154,7 +154,7 @@ class VariationalLinearization {
     // The root of an undivided step, from a guess (s, n). If the guess is too far away, for example because friction
     // changes its sign within the step, from the initial velocity, and then by repetition of the steps before.
     Outcome root(double h, const double* q, const double* p, const double* guess, const double* force, int past) {
-        std::copy(guess, guess + stages * n, stepper.step_equation.V.begin());
+        std::copy(guess, guess + stages * n, stepper.equation.V.begin());
         Outcome outcome = root_at(h, q, p, force);
         if (outcome == Outcome::solved) return outcome;
         if (!stepper.begin_at(q, p, state)) return Outcome::singular;
@@ -177,17 +177,16 @@ class VariationalLinearization {
             state.p[i] = {p[i], 0.0};
         }
         stepper.take_force(force, varies);
-        return stepper.step_equation.solve(
-            h, {state.position.data(), state.p.data(), stepper.force.data(), stepper.stride}, loose, true,
-            stepper.effort);
+        return stepper.equation.solve(h, {state.position.data(), state.p.data(), stepper.force.data(), stepper.stride},
+                                      loose, true, stepper.effort);
     }
 
     Outcome root_of(double h, const Substep& part) {
         stepper.force_in_part(part.begin, part.length / h);
-        std::copy(part.V.begin(), part.V.end(), stepper.step_equation.V.begin());
-        return stepper.step_equation.solve(part.length,
-                                           {part.position.data(), part.p.data(), stepper.force.data(), stepper.stride},
-                                           loose, true, stepper.effort);
+        std::copy(part.V.begin(), part.V.end(), stepper.equation.V.begin());
+        return stepper.equation.solve(part.length,
+                                      {part.position.data(), part.p.data(), stepper.force.data(), stepper.stride},
+                                      loose, true, stepper.effort);
     }
 
     // Repeat the parts of a step. After each solved part, with its root in the stepper, calls visit(begin, length),
@@ -212,7 +211,7 @@ class VariationalLinearization {
         std::vector<double> Jx(4 * n * n), Jf(2 * n * n);
         chained.begin(Jx.data(), Jf.data());
         return parts(h, q, p, force, halvings, [&](double begin, double length) {
-            trail.push_back({from, from_p, stepper.step_equation.V, begin, length, joined(Jx, Jf)});
+            trail.push_back({from, from_p, stepper.equation.V, begin, length, joined(Jx, Jf)});
             part_derivatives(length);
             chained.follow(Jx.data(), Jf.data());
         });
@@ -228,14 +227,14 @@ class VariationalLinearization {
 
     // Derivatives (2n, n) in a ramp of the force over the whole step, of the part whose root is in the stepper.
     void ramp_derivatives(double h, double begin, double share, double* Jr) {
-        stepper.step_equation.weigh_ramp(begin, share);
-        stepper.step_equation.derivatives(h, dV, in_ramp.data(), Jr);
-        stepper.step_equation.weigh_constant();
+        stepper.equation.weigh_ramp(begin, share);
+        stepper.equation.derivatives(h, dV, in_ramp.data(), Jr);
+        stepper.equation.weigh_constant();
     }
 
     // Derivatives of the part whose root is in the stepper.
     void part_derivatives(double length) {
-        stepper.step_equation.derivatives(length, dV, chained.part.data(), chained.part_f.data());
+        stepper.equation.derivatives(length, dV, chained.part.data(), chained.part_f.data());
     }
 
     std::vector<double> joined(const std::vector<double>& Jx, const std::vector<double>& Jf) const {
@@ -260,11 +259,11 @@ class VariationalLinearization {
     // Add start' (z . d2(q1, p1)) start, (L4), at the stepper's root, after part_derivatives; `start` (2n, 3n) may be
     // null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation& equation = stepper.equation;
         const Mechanism& mechanism = stepper.mechanism;
         const int w = 3 * n;
         write_slopes(h, z);
-        stepper.step_equation.solve_transposed(h, slope.data(), multiplier.data());
+        stepper.equation.solve_transposed(h, slope.data(), multiplier.data());
         if (start != nullptr) bring_to_start(start);
         for (int i = 0; i < stages; ++i) {
             differentiate_along(h, i, z, multiplier.data());
@@ -294,7 +293,7 @@ class VariationalLinearization {
 
     // dphi/dV_m = h b_m (zq + (A_m + F_v,m) zp) + h^2 sum_i b_i a_im (L_qq,i + F_q,i) zp into `slope`.
     void write_slopes(double h, const double* z) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation& equation = stepper.equation;
         const Tableau& tableau = equation.tableau;
         for (int m = 0; m < stages; ++m) {
             for (int c = 0; c < n; ++c) {
@@ -316,7 +315,7 @@ class VariationalLinearization {
 
     // The jet at stage i and its derivative along (alpha, -multiplier), of which psi is the Lagrangian's share.
     void differentiate_along(double h, int i, const double* z, const double* multiplier) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation& equation = stepper.equation;
         const Tableau& tableau = equation.tableau;
         for (int c = 0; c < n; ++c) {
             double alpha = tableau.b[i] * z[n + c];
@@ -329,7 +328,7 @@ class VariationalLinearization {
 
     // Derivatives of Q at stage i into dQ.
     void move_stage(double h, int i, const double* start) {
-        const Tableau& tableau = stepper.step_equation.tableau;
+        const Tableau& tableau = stepper.equation.tableau;
         const int w = 3 * n;
         for (int c = 0; c < n; ++c) {
             for (int k = 0; k < w; ++k) {
@@ -359,7 +358,7 @@ class VariationalLinearization {
 
     // The elements' forces at stage i, with derivatives in q, in v and in f.
     void differentiate_elements(int i) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation& equation = stepper.equation;
         for (auto* along : {&along_q, &along_v, &along_f}) {
             for (int c = 0; c < n; ++c) {
                 at_q[c] = {equation.Q[i * n + c], along == &along_q ? 1.0 : 0.0};
@@ -391,7 +390,7 @@ class VariationalLinearization {
 
     // The weight gamma of the force of stage i on coordinate c.
     double weight(double h, int i, int c, const double* z, const double* multiplier) const {
-        const Tableau& tableau = stepper.step_equation.tableau;
+        const Tableau& tableau = stepper.equation.tableau;
         double gamma = tableau.b[i] * z[n + c];
         for (int j = 0; j < stages; ++j) gamma += tableau.force[j * stages + i] * multiplier[j * n + c];
         return h * gamma;
@@ -400,7 +399,7 @@ class VariationalLinearization {
     // Add the second derivatives of gamma . F of couplings at stage i, by columns of the Hessian.
     void add_couplings(double h, int i, const double* z, const double* multiplier, const Moved& moved,
                        const Pulled& pulled) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation& equation = stepper.equation;
         const int w = moved.width;
         for (auto* matrix : {&coupled_q, &coupled_v}) matrix->resize(n * n);
         for (int along = 0; along < 2 * n; ++along) {
