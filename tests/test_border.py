@@ -240,6 +240,23 @@ def test_halvings_that_cannot_be_counted_are_refused(halvings):
         core.Guards.make(**{**GUARDS, "most_halvings": halvings})
 
 
+@pytest.mark.parametrize("rate", [-2, 1])
+def test_rates_that_are_no_controls_are_refused(rate):
+    own = vp.Scene(vp.planar_chain(1), constraints=vp.KinematicInput("joint1"))
+    rows = own.bound_constraints.rows
+    rows = rows._replace(ties=tuple(tie._replace(rate=rate) for tie in rows.ties))
+    with refused(ValueError, "control"):
+        core.Mechanism.make(**of_mechanism(own) | {"constraints": rows})
+
+
+def test_terms_after_a_watch_are_refused():
+    costs = core.CostTerms.make(1, 1)
+    watch = core.Watch(costs, np.ones((1, 9)), np.zeros((2, 1)), np.zeros((2, 1)), np.zeros((1, 1)), np.zeros((1, 0)))
+    costs.add_term(core.Subject.entries, 0, np.eye(3), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
+    with refused(ValueError, "terms"):
+        watch.after(0, 1)
+
+
 @pytest.mark.parametrize("level", [0, 63])
 def test_parts_that_no_step_has_are_refused(level):
     given = {**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)}

@@ -106,7 +106,7 @@ class ConstrainedLinearization {
 
     // Right sides for derivatives in (q0, p0) and in the goals of kinematic inputs.
     void state_columns(double h) {
-        Collocation& equation = stepper.equation;
+        StepEquation& equation = stepper.equation;
         const int r = here.rank(), wide = stages * n, w = 3 * n;
         dV.resize(entries(wide, w));
         equation.right_sides(n, stages, h, {0, n}, dV);

@@ -246,37 +246,21 @@ class VariationalLinearization {
         return both;
     }
 
-    // Changes of Q and V at a stage and of f along w directions, each (n, w).
-    struct Moved {
-        const double *q, *v, *f;
-        int width;
-    };
-    // The sum's derivatives in them along the same directions, each (n, w).
-    struct Pulled {
-        double *q, *v, *f;
-    };
-
     // Add start' (z . d2(q1, p1)) start, (L4), at the stepper's root, after part_derivatives; `start` (2n, 3n) may be
     // null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
         const Collocation& equation = stepper.equation;
-        const Mechanism& mechanism = stepper.mechanism;
         const int w = 3 * n;
         write_slopes(h, z);
         stepper.equation.solve_transposed(h, slope.data(), multiplier.data());
         if (start != nullptr) bring_to_start(start);
         for (int i = 0; i < stages; ++i) {
-            differentiate_along(h, i, z, multiplier.data());
+            differentiate_along(h, i, z);
             move_stage(h, i, start);
             std::fill(inner.begin(), inner.end(), 0.0);
-            const Moved moved{dQ.data(), &dV[i * n * w], df.data(), w};
-            const Pulled pulled{inner.data(), &inner[n * w], H + 2 * n * w};
-            bend_stage(moved, pulled);
-            if (mechanism.forces.any()) {
-                differentiate_elements(i);
-                add_elements(h, i, z, multiplier.data(), moved, pulled);
-            }
-            if (equation.coupled()) add_couplings(h, i, z, multiplier.data(), moved, pulled);
+            bend_stage(i);
+            if (stepper.mechanism.forces.any()) add_elements(h, i, z, H + 2 * n * w);
+            if (equation.coupled()) add_couplings(h, i, z);
             for (int c = 0; c < n; ++c) {
                 const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
                 const double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
@@ -314,7 +298,7 @@ class VariationalLinearization {
     }
 
     // The jet at stage i and its derivative along (alpha, -multiplier), of which psi is the Lagrangian's share.
-    void differentiate_along(double h, int i, const double* z, const double* multiplier) {
+    void differentiate_along(double h, int i, const double* z) {
         const Collocation& equation = stepper.equation;
         const Tableau& tableau = equation.tableau;
         for (int c = 0; c < n; ++c) {
@@ -339,15 +323,15 @@ class VariationalLinearization {
         }
     }
 
-    // Add (psi_qq dQ + psi_qv dV; psi_vq dQ + psi_vv dV) at the stage of `direction`.
-    void bend_stage(const Moved& moved, const Pulled& pulled) const {
-        const int w = moved.width;
+    // Add (psi_qq dQ + psi_qv dV; psi_vq dQ + psi_vv dV) at stage i, that of `direction`, to `inner`.
+    void bend_stage(int i) {
+        const int w = 3 * n;
         for (int r = 0; r < n; ++r) {
-            double *in_q = pulled.q + r * w, *in_v = pulled.v + r * w;
+            double *in_q = &inner[r * w], *in_v = &inner[(n + r) * w];
             for (int j = 0; j < n; ++j) {
                 const double qq = direction.Lqq[r * n + j].slope, vq = direction.A[r * n + j].slope;
                 const double qv = direction.A[j * n + r].slope, vv = direction.M[r * n + j].slope;
-                const double *dq = moved.q + j * w, *dv = moved.v + j * w;
+                const double *dq = &dQ[j * w], *dv = &dV[(i * n + j) * w];
                 for (int k = 0; k < w; ++k) {
                     in_q[k] += qq * dq[k] + qv * dv[k];
                     in_v[k] += vq * dq[k] + vv * dv[k];
@@ -369,17 +353,17 @@ class VariationalLinearization {
         }
     }
 
-    // Add the diagonal second derivatives of gamma . F of the elements that were differentiated at stage i.
-    void add_elements(double h, int i, const double* z, const double* multiplier, const Moved& moved,
-                      const Pulled& pulled) const {
-        const int w = moved.width;
+    // Add the diagonal second derivatives of gamma . F of elements at stage i, those in f to `by_f` (n, 3n).
+    void add_elements(double h, int i, const double* z, double* by_f) {
+        const int w = 3 * n;
+        differentiate_elements(i);
         for (int c = 0; c < n; ++c) {
-            const double gamma = weight(h, i, c, z, multiplier);
+            const double gamma = weight(h, i, c, z);
             const double qq = gamma * along_q[c].by_q.slope, qv = gamma * along_q[c].by_v.slope;
             const double vv = gamma * along_v[c].by_v.slope, ff = gamma * along_f[c].by_f.slope;
             const double qf = gamma * along_f[c].by_q.slope, vf = gamma * along_f[c].by_v.slope;
-            const double *dq = moved.q + c * w, *dv = moved.v + c * w, *of_f = moved.f + c * w;
-            double *in_q = pulled.q + c * w, *in_v = pulled.v + c * w, *in_f = pulled.f + c * w;
+            const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w], *of_f = &df[c * w];
+            double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w], *in_f = by_f + c * w;
             for (int k = 0; k < w; ++k) {
                 in_q[k] += qq * dq[k] + qv * dv[k] + qf * of_f[k];
                 in_v[k] += qv * dq[k] + vv * dv[k] + vf * of_f[k];
@@ -389,7 +373,7 @@ class VariationalLinearization {
     }
 
     // The weight gamma of the force of stage i on coordinate c.
-    double weight(double h, int i, int c, const double* z, const double* multiplier) const {
+    double weight(double h, int i, int c, const double* z) const {
         const Tableau& tableau = stepper.equation.tableau;
         double gamma = tableau.b[i] * z[n + c];
         for (int j = 0; j < stages; ++j) gamma += tableau.force[j * stages + i] * multiplier[j * n + c];
@@ -397,10 +381,9 @@ class VariationalLinearization {
     }
 
     // Add the second derivatives of gamma . F of couplings at stage i, by columns of the Hessian.
-    void add_couplings(double h, int i, const double* z, const double* multiplier, const Moved& moved,
-                       const Pulled& pulled) {
+    void add_couplings(double h, int i, const double* z) {
         const Collocation& equation = stepper.equation;
-        const int w = moved.width;
+        const int w = 3 * n;
         for (auto* matrix : {&coupled_q, &coupled_v}) matrix->resize(n * n);
         for (int along = 0; along < 2 * n; ++along) {
             for (int c = 0; c < n; ++c) {
@@ -410,15 +393,15 @@ class VariationalLinearization {
             std::fill(along_q.begin(), along_q.end(), JointForce<Dual>{});
             stepper.mechanism.couplings.add_forces(n, at_q.data(), at_v.data(), direction.couplings, along_q.data(),
                                                    coupled_q.data(), coupled_v.data());
-            const double* change = along < n ? moved.q + along * w : moved.v + (along - n) * w;
+            const double* change = along < n ? &dQ[along * w] : &dV[(i * n + along - n) * w];
             for (int c = 0; c < n; ++c) {
                 double by_q = 0.0, by_v = 0.0;
                 for (int r = 0; r < n; ++r) {
-                    const double gamma = weight(h, i, r, z, multiplier);
+                    const double gamma = weight(h, i, r, z);
                     by_q += gamma * coupled_q[r * n + c].slope;
                     by_v += gamma * coupled_v[r * n + c].slope;
                 }
-                double *in_q = pulled.q + c * w, *in_v = pulled.v + c * w;
+                double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
                 for (int k = 0; k < w; ++k) {
                     in_q[k] += by_q * change[k];
                     in_v[k] += by_v * change[k];

@@ -8,10 +8,10 @@
 #include <cstdint>
 #include <vector>
 
-#include "varpin/collocation.hpp"
 #include "varpin/guards.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/policy.hpp"
+#include "varpin/step_equation.hpp"
 #include "varpin/substeps.hpp"
 #include "varpin/watch.hpp"
 
@@ -122,7 +122,7 @@ class VariationalStepper {
     const Tableau tableau;
     double tolerance;
     double left;  // share of each kick before the step; the rest acts after it
-    Collocation equation;
+    StepEquation equation;
     EnergyGuard energy_guard;
     int n;
     int m;  // rows of constraints
