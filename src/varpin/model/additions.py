@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from varpin.errors import InputError, RobotError, UnknownJoint
 from varpin.model.mimic import Tie, joint_index
 from varpin.model.sources import Description
-from varpin.model.urdf import build_model, build_shapes, listed, read_urdf
+from varpin.model.urdf import build_shapes, listed, read_urdf
 from varpin.support.checks import JointValues, as_floats, broadcast_array, finite, positive
 
 Base: TypeAlias = Literal["planar"] | ArrayLike | pin.SE3 | None
@@ -112,16 +112,15 @@ def with_mesh_inertias(description: Description, density: float) -> Description:
     if description.urdf is None:
         raise InputError(f"inertia='meshes' needs a URDF file; {description.name!r} does not come from one")
     urdf = read_urdf(description.urdf, description.expanded)
-    full = build_model(urdf)
     known = {inertial.link for inertial in description.inertials}
-    shapes, faults = build_shapes(urdf, full, description.package_dirs)
+    shapes, faults = build_shapes(urdf, description.package_dirs)
     for link, fault in faults.items():
         if link not in known:
             raise RobotError(fault)
     model, index = description.model.copy(), joint_index(description.model)
     masses: dict[str, float] = {}
     for shape in shapes.geometryObjects:
-        link = full.frames[shape.parentFrame].name
+        link = urdf.model.frames[shape.parentFrame].name
         if link in known:
             continue
         volume = float(shape.geometry.computeVolume())
@@ -133,7 +132,7 @@ def with_mesh_inertias(description: Description, density: float) -> Description:
         center = np.asarray(shape.geometry.computeCOM(), dtype=float).reshape(3)
         moments = np.asarray(shape.geometry.computeMomentofInertiaRelatedToCOM(), dtype=float)
         body = pin.Inertia(density * volume, center, 0.5 * density * (moments + moments.T))
-        model.appendBodyToJoint(index.get(full.names[shape.parentJoint], 0), body, shape.placement)
+        model.appendBodyToJoint(index.get(urdf.model.names[shape.parentJoint], 0), body, shape.placement)
         masses[link] = masses.get(link, 0.0) + density * volume
     weighed = listed((f"{link!r} {mass:.3g} kg" for link, mass in masses.items()), "links")
     remark = f"links without an inertia have that of their shapes at {density:g} kg/m^3: {weighed}"

@@ -35,7 +35,7 @@ from varpin.model.tree import (
     to_pinocchio,
 )
 from varpin.model.units import ADVICE, NO_LIMIT, looks_like_degrees, slides_hint
-from varpin.model.urdf import build_model, build_shapes, listed, read_urdf
+from varpin.model.urdf import build_shapes, listed, read_urdf
 from varpin.support import markup
 from varpin.support.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
 from varpin.support.frozen import Frozen
@@ -708,11 +708,10 @@ def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.Geome
         if robot.urdf is None:
             return together, {}
         urdf = read_urdf(robot.urdf, robot.expanded)
-        full = build_model(urdf)
-        shapes, unread = build_shapes(urdf, full, robot.package_dirs, read)
+        shapes, unread = build_shapes(urdf, robot.package_dirs, read)
     except RobotError as error:
         return together, {name: (joint, str(error)) for name, joint in joints.items()}
-    return _hang(robot, full, shapes), {link: (joints[link], what) for link, what in unread.items()}
+    return _hang(robot, urdf.model, shapes), {link: (joints[link], what) for link, what in unread.items()}
 
 
 def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str = "") -> pin.GeometryModel:

@@ -19,7 +19,7 @@ from varpin.model.mimic import JOINT_PARAMETERS, Tie, depth_first, joint_frames,
 from varpin.model.mjcf import is_mjcf, read_mjcf, root_tag
 from varpin.model.packages import Packages
 from varpin.model.srdf import Posture, beside, read_postures, read_rotors, reference_postures
-from varpin.model.urdf import Inertial, compared_model, read_inertials, read_urdf
+from varpin.model.urdf import Inertial, read_urdf
 from varpin.model.xacro import expand, is_xacro, plain_name
 
 logger = logging.getLogger(__name__)
@@ -292,24 +292,21 @@ def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
 
 def _of_urdf(path: Path, name: str, request: _Request, expanded: str | None = None) -> Description:
     urdf = read_urdf(path, expanded)
-    model, differences = compared_model(urdf, expanded)
-    inertials, lacks = read_inertials(urdf, model)
-    remarks = (*urdf.remarks, *filter(None, [urdf.unlimited]), *differences)
     for note in urdf.notes:
         logger.info("robot %r: %s", name, note)
     description = Description(
         name=name,
-        model=model,
-        ties=ties_of(urdf.mimics, model) if request.mimic else (),
+        model=urdf.model,
+        ties=ties_of(urdf.mimics, urdf.model) if request.mimic else (),
         urdf=path,
         expanded=expanded,
         package_dirs=_places(path, request.folders),
-        inertials=inertials,
-        remarks=remarks,
-        faults=lacks,
+        inertials=urdf.inertials,
+        remarks=urdf.remarks + urdf.unlimited,
+        faults=urdf.faults,
         loops=urdf.loops,
     )
-    order = depth_first(model, description.ties)
+    order = depth_first(urdf.model, description.ties)
     return description if order == sorted(order) else description.rebuilt(order=order)
 
 

@@ -51,7 +51,7 @@ def read_rotors(path: Path, text: str | None = None) -> dict[str, float]:
         RobotError: It is not an SRDF, or a number in it is none.
     """
     armature = {}
-    for joint in read_xml(path, text)[0].iterfind("rotor_params/joint"):
+    for joint in read_xml(path, text).iterfind("rotor_params/joint"):
         name = joint.get("name", "")
         mass, ratio = (
             finite_number(joint.get(key, "0"), f"{path}: {key} of the rotor of joint {name!r}")
@@ -74,7 +74,7 @@ def read_postures(path: Path, text: str | None = None) -> tuple[Posture, ...]:
         FileError: The file cannot be read.
         RobotError: It is not an SRDF, or a position in it is not a number.
     """
-    root, _ = read_xml(path, text)
+    root = read_xml(path, text)
     if root.tag != "robot":
         raise RobotError(f"{path} is not an SRDF: its root element is <{root.tag}>, not <robot>")
     postures = []
@@ -116,6 +116,6 @@ def _angle(numbers: Sequence[float]) -> float:
 def _robot_of(path: Path) -> str:
     """The name of the robot in a file; empty if the file cannot be read."""
     try:
-        return read_xml(path)[0].get("name", "")
+        return read_xml(path).get("name", "")
     except (RobotError, FileError):
         return ""

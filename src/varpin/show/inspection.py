@@ -23,7 +23,7 @@ from varpin.model.inertia import fault, inertials_of, one_of_each, principal_mom
 from varpin.model.mimic import joint_index
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.units import NO_LIMIT
-from varpin.model.urdf import Inertial, Urdf, build_model, listed, read_inertials, read_urdf
+from varpin.model.urdf import Inertial, Urdf, listed, read_urdf
 from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
 from varpin.support.checks import JointValues, joint_array
 
@@ -100,11 +100,10 @@ def inspect_robot(
     margin = Guard().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
     urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
-    inertials, lacks = ((), ()) if urdf is None else read_inertials(urdf, build_model(urdf))
-    joints, links, (shapes, unread) = _joints(robot), _links(robot, inertials), readable_geometry(robot)
+    links = _links(robot, () if urdf is None else urdf.inertials)
+    joints, (shapes, unread) = _joints(robot), readable_geometry(robot)
     warnings = [
-        *(() if urdf is None else (*urdf.remarks, *urdf.notes)),
-        *lacks,
+        *(() if urdf is None else (*urdf.remarks, *urdf.notes, *urdf.faults)),
         *robot.limit_remarks(),
         *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes), _ratio_warnings(robot))),
         *_mesh_warnings(robot, shapes),
