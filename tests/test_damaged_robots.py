@@ -10,7 +10,6 @@ from mechanisms import INERTIAL, joint, link, random_tree, write_urdf
 from refusals import refused
 
 import varpin as vp
-from varpin.model import geometry
 
 
 class TestUrdf:

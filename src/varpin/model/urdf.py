@@ -30,6 +30,7 @@ from varpin.errors import FileError, RobotError
 from varpin.model.meshes import Reader, put_mesh, read_mesh
 from varpin.model.packages import LFS_POINTER, Packages
 from varpin.model.units import NO_LIMIT, limits_in_degrees
+from varpin.support.frozen import Frozen
 
 logger = logging.getLogger(__name__)
 
@@ -59,7 +60,7 @@ class Mimic:
 
 
 @dataclass(frozen=True, eq=False)
-class Inertial:
+class Inertial(Frozen):
     """Mass and inertia of a link, as Pinocchio reads them.
 
     Attributes:
@@ -87,7 +88,6 @@ class Urdf:
         inertials: The inertias of the links that have one.
         faults: What Pinocchio leaves out of links and joints, in words; empty if it leaves out nothing.
         remarks: How the file is read where that is not plain, one sentence a kind.
-        unlimited: A sentence about limits that are read as none, if there are any.
         notes: What of the file has no effect on purpose, likewise.
     """
 
@@ -98,7 +98,6 @@ class Urdf:
     inertials: tuple[Inertial, ...] = field(repr=False)
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
-    unlimited: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
@@ -133,12 +132,12 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
                 "varpin takes trees, no closed loops"
             )
     mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
-    remarks, unlimited = tuple(_remarks(root)), tuple(_unlimited(root))
+    remarks = *_remarks(root), *_unlimited(root)
     soft = _joints_with(root, "safety_controller")
     notes = (f"soft limits of <safety_controller> have no effect: {listed(soft, 'joints')}",) if soft else ()
     model, complaint = _model(root, path)
     faults = (f"Pinocchio reads links in part: {complaint}",) if complaint else ()
-    return Urdf(path, root, model, mimics, _inertials(root, model), faults, remarks, unlimited, notes)
+    return Urdf(path, root, model, mimics, _inertials(root, model), faults, remarks, notes)
 
 
 def _model(root: ET.Element, path: Path) -> tuple[pin.Model, str]:
@@ -381,9 +380,11 @@ def _mimic(joint: ET.Element, path: Path) -> Mimic:
     element, where = joint.findall("mimic")[0], f"{path}: joint {joint.get('name')!r}: its mimic"
     if not element.get("joint"):
         raise RobotError(f"{where} element names no joint")
-    ratio, offset = element.get("multiplier", "1"), element.get("offset", "0")
-    ratio, offset = finite_number(ratio, f"{where} multiplier"), finite_number(offset, f"{where} offset")
-    return Mimic(element.get("joint", ""), ratio, offset)
+    return Mimic(
+        element.get("joint", ""),
+        finite_number(element.get("multiplier", "1"), f"{where} multiplier"),
+        finite_number(element.get("offset", "0"), f"{where} offset"),
+    )
 
 
 def _number(word: str | None) -> float:
