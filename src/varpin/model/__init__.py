@@ -17,7 +17,6 @@ from varpin.model.units import AFAR as AFAR
 from varpin.model.units import ASIDE as ASIDE
 from varpin.model.units import IN_MILLIMETRES as IN_MILLIMETRES
 from varpin.model.units import degrees_hint as degrees_hint
-from varpin.model.units import degrees_per_second_hint as degrees_per_second_hint
 from varpin.model.units import joint_unit as joint_unit
 from varpin.model.units import longest_reach as longest_reach
 from varpin.model.units import looks_like_degrees as looks_like_degrees
