@@ -102,7 +102,7 @@ def test_faulty_link_is_named(tmp_path, links, facts):
 def test_inertia_that_its_shape_cannot_have():
     """A published UR5 gives its wrists a radius of gyration of 0.42 m, and they are as large as a hand."""
     (warning,) = [text for text in inspect_robot("ur5").warnings if "implausibly large inertia" in text]
-    assert not unnamed(warning, "'wrist_1_link'", "'wrist_2_link'", "'wrist_3_link'", "0.424 m", "0.15 m")
+    assert not unnamed(warning, "'wrist_1_link'", "'wrist_2_link'", "'wrist_3_link'", "0.424 m", "0.14 m")
     assert not [text for text in inspect_robot("ur10").warnings if "inertia" in text]
 
 

@@ -22,7 +22,15 @@ from varpin.model.robot import Robot, check_inertia
 from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
 from varpin.model.units import ADVICE, looks_like_degrees
-from varpin.support.checks import JointValues, as_floats, broadcast_array, finite, is_one_of, require_finite
+from varpin.support.checks import (
+    JointValues,
+    as_floats,
+    broadcast_array,
+    finite,
+    is_one_of,
+    require_finite,
+    rotation_matrix,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -155,13 +163,13 @@ def transform(base: ArrayLike | pin.SE3, what: str, otherwise: str = "") -> pin.
         InputError: It is none; the message calls it ``what``, and names what it may be ``otherwise``.
     """
     matrix = as_floats(what, base.homogeneous if isinstance(base, pin.SE3) else base)
-    if matrix.shape != (4, 4):
-        raise InputError(f"{what} must be a transform (4, 4) or a pin.SE3{otherwise}, got shape {matrix.shape}")
-    turn = matrix[:3, :3]
-    rigid = np.isfinite(matrix).all() and np.abs(turn.T @ turn - np.eye(3)).max() < 1e-6 and np.linalg.det(turn) > 0.0
-    if not rigid or (matrix[3] != [0.0, 0.0, 0.0, 1.0]).any():
-        raise InputError(f"{what} must be a rotation and a translation, with 0 0 0 1 in its last row")
-    u, _, v = np.linalg.svd(turn)
+    if matrix.shape != (4, 4) or (matrix[3] != [0.0, 0.0, 0.0, 1.0]).any():
+        raise InputError(
+            f"{what} must be a rotation and a translation (4, 4), with 0 0 0 1 in its last row, or a pin.SE3{otherwise}, "
+            f"got shape {matrix.shape}"
+        )
+    require_finite(what, matrix)
+    u, _, v = np.linalg.svd(rotation_matrix(f"the rotation in {what}", matrix[:3, :3]))
     return pin.SE3(u @ v, matrix[:3, 3])
 
 

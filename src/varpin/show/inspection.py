@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, product
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +20,7 @@ from varpin.mechanics.scene import Scene
 from varpin.model import Robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.inertia import fault, inertials_of, one_of_each, principal_moments
 from varpin.model.loading import Base, assemble
+from varpin.model.meshes import shape_points
 from varpin.model.mimic import joint_index
 from varpin.model.robot import limits_of
 from varpin.model.sources import describe
@@ -192,18 +193,10 @@ def _frames(robot: Robot) -> tuple[FrameReport, ...]:
     return tuple(reports.values())
 
 
-def _body_name(robot: Robot, joint: int) -> str:
-    """Name of the first link on a joint, or of the joint if the model has no links there."""
-    for frame in robot.free_model.frames:
-        if frame.parentJoint == joint and frame.type == pin.FrameType.BODY:
-            return str(frame.name)
-    return str(robot.free_model.names[joint])
-
-
 def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
-    tree = robot.tree
+    tree, names = robot.tree, [part.link for part in inertials_of(robot.free_model)]
     for body, mass in enumerate(tree.mass):
-        name, joint = _body_name(robot, body + 1), robot.free_model.names[body + 1]
+        name, joint = names[body], robot.free_model.names[body + 1]
         if mass == 0.0:
             carries = "only the links that it carries give the joint inertia"
             if body not in tree.parent:
@@ -215,7 +208,7 @@ def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
         light, heavy = sorted((tree.mass[parent], mass)) if parent >= 0 else (mass, mass)
         if light > 0.0 and heavy > MASS_RATIO * light:
             sentence = (
-                f"the masses of neighbouring links {_body_name(robot, parent + 1)!r} and {name!r} differ by a factor "
+                f"the masses of neighbouring links {names[parent]!r} and {name!r} differ by a factor "
                 f"of {heavy / light:.1g}: {tree.mass[parent]:.3g} and {mass:.3g} kg"
             )
             yield "masses", name, sentence
@@ -224,7 +217,10 @@ def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
 def _inertia_warnings(
     robot: Robot, links: Sequence[LinkReport], shapes: pin.GeometryModel
 ) -> Iterator[tuple[str, str, str]]:
-    length, corners = LENGTH_RATIO * longest_reach(robot, slides=False, centers=False) or LENGTH, _corners(shapes)
+    length = LENGTH_RATIO * longest_reach(robot, slides=False, centers=False) or LENGTH
+    around: dict[int, list[Floats]] = {}
+    for shape in shapes.geometryObjects:
+        around.setdefault(shape.parentJoint, []).append(shape_points(shape))
     frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
         if not link.joint or not link.inertia.any():
@@ -237,9 +233,9 @@ def _inertia_warnings(
         # A ball has the least inertia of all bodies of a given mass and density.
         radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
         gyration, against, size = float(np.sqrt(link.moments[-1] / link.mass)), _against_reach(robot), np.inf
-        near = [points for joint, points in corners if frame is not None and joint == frame.parentJoint]
-        if frame is not None and near:
-            size = float(np.linalg.norm(np.vstack(near) - frame.placement.act(link.center), axis=1).max())
+        if frame is not None and frame.parentJoint in around:
+            points = np.vstack(around[frame.parentJoint])
+            size = float(np.linalg.norm(points - frame.placement.act(link.center), axis=1).max())
         if SIZE_RATIO * size < length:
             against = f"and its body reaches {size:.2g} m from its centre of mass"
         if link.moments.sum() < 1.2 * link.mass * radius**2:
@@ -259,22 +255,6 @@ def _inertia_warnings(
         if link.joint and away > length:
             far = f"link {link.name!r} has its centre of mass {away:.3g} m away from its frame, {_against_reach(robot)}"
             yield "away", link.name, f"{far}; are these millimetres?"
-
-
-def _corners(shapes: pin.GeometryModel) -> list[tuple[int, Floats]]:
-    """The joint and the corners (8, 3) [m], in the joint's frame, of the box around each shape."""
-    found = []
-    for shape in shapes.geometryObjects:
-        if isinstance(shape.geometry, pin.coal.BVHModelBase):
-            vertices = np.asarray(shape.geometry.vertices(), dtype=np.float64)
-            low, high = vertices.min(axis=0), vertices.max(axis=0)
-        else:
-            shape.geometry.computeLocalAABB()
-            low, high = shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_
-        corners = np.array(list(product(*zip(low, high, strict=True))))
-        placed = corners @ shape.placement.rotation.T + shape.placement.translation
-        found.append((shape.parentJoint, placed))
-    return found
 
 
 def _against_reach(robot: Robot) -> str:
