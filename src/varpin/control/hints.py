@@ -18,7 +18,6 @@ from varpin.control.constraints import (
     PlanConstraint,
     ReachFrame,
     WithinJointLimits,
-    WithinVelocityLimits,
 )
 from varpin.control.costs import Cost, FramePositionCost, TrackingCost, weight_matrix
 from varpin.control.problem import OptimalControlProblem
@@ -31,7 +30,6 @@ from varpin.model import (
     IN_MILLIMETRES,
     Robot,
     degrees_hint,
-    degrees_per_second_hint,
     joint_unit,
     looks_like_degrees,
     millimetres_hint,
@@ -62,7 +60,7 @@ _SAME = 1e-6
 
 def hints(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about constraints that no motion satisfies, and about values that look like degrees or millimetres."""
-    found = [*in_other_units(problem.scene, problem.q0, problem.v0)]
+    found = [*in_other_units(problem.scene, problem.q0)]
     found += [*_goals(problem), *_targets(problem), *_limits(problem), *_ends(problem), *_places(problem)]
     found += _weights(problem)
     for bound in problem.bound_constraints:
@@ -170,15 +168,9 @@ def _away(term: FramePositionCost, root: Floats) -> float:
 
 
 def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Limits of joints that look like degrees, and those of velocities that look like degrees per second."""
+    """Limits of joints that look like degrees."""
     turning = _turning(problem.scene.robot)
     for limits in problem.constraints:
-        if isinstance(limits, WithinVelocityLimits):
-            given = np.isfinite(limits.limits) & (np.abs(limits.limits) != limits.robot.velocity_limit)
-            fast = np.where(given, np.abs(limits.limits), 0.0).max(axis=0)
-            sentence = degrees_per_second_hint(limits.robot, f"{limits.label}: limit", fast)
-            if sentence:
-                yield Finding("limits in degrees", sentence)
         if not isinstance(limits, WithinJointLimits):
             continue
         # Limits of the robot's description are in radians, however wide.
