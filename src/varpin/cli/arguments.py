@@ -283,8 +283,7 @@ def scene_file(request: argparse.Namespace, word: str, *given: str) -> SceneFile
             option = name.replace("_", "-") if getattr(request, name) is not False else f"no-{name}"
             raise InputError(f"--{option} cannot be given with a scene file: {command} {word} takes it from the file")
     scene = load_scene(word)
-    outputs = scene.spec.outputs
-    for name in ("save", "plot", "html", "speed"):
-        if hasattr(request, name) and getattr(request, name) is None:
-            setattr(request, name, getattr(outputs, name))
+    for name, value in scene.outputs.items():
+        if getattr(request, name, value) is None:
+            setattr(request, name, value)
     return scene

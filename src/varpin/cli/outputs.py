@@ -14,7 +14,6 @@ from varpin.cli.exits import INTERRUPTED, MISTAKE
 from varpin.cli.interrupts import Interrupts
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.io.archive import atomic_file
-from varpin.io.scenefile.tables import FIGURES
 from varpin.marks import Marks
 from varpin.model import Robot
 from varpin.show.replay.video import FORMATS, check_film
@@ -66,7 +65,7 @@ def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Wri
     found: Writers = {}
     for option, endings, make in (
         ("save", (".npz",), _record),
-        ("plot", FIGURES, _figure),
+        ("plot", (".png", ".pdf", ".svg"), _figure),
         ("html", (".html", ".htm"), _replay),
         ("video", FORMATS, _replay),
     ):
