@@ -325,7 +325,7 @@ def test_replay_opens_a_window_until_ctrl_c(saved, arm, monkeypatch, capsys):
     shown = []
     monkeypatch.setattr("varpin.show.replay.motion.replay", lambda *words, **options: shown.append(options) or Viewer())
     monkeypatch.setattr("varpin.cli.replay.time.sleep", interrupt)
-    assert main(["replay", saved, "--robot", arm, "--once"]) == 0
+    assert main(["replay", saved, "--robot", arm]) == 0
     assert not unnamed(capsys.readouterr().err, "http://here", "Ctrl-C")
     assert shown[0]["open"]
     assert not shown[0]["loop"]

@@ -213,4 +213,4 @@ def test_a_frame_of_no_size_is_refused(size):
     robot = vp.planar_chain(1)
     motion = vp.simulate(vp.Scene(robot), [0.1], [0.0], dt=1e-2, steps=2)
     with refused(vp.InputError, "size"):
-        vp.replay(robot, motion, inline=True, size=size)
+        vp.replay(robot, motion, size=size)

@@ -117,14 +117,12 @@ def test_plays_in_real_time(browser, finger, tmp_path):
     assert end - start == pytest.approx(after - before, abs=0.3)
 
 
-def test_speed_and_loop(finger, tmp_path):
+def test_speed(finger, tmp_path):
     q = np.zeros((11, 3))
-    slow = replay(finger, q, dt=0.1, speed=0.1, loop=False, html=tmp_path / "slow.html")
+    slow = replay(finger, q, dt=0.1, speed=0.1, html=tmp_path / "slow.html")
     tracks, options = animation(slow)
     assert {times[-1] for times, _ in tracks.values()} == {10.0}
-    assert options == {"play": True, "repetitions": 1}
-    _, options = animation(replay(finger, q, dt=0.1, html=tmp_path / "loop.html"))
-    assert options["repetitions"] == float("inf")
+    assert options == {"play": True, "repetitions": float("inf")}
 
 
 def bar(browser):
@@ -166,13 +164,6 @@ def test_the_bar_sets_the_speed(browser, finger, tmp_path):
     assert choice.first_selected_option.text == "0.5 x"
     choice.select_by_visible_text("2 x")
     assert browser.execute_script("return viewer.animator.mixer.timeScale") == 4.0
-
-
-def test_a_motion_that_is_over_stays_and_plays_again(browser, finger, tmp_path):
-    visit(browser, replay(finger, [[0.1] * 3, [0.5] * 3], dt=0.3, loop=False, html=tmp_path / "once.html"))
-    wait_until(lambda: bar(browser) == [0.3, 0.3, False])
-    browser.find_element(By.ID, "play").click()
-    wait_until(lambda: bar(browser) == [0.3, 0.3, False])
 
 
 def test_a_pose_has_no_bar_and_does_not_move(browser, finger, tmp_path):
@@ -400,7 +391,7 @@ def test_live_window(browser, finger, motion, monkeypatch, capfd):
 
 
 def test_a_notebook_shows_the_page_in_a_frame(browser, finger, motion, tmp_path):
-    shown = replay(finger, motion, inline=True, size=(600, 400))
+    shown = replay(finger, motion, size=(600, 400))
     assert repr(shown) == f"Inline(replay of finger, {len(shown.html) / 1e6:.1f} MB)"
     page = tmp_path / "notebook.html"
     page.write_text(f"<!DOCTYPE html><title>notebook</title><p>above</p>{shown._repr_html_()}<p>below</p>")
@@ -431,7 +422,6 @@ def test_refuses_what_it_cannot_show(finger, motion, tmp_path):
             replay(robot, motion, html=html, **options)
 
     q = np.zeros((3, 3))
-    no("html=path", "open=True", html=None)
     no("html=path", "open=True", open=True)
     no("robot", "load_robot", robot=finger.model)
     no("dt", motion=q)

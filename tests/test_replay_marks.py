@@ -401,12 +401,10 @@ def test_torque_colours_are_seen(browser, ur5, tmp_path):
 def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_path):
     finger = vp.load_robot("finger")
     bend = np.linspace([0.0, 0.0, 0.0], [0.5, 0.6, 0.7], 6)
-    step = np.array([0.0, 1.5, 0.0])
     pairs = [(ur5, sweep), (ur5, sweep[::-1]), (finger, bend)]
     page = replay(
         pairs,
         dt=0.05,
-        offset=step,
         html=tmp_path / "three.html",
         marks=vp.Marks(trace=TIP, targets={"goal": [0.4, 0.0, 0.5]}),
     )
@@ -416,15 +414,18 @@ def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_pat
     # The finger's motion is over after 0.25 s, and held.
     for k, (robot, q) in enumerate([(ur5, sweep[15]), (ur5, sweep[::-1][15]), (finger, bend[-1])]):
         number = f" {k + 1}" if k else ""
+        shift = pose(browser, [f"robot{number}"])[:3, 3]
         shapes, model = geometry(robot), robot.free_model
         at, data = shapes.createData(), model.createData()
         pin.updateGeometryPlacements(model, data, shapes, at, robot.free_positions(q))
         for index, found in shape_poses(browser, f"robot{number}").items():
-            np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + k * step, atol=2e-5)
+            np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + shift, atol=2e-5)
         goal = pose(browser, [f"notes{number}", names(browser, [f"notes{number}"])[-1]])[:3, 3]
-        np.testing.assert_allclose(goal, np.array([0.4, 0.0, 0.5]) + k * step, atol=1e-6)
+        np.testing.assert_allclose(goal, np.array([0.4, 0.0, 0.5]) + shift, atol=1e-6)
     second = along(browser, "0 motion tool0", "notes 2")
-    np.testing.assert_allclose(second[0], placements(ur5, sweep[-1], TIP)[0, :3, 3] + step, atol=1e-5)
+    np.testing.assert_allclose(
+        second[0], placements(ur5, sweep[-1], TIP)[0, :3, 3] + pose(browser, ["robot 2"])[:3, 3], atol=1e-5
+    )
 
 
 @pytest.mark.slow
@@ -433,11 +434,9 @@ def test_each_of_several_robots_has_its_ghost_and_its_torques(browser, ur5, swee
     bend = np.linspace([0.0, 0.0, 0.0], [0.5, 0.6, 0.7], 21)
     straight = np.array([[0.1, 0.2, 0.3]])
     torques = np.tile([0.0, 1.0, 2.0], (20, 1))
-    step = np.array([0.0, 1.5, 0.0])
     page = replay(
         [(ur5, sweep), (finger, bend, vp.Marks(ghost=straight, torques=torques, torque_limit=2.0))],
         dt=0.05,
-        offset=step,
         html=tmp_path / "both.html",
     )
     visit(browser, page)
@@ -450,7 +449,9 @@ def test_each_of_several_robots_has_its_ghost_and_its_torques(browser, ur5, swee
     at, data = shapes.createData(), model.createData()
     pin.updateGeometryPlacements(model, data, shapes, at, finger.free_positions(straight[0]))
     for index, found in shape_poses(browser, "ghost 2").items():
-        np.testing.assert_allclose(found[:3, 3], at.oMg[index].translation + step, atol=2e-5)
+        np.testing.assert_allclose(
+            found[:3, 3], at.oMg[index].translation + pose(browser, ["robot 2"])[:3, 3], atol=2e-5
+        )
     colors = link_colors(browser, "robot 2")
     for k, shape in enumerate(shapes.geometryObjects):
         if shape.parentJoint:
@@ -490,9 +491,9 @@ def test_robots_share_one_clock(ur5, sweep, tmp_path):
 def test_refuses_marks_it_cannot_show(ur5, sweep, run, tmp_path):
     page = tmp_path / "page.html"
 
-    def no(*facts, robot=ur5, motion=sweep, dt=0.05, offset=None, **marks):
+    def no(*facts, robot=ur5, motion=sweep, dt=0.05, **marks):
         with refused(vp.InputError, *facts):
-            replay(robot, motion, dt=dt, html=page, offset=offset, marks=vp.Marks(**marks))
+            replay(robot, motion, dt=dt, html=page, marks=vp.Marks(**marks))
 
     with refused(vp.UnknownFrame, "trace", "'ur5'", "'fore_link'", "'forearm_link'"):
         replay(ur5, sweep, dt=0.05, html=page, marks=vp.Marks(trace="fore_link"))
@@ -512,7 +513,6 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, run, tmp_path):
     no("torques", "(N, 6)", "(20, 5)", torques=np.zeros((20, 5)))
     no("torque_limit", "torques", torque_limit=1.0)
     no("torque_limit", "0.0", torques=np.ones((20, 6)), torque_limit=0.0)
-    no("offset", "(3,)", "(2,)", offset=[1.0, 0.0])
     no("robots", "pairs", robot=[(ur5, sweep)])
     no("robots", "pairs", robot=[ur5, ur5], motion=None)
     both = [(ur5, sweep), (ur5, sweep)]

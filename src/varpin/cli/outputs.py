@@ -108,8 +108,7 @@ def _replay(
 
         task = Marks() if marks is None else marks(trajectory.duration)
         shown, files = replace(task, trace=request.trace or task.trace), {option: path}
-        loop, html, video = not getattr(request, "once", False), files.get("html"), files.get("video")
-        replay(robot, trajectory, html=html, video=video, speed=speed, loop=loop, marks=shown)
+        replay(robot, trajectory, html=files.get("html"), video=files.get("video"), speed=speed, marks=shown)
 
     return write
 
