@@ -229,9 +229,8 @@ def plot_study(study: Study[Any], axes: Axes | None = None, **options: str) -> t
     Args:
         study: From :func:`varpin.work_precision`, :func:`varpin.advise` or :func:`varpin.optimal_control_tradeoff`.
         axes: Where to draw; a new figure if left out.
-        options: For work and precision ``quantity``: ``"q"``, the largest error in q over the motion; ``"end"``, that
-            at its end; ``"energy"``, the energy error of a conservative motion; ``"tip"``, the error of the end
-            effector. Errors below that of the reference are drawn on its line.
+        options: For work and precision ``quantity``: ``"q"``, the largest error in q over the motion, or ``"energy"``,
+            that of the energy of a conservative motion. Errors below that of the reference are drawn on its line.
 
     Returns:
         The figure and its axes.
