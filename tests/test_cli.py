@@ -112,18 +112,6 @@ def test_outputs_are_written_and_listed(arm, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.html", "a.npz", "a.png", "arm.urdf"]
 
 
-@pytest.mark.parametrize("kind", ["pdf", "svg"])
-def test_plot_takes_its_format_from_the_name(arm, tmp_path, kind):
-    path = tmp_path / f"a.{kind}"
-    assert main(["simulate", arm, "--steps", "10", "--quiet", "--plot", str(path)]) == 0
-    assert path.read_bytes()[:5] == {"pdf": b"%PDF-", "svg": b"<?xml"}[kind]
-
-
-def test_quiet_run_prints_nothing(arm, capsys):
-    assert main(["simulate", arm, "--steps", "10", "--quiet"]) == 0
-    assert capsys.readouterr() == ("", "")
-
-
 def test_split_steps_are_flagged_in_the_table(arm, capsys):
     assert main(["simulate", arm, "--integrator", "midpoint", "--dt", "0.3", "--steps", "20", "--v0", "5", "0"]) == 0
     out, err = capsys.readouterr()
@@ -147,15 +135,6 @@ def test_forced_motion_has_an_energy_change_and_no_error(arm, capsys):
     out = capsys.readouterr().out
     assert re.search(r"energy change \+\S+ J from start to end, \S+ J at most in between", " ".join(out.split()))
     assert "energy error" not in out
-
-
-def test_energy_of_a_damped_motion_is_what_it_lost(arm, tmp_path, capsys):
-    path = tmp_path / "a.npz"
-    assert main(["simulate", arm, "--damping", "0.5", "--no-gravity", "--v0", "1", "--save", str(path)]) == 0
-    energy = vp.Trajectory.load(path).energy
-    lost = float(re.search(r"energy change +(\S+) J from start to end", capsys.readouterr().out)[1])
-    assert lost == pytest.approx(energy[-1] - energy[0], rel=5e-3)
-    assert lost < 0.0
 
 
 @pytest.mark.parametrize(
@@ -189,12 +168,6 @@ def test_mistakes_are_one_line_and_status_2(arm, capsys, options, facts):
     line = error_of(capsys)
     assert line.startswith("varpin: error: ")
     assert not unnamed(line, facts)
-
-
-@pytest.mark.parametrize("command", ["simulate", "inspect"])
-def test_unknown_robot_gets_close_matches(capsys, command):
-    assert main([command, "ur55"]) == 2
-    assert not unnamed(error_of(capsys), "'ur55'", "ur5", "ur3", "ur10")
 
 
 @pytest.mark.parametrize(
@@ -281,13 +254,6 @@ def test_a_saved_motion_is_replayed(arm, saved, tmp_path, capsys):
     paths = [command["path"] for command in commands(page) if command["type"] == "set_object"]
     assert any(path.endswith("motion lower") for path in paths)
     assert any(path.endswith("frame upper") for path in paths), paths
-
-
-def test_a_motion_of_a_robot_with_a_name_needs_no_other(tmp_path):
-    scene = vp.Scene(vp.load_robot("finger"))
-    path = str(vp.simulate(scene, {"pip": 0.3}, {}, dt=0.01, steps=5).save(tmp_path / "a.npz"))
-    assert main(["replay", path, "--html", str(tmp_path / "a.html")]) == 0
-    assert (tmp_path / "a.html").stat().st_size > 10_000
 
 
 def test_a_saved_plan_is_replayed_with_its_task(scene, tmp_path):
@@ -391,13 +357,6 @@ def test_failed_step_keeps_what_was_before_it(arm, tmp_path, capsys, monkeypatch
     assert vp.Trajectory.load(path).steps == 7
 
 
-def test_hopeless_step_is_status_3(arm, tmp_path, capsys):
-    path = tmp_path / "a.npz"
-    assert main(["simulate", arm, "--dt", "1e4", "--steps", "3", "--v0", "1e3", "--quiet", "--save", str(path)]) == 3
-    assert not unnamed(error_of(capsys), "varpin: error", "step 0", "t = 0 s")
-    assert vp.Trajectory.load(path).steps == 0
-
-
 def test_interrupted_run_keeps_its_data(arm, tmp_path, capsys, monkeypatch):
     def interrupt(done, steps):
         raise KeyboardInterrupt
@@ -447,12 +406,6 @@ def test_progress_bar_on_a_terminal_vanishes_without_hiding_warnings():
         logging.getLogger("varpin.simulation.simulate").warning("something [bold] happened")
     assert "varpin: warning: something [bold] happened" in stream.getvalue()
     assert "varpin" in stream.getvalue()
-
-
-def test_logging_is_as_it_was_after_the_command(arm):
-    before = list(logging.getLogger("varpin").handlers)
-    main(["simulate", arm, "--steps", "2", "--quiet"])
-    assert logging.getLogger("varpin").handlers == before
 
 
 def test_inspect_prints_tables_and_then_warnings(capsys):
@@ -510,11 +463,6 @@ def test_inspect_takes_what_simulate_refuses(tmp_path, capsys):
     assert naming(out.splitlines(), "warning", "'ghost'", "'hinge'")
 
 
-def test_inspect_refuses_a_wrong_configuration(arm, capsys):
-    assert main(["inspect", arm, "--q", "1", "2", "3"]) == 2
-    assert not unnamed(error_of(capsys), "varpin: error", "q", "(2,)", "(3,)")
-
-
 def test_version_and_help(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["--version"])
@@ -531,14 +479,6 @@ def test_version_and_help(capsys):
 def python_m_varpin(*arguments):
     command = [sys.executable, "-m", "varpin", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-
-
-def test_process_simulates_and_saves(arm, tmp_path):
-    path = tmp_path / "a.npz"
-    done = python_m_varpin("simulate", arm, "--q0", "-5e-1", "0.2", "--steps", "100", "--save", str(path))
-    assert done.returncode == 0, done.stderr
-    assert not unnamed(done.stdout, "100", "0.001 s")
-    assert vp.Trajectory.load(path).q[0].tolist() == [-0.5, 0.2]
 
 
 def test_process_reports_a_mistake_without_a_traceback():
@@ -625,10 +565,6 @@ def test_advise_says_what_to_take(arm, tmp_path, capsys):
     assert about(capsys.readouterr().out, "out of reach")
     assert main(["advise", arm, "--tolerance", "0"]) == 2
     assert not unnamed(error_of(capsys), "tolerance")
-
-
-def test_advise_needs_one_wish(arm, capsys):
-    assert not unnamed(usage_error(["advise", arm], capsys), "--tolerance", "--budget")
 
 
 SCENE = """

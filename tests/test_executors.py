@@ -7,7 +7,7 @@ import pickle
 import signal
 import threading
 import time
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 
@@ -79,12 +79,6 @@ def test_generators_go_on_as_with_threads(spawned):
     assert one.spawn(1)[0].random() == other.spawn(1)[0].random() == np.random.default_rng(3).spawn(41)[40].random()
 
 
-def test_policies_and_integrators_on_velocities(spawned):
-    policy = vp.LinearPolicy(np.zeros((10, 2)), -np.ones((10, 2, 4)), np.zeros((10, 4)), hold=5, limits=(-1.0, 1.0))
-    options = {"controls": policy, "integrator": vp.RungeKutta4(), "paths": 100}
-    same_ensembles(run(executor=spawned, **options), run(**options))
-
-
 def test_nothing_comes_back_that_was_not_asked_for():
     shipping = Shipping()
     paths, steps = 2000, 50
@@ -137,18 +131,6 @@ def test_monte_carlo_on_processes(spawned):
     shipping = Shipping()
     assert plan.monte_carlo(300, 1, executor=shipping) == found
     assert shipping.returned < 300 * 8 + 3000 * shipping.sent
-
-
-def field(q, v, u):
-    return 0.1 * np.eye(2)
-
-
-def test_monte_carlo_with_noise_of_ones_own_on_processes(spawned):
-    plan = plan_of(vp.Scene(vp.planar_chain(2), noise=vp.CustomNoise(field, 2)), max_iterations=2)
-    assert plan.monte_carlo(4, 1, executor=spawned) == plan.monte_carlo(4, 1)
-    here = plan_of(vp.Scene(vp.planar_chain(2), noise=vp.CustomNoise(lambda q, v, u: 0.1 * np.eye(2), 2)))
-    with refused(vp.InputError, "importable"):
-        here.monte_carlo(4, 1, executor=spawned)
 
 
 def test_references_in_place_are_sampled_before_they_are_sent(spawned):
@@ -289,15 +271,6 @@ def test_what_work_raises_comes_back(spawned):
         next(results)
     # The pool is as good as before.
     assert list(in_order(spawned, abs, [-1, 2])) == [1, 2]
-
-
-def test_executors_of_others_that_break_are_told_of():
-    class Broken(Executor):
-        def submit(self, fn, /, *args, **kwargs):
-            raise BrokenExecutor("the cluster is gone")
-
-    with refused(vp.WorkersLost, "the cluster is gone"):
-        run(executor=Broken())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")

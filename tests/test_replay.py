@@ -188,12 +188,6 @@ def test_the_key_names_what_has_a_colour_of_its_own(finger, tmp_path):
     assert words == ["torque: none, half, all of the limit", "ghost", *paths, "reference: way", "target: cup &lt;1&gt;"]
 
 
-def test_trajectory_and_its_array_give_the_same_animation(finger, motion, tmp_path):
-    whole = animation(replay(finger, motion, html=tmp_path / "trajectory.html"))
-    array = animation(replay(finger, motion.q, dt=motion.dt, html=tmp_path / "array.html"))
-    assert whole == array
-
-
 def test_size_stays_sane_for_a_long_motion(finger, tmp_path):
     t = np.arange(1_000_001) * 1e-3
     q = np.column_stack([np.sin(t), 1.0 + np.cos(0.7 * t), 0.5 + 0.5 * np.sin(1.3 * t)])
@@ -258,25 +252,6 @@ def test_ghost_is_translucent_and_hides_where_the_robot_is(browser, finger, tmp_
     assert opacities["ghost"] == pytest.approx([0.35] * len(opacities["ghost"]))
 
 
-def test_ghost_of_another_time_step_and_length(finger, motion, tmp_path):
-    scene = vp.Scene(finger, gravity=False)
-    start = {"q0": [0.2, 0.3, 0.4], "v0": [1.0, 2.0, -1.0]}
-    t = np.linspace(0.0, 0.5, 200)
-    for dt, steps in [(7e-4, 1000), (1e-2, 20)]:
-        ghost = vp.simulate(scene, **start, dt=dt, steps=steps)
-        tracks, _ = animation(
-            replay(finger, motion, marks=vp.Marks(ghost=ghost), fps=5000.0, html=tmp_path / "ghost.html")
-        )
-        assert len(tracks) == 6
-        assert len({tuple(times) for times, _ in tracks.values()}) == 1
-        for shown, q in zip(("robot", "ghost"), (motion, ghost), strict=True):
-            own = [track for (path, _), track in tracks.items() if f"/{shown}/" in path]
-            for (times, values), column in zip(own, q.q.T, strict=True):
-                assert times[-1] == pytest.approx(motion.duration)
-                # Over before the motion is, it stands still: np.interp holds the last value, too.
-                np.testing.assert_allclose(np.interp(t, times, values), np.interp(t, q.t, column), atol=1e-6)
-
-
 def test_ghost_keeps_its_corners_between_sparse_nodes_of_the_motion(finger, tmp_path):
     ghost = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     path = replay(
@@ -287,14 +262,6 @@ def test_ghost_keeps_its_corners_between_sparse_nodes_of_the_motion(finger, tmp_
         np.testing.assert_allclose(times, [0.0, 4.0 / 3.0, 2.0, 8.0 / 3.0, 4.0], rtol=1e-6)
         moves = "/ghost/" in node and "mcp" in node.rsplit("/", 2)[-2]
         np.testing.assert_allclose(values, [0.0, 1.0, 0.5, 0.0, 1.0] if moves else np.zeros(5), atol=1e-6)
-
-
-def test_ghost_costs_less_than_the_robot(tmp_path):
-    ur5, q = vp.load_robot("ur5"), np.zeros((2, 6))
-    empty = replay(vp.planar_chain(1), [[0.0]], dt=1.0, html=tmp_path / "empty.html").stat().st_size
-    alone = replay(ur5, q, dt=1.0, html=tmp_path / "alone.html").stat().st_size
-    both = replay(ur5, q, dt=1.0, marks=vp.Marks(ghost=q), html=tmp_path / "both.html").stat().st_size
-    assert both - alone < 0.5 * (alone - empty)
 
 
 def test_ghost_of_a_robot_without_geometry_is_a_skeleton(browser, tmp_path):
@@ -466,13 +433,6 @@ def test_a_failure_leaves_the_old_page_alone(finger, motion, tmp_path, monkeypat
         replay(finger, motion, html=page)
     assert page.read_text() == "old"
     assert list(tmp_path.iterdir()) == [page]
-
-
-def test_titles_are_escaped(tmp_path):
-    model = vp.planar_chain(1).model
-    model.name = "<b>arm</b>"
-    page = replay(vp.load_robot(model), [[0.0]], dt=1.0, html=tmp_path / "page.html").read_text()
-    assert "<title>&lt;b&gt;arm&lt;/b&gt; - varpin</title>" in page
 
 
 @pytest.mark.parametrize("size", [(800, 640), (400, 700)])

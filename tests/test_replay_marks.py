@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from chromium import animation, commands, picture, seek, shape_poses, visit
+from chromium import commands, seek, shape_poses, visit
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
@@ -194,30 +194,6 @@ def test_a_controllers_run_shows_its_plans(browser, run, tmp_path):
             np.testing.assert_allclose(figure[max(figure)][:3, 3], moved, atol=1e-5)
 
 
-def test_a_run_may_have_another_ghost(run, tmp_path):
-    robot = run.plans[0].problem.scene.robot
-    page = replay(
-        robot, run, html=tmp_path / "other.html", marks=vp.Marks(trace=True, ghost=np.array([[0.0, 1.0], [0.5, 0.5]]))
-    )
-    paths = [command["path"] for command in commands(page) if command["type"] == "set_object"]
-    marks = {path.split("/")[3] for path in paths if "/notes/" in path}
-    kinds = ("0 motion", "1 ghost", "2 plan")
-    assert marks == {f"{kind} {robot.end_effector}" for kind in kinds}
-    tracks, _ = animation(page)
-    (elbow,) = [path for path, _ in tracks if path.startswith("/meshcat/ghost/") and path.endswith("joint2/moving")]
-    assert tracks[elbow, ".rotation[z]"][1][-1] == pytest.approx(0.5)
-
-
-def test_plans_are_not_shown_where_nobody_wants_them(browser, run, tmp_path):
-    robot = run.plans[0].problem.scene.robot
-    visit(browser, replay(robot, run, html=tmp_path / "bare.html", marks=vp.Marks(trace=True, ahead=0)))
-    assert sorted(browser.execute_script("return Object.keys(viewer.scene_tree.find(['meshcat']).children)")) == [
-        "notes",
-        "robot",
-    ]
-    assert names(browser, ["notes"]) == [f"0 motion {robot.end_effector}"]
-
-
 def test_a_frame_that_stays_leaves_no_trace(browser, arm, tmp_path):
     q = np.zeros((5, 6))
     q[:, -1] = np.linspace(0.0, 1.0, 5)
@@ -383,21 +359,6 @@ def test_torques_of_a_plan_are_held_against_its_control_limits(ur5):
         np.testing.assert_allclose(shares(given, limit=1e3), np.abs(motion.u) / 1e3, rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_torque_colours_are_seen(browser, ur5, tmp_path):
-    def red(seconds):
-        seek(browser, seconds)
-        image = picture(browser)
-        return ((image[..., 0] > 120.0) & (image[..., 1] < 60.0)).mean()
-
-    torques = np.zeros((10, 6))
-    torques[5:] = 1e3
-    q = np.tile([0.0, -1.0, 1.0, 0.0, 0.0, 0.0], (11, 1))
-    visit(browser, replay(ur5, q, dt=0.1, html=tmp_path / "red.html", marks=vp.Marks(torques=torques)))
-    assert red(0.0) < 1e-3
-    assert red(0.9) > 0.01
-
-
 def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_path):
     finger = vp.load_robot("finger")
     bend = np.linspace([0.0, 0.0, 0.0], [0.5, 0.6, 0.7], 6)
@@ -428,36 +389,6 @@ def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_pat
     )
 
 
-@pytest.mark.slow
-def test_each_of_several_robots_has_its_ghost_and_its_torques(browser, ur5, sweep, tmp_path):
-    finger = vp.load_robot("finger")
-    bend = np.linspace([0.0, 0.0, 0.0], [0.5, 0.6, 0.7], 21)
-    straight = np.array([[0.1, 0.2, 0.3]])
-    torques = np.tile([0.0, 1.0, 2.0], (20, 1))
-    page = replay(
-        [(ur5, sweep), (finger, bend, vp.Marks(ghost=straight, torques=torques, torque_limit=2.0))],
-        dt=0.05,
-        html=tmp_path / "both.html",
-    )
-    visit(browser, page)
-    assert_no_errors(browser)
-    seek(browser, 0.5)
-    figures = browser.execute_script("return Object.keys(viewer.scene_tree.find(['meshcat']).children)")
-    assert {"robot", "robot 2", "ghost 2"} <= set(figures)
-    assert "ghost" not in figures
-    shapes, model = geometry(finger), finger.free_model
-    at, data = shapes.createData(), model.createData()
-    pin.updateGeometryPlacements(model, data, shapes, at, finger.free_positions(straight[0]))
-    for index, found in shape_poses(browser, "ghost 2").items():
-        np.testing.assert_allclose(
-            found[:3, 3], at.oMg[index].translation + pose(browser, ["robot 2"])[:3, 3], atol=2e-5
-        )
-    colors = link_colors(browser, "robot 2")
-    for k, shape in enumerate(shapes.geometryObjects):
-        if shape.parentJoint:
-            np.testing.assert_allclose(colors[str(k)], [GREY, YELLOW, RED][shape.parentJoint - 1], atol=1e-5)
-
-
 def test_robots_beside_each_other_do_not_overlap(ur5, sweep, tmp_path):
     page = replay([(ur5, sweep), (ur5, sweep[::-1])], dt=0.05, html=tmp_path / "two.html")
     (move,) = [
@@ -476,16 +407,6 @@ def test_robots_beside_each_other_do_not_overlap(ur5, sweep, tmp_path):
             spans.append(corners @ move)
     values = np.concatenate(spans) / np.linalg.norm(move)
     assert np.ptp(values) < np.linalg.norm(move) < 3.0 * np.ptp(values)
-
-
-def test_robots_share_one_clock(ur5, sweep, tmp_path):
-    tracks, _ = animation(replay([(ur5, sweep), (ur5, sweep[:8])], dt=0.05, html=tmp_path / "clock.html"))
-    assert {len(times) for times, _ in tracks.values()} == {21}
-    assert [times[-1] for times, _ in tracks.values()] == pytest.approx([1.0] * 12)
-    for (path, _), (times, values) in tracks.items():
-        if "/robot 2/" in path:
-            late = [value for time, value in zip(times, values, strict=True) if time >= 0.35]
-            assert len(set(late)) == 1
 
 
 def test_refuses_marks_it_cannot_show(ur5, sweep, run, tmp_path):

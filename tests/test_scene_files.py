@@ -884,38 +884,6 @@ def test_of_joints_that_cost_nothing_the_ghost_stays_where_they_start(tmp_path):
     np.testing.assert_allclose(marks.ghost, [[0.7, 0.3, 0.0]])
 
 
-def test_a_frame_that_costs_along_some_axes_only_has_no_target(tmp_path):
-    cost = 'type = "frame_position"\nframe = "tip"\ntarget = [0.1, 0.0, 0.0]\nweight = { x = 1.0 }\n'
-    marks = vp.load_scene(write(tmp_path, BARE + cost)).marks()
-    assert (marks.trace, marks.ghost, marks.targets) == (False, None, {})
-
-
-def test_no_other_key_is_taken(tmp_path, monkeypatch):
-    whole = tomllib.loads(GOOD)
-    free = ("damping", "lock", "gear", "v", "offset", "weight")
-    places = [(), *(place for place in leaves(whole) if isinstance(at(whole, place), dict) and place[-1] not in free)]
-    path = write(tmp_path, "")
-    for place in places:
-        data = copy.deepcopy(whole)
-        at(data, place)["strange"] = 1
-        monkeypatch.setattr(tomllib, "loads", lambda _, data=data: data)
-        with refused(vp.SceneFileError) as caught:
-            vp.load_scene(path)
-        assert caught.value.key.rpartition(".")[2] == "strange"
-
-
-def at(data, place):
-    return functools.reduce(lambda table, key: table[key], place, data)
-
-
-def test_stages_of_radau_are_taken(tmp_path):
-    head = '[robot]\nsource = "ur5"\n[horizon]\ndt = 2e-3\nduration = 0.02\n[integrator]\ntype = "radau"\n'
-    path = tmp_path / "radau.toml"
-    for line, expected in (("stages = 3\n", vp.Radau(3)), ("", vp.Radau())):
-        path.write_text(head + line)
-        assert vp.load_scene(path).integrator == expected
-
-
 def test_without_an_integrator_a_file_takes_that_of_its_problem(tmp_path):
     """As in Python: dampers far faster than the step are for an L-stable method."""
     text = '[robot]\nsource = "finger"\n[horizon]\ndt = 1e-2\nsteps = 4\n[[cost]]\ntype = "control"\n'
