@@ -128,7 +128,7 @@ def write_all(
     written: list[Path] = []
     status = 0
     for path, write in files.items():
-        if interrupts.ended or (interrupts.wanted and (written or status)):
+        if interrupts.wanted:
             complain(errors, f"{path} was not written: interrupted")
             continue
         try:
