@@ -5,11 +5,8 @@ import multiprocessing
 import os
 import pickle
 import signal
-import threading
-import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -19,7 +16,7 @@ from test_ensemble import ARRAYS, make_scene, run, same_statistics
 
 import varpin as vp
 import varpin.ensemble
-from varpin.support.executors import executing, in_order, take_all
+from varpin.support.executors import executing, in_order
 
 
 @pytest.fixture(scope="module", params=["fork", "spawn"])
@@ -271,60 +268,6 @@ def test_what_work_raises_comes_back(spawned):
         next(results)
     # The pool is as good as before.
     assert list(in_order(spawned, abs, [-1, 2])) == [1, 2]
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
-@pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize("waiting", [True, False], ids=["waiting", "telling"])
-def test_ctrl_c_keeps_all_that_threads_have_begun(workers, waiting):
-    begun, taken, gate = [], [], threading.Event()
-
-    def task(number):
-        begun.append(number)
-        if number:
-            gate.wait(10.0)
-        return number
-
-    def tell():
-        if len(taken) > 1:
-            return
-        while len(begun) < 1 + workers:
-            time.sleep(1e-3)
-        threading.Timer(0.1, gate.set).start()
-        if not waiting:
-            raise KeyboardInterrupt
-        threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT)).start()
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with (
-            ThreadPoolExecutor(workers) as pool,
-            closing(in_order(pool, task, range(100))) as results,
-            pytest.raises(KeyboardInterrupt),
-        ):
-            take_all(results, taken.append, tell)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert taken == sorted(begun) == list(range(1 + workers))
-
-
-def test_ctrl_c_leaves_no_gap():
-    """The second task of four is lost: those after it are not taken, finished or not."""
-
-    class Losing(Shipping):
-        def submit(self, fn, /, *given):
-            done = super().submit(fn, *given)
-            if given[0] != -1:
-                return done
-            return Future()
-
-    def stop():
-        raise KeyboardInterrupt
-
-    taken = []
-    with closing(in_order(Losing(), abs, [0, -1, 2, 3])) as results, pytest.raises(KeyboardInterrupt):
-        take_all(results, taken.append, stop)
-    assert taken == [0]
 
 
 def test_interruption_on_processes_keeps_what_is_done(spawned):

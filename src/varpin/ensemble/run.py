@@ -99,8 +99,7 @@ def simulate_ensemble(
         AssemblyError: No configuration near q0 satisfies the scene's constraints.
         VarpinError: Every path failed.
         WorkersLost: The executor has lost its workers; holds the finished paths.
-        EnsembleInterrupted: Ctrl-C; holds the finished paths, and those that threads had begun. It is a
-            KeyboardInterrupt.
+        EnsembleInterrupted: Ctrl-C; holds the finished paths. It is a KeyboardInterrupt.
     """
     require_scene(scene)
     dt, steps = time_steps(dt, steps, duration)
