@@ -320,14 +320,16 @@ def test_advice_meets_the_tolerance_and_takes_the_cheapest():
     exact = vp.simulate(scene, rest, rest, dt=1.0, steps=1, integrator=vp.Reference(rtol=1e-13)).q[-1]
     for tolerance in (1e-2, 1e-5, 1e-8):
         advice = vp.advise(scene, rest, rest, duration=1.0, tolerance=tolerance)
-        motion = vp.simulate(scene, rest, rest, dt=advice.dt, steps=advice.steps, integrator=advice.integrator)
+        motion = vp.simulate(
+            scene, rest, rest, dt=advice.best.dt, steps=advice.best.steps, integrator=advice.best.integrator
+        )
         error = np.abs(motion.q[-1] - exact).max()
         assert advice.reached
         assert error <= tolerance
-        assert advice.error / 3 < error < 3 * advice.error
-        assert all(advice.seconds <= 1.3 * other.seconds for other in advice.alternatives)
-    assert advice.integrator.order > 2
-    assert str(advice).startswith(f"{advice.integrator} at dt = ")
+        assert advice.best.error / 3 < error < 3 * advice.best.error
+        assert all(advice.best.seconds <= 1.3 * other.seconds for other in advice.alternatives)
+    assert advice.best.integrator.order > 2
+    assert str(advice).startswith(f"{advice.best.integrator} at dt = ")
 
 
 def test_advice_within_a_budget(monkeypatch):
@@ -343,10 +345,10 @@ def test_advice_within_a_budget(monkeypatch):
     small, large = (vp.advise(scene, rest, rest, duration=1.0, budget=budget) for budget in (1e-4, 2e-2))
     assert small.reached
     assert large.reached
-    assert small.seconds <= 1e-4
-    assert large.seconds <= 2e-2
-    assert large.error < small.error
-    assert all(large.error <= other.error for other in large.alternatives)
+    assert small.best.seconds <= 1e-4
+    assert large.best.seconds <= 2e-2
+    assert large.best.error < small.best.error
+    assert all(large.best.error <= other.error for other in large.alternatives)
 
 
 def test_advice_holds_controls_where_they_are():
@@ -354,11 +356,17 @@ def test_advice_holds_controls_where_they_are():
     q0 = np.linspace(0.2, 0.6, 6)
     controls = np.random.default_rng(0).normal(size=(5, 6))
     advice = vp.advise(scene, q0, np.zeros(6), duration=0.5, controls=controls, tolerance=1e-6)
-    assert advice.steps % 5 == 0
+    assert advice.best.steps % 5 == 0
     exact = vp.simulate(scene, q0, np.zeros(6), dt=0.1, steps=5, controls=controls, integrator=vp.Reference()).q[-1]
-    held = np.repeat(controls, advice.steps // 5, axis=0)
+    held = np.repeat(controls, advice.best.steps // 5, axis=0)
     motion = vp.simulate(
-        scene, q0, np.zeros(6), dt=advice.dt, steps=advice.steps, controls=held, integrator=advice.integrator
+        scene,
+        q0,
+        np.zeros(6),
+        dt=advice.best.dt,
+        steps=advice.best.steps,
+        controls=held,
+        integrator=advice.best.integrator,
     )
     assert np.abs(motion.q[-1] - exact).max() <= 1e-6
 
@@ -369,7 +377,7 @@ def test_advice_says_when_a_wish_is_out_of_reach():
     assert not advice.reached
     assert about(str(advice), "out of reach")
     # Rounding leaves no more, even where a motion and its repetition agree to the last bit.
-    assert advice.error > 1e-14
+    assert advice.best.error > 1e-14
     members = [vp.RungeKutta4(), vp.Gauss(4)]
     chaotic = vp.advise(scene, rest, rest, duration=60.0, tolerance=1e-9, patience=2.0, integrators=members)
     assert not chaotic.reached
@@ -389,7 +397,7 @@ def test_steps_that_a_guard_splits_are_not_taken_for_agreement():
         q0, v0 = rng.uniform(-1.5, 1.5, 6), rng.uniform(-1, 1, 6)
         advice = vp.advise(scene, q0, v0, duration=1.0, tolerance=1e-5, integrators=[vp.Midpoint()])
         exact = vp.simulate(scene, q0, v0, dt=1.0, steps=1, integrator=vp.Reference()).q[-1]
-        motion = vp.simulate(scene, q0, v0, dt=advice.dt, steps=advice.steps)
+        motion = vp.simulate(scene, q0, v0, dt=advice.best.dt, steps=advice.best.steps)
         assert np.abs(motion.q[-1] - exact).max() <= 1e-5
 
 

@@ -84,7 +84,8 @@ def _advise(request: argparse.Namespace, errors: Console) -> int:
     options = {"controls": torque, "tolerance": request.tolerance, "budget": request.budget}
     advice = advise(scene, q0, v0, duration=request.duration, **options)
     show("\n".join(advice.notes))
-    words = ["--integrator", str(advice.integrator), "--dt", repr(advice.dt), "--steps", str(advice.steps)]
+    best = advice.best
+    words = ["--integrator", str(best.integrator), "--dt", repr(best.dt), "--steps", str(best.steps)]
     show(f"run it: varpin simulate {shlex.quote(request.robot)} {shlex.join(words)}, and the same start and forces")
     show(advice.table("The best of each method"))
     show(f"(found in {advice.calibration:.2g} s)")
