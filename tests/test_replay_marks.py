@@ -307,15 +307,14 @@ def link_colors(browser, figure="robot"):
 GREY, YELLOW, RED = [0.72, 0.76, 0.8], [0.98, 0.75, 0.1], [0.8, 0.05, 0.05]
 
 
-@pytest.mark.parametrize("limit", [None, [4.0, 2.0, 2.0]])
-def test_links_take_the_colour_of_their_torque(browser, tmp_path, limit):
+def test_links_take_the_colour_of_their_torque(browser, tmp_path):
     finger = vp.load_robot("finger")
     own = finger.effort_limit
     controls = np.array([[0.0, 1.0, -2.0], [4.0, 1.0, 0.0]])
-    bound = np.where(np.isfinite(own) & (own > 0.0), own, [4.0, 1.0, 2.0]) if limit is None else np.array(limit)
+    bound = np.where(np.isfinite(own) & (own > 0.0), own, [4.0, 1.0, 2.0])
     scene = vp.Scene(finger, gravity=False, damping=1.0)
     motion = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.01, steps=2, controls=controls)
-    page = replay(finger, motion, html=tmp_path / "torques.html", marks=vp.Marks(torques=True, torque_limit=limit))
+    page = replay(finger, motion, html=tmp_path / "torques.html", marks=vp.Marks(torques=True))
     visit(browser, page)
     assert_no_errors(browser)
     shapes = geometry(finger).geometryObjects
@@ -350,13 +349,12 @@ def test_torques_of_a_plan_are_held_against_its_control_limits(ur5):
     for given, motion in ((plan, plan.trajectory), (run, run.motion)):
         bound = np.minimum(limits, ur5.effort_limit)
 
-        def shares(of, torques=True, limit=None):
-            return torque_shares(ur5, of, vp.Marks(torques=torques, torque_limit=limit))
+        def shares(of, torques=True):
+            return torque_shares(ur5, of, vp.Marks(torques=torques))
 
         np.testing.assert_allclose(shares(given), np.abs(motion.u) / bound, rtol=1e-12)
         own = np.minimum(np.abs(motion.u) / ur5.effort_limit, 1.0)
         np.testing.assert_allclose([shares(motion), shares(given, motion.u)], [own, own], rtol=1e-12)
-        np.testing.assert_allclose(shares(given, limit=1e3), np.abs(motion.u) / 1e3, rtol=1e-12)
 
 
 def test_robots_side_by_side_keep_their_own_motions(browser, ur5, sweep, tmp_path):
@@ -432,14 +430,10 @@ def test_refuses_marks_it_cannot_show(ur5, sweep, run, tmp_path):
     no("targets['a']", "2", motion=sweep[:1], targets={"a": np.zeros((2, 3))})
     no("torques=True", torques=True)
     no("torques", "(N, 6)", "(20, 5)", torques=np.zeros((20, 5)))
-    no("torque_limit", "torques", torque_limit=1.0)
-    no("torque_limit", "0.0", torques=np.ones((20, 6)), torque_limit=0.0)
     no("robots", "pairs", robot=[(ur5, sweep)])
     no("robots", "pairs", robot=[ur5, ur5], motion=None)
-    both = [(ur5, sweep), (ur5, sweep)]
     with refused(vp.InputError, "marks", "Marks(trace=True)", "{'trace': True}"):
         replay(ur5, sweep, dt=0.05, html=page, marks={"trace": True})
-    no("torque_limit", "torques", robot=both, motion=None, torques=False, torque_limit=1.0)
     no("ahead", "Mpc", ahead=0.1)
     no("ahead", "-0.1", robot=run.plans[0].problem.scene.robot, motion=run, dt=None, ahead=-0.1)
     no("motion 2", "(N + 1, 6)", robot=[(ur5, sweep), (ur5, sweep[:, :3])], motion=None)
