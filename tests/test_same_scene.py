@@ -18,7 +18,7 @@ OTHERS = [
     ({"damping": [0.1, 0.1, 0.4, 0.1, 0.1, 0.1]}, ("damping", "0.1", "'elbow_joint'", "0.4")),
     ({"stiffness": 0.0}, ("stiffness", "2", "'shoulder_pan_joint'", "0")),
     ({"rest": 0.2}, ("rest", "0.3", "'shoulder_pan_joint'", "0.2")),
-    ({"gravity": False}, ("gravity", "(0, 0, -9.81)", "(0, 0, 0)")),
+    ({"gravity": False}, ("gravity", "-9.81", "0")),
     ({"actuation": 2.0 * np.eye(6)}, "actuation"),
 ]
 

@@ -43,8 +43,7 @@ from varpin.signals.policy import LinearPolicy, OpenLoop
 from varpin.simulation.choice import usual_kick
 from varpin.simulation.simulate import simulate
 from varpin.simulation.spectrum import damping_matrices, rate_at_rest
-from varpin.simulation.start import on_constraints
-from varpin.simulation.time_steps import time_steps
+from varpin.simulation.start import on_constraints, time_steps
 from varpin.support.checks import (
     JointValues,
     control_values,

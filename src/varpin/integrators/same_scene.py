@@ -33,9 +33,10 @@ def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
     """
     found = differences(scene, trajectory.scene_values, noise=bool(trajectory.dw.any()))
     if not same(trajectory.masses, scene.robot.tree.mass):
-        found.insert(0, "the robot's masses are others in the scene")
+        found.insert(0, "the robot's masses")
     if found:
+        more = f" and {len(found) - 2} more" if len(found) > 2 else ""
         raise InputError(
-            f"the trajectory was made in another scene than the one given: {'; '.join(found)}. Give the scene that "
-            "made it, or simulate again in this one"
+            f"the trajectory was made in another scene than the one given, which differs in {', '.join(found[:2])}"
+            f"{more}. Give the scene that made it, or simulate again in this one"
         )

@@ -23,6 +23,7 @@ from varpin.errors import InputError, UnknownJoint
 from varpin.mechanics.forces import Described, Point, point_of, require_index, require_movable, shown
 from varpin.model import Robot
 from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, returned, tuple_of
+from varpin.support.differences import slopes
 
 _AXES = "xyz"
 
@@ -360,13 +361,8 @@ class _Curvature:
         curvature = self.custom.curvature
         if curvature is not None:
             return _called("curvature", lambda: curvature(q, weights), (n, n), q)
-        slope = _Values(self.custom, n).jacobian
-        H = np.empty((n, n))
-        for c in range(n):
-            size = 1e-3 * max(1.0, abs(q[c]))
-            step = size * np.eye(n)[c]
-            parts = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-            H[c] = sum(w * (weights @ (slope(q + k * step) - slope(q - k * step))) for k, w in parts.items()) / size
+        jacobian = _Values(self.custom, n).jacobian
+        H = slopes(lambda at: weights @ jacobian(at), q, 1e-3 * np.maximum(1.0, np.abs(q)))
         symmetric: Floats = 0.5 * (H + H.T)
         return symmetric
 

@@ -27,8 +27,13 @@ from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, nam
 from varpin.simulation.loop import outgrown, unstable_loop
 from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import MotionRecord, function_error, next_block
-from varpin.simulation.start import controls_in_degrees, in_other_units, on_constraints
-from varpin.simulation.time_steps import duration_for_tolerance, time_steps
+from varpin.simulation.start import (
+    controls_in_degrees,
+    duration_for_tolerance,
+    in_other_units,
+    on_constraints,
+    time_steps,
+)
 from varpin.simulation.tolerance import steps_for_tolerance
 from varpin.support.checks import JointValues, as_floats, count, flag, joint_array, require_memory
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory

@@ -21,11 +21,10 @@ from varpin.signals.controls import Controls, commands_of, control_rows
 from varpin.signals.functions import ControlLaw, Sampled, require_law
 from varpin.signals.inputs import held_in_parts
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.check import closer, distance, repeated
+from varpin.simulation.check import closer, distance, repeated, short_forces
 from varpin.simulation.failures import ToleranceError
 from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, candidates, first_steps
 from varpin.simulation.record import Motions
-from varpin.simulation.short_forces import short_forces
 from varpin.support.checks import positive
 from varpin.trajectory import Accuracy
 

@@ -18,8 +18,8 @@ from varpin.io.scenefile.terms import CostTable
 from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import CoulombFriction, Force, PositionServo
 from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
-from varpin.mechanics.reduction import Required, driving, idle_joints, joints_with, report
-from varpin.mechanics.scene import Scene, closest_controls
+from varpin.mechanics.reduction import Required, driving, idle_joints, report
+from varpin.mechanics.scene import Scene, closest_controls, joints_with
 from varpin.model import Robot, combine, load_robot, looks_like_degrees
 from varpin.model.tree import frame_index
 from varpin.simulation.start import on_constraints
