@@ -34,7 +34,7 @@ from varpin.core import sample_steps
 from varpin.errors import InputError
 from varpin.finding import announce
 from varpin.integrators import Gauss, Integrator, Radau
-from varpin.integrators.same_scene import require_motion
+from varpin.integrators.registry import require_motion
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
 from varpin.signals.commands import cubics

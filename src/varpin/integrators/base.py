@@ -175,32 +175,19 @@ class Integrator(ABC):
 
         Returns the failure, if any, and the halvings of the divided steps.
         """
-        decisions, done = len(commands.u), 0
-        halvings = [np.zeros(0, dtype=np.uint8)]
-        # In thirds, since the watch may stop it early.
-        ends = sorted({decisions // 3, 2 * decisions // 3, decisions} - {0})
-        for begin, end in zip([0, *ends], ends, strict=False):
-            block = rows(commands, begin, end, nodes.u[0, done - 1 : done] if done else None)
-            segment = self.rollout(scene, state, block, scene.silence, dt)[0]
-            statistics, taken = segment.statistics, slice(done, done + len(segment.u))
-            for name in _ARRAYS:
-                getattr(nodes, name)[0, taken] = getattr(segment, name)
-            nodes.tally[0, taken] = np.stack(
-                [statistics.newton_iterations, statistics.jets, statistics.sweeps, statistics.substeps], axis=1
-            )
-            if impulses is not None and segment.impulses is not None:
-                impulses[taken] = segment.impulses
-            nodes.quality[0, taken] = np.stack(
-                [statistics.residual, statistics.branch_margin, statistics.energy_defect], axis=1
-            )
-            for step, parts in enumerate(statistics.substeps.tolist()):
-                done = nodes.done[0] = taken.start + step + 1
-                if not watch.after(taken.start + step, parts):
-                    return None, np.concatenate([*halvings, statistics.part(0, step + 1).halvings])
-            halvings.append(statistics.halvings)
-            if segment.failure is not None:
-                return segment.failure, np.concatenate(halvings)
-        return None, np.concatenate(halvings)
+        (segment,) = self.rollout(scene, state, commands, scene.silence, dt)
+        done, own = len(segment.u), segment.statistics
+        for name in _ARRAYS:
+            getattr(nodes, name)[0, :done] = getattr(segment, name)
+        nodes.tally[0, :done] = np.stack([own.newton_iterations, own.jets, own.sweeps, own.substeps], axis=1)
+        nodes.quality[0, :done] = np.stack([own.residual, own.branch_margin, own.energy_defect], axis=1)
+        if impulses is not None and segment.impulses is not None:
+            impulses[:done] = segment.impulses
+        for step, parts in enumerate(own.substeps.tolist()):
+            nodes.done[0] = step + 1
+            if not watch.after(step, parts):
+                return None, own.part(0, step + 1).halvings
+        return segment.failure, own.halvings
 
     @abstractmethod
     def rollout_compiled(
@@ -281,17 +268,11 @@ class Integrator(ABC):
 
 @dataclass(frozen=True)
 class Run:
-    """State of a rollout in the core.
+    """State of a rollout in the core."""
 
-    Attributes:
-        paths: The paths, with their work arrays.
-        start: Initial configurations (P, n) [rad or m].
-        driven: Whether the scene has kinematic inputs.
-    """
-
-    paths: Any
-    start: Floats
-    driven: bool = False
+    paths: Any  # with their work arrays
+    start: Floats  # initial configurations (P, n) [rad or m]
+    driven: bool = False  # whether the scene has kinematic inputs
 
 
 class Compiled(Integrator):
@@ -314,7 +295,6 @@ class Compiled(Integrator):
         """One step of the only path under a drift (n,), with a noise impulse (n,) or its first part."""
 
     def rollout(self, scene: Scene, state: Run, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
-        """See :meth:`Integrator.rollout`."""
         if scene.noise.diffusion is not None:
             return super().rollout(scene, state, commands, increments, dt)
         segments: list[Segment] = []
@@ -363,7 +343,6 @@ class Compiled(Integrator):
         dt: float,
         impulses: Floats | None = None,
     ) -> list[Segment]:
-        """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
         state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
         return self._segments(scene, state.paths, nodes)
@@ -382,7 +361,6 @@ class Compiled(Integrator):
         watch: Watch,
         impulses: Floats | None = None,
     ) -> tuple[Failure | None, Bytes]:
-        """See :meth:`Integrator.watched`."""
         if scene.noise.diffusion is None or scene.constraints:
             return super().watched(scene, state, commands, dt, nodes, watch, impulses)
         state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
@@ -392,7 +370,6 @@ class Compiled(Integrator):
     def motions(
         self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, dt: float
     ) -> tuple[Floats, Floats] | None:
-        """See :meth:`Integrator.motions`."""
         try:
             state = self.begun(scene, q0, v0)
         except SingularMassMatrix:

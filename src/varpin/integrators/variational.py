@@ -122,17 +122,14 @@ class Variational(Compiled):
 
     @property
     def left(self) -> float:
-        """See :attr:`Integrator.left`."""
         return 0.5 if self.kick == "split" else 1.0
 
     @property
     def holds_noise(self) -> bool:
-        """See :attr:`Integrator.holds_noise`."""
         return self.kick == "held"
 
     @property
     def keeps_constraints(self) -> bool:
-        """See :attr:`Integrator.keeps_constraints`."""
         return self._constraint_places() is not None
 
     @abstractmethod
@@ -209,7 +206,6 @@ class Variational(Compiled):
         return Run(rollout, q0.copy(), bool(scene.inputs))
 
     def fork(self, state: Run) -> Run:
-        """See :meth:`Integrator.fork`."""
         return replace(state, paths=state.paths.fork(self._guards(energy=not state.driven)))
 
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:
@@ -219,14 +215,12 @@ class Variational(Compiled):
         return [_constrained(scene, paths, i, segment) for i, segment in enumerate(found)]
 
     def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
-        """See :meth:`Compiled.state_of`."""
         q, p, v, _ = state.paths.nodes()
         return q[0], p[0], v[0]
 
     def kicked(
         self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
     ) -> Segment:
-        """See :meth:`Compiled.kicked`."""
         held = None
         if impulse is not None and self.holds_noise:
             held = np.stack([impulse, np.zeros_like(impulse)])[None, None]
@@ -243,7 +237,6 @@ class Variational(Compiled):
         return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf)
 
     def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        """See :meth:`Integrator.linearize_with_ramps`."""
         if not self.stage_times:
             return super().linearize_with_ramps(scene, trajectory)
         Jx, Jf, Jr = self._derivatives(scene, trajectory, ramp=True)

@@ -118,21 +118,17 @@ class CompiledFields(BoundNoise):
 
     @property
     def diffusion(self) -> Diffusion:
-        """See :attr:`BoundNoise.diffusion`."""
         return self.arrays
 
     @property
     def processes(self) -> int:
-        """See :attr:`BoundNoise.processes`."""
         return int(self.arrays.constant.shape[1])
 
     def curvature(self, weight: Floats) -> Floats:
-        """See :meth:`BoundNoise.curvature`."""
         second: Floats = 2.0 * (self.arrays.quadratic * weight).sum(axis=2)
         return second[:, :, None] * np.eye(second.shape[1])
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
-        """See :meth:`BoundNoise.fields`."""
         arrays = self.arrays
         n, k = arrays.constant.shape
         offset = q[:, :, None] - np.where(np.isnan(arrays.center), start[:, None], arrays.center)
@@ -185,22 +181,18 @@ class CompositeFields(BoundNoise):
 
     @property
     def processes(self) -> int:
-        """See :attr:`BoundNoise.processes`."""
         return sum(part.processes for part in self.parts)
 
     @property
     def velocity_dependent(self) -> bool:
-        """See :attr:`BoundNoise.velocity_dependent`."""
         return any(part.velocity_dependent for part in self.parts)
 
     @property
     def sloped(self) -> Integers:
-        """See :attr:`BoundNoise.sloped`."""
         first = np.cumsum([0, *(part.processes for part in self.parts)])
         return np.concatenate([start + part.sloped for start, part in zip(first[:-1], self.parts, strict=True)])
 
     def curvature(self, weight: Floats) -> Floats:
-        """See :meth:`BoundNoise.curvature`."""
         ends = np.cumsum([part.processes for part in self.parts])
         columns = np.split(weight, ends[:-1], axis=2)
         total: Floats = sum(
@@ -210,7 +202,6 @@ class CompositeFields(BoundNoise):
         return total
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:
-        """See :meth:`BoundNoise.fields`."""
         parts = [part.fields(q, v, u, start) for part in self.parts]
         Fv = None
         if any(part.Fv is not None for part in parts):
@@ -242,7 +233,6 @@ class AdditiveNoise(Noise):
     intensity: JointValues
 
     def bind(self, actuation: Floats) -> CompiledFields:
-        """See :meth:`Noise.bind`."""
         n, m = actuation.shape
         values = require_finite("AdditiveNoise intensity", as_floats("AdditiveNoise intensity", self.intensity))
         if values.ndim == 2:
@@ -264,7 +254,6 @@ class ControlNoise(Noise):
     intensity: ArrayLike
 
     def bind(self, actuation: Floats) -> CompiledFields:
-        """See :meth:`Noise.bind`."""
         n, m = actuation.shape
         values = require_finite("ControlNoise intensity", as_floats("ControlNoise intensity", self.intensity))
         if values.ndim == 3:
@@ -289,7 +278,6 @@ class StateNoise(Noise):
     center: JointValues | None = None
 
     def bind(self, actuation: Floats) -> CompiledFields:
-        """See :meth:`Noise.bind`."""
         n, m = actuation.shape
         strength = np.diag(broadcast_array("StateNoise intensity", self.intensity, n))
         center = np.full(n, np.nan) if self.center is None else broadcast_array("StateNoise center", self.center, n)
@@ -321,7 +309,6 @@ class CustomNoise(Noise):
     check: bool = False
 
     def bind(self, actuation: Floats) -> CustomFields:
-        """See :meth:`Noise.bind`."""
         count("CustomNoise processes", self.processes)
         for name in ("field", "dq", "dv", "du"):
             value = getattr(self, name)
@@ -343,17 +330,14 @@ class CustomFields(BoundNoise):
 
     @property
     def processes(self) -> int:
-        """See :attr:`BoundNoise.processes`."""
         return self.noise.processes
 
     @property
     def velocity_dependent(self) -> bool:
-        """See :attr:`BoundNoise.velocity_dependent`."""
         return self.noise.dv is not None
 
     @property
     def sloped(self) -> Integers:
-        """See :attr:`BoundNoise.sloped`."""
         return np.arange(0 if self.noise.du is None else self.processes)
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
@@ -417,7 +401,6 @@ class NoiseSum(Noise):
     terms: tuple[Noise, ...]
 
     def bind(self, actuation: Floats) -> BoundNoise:
-        """See :meth:`Noise.bind`."""
         return _together([term.bind(actuation) for term in self.terms])
 
 
