@@ -32,10 +32,10 @@ from varpin.signals.controls import Controls, commands_of
 from varpin.signals.functions import Sampled, parts_to_follow
 from varpin.signals.inputs import in_parts_of_steps, prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.gate import proven_error, speed_scales, travel_scales
+from varpin.simulation.gate import proven_error
+from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
-from varpin.simulation.loop import Law, law_of
-from varpin.simulation.spectrum import contact_rate, fastest_rate
+from varpin.simulation.spectrum import contact_rate, fastest_rate, speed_scales, travel_scales
 from varpin.simulation.start import finer
 from varpin.trajectory import Trajectory
 

@@ -15,22 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from varpin.arrays import Floats, Integers
+from varpin.arrays import Floats
 from varpin.errors import AssemblyError, LinearizationError, SingularMassMatrix
 from varpin.finding import Finding
 from varpin.mechanics.assembly import nearest
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
+from varpin.simulation.law import NOTHING, Law, decisions, law_of
 from varpin.simulation.spectrum import first_order, linearized
 from varpin.trajectory import Trajectory
 
 KIND = "unstable loop"
-# Least nodes of a fit, spread over the motion, but four a joint at least: 30 to 300 give the same.
-_NODES = 100
-# Largest error of a fit by that of squares of the state: short smooth curves fit any function. 1e-9 to 1e-6: the same.
-_TELLING = 1e-6
-# Share of the largest below which a direction of the motion or the force at an equilibrium is zero: 1e-11 to 1e-6.
-_NOTHING = 1e-8
 # Least growth a period: rounding of fitted gains may split double eigenvalues by 3e-6. 0 to 1e-5: the same.
 _GROWTH = 1e-5
 # The period causes growth if its exponent exceeds that in continuous time by this factor: 1.1 to 3 give the same.
@@ -47,101 +42,9 @@ _AT = 0.25
 _CLIPPED, _NEAR = 0.1, 1e-3
 # Least share of the sides that a linear function of the state tells for them to be feedback: random ones have 2n / P.
 _FOLLOWS = 0.15
-# Least growth of controls from the first quarter to the last (10 to 1000: the same), up to a failed step (3 to 100).
-_GREW, _OUTGROWN = 100.0, 10.0
-
-
-@dataclass(frozen=True)
-class Law:
-    """A control law from a record: u = K (q, v, L_q(q, 0)) + c, with the forces L_q(q, 0) of gravity and springs.
-
-    Attributes:
-        K: (m, 3n).
-        c: (m,).
-        directions: Of (q, v), in which the motion tells the law (2n, r).
-        near: A configuration of the motion (n,) [rad or m].
-    """
-
-    K: Floats
-    c: Floats
-    directions: Floats
-    near: Floats
-
-    def control(self, scene: Scene, q: Floats, v: Floats) -> Floats:
-        """The control (m,) at a state (n,), (n,), not limited."""
-        found: Floats = self.K @ np.concatenate([q, v, lagrangian_jet(scene, q, np.zeros_like(q)).Lq]) + self.c
-        return found
-
-
-def law_of(scene: Scene, trajectory: Trajectory, hold: int) -> Law | None:
-    """The law of a motion under feedback every ``hold`` steps, if its record tells it."""
-    at, x, u = decisions(trajectory, hold)
-    # Commands of kinematic inputs are positions.
-    if scene.inputs or len(at) < 3:
-        return None
-    with np.errstate(all="ignore"):
-        try:
-            return _law(scene, x, u)
-        except (np.linalg.LinAlgError, LinearizationError):
-            return None
-
-
-def decisions(trajectory: Trajectory, hold: int) -> tuple[Integers, Floats, Floats]:
-    """The nodes (P,) at which a period begins, the states (q, v) (P, 2n) there, and the controls (P, m)."""
-    at = np.arange(0, trajectory.steps, hold)
-    return at, np.concatenate([trajectory.q[at], trajectory.v[at]], axis=1), trajectory.u[at]
-
-
-def _law(scene: Scene, x: Floats, u: Floats) -> Law | None:
-    """The law from all nodes or, where it clips, of each control from the nodes at which it is inside its limits."""
-    law = fitted_law(scene, x, u)
-    clipped = np.any([end & (end.sum(axis=0) > 1) for end in (u == u.min(axis=0), u == u.max(axis=0))], axis=0)
-    if law is not None or not clipped.any():
-        return law
-    laws = [fitted_law(scene, x[~rows], u[~rows, k : k + 1]) for k, rows in enumerate(clipped.T)]
-    # Directions that one control does not know cannot be combined with those of another.
-    known = [law for law in laws if law is not None and law.directions.shape[1] >= x.shape[1]]
-    if len(known) < len(laws):
-        return None
-    K, c = np.concatenate([law.K for law in known]), np.concatenate([law.c for law in known])
-    return Law(K, c, known[0].directions, known[0].near)
-
-
-def fitted_law(scene: Scene, x: Floats, u: Floats) -> Law | None:
-    """The law that gives u (P, m) at states (q, v) = x (P, 2n), if there is one that the record tells."""
-    n = x.shape[1] // 2
-    if len(x) < 3:
-        return None
-    # An odd interval: controls may alternate.
-    every = 1 + 2 * (len(x) // max(2 * _NODES, 8 * n))
-    x, u = x[::every], u[::every]
-    pulled = (np.append(state, lagrangian_jet(scene, state[:n], np.zeros(n)).Lq) for state in x)
-    fit = _affine(x, u) or _affine(np.array(list(pulled)), u)
-    if fit is None:
-        return None
-    K, c, directions = fit
-    return Law(np.pad(K, ((0, 0), (0, 3 * n - K.shape[1]))), c, directions[: 2 * n], x[0, :n])
-
-
-def _affine(x: Floats, u: Floats) -> tuple[Floats, Floats, Floats] | None:
-    """K (m, k), c (m,) of u = K x + c, if the record tells that, and directions (k, r) of x; the least of equal K."""
-    mean, mean_u = x.mean(axis=0), u.mean(axis=0)
-    size = np.std(x, axis=0)
-    moving = size > _NOTHING * size.max()
-    unit = np.where(moving, size, np.inf)
-    state, target = (x - mean) / unit, u - mean_u
-    left, sizes, right = np.linalg.svd(state, full_matrices=False)
-    known = sizes > _NOTHING * sizes[0]
-    if not moving.any() or len(x) < known.sum() + 2:
-        return None
-    left, directions = left[:, known], right[known].T
-    squares = state[:, moving] ** 2 - 1.0
-    missed = np.abs(squares - left @ (left.T @ squares)).max(axis=0) / np.abs(squares).max(axis=0)
-    off = np.abs(target - left @ (left.T @ target)).max()
-    if off > _TELLING * np.median(missed) * np.abs(target).max():
-        return None
-    K = ((directions / sizes[known]) @ (left.T @ target)).T / unit
-    return K, mean_u - K @ mean, directions * np.where(moving, size, 0.0)[:, None]
+# Least growth of controls from the first quarter of a motion to the last, or up to a step that failed: 10 to 100 give
+# the same.
+_GREW = 30.0
 
 
 @dataclass(frozen=True)
@@ -194,10 +97,10 @@ def unstable_loop(scene: Scene, trajectory: Trajectory, hold: int = 1) -> tuple[
 
 
 def outgrown(u: Floats, period: float) -> tuple[Finding, ...]:
-    """The warning if controls (P, m), every period [s] up to a step that failed, have grown tenfold."""
+    """The warning if controls (P, m), every period [s] up to a step that failed, have grown by much."""
     size = np.abs(u).max(axis=1, initial=0.0)
     first = size[size > 0.0][:1]
-    if not len(first) or not size[-1] >= _OUTGROWN * first[0]:
+    if not len(first) or not size[-1] >= _GREW * first[0]:
         return ()
     text = (
         f"control loop may be unstable at its period of {period:.4g} s: controls grow from {first[0]:.3g} to "
@@ -280,7 +183,7 @@ def loop_at_rest(scene: Scene, law: Law) -> Loop:
             loop, off, way = _linearized(scene, law, nearest(scene, q) if scene.constraints else q)
         except (AssemblyError, SingularMassMatrix):
             break
-        if off <= _NOTHING:
+        if off <= NOTHING:
             return loop
         q = q + way / max(1.0, np.abs(way).max())
     return _linearized(scene, law, law.near)[0]
@@ -299,4 +202,4 @@ def _linearized(scene: Scene, law: Law, q: Floats) -> tuple[Loop, float, Floats]
     terms = np.abs(pushed) @ (np.abs(Kq) @ np.abs(q) + np.abs(law.c)) + np.abs(af) @ np.abs(jet.Lq)
     off = float(np.abs(a).max(initial=0.0) / max(terms.max(initial=0.0), 1e-300))
     known, sizes, _ = np.linalg.svd(np.concatenate([onto @ part for part in np.split(law.directions, 2)]), False)
-    return Loop(A, B, gains, known[:, sizes > _NOTHING * sizes.max(initial=0.0)]), off, way
+    return Loop(A, B, gains, known[:, sizes > NOTHING * sizes.max(initial=0.0)]), off, way
