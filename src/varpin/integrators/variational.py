@@ -39,14 +39,13 @@ from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.signals.commands import cubics
 from varpin.support.checks import count, fraction, is_one_of, positive
+from varpin.support.differences import FOURTH, slopes
 from varpin.trajectory import MOST_HALVINGS, Trajectory
 
 # Tolerance of an energy balance that is not checked.
 _UNCHECKED = 1e300
 
-# Points and weights of fourth-order differences of first derivatives, for second derivatives under constraints.
-_DIFFERENCES = ((1.0, 2.0 / 3.0), (-1.0, -2.0 / 3.0), (2.0, -1.0 / 12.0), (-2.0, 1.0 / 12.0))
-# Unit of the points [rad or m, and for momenta and forces the speeds rad/s or m/s].
+# Steps of differences for second derivatives under constraints [rad or m, and of momenta and forces by speeds].
 _SHIFT = 2.5e-4
 
 REASONS: dict[int, str] = {
@@ -293,7 +292,6 @@ class Variational(Compiled):
         n, N = scene.robot.dof, trajectory.steps
         rates, cubic = _rates(scene, trajectory)
         wide = 3 * n + len(cubic)
-        steps, guess = self._steps(scene, trajectory), np.ascontiguousarray(self._guess(trajectory))
         M, _ = scene.core.jets(np.ascontiguousarray(trajectory.q[:-1]), np.ascontiguousarray(trajectory.v[:-1]))
         S = np.zeros((N, wide, wide))
         S[:] = np.eye(wide)
@@ -303,26 +301,21 @@ class Variational(Compiled):
             # The control of a kinematic input is a position, not a force.
             S[:, 2 * n + c, 2 * n : 3 * n] = S[:, 2 * n : 3 * n, 2 * n + c] = 0.0
             S[:, 2 * n + c, 2 * n + c] = 1.0
-        copies = len(_DIFFERENCES)
-        whole = {name: np.concatenate([steps[name]] * copies) for name in ("substeps", "halvings")}
-        whole |= {"guess": np.concatenate([guess] * copies), "places": self._places(scene)}
-        towards = np.empty((N, wide, wide))
-        for d in range(wide):
-            shift = np.concatenate([_SHIFT * share * S[:, :, d] for share, _ in _DIFFERENCES])
-            given = dict(steps)
-            given["q"] = np.concatenate([steps["q"]] * copies) + shift[:, :n]
-            given["p"] = np.concatenate([steps["p"]] * copies) + shift[:, n : 2 * n]
-            force = shift[:, 2 * n : 3 * n]
-            given["force"] = np.concatenate([steps["force"]] * copies)
-            given["force"] = given["force"] + (force if given["force"].ndim == 2 else force[:, None])
-            moved = np.concatenate([rates] * copies)
-            moved[:, cubic] += shift[:, 3 * n :]
-            Jx, Jf, Jr, outcome, done = constrained_derivatives(**(given | whole), rates=moved, ramp=False)
-            if outcome in REASONS:
-                raise LinearizationError(done % N, done % N * trajectory.dt, REASONS[outcome])
-            J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2).reshape(copies, N, 2 * n, wide)
-            weights = np.array([weight for _, weight in _DIFFERENCES]) / _SHIFT
-            towards[:, :, d] = np.einsum("k,Na,kNab->Nb", weights, z, J)
+        given = {"guess": np.ascontiguousarray(self._guess(trajectory)), "places": self._places(scene), "ramp": False}
+        steps = self._steps(scene, trajectory)
+
+        def gradients(y: Floats) -> Floats:
+            shift, by = S @ y, rates.copy()
+            by[:, cubic] += shift[:, 3 * n :]
+            at = {"q": steps["q"] + shift[:, :n], "p": steps["p"] + shift[:, n : 2 * n], "rates": by}
+            at["force"] = steps["force"] + shift[:, None, 2 * n : 3 * n]
+            Jx, Jf, Jr, outcome, done = constrained_derivatives(**(steps | given | at))
+            _require_solved(trajectory, outcome, done)
+            J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2)
+            found: Floats = np.einsum("Na,Nab->Nb", z, J)
+            return found
+
+        towards = slopes(gradients, np.zeros(wide), _SHIFT, FOURTH)
         H = np.swapaxes(np.linalg.solve(np.swapaxes(S, 1, 2), np.swapaxes(towards, 1, 2)), 1, 2)
         symmetric: Floats = 0.5 * (H + np.swapaxes(H, 1, 2))
         return symmetric

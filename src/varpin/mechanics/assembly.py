@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy
 
 from varpin.arrays import Floats
 from varpin.errors import AssemblyError, SingularMassMatrix
@@ -17,8 +16,8 @@ _RANK = 1e-9
 _ROUNDING = 256.0 * np.finfo(np.float64).eps
 # Residuals below this are equal up to rounding [m or rad].
 _POLISHED = 1e-12
-# Most Newton iterations.
-_NEWTON_ITERATIONS = 12
+# Most Newton iterations, and most Levenberg-Marquardt trials.
+_NEWTON_ITERATIONS, _TRIALS = 12, 200
 # Shortest homotopy step, as a share of the whole, and longest change of q in one iteration [rad or m].
 _SHORTEST, _LONGEST = 1e-3, 0.5
 # Restarts around the start after a failed search, and the standard deviation of the last one [rad or m].
@@ -159,15 +158,24 @@ def _nearest(
 
 def _reached(scene: Scene, q: Floats, root: Floats) -> Floats:
     """A configuration with g = 0, or a local minimum of g, by the Levenberg-Marquardt method from q."""
-
-    def residuals(y: Floats) -> Floats:
-        return _values(scene, q + root.T @ y)[0]
-
-    def slopes(y: Floats) -> Floats:
-        return _values(scene, q + root.T @ y)[1] @ root.T
-
-    found = scipy.optimize.least_squares(residuals, np.zeros(q.size), slopes, xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    return np.asarray(q + root.T @ found.x, dtype=np.float64)
+    g, C = _values(scene, q)
+    damping = 1e-3
+    for _ in range(_TRIALS):
+        size = float(g @ g)
+        if size < 1e-24:
+            break
+        B = C @ root.T
+        scale = float(np.square(B).sum())
+        shift = -root.T @ (B.T @ np.linalg.solve(B @ B.T + damping * scale * np.eye(len(g)), g))
+        trial = q + shift * min(1.0, _LONGEST / max(float(np.abs(shift).max()), 1e-300))
+        g_trial, C_trial = _values(scene, trial)
+        if float(g_trial @ g_trial) < size:
+            q, g, C, damping = trial, g_trial, C_trial, max(0.1 * damping, 1e-14)
+        else:
+            damping *= 10.0
+            if damping > 1e12:
+                break
+    return q
 
 
 def _reached_around(scene: Scene, start: Floats, root: Floats) -> Floats | None:
