@@ -310,14 +310,6 @@ def test_ctrl_c_in_a_field_is_no_noise_error():
     assert info.value.trajectory.steps == 3
 
 
-def test_a_field_that_raises_is_named_when_it_is_checked():
-    def field(q, v, u):
-        raise ZeroDivisionError("no field")
-
-    with refused(vp.NoiseFieldError, "CustomNoise field", "ZeroDivisionError('no field')"):
-        chain(vp.CustomNoise(field, 2, check=True))
-
-
 def test_a_field_cannot_reach_into_the_motion():
     def vandal(q, v, u):
         value = np.diag(q)

@@ -29,17 +29,6 @@ def test_increments_are_normal_with_variance_dt():
     assert abs((z[1:] * z[:-1]).mean()) < 4.0 / np.sqrt(samples)
 
 
-def test_refining_keeps_the_path():
-    dt = 0.1
-    dw = wiener_increments(3, dt, 1000, rng=1)
-    fine = refine(dw, dt, rng=2)
-    assert fine.shape == (2000, 3)
-    np.testing.assert_allclose(coarsen(fine), dw, rtol=0, atol=4 * np.finfo(float).eps * np.abs(fine).max())
-    np.testing.assert_allclose(np.cumsum(fine, axis=0)[1::2], np.cumsum(dw, axis=0), rtol=0, atol=1e-12)
-    assert refine(np.zeros((4, 0)), dt, rng=0).shape == (8, 0)
-    assert refine(np.zeros((0, 2)), dt, rng=0).shape == (0, 2)
-
-
 def test_refined_increments_are_wiener_increments_of_half_the_step():
     dt, N = 0.1, 100_000
     dw = wiener_increments(1, dt, N, rng=1)
