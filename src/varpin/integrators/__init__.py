@@ -12,5 +12,4 @@ from varpin.integrators.midpoint import largest_step as largest_step
 from varpin.integrators.reference import Reference as Reference
 from varpin.integrators.registry import BY_NAME as BY_NAME
 from varpin.integrators.registry import integrator_of as integrator_of
-from varpin.integrators.registry import options_of as options_of
 from varpin.integrators.variational import Guard as Guard

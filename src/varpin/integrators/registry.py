@@ -23,11 +23,6 @@ _OWN: tuple[type[Integrator], ...] = (Midpoint, Gauss, Radau, ExplicitEuler, Sem
 BY_NAME: Mapping[str, type[Integrator]] = MappingProxyType({kind.__name__: kind for kind in _OWN})
 
 
-def options_of(kind: type[Integrator]) -> tuple[str, ...]:
-    """The names of an integrator's options, in order."""
-    return tuple(item.name for item in fields(kind))  # type: ignore[arg-type]
-
-
 def integrator_of(text: str) -> Integrator:
     """The integrator of a text with its name and options, as ``str`` and ``repr`` of an integrator write it.
 
@@ -54,14 +49,18 @@ def integrator_of(text: str) -> Integrator:
         raise InputError(f"an integrator is written as {form}, got {text!r}") from None
     if name not in BY_NAME:
         raise InputError(f"varpin has no integrator {name!r}; it has {', '.join(BY_NAME)}")
-    kind = BY_NAME[name]
-    known = options_of(kind)
-    odd = [option for option in named if option not in known[len(values) :]]
-    if len(values) > len(known) or odd:
-        which = f"no option {odd[0]!r}" if odd and odd[0] not in known else "fewer options than given"
-        has = f"its options are {', '.join(known)}" if known else "it has none"
-        raise InputError(f"{name} has {which}; {has}: {text!r}")
-    return kind(*values, **named)
+    made: Integrator = _made(BY_NAME[name], values, named, text)
+    return made
+
+
+def _made(kind: type[Any], values: list[Any], named: dict[str, Any], text: str) -> Any:
+    """The object of a class with options."""
+    try:
+        return kind(*values, **named)
+    except TypeError:
+        known = ", ".join(item.name for item in fields(kind)) or "none"
+        given = ", ".join([*map(repr, values), *map(repr, named)])
+        raise InputError(f"options of {kind.__name__} are {known}, not {given}: {text!r}") from None
 
 
 def _value(node: ast.expr) -> Any:
@@ -71,9 +70,7 @@ def _value(node: ast.expr) -> Any:
             return name
         case ast.Call(func=ast.Name(id="Guard"), args=[], keywords=keywords):
             given = {str(keyword.arg): _value(keyword.value) for keyword in keywords}
-            if odd := [option for option in given if option not in (known := [item.name for item in fields(Guard)])]:
-                raise InputError(f"Guard has no option {odd[0]!r}; its options are {', '.join(known)}")
-            return Guard(**given)
+            return _made(Guard, [], given, ast.unparse(node))
     try:
         return ast.literal_eval(node)
     except ValueError:
