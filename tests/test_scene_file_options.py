@@ -75,7 +75,7 @@ def test_friction_is_short_for_a_force(arm):
 
 
 @pytest.mark.parametrize(
-    ("keys", "messages"), [("", 1), ("damping = 0.0", 0), ('damping = "robot"\nfriction = 0.0', 0)]
+    ("keys", "messages"), [("", 2), ("damping = 0.0", 0), ('damping = "robot"\nfriction = 0.0', 0)]
 )
 def test_what_a_file_leaves_out_is_logged_once(arm, caplog, keys, messages):
     with caplog.at_level(logging.WARNING):

@@ -33,7 +33,7 @@ from varpin.core import sample_steps
 from varpin.errors import InputError
 from varpin.finding import announce
 from varpin.integrators import Gauss, Integrator, Radau
-from varpin.integrators.same_scene import require_motion
+from varpin.integrators.registry import require_motion
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene, closest_controls, differences, require_scene, tangent_basis
 from varpin.signals.commands import cubics
@@ -42,8 +42,7 @@ from varpin.signals.policy import LinearPolicy, OpenLoop
 from varpin.simulation.choice import usual_integrator, usual_kick
 from varpin.simulation.simulate import simulate
 from varpin.simulation.spectrum import damping_matrices, rate_at_rest
-from varpin.simulation.start import on_constraints
-from varpin.simulation.time_steps import time_steps
+from varpin.simulation.start import on_constraints, time_steps
 from varpin.support.checks import (
     JointValues,
     control_values,
