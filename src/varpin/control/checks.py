@@ -18,10 +18,8 @@ from varpin.control.constraints import (
     PlanConstraint,
     ReachFrame,
     WithinJointLimits,
-    WithinVelocityLimits,
 )
-from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
-from varpin.control.costs.base import Scaled, weight_matrix
+from varpin.control.costs import FramePositionCost, TrackingCost, weight_matrix
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
 from varpin.control.moments import noise_cost, noise_cost_in_halves
@@ -42,7 +40,6 @@ from varpin.model import (
     IN_MILLIMETRES,
     Robot,
     degrees_hint,
-    degrees_per_second_hint,
     joint_unit,
     looks_like_degrees,
     millimetres_hint,
@@ -127,7 +124,7 @@ def _unfinished(solution: Solution) -> Iterator[Finding]:
 
 def foreseen(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about a problem before any search; where values are in wrong units, these alone."""
-    units = [*in_other_units(problem.scene, problem.q0, problem.v0)]
+    units = [*in_other_units(problem.scene, problem.q0)]
     goals = [*_goals(problem), *_ends(problem)]
     units += [*_in_degrees(problem), *_in_millimetres(problem), *(own for own in goals if own.kind in _UNITS)]
     return units or [*_starts_outside(problem), *goals, *_weights(problem)]
@@ -154,11 +151,11 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
     for goal in problem.constraints:
         if isinstance(goal, ReachFrame) and goal.position is not None:
             places.append((goal.label, goal.frame, np.eye(3), goal.position))
-    for term, _ in _terms(problem.cost):
+    for term in problem.cost.terms:
         if isinstance(term, FramePositionCost) and not callable(term.target):
-            strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, term.size))
+            strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
             weighed = axes[:, strengths > _SAME * strengths[-1]]
-            places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, term.target))
+            places.append((f"FramePositionCost({term.frame!r})", term.frame, weighed, np.asarray(term.target)))
     told = set()
     for label, frame, axes, place in places:
         kinematics = frame_kinematics(robot, frame)
@@ -200,8 +197,8 @@ def reach(robot: Robot, frame: FrameKinematics) -> float:
 
 def _postures(problem: OptimalControlProblem) -> Iterator[Floats]:
     """Goal configurations (n,) of terminal costs."""
-    for term, at_end in _terms(problem.cost):
-        end = term.reference if isinstance(term, TrackingCost) and at_end else None
+    for term in problem.cost.terms:
+        end = term.reference if isinstance(term, TrackingCost) and term.at_end else None
         if isinstance(end, np.ndarray) and end.shape == problem.q0.shape:
             yield end
 
@@ -244,23 +241,20 @@ def _weights(problem: OptimalControlProblem) -> Iterator[Finding]:
 
 
 def _in_degrees(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Limits of joints that look like degrees, and those of velocities that look like degrees per second."""
+    """Limits of joints that look like degrees."""
     robot = problem.scene.robot
     for limits in problem.constraints:
-        if not isinstance(limits, WithinJointLimits | WithinVelocityLimits):
+        if not isinstance(limits, WithinJointLimits):
             continue
-        speeds = isinstance(limits, WithinVelocityLimits)
         # Limits of the robot's description are in radians, however wide.
-        own = np.abs(limits.limits) == robot.velocity_limit if speeds else limits.limits == robot.position_limits
-        most = np.where(np.isfinite(limits.limits) & ~own, np.abs(limits.limits), 0.0).max(axis=0)
-        sentence = degrees_per_second_hint(robot, f"{limits.label}: limit", most) if speeds else ""
-        joint = int(np.argmax(np.where(robot.slides, 0.0, most)))
-        if not speeds and not robot.slides[joint] and looks_like_degrees(most[joint]):
+        given = np.isfinite(limits.limits) & (limits.limits != robot.position_limits) & ~robot.slides
+        most = np.where(given, np.abs(limits.limits), 0.0).max(axis=0)
+        joint = int(np.argmax(most))
+        if looks_like_degrees(most[joint]):
             sentence = (
                 f"{limits.label} lets {robot.joint_names[joint]} turn to {most[joint]:.4g} rad, "
                 f"{most[joint] / (2.0 * np.pi):.0f} turns, and looks like degrees: {ADVICE}"
             )
-        if sentence:
             yield Finding("limits in degrees", sentence)
 
 
@@ -298,16 +292,6 @@ def _lengths(constraint: PlanConstraint) -> dict[str, float]:
         sides = np.abs(constraint.limits[np.isfinite(constraint.limits)])
         found = {f"{name}: its nearest side": float(sides[sides > 0.0].min(initial=np.inf)) if sides.any() else 0.0}
     return found
-
-
-def _terms(cost: Cost) -> Iterator[tuple[Cost, bool]]:
-    """The terms of a cost without factors, and whether each is terminal."""
-    for term in cost.terms:
-        inner, at_end = term, False
-        while isinstance(inner, Terminal | Scaled):
-            at_end = at_end or isinstance(inner, Terminal)
-            inner = inner.cost
-        yield from ((part.cost if isinstance(part, Scaled) else part, at_end) for part in inner.terms)
 
 
 # The finished plan
