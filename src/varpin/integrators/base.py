@@ -237,17 +237,11 @@ class Integrator(ABC):
 
 @dataclass(frozen=True)
 class Run:
-    """State of a rollout in the core.
+    """State of a rollout in the core."""
 
-    Attributes:
-        paths: The paths, with their work arrays.
-        start: Initial configurations (P, n) [rad or m].
-        driven: Whether the scene has kinematic inputs.
-    """
-
-    paths: Any
-    start: Floats
-    driven: bool = False
+    paths: Any  # with their work arrays
+    start: Floats  # initial configurations (P, n) [rad or m]
+    driven: bool = False  # whether the scene has kinematic inputs
 
 
 class Compiled(Integrator):
@@ -270,7 +264,6 @@ class Compiled(Integrator):
         """One step of the only path under a drift (n,), with a noise impulse (n,) or its first part."""
 
     def rollout(self, scene: Scene, state: Run, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
-        """See :meth:`Integrator.rollout`."""
         if scene.noise.diffusion is not None:
             return super().rollout(scene, state, commands, increments, dt)
         segments: list[Segment] = []
@@ -319,7 +312,6 @@ class Compiled(Integrator):
         dt: float,
         impulses: Floats | None = None,
     ) -> list[Segment]:
-        """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
         state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
         return self._segments(scene, state.paths, nodes)
@@ -331,7 +323,6 @@ class Compiled(Integrator):
     def motions(
         self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, dt: float
     ) -> tuple[Floats, Floats] | None:
-        """See :meth:`Integrator.motions`."""
         try:
             state = self.begun(scene, q0, v0)
         except SingularMassMatrix:
