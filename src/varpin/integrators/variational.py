@@ -35,14 +35,13 @@ from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.signals.commands import cubics
 from varpin.support.checks import count, fraction, is_one_of, positive
+from varpin.support.differences import FOURTH, slopes
 from varpin.trajectory import MOST_HALVINGS, Trajectory
 
 # Tolerance of an energy balance that is not checked.
 _UNCHECKED = 1e300
 
-# Points and weights of fourth-order differences of first derivatives, for second derivatives under constraints.
-_DIFFERENCES = ((1.0, 2.0 / 3.0), (-1.0, -2.0 / 3.0), (2.0, -1.0 / 12.0), (-2.0, 1.0 / 12.0))
-# Unit of the points [rad or m, and for momenta and forces the speeds rad/s or m/s].
+# Steps of differences for second derivatives under constraints [rad or m, and of momenta and forces by speeds].
 _SHIFT = 2.5e-4
 
 REASONS: dict[int, str] = {
@@ -118,17 +117,14 @@ class Variational(Compiled):
 
     @property
     def left(self) -> float:
-        """See :attr:`Integrator.left`."""
         return 0.5 if self.kick == "split" else 1.0
 
     @property
     def holds_noise(self) -> bool:
-        """See :attr:`Integrator.holds_noise`."""
         return self.kick == "held"
 
     @property
     def keeps_constraints(self) -> bool:
-        """See :attr:`Integrator.keeps_constraints`."""
         return self._constraint_places() is not None
 
     @abstractmethod
@@ -201,7 +197,6 @@ class Variational(Compiled):
         return Run(rollout, q0.copy(), bool(scene.inputs))
 
     def fork(self, state: Run) -> Run:
-        """See :meth:`Integrator.fork`."""
         return replace(state, paths=state.paths.fork(self._guards(energy=not state.driven)))
 
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:
@@ -211,14 +206,12 @@ class Variational(Compiled):
         return [_constrained(scene, paths, i, segment) for i, segment in enumerate(found)]
 
     def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
-        """See :meth:`Compiled.state_of`."""
         q, p, v, _ = state.paths.nodes()
         return q[0], p[0], v[0]
 
     def kicked(
         self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
     ) -> Segment:
-        """See :meth:`Compiled.kicked`."""
         held = None
         if impulse is not None and self.holds_noise:
             held = np.stack([impulse, np.zeros_like(impulse)])[None, None]
@@ -235,7 +228,6 @@ class Variational(Compiled):
         return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf)
 
     def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        """See :meth:`Integrator.linearize_with_ramps`."""
         if not self.stage_times:
             return super().linearize_with_ramps(scene, trajectory)
         Jx, Jf, Jr = self._derivatives(scene, trajectory, ramp=True)
@@ -286,7 +278,6 @@ class Variational(Compiled):
         n, N = scene.robot.dof, trajectory.steps
         rates, cubic = _rates(scene, trajectory)
         wide = 3 * n + len(cubic)
-        steps, places = self._steps(scene, trajectory), self._places(scene)
         M, _ = scene.core.jets(np.ascontiguousarray(trajectory.q[:-1]), np.ascontiguousarray(trajectory.v[:-1]))
         S = np.zeros((N, wide, wide))
         S[:] = np.eye(wide)
@@ -296,25 +287,21 @@ class Variational(Compiled):
             # The control of a kinematic input is a position, not a force.
             S[:, 2 * n + c, 2 * n : 3 * n] = S[:, 2 * n : 3 * n, 2 * n + c] = 0.0
             S[:, 2 * n + c, 2 * n + c] = 1.0
-        copies = len(_DIFFERENCES)
-        whole = {name: np.concatenate([steps[name]] * copies) for name in ("substeps", "halvings", "guess")}
-        towards = np.empty((N, wide, wide))
-        for d in range(wide):
-            shift = np.concatenate([_SHIFT * share * S[:, :, d] for share, _ in _DIFFERENCES])
-            given = dict(steps)
-            given["q"] = np.concatenate([steps["q"]] * copies) + shift[:, :n]
-            given["p"] = np.concatenate([steps["p"]] * copies) + shift[:, n : 2 * n]
+        steps, places = self._steps(scene, trajectory), self._places(scene)
+
+        def gradients(y: Floats) -> Floats:
+            shift, by = S @ y, rates.copy()
+            by[:, cubic] += shift[:, 3 * n :]
+            at = {"q": steps["q"] + shift[:, :n], "p": steps["p"] + shift[:, n : 2 * n]}
             force = shift[:, 2 * n : 3 * n]
-            given["force"] = np.concatenate([steps["force"]] * copies)
-            given["force"] = given["force"] + (force if given["force"].ndim == 2 else force[:, None])
-            moved = np.concatenate([rates] * copies)
-            moved[:, cubic] += shift[:, 3 * n :]
-            Jx, Jf, Jr, outcome, done = constrained_derivatives(Steps(**(given | whole)), places=places, rates=moved)
-            if outcome in REASONS:
-                raise LinearizationError(done % N, done % N * trajectory.dt, REASONS[outcome])
-            J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2).reshape(copies, N, 2 * n, wide)
-            weights = np.array([weight for _, weight in _DIFFERENCES]) / _SHIFT
-            towards[:, :, d] = np.einsum("k,Na,kNab->Nb", weights, z, J)
+            at["force"] = steps["force"] + (force if steps["force"].ndim == 2 else force[:, None])
+            Jx, Jf, Jr, outcome, done = constrained_derivatives(Steps(**(steps | at)), places=places, rates=by)
+            _require_solved(trajectory, outcome, done)
+            J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2)
+            found: Floats = np.einsum("Na,Nab->Nb", z, J)
+            return found
+
+        towards = slopes(gradients, np.zeros(wide), _SHIFT, FOURTH)
         H = np.swapaxes(np.linalg.solve(np.swapaxes(S, 1, 2), np.swapaxes(towards, 1, 2)), 1, 2)
         symmetric: Floats = 0.5 * (H + np.swapaxes(H, 1, 2))
         return symmetric
