@@ -19,8 +19,7 @@ from varpin.control.constraints import (
     ReachFrame,
     WithinJointLimits,
 )
-from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
-from varpin.control.costs.base import Scaled, weight_matrix
+from varpin.control.costs import Cost, FramePositionCost, TrackingCost, weight_matrix
 from varpin.control.problem import OptimalControlProblem
 from varpin.finding import Finding
 from varpin.mechanics.scene import closest_controls
@@ -144,7 +143,7 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _targets(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Targets of costs on a frame's position that are out of reach, or look like millimetres."""
     robot, named = problem.scene.robot, set()
-    for term in _parts(problem.cost):
+    for term in problem.cost.terms:
         if not isinstance(term, FramePositionCost) or callable(term.target) or term.frame in named:
             continue
         frame = frame_kinematics(robot, term.frame)
@@ -163,7 +162,7 @@ def _targets(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _away(term: FramePositionCost, root: Floats) -> float:
     """Largest distance of a target from the root in the directions that have a weight [m]."""
     off = np.atleast_2d(np.asarray(term.target)) - root
-    strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, term.size))
+    strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
     off = off @ axes[:, strengths > _SAME * strengths[-1]]
     return float(np.linalg.norm(off, axis=1).max())
 
@@ -314,20 +313,5 @@ def _turning(robot: Robot) -> Floats:
 
 
 def _last(cost: Cost) -> Iterator[Cost]:
-    """The terminal costs, without factors."""
-    return (part for part, at_end in _parts_of(cost) if at_end)
-
-
-def _parts(cost: Cost) -> Iterator[Cost]:
-    """The running and terminal costs, without factors."""
-    return (part for part, _ in _parts_of(cost))
-
-
-def _parts_of(cost: Cost) -> Iterator[tuple[Cost, bool]]:
-    """The terms of a cost without factors, and whether each is terminal."""
-    for term in cost.terms:
-        inner, at_end = term, False
-        while isinstance(inner, Terminal | Scaled):
-            at_end = at_end or isinstance(inner, Terminal)
-            inner = inner.cost
-        yield from ((part.cost if isinstance(part, Scaled) else part, at_end) for part in inner.terms)
+    """The terminal costs."""
+    return (term for term in cost.terms if term.at_end)
