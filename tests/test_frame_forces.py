@@ -8,11 +8,9 @@ import pytest
 from findings import about
 from naive import gradient, joint_axis, rotation
 from refusals import refused
-from test_elimination import rolled
 from test_groups import forest
 
 import varpin as vp
-from varpin.core import Elimination, Solver
 
 # Tip and a frame before it, or on another branch.
 ROBOTS = {
@@ -123,19 +121,6 @@ def test_groups_that_couplings_join():
     # Errors of the energy that passes between arms are no errors.
     motion = vp.simulate(scene, q, np.zeros(7), dt=1e-3, steps=300, integrator=vp.RungeKutta4())
     assert not about(motion.warnings, "error")
-
-
-def test_elimination_leaves_steps_with_couplings_to_the_dense_solver():
-    robot = vp.planar_chain(20)
-    q, v = np.linspace(-0.5, 0.5, 20), np.linspace(1.0, -1.0, 20)
-    scene = vp.Scene(
-        robot, forces=[vp.FrameSpring("joint20", [1.0, 0.0, 0.0], 30.0), vp.FrameDamper("joint20", "joint2", 0.5)]
-    )
-    ways = [rolled(scene, q, v, 1e-3, 10, way, vp.Gauss(2)) for way in (Solver.dense, Solver.elimination)]
-    for name in ("q", "p", "energy"):
-        np.testing.assert_allclose(getattr(ways[0], name), getattr(ways[1], name), rtol=1e-9, atol=1e-9)
-    with refused(ValueError, "couplings"):
-        Elimination(scene.core, q, v)
 
 
 def test_a_hanging_spring_finds_its_rest():

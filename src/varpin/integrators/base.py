@@ -14,7 +14,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from varpin.arrays import Floats, Integers
-from varpin.core import Watch
 from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.errors import InputError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -158,36 +157,6 @@ class Integrator(ABC):
         path; with diffusion fields that only Python can evaluate there is one path.
         """
         return self.rollout_compiled(scene, state, contiguous(commands), increments, scene.no_drift, dt)
-
-    def watched(
-        self,
-        scene: Scene,
-        state: Any,
-        commands: Commands,
-        dt: float,
-        nodes: RolloutArrays,
-        watch: Watch,
-        impulses: Floats | None = None,
-    ) -> tuple[Failure | None, Bytes]:
-        """:meth:`rollout` of one path without noise into ``nodes``, until the ``watch`` stops it.
-
-        Constraint impulses (N, c) are written to ``impulses``, if given.
-
-        Returns the failure, if any, and the halvings of the divided steps.
-        """
-        (segment,) = self.rollout(scene, state, commands, scene.silence, dt)
-        done, own = len(segment.u), segment.statistics
-        for name in _ARRAYS:
-            getattr(nodes, name)[0, :done] = getattr(segment, name)
-        nodes.tally[0, :done] = np.stack([own.newton_iterations, own.jets, own.sweeps, own.substeps], axis=1)
-        nodes.quality[0, :done] = np.stack([own.residual, own.branch_margin, own.energy_defect], axis=1)
-        if impulses is not None and segment.impulses is not None:
-            impulses[:done] = segment.impulses
-        for step, parts in enumerate(own.substeps.tolist()):
-            nodes.done[0] = step + 1
-            if not watch.after(step, parts):
-                return None, own.part(0, step + 1).halvings
-        return segment.failure, own.halvings
 
     @abstractmethod
     def rollout_compiled(
@@ -350,22 +319,6 @@ class Compiled(Integrator):
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:  # noqa: ARG002
         """A segment for each of the core's paths, which have written ``nodes``."""
         return segments_of(nodes, self.reasons, paths)
-
-    def watched(
-        self,
-        scene: Scene,
-        state: Run,
-        commands: Commands,
-        dt: float,
-        nodes: RolloutArrays,
-        watch: Watch,
-        impulses: Floats | None = None,
-    ) -> tuple[Failure | None, Bytes]:
-        if scene.noise.diffusion is None or scene.constraints:
-            return super().watched(scene, state, commands, dt, nodes, watch, impulses)
-        state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
-        done = int(nodes.done[0])
-        return failure_of(nodes, 0, done, self.reasons), parts_of(nodes, 0, done, state.paths)
 
     def motions(
         self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, dt: float

@@ -11,16 +11,12 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.core import (
-    ConstrainedRollout,
     Guards,
     Outcome,
+    Rollout,
+    Steps,
     Tableau,
-    VariationalRollout,
     constrained_derivatives,
-    variational_bends,
-    variational_curvatures,
-    variational_derivatives,
-    variational_ends,
 )
 from varpin.core.arrays import Commands, RolloutArrays
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
@@ -193,13 +189,9 @@ class Variational(Compiled):
         Raises:
             SingularMassMatrix: M(q0) is not positive definite.
         """
-        rollout: VariationalRollout | ConstrainedRollout
-        method = scene.core, self._tableau()
-        options = float(self.tolerance), self._guards(energy=not scene.inputs)
-        if scene.constraints:
-            rollout = ConstrainedRollout(*method, self._places(scene), *options, len(q0), self.holds_noise)
-        else:
-            rollout = VariationalRollout(*method, *options, self.left, len(q0), held=self.holds_noise)
+        guards, places = self._guards(energy=not scene.inputs), self._places(scene) if scene.constraints else None
+        method = scene.core, self._tableau(), float(self.tolerance), guards, self.left
+        rollout = Rollout(*method, len(q0), self.holds_noise, places)
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return Run(rollout, q0.copy(), bool(scene.inputs))
@@ -209,7 +201,7 @@ class Variational(Compiled):
 
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:
         found = super()._segments(scene, paths, nodes)
-        if not isinstance(paths, ConstrainedRollout):
+        if not scene.constraints:
             return found
         return [_constrained(scene, paths, i, segment) for i, segment in enumerate(found)]
 
@@ -263,23 +255,17 @@ class Variational(Compiled):
         Without ``ramp`` the last array is empty. With ``external`` the force is one that drives do not limit. The
         columns of velocities of cubic inputs follow those of the force, as in :attr:`Scene.transmission`.
         """
-        steps = self._steps(scene, trajectory)
-        guess = np.ascontiguousarray(self._guess(trajectory))
+        steps = Steps(**self._steps(scene, trajectory))
         if scene.constraints:
             rates, cubic = _rates(scene, trajectory)
-            given: dict[str, Any] = {
-                "rates": rates,
-                "places": self._places(scene),
-                "guess": guess,
-                "external": external,
-            }
+            given: dict[str, Any] = {"rates": rates, "places": self._places(scene), "external": external}
             found = []
             for growing in (False, True) if ramp else (False,):
-                Jx, Jf, by_rate, outcome, done = constrained_derivatives(**steps, **given, ramp=growing)
+                Jx, Jf, by_rate, outcome, done = constrained_derivatives(steps, **given, ramp=growing)
                 _require_solved(trajectory, outcome, done)
                 found.append(np.concatenate([Jf, by_rate[:, :, cubic]], axis=2) if cubic else Jf)
             return Jx, found[0], found[1] if ramp else Jf[:0]
-        Jx, Jf, Jr, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp, external=external)
+        Jx, Jf, Jr, outcome, done = steps.derivatives(ramp, external)
         _require_solved(trajectory, outcome, done)
         return Jx, Jf, Jr
 
@@ -292,6 +278,7 @@ class Variational(Compiled):
         n, N = scene.robot.dof, trajectory.steps
         rates, cubic = _rates(scene, trajectory)
         wide = 3 * n + len(cubic)
+        steps, places = self._steps(scene, trajectory), self._places(scene)
         M, _ = scene.core.jets(np.ascontiguousarray(trajectory.q[:-1]), np.ascontiguousarray(trajectory.v[:-1]))
         S = np.zeros((N, wide, wide))
         S[:] = np.eye(wide)
@@ -301,15 +288,13 @@ class Variational(Compiled):
             # The control of a kinematic input is a position, not a force.
             S[:, 2 * n + c, 2 * n : 3 * n] = S[:, 2 * n : 3 * n, 2 * n + c] = 0.0
             S[:, 2 * n + c, 2 * n + c] = 1.0
-        given = {"guess": np.ascontiguousarray(self._guess(trajectory)), "places": self._places(scene), "ramp": False}
-        steps = self._steps(scene, trajectory)
 
         def gradients(y: Floats) -> Floats:
             shift, by = S @ y, rates.copy()
             by[:, cubic] += shift[:, 3 * n :]
-            at = {"q": steps["q"] + shift[:, :n], "p": steps["p"] + shift[:, n : 2 * n], "rates": by}
+            at = {"q": steps["q"] + shift[:, :n], "p": steps["p"] + shift[:, n : 2 * n]}
             at["force"] = steps["force"] + shift[:, None, 2 * n : 3 * n]
-            Jx, Jf, Jr, outcome, done = constrained_derivatives(**(steps | given | at))
+            Jx, Jf, Jr, outcome, done = constrained_derivatives(Steps(**(steps | at)), places=places, rates=by)
             _require_solved(trajectory, outcome, done)
             J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2)
             found: Floats = np.einsum("Na,Nab->Nb", z, J)
@@ -326,30 +311,13 @@ class Variational(Compiled):
             raise InputError("second derivatives are not there for a scene with a CustomForce")
         if scene.constraints:
             return self._contract_by_differences(scene, trajectory, z)
-        steps = self._steps(scene, trajectory)
-        H, outcome, done = variational_curvatures(
-            **steps, guess=np.ascontiguousarray(self._guess(trajectory)), z=np.ascontiguousarray(z)
-        )
+        H, outcome, done = Steps(**self._steps(scene, trajectory)).curvatures(np.ascontiguousarray(z))
         _require_solved(trajectory, outcome, done)
         return H
 
-    def bend(self, scene: Scene, trajectory: Trajectory, weights: Floats) -> Floats:
-        """Derivatives (N, 3n) in (q, p, force) of sums of ``weights`` (N, 2n, 3n) times first derivatives of steps.
-
-        These are :meth:`contract`'s second derivatives times a matrix, for scenes without custom forces, constraints
-        and kinematic inputs.
-        """
-        found, outcome, done = variational_bends(
-            **self._steps(scene, trajectory),
-            guess=np.ascontiguousarray(self._guess(trajectory)),
-            weights=np.ascontiguousarray(weights),
-        )
-        _require_solved(trajectory, outcome, done)
-        return found
-
     def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.quiet_ends`; the steps are those that :meth:`linearize` differentiates."""
-        q, v, outcome, done = variational_ends(**self._steps(scene, trajectory))
+        q, v, outcome, done = Steps(**self._steps(scene, trajectory)).ends()
         _require_solved(trajectory, outcome, done)
         return q, v
 
@@ -370,6 +338,7 @@ class Variational(Compiled):
             "force": force,
             "substeps": statistics.substeps,
             "halvings": statistics.halvings,
+            "guess": self._guess(trajectory),
         }
         return {
             "mechanism": scene.core,
@@ -399,7 +368,7 @@ class Variational(Compiled):
         """Times of the stages in a unit step (s,)."""
 
 
-def _constrained(scene: Scene, paths: ConstrainedRollout, i: int, segment: Segment) -> Segment:
+def _constrained(scene: Scene, paths: Rollout, i: int, segment: Segment) -> Segment:
     """The segment with the impulses of path ``i`` and, in its failure, the constraint that stopped the path."""
     failure = segment.failure
     if failure is not None and failure.reason in (REASONS[Outcome.toggle], REASONS[Outcome.assembly]):

@@ -16,7 +16,7 @@ from varpin.mechanics.forces import Force, of_kind
 from varpin.mechanics.noise import BoundNoise, CompiledFields, Noise
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, combine
-from varpin.model.robot import hold_joints
+from varpin.model.loading import hold_joints
 from varpin.support.checks import JointValues, as_floats, joint_array
 from varpin.support.markup import facts, listed
 

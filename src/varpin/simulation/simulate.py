@@ -136,7 +136,7 @@ def simulate(
     accuracy: Accuracy | None = None
     error: Floats | None = None
     unmet: tuple[Finding, ...] = ()
-    early = in_other_units(scene, q0, v0)
+    early = in_other_units(scene, q0)
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
         early = (*early, *moved)
@@ -206,7 +206,7 @@ def simulate(
             # Without controls servos hold the start.
             found += controls_in_degrees(scene, motion.u)
         # Values in wrong units explain all else.
-        found.sort(key=lambda told: not told.kind.endswith(("degrees", "degrees per second", "millimetres")))
+        found.sort(key=lambda told: not told.kind.endswith(("degrees", "millimetres")))
         motion = motion.changed(warnings=ranked(found), accuracy=accuracy)
     except KeyboardInterrupt:
         raise Interrupted(motion.changed(accuracy=accuracy)) from None

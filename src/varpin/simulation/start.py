@@ -11,7 +11,7 @@ from varpin.errors import InputError
 from varpin.finding import Finding
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.scene import CORRECTED, EARTH, Scene
-from varpin.model import degrees_hint, degrees_per_second_hint, joint_unit, millimetres_hint
+from varpin.model import degrees_hint, joint_unit, millimetres_hint
 from varpin.support.checks import count, positive
 from varpin.trajectory import Trajectory
 
@@ -26,11 +26,10 @@ _PULL = math.hypot(*EARTH)
 _SPRINGS = {"FrameSpring": 9, "FrameLengthSpring": 7}
 
 
-def in_other_units(scene: Scene, q0: Floats, v0: Floats) -> tuple[Finding, ...]:
+def in_other_units(scene: Scene, q0: Floats) -> tuple[Finding, ...]:
     """Warnings of an initial state (n,) that looks like degrees, and of millimetres in gravity and springs."""
     told = {
         "start in degrees": degrees_hint(scene.robot, "q0", q0),
-        "start in degrees per second": degrees_per_second_hint(scene.robot, "v0", v0),
         "gravity in millimetres": _gravity_hint(scene),
         "springs in millimetres": _springs_hint(scene),
     }

@@ -288,7 +288,6 @@ class SolveTable:
     tolerance: Annotated[float | None, number(above=0.0)] = None
     max_iterations: Annotated[int | None, whole()] = None
     second_order: Annotated[bool | None, FLAG] = None
-    forward: Annotated[str | None, word("closed", "open")] = None
     regularization: Annotated[float | None, number(least=0.0)] = None
     true_cost: Annotated[float | None, number(above=0.0)] = None
 
