@@ -521,7 +521,7 @@ def clear(robot, **options):
         (lambda r, s: clear(r, itself="no"), ("itself", "'no'")),
         (lambda r, s: vp.LiveView(r, marks=vp.Marks(constraints=3), open=False), ("constraints", "3")),
         (lambda r, s: vp.LiveView(r, open="no"), ("open", "'no'")),
-        (lambda r, s: vp.replay(r, ARRAY, html="x.html", loop="no"), ("loop", "'no'")),
+        (lambda r, s: vp.replay(r, ARRAY, open="no"), ("open", "'no'")),
         (lambda r, s: vp.replay(r, ARRAY, html="x.html", marks=vp.Marks(growing=ARRAY)), "growing"),
         (lambda r, s: vp.plots.plot_energy_error(vp.simulate(s, *REST, **FREE), relative="no"), ("relative", "'no'")),
     ],

@@ -236,10 +236,13 @@ type = "control"
 [[plan_constraint]]
 type = "clearance"
 links = ["wrist_3_link"]
-hulls = [
-    [[1, 0, 0], [1.4, 0, 0], [1, 0.3, 0], [1, 0, 0.25]],
-    [[1, 0, 1], [1.4, 0, 1], [1, 0.3, 1], [1, 0, 1.25], [1.1, 0.1, 1.1]],
-]
+[[plan_constraint.obstacles]]
+type = "convex"
+points = [[1, 0, 0], [1.4, 0, 0], [1, 0.3, 0], [1, 0, 0.25]]
+[[plan_constraint.obstacles]]
+type = "convex"
+name = "other"
+points = [[1, 0, 1], [1.4, 0, 1], [1, 0.3, 1], [1, 0, 1.25], [1.1, 0.1, 1.1]]
 """
 
 
@@ -247,13 +250,13 @@ def test_scene_files(tmp_path):
     path = tmp_path / "arm.toml"
     path.write_text(SCENE, encoding="utf-8")
     (clear,) = vp.load_scene(path).problem.constraints
-    assert clear.pairs == ("wrist_3_link and hull[0]", "wrist_3_link and hull[1]")
+    assert clear.pairs == ("wrist_3_link and convex", "wrist_3_link and other")
     one, other = clear.obstacles
     np.testing.assert_allclose(one.begin + one.hull.points.max(axis=0), [1.4, 0.3, 0.25])
     assert len(other.hull.points) == 4
     for old, new, facts in [
-        ("[1.4, 0, 0]", "[1.4, 0]", ("plan_constraint[0].hulls[0][1]",)),
-        ("[1, 0, 0.25]", "[1.2, 0.3, 0]", ("plan_constraint[0]", "plane")),
+        ("[1.4, 0, 0]", "[1.4, 0]", ("plan_constraint[0].obstacles[0].points",)),
+        ("[1, 0, 0.25]", "[1.2, 0.3, 0]", ("plan_constraint[0].obstacles[0]", "plane")),
     ]:
         path.write_text(SCENE.replace(old, new), encoding="utf-8")
         with refused(vp.SceneFileError, *facts):
@@ -263,15 +266,17 @@ def test_scene_files(tmp_path):
 def test_scene_files_take_meshes_and_srdf_files(tmp_path):
     """A mesh's file gives the hull of its vertices, a missing one an error at its key."""
     (tmp_path / "tetra.obj").write_text("v 1 0 0\nv 1.4 0 0\nv 1 0.3 0\nv 1 0 0.25\nf 1 2 3\nf 1 2 4\n")
-    path, (head, _, last) = tmp_path / "arm.toml", SCENE.partition("    [[1, 0, 0]")
-    text = f'{head}    "tetra.obj",\n{last[last.index(chr(10)) + 1 :]}'
+    path = tmp_path / "arm.toml"
+    text = SCENE.replace(
+        '"convex"\npoints = [[1, 0, 0], [1.4, 0, 0], [1, 0.3, 0], [1, 0, 0.25]]', '"mesh"\npath = "tetra.obj"'
+    )
     path.write_text(text, encoding="utf-8")
     one, other = vp.load_scene(path).problem.constraints[0].obstacles
     np.testing.assert_allclose(one.begin + one.hull.points.max(axis=0), [1.4, 0.3, 0.25])
-    assert (one.name, other.name) == ("hull[0]", "hull[1]")
+    assert (one.name, other.name) == ("tetra", "other")
     for old, new, facts in [
-        ("tetra.obj", "lost.obj", ("plan_constraint[0].hulls[0]", "there is no file", "lost.obj")),
-        ('"tetra.obj"', "7", ("plan_constraint[0].hulls[0]", "a list of points", "mesh file", "7")),
+        ("tetra.obj", "lost.obj", ("plan_constraint[0].obstacles[0].path", "there is no file", "lost.obj")),
+        ('"tetra.obj"', "7", ("plan_constraint[0].obstacles[0].path", "7")),
         ("links =", 'srdf = "lost.srdf"\nlinks =', ("plan_constraint[0].srdf", "lost.srdf")),
         ("links =", 'srdf = "tetra.obj"\nlinks =', ("plan_constraint[0]", "srdf", "itself")),
     ]:

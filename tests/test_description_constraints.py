@@ -169,4 +169,3 @@ def test_the_command_takes_them(tmp_path, looped, capsys):
     assert motion.constraint_forces.shape[1] == 4
     capsys.readouterr()
     assert main(["advise", *options, "--tolerance", "1e-3"]) == 0
-    assert "--constraints robot" in capsys.readouterr().out

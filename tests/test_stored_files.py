@@ -189,19 +189,6 @@ def test_no_file(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", LOADERS)
-def test_unreadable(name):
-    # A regular file whose every read fails, even for root.
-    unread(name, Path("/proc/self/mem"))
-
-
-@pytest.mark.parametrize("name", LOADERS)
-def test_foreign_archive(name, tmp_path):
-    path = tmp_path / name
-    np.savez(path, q=np.zeros((3, 2)), t=np.zeros(3))
-    unread(name, path, "format")
-
-
-@pytest.mark.parametrize("name", LOADERS)
 def test_pickles_are_not_opened(name, tmp_path):
     witness = tmp_path / "witness"
 

@@ -39,10 +39,9 @@ def add_inspect(parser: argparse.ArgumentParser) -> None:
 
 def _inspect_scene(request: argparse.Namespace) -> int:
     file = scene_file(request, request.robot, "inspect", *ROBOT_OPTIONS, "gravity", "q", "v")
-    spec, required = file.spec, file.required
-    rows = [("robot", file.robot.name), *required.rows]
-    rows.append(("horizon", f"{spec.steps} steps of {spec.dt:g} s, {file.integrator}"))
-    show(Table(f"{spec.title} ({spec.path.name})", (), rows))
+    rows = [("robot", file.robot.name), *file.required.rows]
+    rows.append(("horizon", f"{file.steps} steps of {file.dt:g} s, {file.integrator}"))
+    show(Table(f"{file.title} ({file.path.name})", (), rows))
     return 0
 
 

@@ -165,7 +165,7 @@ def transform(base: ArrayLike | pin.SE3, what: str, otherwise: str = "") -> pin.
     matrix = as_floats(what, base.homogeneous if isinstance(base, pin.SE3) else base)
     if matrix.shape != (4, 4) or (matrix[3] != [0.0, 0.0, 0.0, 1.0]).any():
         raise InputError(
-            f"{what} must be a rotation and a translation (4, 4), with 0 0 0 1 in its last row, or a pin.SE3{otherwise}, "
+            f"{what} must be a rotation and a translation (4, 4), its last row 0 0 0 1, or a pin.SE3{otherwise}, "
             f"got shape {matrix.shape}"
         )
     require_finite(what, matrix)
