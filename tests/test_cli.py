@@ -424,7 +424,7 @@ def test_inspect_prints_tables_and_then_warnings(capsys):
     first = next(k for k, line in enumerate(lines) if line.startswith("warning: "))
     assert all(line.startswith("warning: ") for line in lines[first:])
     assert max(map(len, lines[:first])) <= 80
-    assert naming(lines[first:], "'panda_finger_joint2'", "mimic")
+    assert naming(lines[:first], "panda_finger_joint2", "mimic", "1 * panda_finger_joint1")
 
 
 def test_inspect_takes_a_curvature_of_rounding_for_none(capsys):

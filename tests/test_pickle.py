@@ -149,7 +149,7 @@ def test_problems_and_solutions_go_on_as_before():
 
 def test_a_controller_its_plant_and_its_run_go_round():
     scene = vp.Scene(vp.planar_chain(2))
-    controller = vp.Mpc(make_problem(scene), first_iterations=5)
+    controller = vp.Mpc(make_problem(scene))
     plant = vp.Plant(scene, substeps=2)
     done = controller.run(plant, duration=0.06)
     for way in WAYS:

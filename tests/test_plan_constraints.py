@@ -613,20 +613,6 @@ def test_references_of_rows_go_with_constraints():
     assert plan.violation <= 1e-6
 
 
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("time_limit", -1.0), ("time_limit", np.nan), ("max_iterations", -3), ("callback", 3), ("progress", 3),
-     ("check", "no"), ("second_order", "yes")],
-)  # fmt: skip
-def test_options_are_checked_with_constraints_as_without(option, value):
-    told = []
-    for constraints in ([], FAMILIES["velocities"]):
-        with refused(vp.InputError, option) as found:
-            vp.solve(two_links(constraints, steps=8), **{option: value})
-        told.append(str(found.value))
-    assert told[0] == told[1]
-
-
 def test_verification_tells_what_the_continuous_robot_violates():
     """Between nodes, and where coarse steps mislead; against an integration by SciPy."""
     problem = two_links(

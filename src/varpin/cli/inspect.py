@@ -18,7 +18,7 @@ from varpin.cli.arguments import (
     values_of,
 )
 from varpin.cli.console import show
-from varpin.model import build_robot, robot_names
+from varpin.model import load_robot, robot_names
 from varpin.show.inspection import inspect_robot
 from varpin.support.tables import Table
 
@@ -64,6 +64,6 @@ def add_robots(parser: argparse.ArgumentParser) -> None:
 
 
 def _robots(_request: argparse.Namespace, _errors: Console) -> int:
-    show(Table("Robots", ("name", "joints"), [(name, build_robot(name).dof) for name in robot_names()]))
+    show(Table("Robots", ("name", "joints"), [(name, load_robot(name).dof) for name in robot_names()]))
     show("joints without mimic joints; --lock locks some of them")
     return 0

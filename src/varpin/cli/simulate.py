@@ -30,7 +30,7 @@ from varpin.mechanics.scene import Scene
 from varpin.show.given import frame_names
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.simulate import simulate
-from varpin.simulation.time_steps import time_steps
+from varpin.simulation.start import time_steps
 from varpin.support.checks import count, positive
 from varpin.support.tables import Table
 from varpin.trajectory import Trajectory

@@ -185,7 +185,6 @@ class Along:
         size = hessian.shape[-1]
         rows, points = slice(begin // problem.hold, end // problem.hold), slice(begin * samples, end * samples)
         lin, velocity = self.linearized(begin, end)
-        slack, expected = self._limits(rows)
         G, Gx, Gu, count = lin.G, lin.Gx, lin.Gu, self.processes
         if count < G.shape[2]:
             G, Gx, Gu = (np.ascontiguousarray(array[:, :, :count]) for array in (G, Gx, Gu))
@@ -200,25 +199,14 @@ class Along:
             hessian=hessian[points] if len(hessian) > 1 else hessian,
             velocity=velocity,
             curvature=np.zeros((0, size, size)) if curvature is None else curvature[begin:end],
-            slack=slack,
-            expected=expected,
             rate=self.rate[rows],
             pull=self.pull[rows],
             within=None if self.within is None else self.within[begin:end],
+            held=None if self.held is None else self.held[rows],
         )
-
-    def _limits(self, rows: slice) -> tuple[Floats, Floats]:
-        """Slack (R, 2, m) that keeps controls which are held, and expected states, as the core takes them."""
-        m = self.problem.scene.controls
-        expected = np.zeros((0, self.states + m))
-        if self.held is None:
-            return np.zeros((0, 2, m)), expected
-        far = np.where(self.held[rows], 0.0, np.inf)
-        return np.ascontiguousarray(np.stack([-far, far], axis=1)), expected
 
     def _on_lines(self, curvature: Floats | None) -> core.ExpandedSteps:
         X, m = self.line.B.shape[1:]
-        slack, expected = self._limits(slice(None))
         return core.ExpandedSteps(
             A=self.line.A,
             B=self.line.B,
@@ -230,10 +218,9 @@ class Along:
             hessian=self.line.hessian,
             velocity=np.zeros((0, X // 2, X)),
             curvature=np.zeros((0, X + m, X + m)) if curvature is None else curvature,
-            slack=slack,
-            expected=expected,
             rate=np.zeros((0, m, m)),
             pull=np.zeros((0, m)),
+            held=self.held,
         )
 
 

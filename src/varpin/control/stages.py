@@ -235,6 +235,14 @@ class Stages(Frozen):
 
     def slopes(self, rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
         """The gradient of the Lagrangian in the controls (R, m), by costates."""
+        return self.layout.controls_of(self._lagrangian(rows, multipliers))
+
+    def costates(self, rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
+        """Derivatives (R, 2n) of the Lagrangian in the state after each stage."""
+        return self._lagrangian(rows, multipliers)[self.layout.state(np.arange(1, self.layout.stages + 1))]
+
+    def _lagrangian(self, rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
+        """Derivatives of the Lagrangian in all variables, states after them left free."""
         layout = self.layout
         total = np.zeros(layout.size + 1)
         for at, gradient, _ in self.costs:
@@ -244,7 +252,7 @@ class Stages(Frozen):
         at = layout.in_stage(np.arange(layout.stages))
         for k in range(layout.stages - 1, -1, -1):
             np.add.at(total, at[k], self.J[k].T @ total[layout.state(np.array([k + 1]))[0]])
-        return layout.controls_of(total)
+        return total
 
     def gaps_of(self, z: Floats) -> Floats:
         """What the linearized stages miss the states in z by (R, 2n)."""

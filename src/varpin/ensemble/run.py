@@ -22,8 +22,7 @@ from varpin.mechanics.wiener import children
 from varpin.signals.controls import commands_of
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.choice import stronger, usual_integrator
-from varpin.simulation.start import in_other_units, on_constraints
-from varpin.simulation.time_steps import time_steps
+from varpin.simulation.start import in_other_units, on_constraints, time_steps
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -144,7 +143,7 @@ def simulate_ensemble(
             raise EnsembleInterrupted(kept) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
+    found = (*in_other_units(scene, start[0][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene.announced, dt, found)
     return sums.ensemble(found)
 

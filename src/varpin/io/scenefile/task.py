@@ -19,14 +19,13 @@ from varpin.io.scenefile.references import Timeline, constant, timeline
 from varpin.mechanics.description import description_constraints
 from varpin.mechanics.forces import Force, PositionServo
 from varpin.mechanics.noise import Noise
-from varpin.mechanics.reduction import Required, driving, idle_joints, joints_with, report
-from varpin.mechanics.scene import Scene, closest_controls
+from varpin.mechanics.reduction import Required, driving, idle_joints, report
+from varpin.mechanics.scene import Scene, closest_controls, joints_with
 from varpin.model import Robot, combine, load_robot
 from varpin.model.clearance import Obstacle
 from varpin.model.payload import Payload
 from varpin.model.tree import frame_index
-from varpin.simulation.start import on_constraints
-from varpin.simulation.time_steps import time_steps
+from varpin.simulation.start import on_constraints, time_steps
 from varpin.support.checks import count
 
 # Largest number of steps; with costs a tenth of it by their number, as each evaluates its reference at each step.
