@@ -22,7 +22,7 @@ from varpin.mechanics.wiener import children
 from varpin.signals.policy import LinearPolicy
 from varpin.simulation.check import check
 from varpin.simulation.loop import unstable_loop
-from varpin.support.checks import count, counting
+from varpin.support.checks import count, told_motion
 from varpin.support.executors import executing, in_order, take_all
 from varpin.support.markup import facts, warning_count
 
@@ -150,7 +150,7 @@ def monte_carlo(
 ) -> MonteCarlo:
     """See :meth:`Solution.monte_carlo`; for any policy. ``within`` is what no path shows of the noise within steps."""
     paths = count("paths", paths, least=2)
-    counting("progress", progress, "paths done, paths in all")
+    told_motion("progress", progress, "paths done, paths in all")
     every = Paths.of(problem, policy, children(rng, paths), paths)
     parts: list[Found] = []
     extremes: Extremes = {}
