@@ -552,7 +552,7 @@ class Search:
         return True
 
     def _line_search(self) -> Taken:
-        """Move to the trial along the step that a line search accepts, if any."""
+        """Move to the trial along the step that a line search accepts, if any, by the merit (O11)."""
         step, noise, problem, motion = self._known, self.noise, self.problem, self.trajectory
         assert noise is not None
         z = None if step.minimum is None else step.minimum.z
