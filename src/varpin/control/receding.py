@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from varpin.arrays import Floats
 from varpin.control.between_nodes import enforced, middles
-from varpin.control.commands import shifted_commands
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Status
 from varpin.control.multipliers import REPORTED, Multipliers, at_nodes, flat
 from varpin.control.problem import OptimalControlProblem
+from varpin.control.rollout import shifted_commands
 from varpin.control.search import Search
 from varpin.control.solution import Solution
 from varpin.support.frozen import Frozen

@@ -18,24 +18,21 @@ from typing import NamedTuple
 import numpy as np
 
 from varpin.arrays import Floats, Mask
-from varpin.control.along import Along, states
 from varpin.control.between_nodes import NOWHERE, Instants, beyond, enforced, extended, seen, watched
 from varpin.control.constraints import BoundBetween, BoundConstraint
 from varpin.control.costs import CostError
-from varpin.control.descent import rounding
-from varpin.control.feedback import around, held
 from varpin.control.history import Iteration, SearchState, Status
 from varpin.control.line_search import ARMIJO, BACKTRACKING, Lengths
-from varpin.control.linear_controls import widened as widened_curvature
 from varpin.control.margins import widened
 from varpin.control.multipliers import FEASIBLE, Multipliers, flat, split
-from varpin.control.passes import Plan, foreseen, noise_shares, single_pass
+from varpin.control.noise import deviations
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.qp import Minimum, Program
+from varpin.control.riccati import Plan, backward, foreseen, noise_shares
+from varpin.control.rollout import around, held
 from varpin.control.second_order import curvature_along
 from varpin.control.solution import Solution
-from varpin.control.spread import Feedback, deviations, state_slopes
-from varpin.control.stages import Layout, Rows, Stages
+from varpin.control.stages import Feedback, Rows, Stages, Steps, states
 from varpin.control.starts import holding_gains, joint_forces, states_on
 from varpin.control.trials import Attempt, Trials
 from varpin.core.arrays import Commands
@@ -196,7 +193,7 @@ class Search:
         self.step: Step | None = None
         robot = problem.scene.robot.name
         self.label = f"{robot}, {problem.steps} steps of {problem.dt:g} s from t = {problem.t0:g} s"
-        self._expansions: Along | None = None
+        self._expansions: Steps | None = None
         self._enforce(NOWHERE)
 
     def begin(self, commands: Commands) -> None:
@@ -303,10 +300,10 @@ class Search:
         return Status.OUT_OF_TIME if time.perf_counter() > deadline else None
 
     @property
-    def along(self) -> Along:
+    def along(self) -> Steps:
         """The expansions along the motion."""
         if self._expansions is None or self._expansions.trajectory is not self.trajectory:
-            self._expansions = Along(self.problem, self.trajectory)
+            self._expansions = Steps(self.problem, self.trajectory)
         return self._expansions
 
     @property
@@ -372,7 +369,7 @@ class Search:
             self.noise = (self._pass(0.0) if self.regularization > 0.0 else plan) or plan
         if self._has_goals:
             self._passes += 1
-            self.plan = single_pass(self._with_goals(along), 0.0)[0] or plan
+            self.plan = backward(self._with_goals(along), 0.0) or plan
         if problem.processes and not self.tick:
             self._take_margins(self.plan)
         if free:
@@ -384,7 +381,7 @@ class Search:
             return True
         spread = self.noise.spread if problem.processes else None
         stages = Stages.along(along, spread, curvature)
-        rows = [stages.rows(problem, self.trajectory, *pair) for pair in zip(self.bound, self.backoff, strict=True)]
+        rows = [stages.rows(*pair) for pair in zip(self.bound, self.backoff, strict=True)]
         self._excess = [_excess(row.values, equality=row.equality) for row in rows]
         self.stages, self.rows = stages, rows
         if calm and self.bound and self._is_free(plan, rows):
@@ -406,26 +403,16 @@ class Search:
         exists = smooth and self.problem.integrator.variational and not self.tick
         return exists and saturates(scene, self.trajectory)
 
-    def _pass(self, regularization: float, curvature: Floats | None = None, held: Mask | None = None) -> Plan | None:
-        """A backward pass of the costs, in which some controls (R, m) may be ``held`` as they are."""
-        along = self.along
-        if held is not None:
-            along = copy(along)
-            along.held = held
+    def _pass(self, regularization: float, curvature: Floats | None = None, fixed: Mask | None = None) -> Plan | None:
+        """A backward pass of the costs, in which some controls (R, m) may stay as they are."""
         self._passes += 1
-        return single_pass(along, regularization, curvature=self._wide(curvature))[0]
+        return backward(self.along, regularization, curvature=curvature, fixed=fixed)
 
     def _at_limits(self) -> Mask | None:
         """Which controls of the motion are at their limits (R, m); None where there are none."""
         u, (lower, upper) = self.problem.decided(self.trajectory), self.problem.control_limits
         found = (u <= lower) | (u >= upper)
         return found if found.any() else None
-
-    def _wide(self, curvature: Floats | None) -> Floats | None:
-        """Second derivatives of steps as the pass takes them."""
-        if curvature is None or not self.problem.linear:
-            return curvature
-        return widened_curvature(curvature, self.problem.scene.controls)
 
     def _solve_program(self) -> bool:
         program, rows = self.program, self.rows
@@ -470,7 +457,7 @@ class Search:
     def _has_goals(self) -> bool:
         return any(item.source.equality for item in self.bound)
 
-    def _with_goals(self, along: Along) -> Along:
+    def _with_goals(self, along: Steps) -> Steps:
         """The expansions with the goals at the end as a cost, for the feedback."""
         if not self._has_goals:
             return along
@@ -486,34 +473,26 @@ class Search:
     def _foreseen_states(self) -> Floats | None:
         """The changes of q and v at the nodes (N + 1, 2n) with a full step, by the linear model."""
         problem, along, plan = self.problem, self.along, self.plan
-        n = problem.scene.robot.dof
-        if self._known.minimum is not None or len(along.blocks) > 1 or plan is None:
+        if self._known.minimum is not None or plan is None:
             return None
-        change = np.zeros((problem.steps + 1, 2 * n))
-        foreseen(along, plan, after=change[1:])
-        if problem.integrator.variational:
-            slopes = state_slopes(problem, self.trajectory)
-            change = (slopes @ change[:, :, None])[:, :, 0]
+        z, _ = foreseen(along, plan)
+        stages, padded = Stages.along(along), np.append(z, 0.0)
+        layout = stages.layout
+        moved = padded[layout.in_stage(np.arange(problem.steps) // problem.hold)]
+        moved[: problem.hold, : layout.states] = 0.0
+        x = (stages._within @ moved[:, :, None])[:, : layout.states, 0]
+        x = np.vstack([x, layout.states_of(z)[-1:]])
+        change: Floats = (along.slopes @ x[:, :, None])[:, :, 0]
         return change
 
     def _is_free(self, plan: Plan, rows: Sequence[Rows]) -> bool:
         """Whether the full step of a backward pass keeps to all limits and rows, by the linear model."""
-        along, problem = self.along, self.problem
-        if len(along.blocks) > 1:
-            return False
-        layout = Layout.of(problem)
-        after = np.empty((problem.decisions if problem.linear else problem.steps, along.states))
-        found = foreseen(along, plan, after=after)
-        if found.limited:
-            return False
-        x = np.vstack([np.zeros((1, layout.states)), after[problem.hold - 1 :: problem.hold, : layout.states]])
-        z = layout.joined(x[1:] if problem.linear else x, found.moves)
+        z, limited = foreseen(self.along, plan)
         padded = np.append(z, 0.0)
-        for row in rows:
-            moved = np.where(row.at >= 0, padded[row.at], 0.0)
-            if (row.values + (row.slopes * moved).sum(axis=1) > 0.0).any():
-                return False
-        return True
+        return not limited and all(
+            (row.values + (row.slopes * np.where(row.at >= 0, padded[row.at], 0.0)).sum(axis=1) <= 0.0).all()
+            for row in rows
+        )
 
     def _feedforward(self, z: Floats) -> Floats:
         """The changes of the controls in z, without what feedback gives for its states."""
@@ -531,37 +510,19 @@ class Search:
 
     def _costates(self) -> Floats:
         """Derivatives (N, 2n) of the Lagrangian in the state after each step, with the known multipliers."""
-        problem = self.problem
-        # Derivatives are made once: copies share those that are there.
-        self.along.linearized(0, problem.steps)
-        along, plain = copy(self.along), object.__new__(type(problem))
-        # As if controls were held over one step: the dataclass is frozen.
-        vars(plain).update(vars(problem) | {"hold": 1})
-        along.problem = plain
-        stages = Stages.along(along)
-        layout = stages.layout
-        total = np.zeros(layout.size + 1)
-        for at, gradient, _ in stages.costs:
-            np.add.at(total, at, gradient)
+        stages, rows, pushes = Stages.along(self.along, single=True), [], []
         for item, margin, push in zip(self.bound, self.backoff, self.multipliers, strict=True):
             if push.any() and not item.of_controls:
-                row = stages.rows(plain, self.trajectory, item, margin)
-                np.add.at(total, row.at, (push.ravel() * item.scale)[:, None] * row.slopes)
-        own: Floats = total[layout.state(np.arange(1, layout.stages + 1))]
-        found = np.empty(own.shape)
-        found[-1] = own[-1]
-        for k in range(layout.stages - 1, 0, -1):
-            found[k - 1] = own[k - 1] + stages.J[k, :, : layout.states].T @ found[k]
-        return found
+                rows.append(stages.rows(item, margin))
+                pushes.append(push.ravel() * item.scale)
+        return stages.costates(rows, pushes)
 
     def _take_margins(self, plan: Plan) -> None:
         """Margins of all rows, in their units: standard deviations under the plan's feedback, and what is added."""
         kept = [item for item in self.bound if item.source.margin > 0.0]
         if not kept:
             return
-        feedback, problem = Feedback(plan.feedback, plan.previous), self.problem
-        lin, _ = self.along.linearized(0, problem.steps)
-        spreads = iter(deviations(problem, self.trajectory, feedback, kept, lin))
+        spreads = iter(deviations(self.along, Feedback(plan.feedback, plan.previous), kept))
         own = [
             item.source.margin * next(spreads) if item.source.margin > 0.0 else np.zeros(item.shape)
             for item in self.bound
@@ -628,7 +589,7 @@ class Search:
         margins = any(item.source.margin > 0.0 for item in self.bound)
         if self.problem.processes and self.problem.limited and not (margins or self._has_goals or self.tick):
             # Controls at their limits do not react to noise, and the plan tells what it costs then.
-            held = self._pass(0.0, held=self._at_limits())
+            held = self._pass(0.0, fixed=self._at_limits())
             self.plan, self.noise = held or self.plan, held or self.noise
 
     def _gains_more(self, share: float) -> bool:
@@ -740,7 +701,7 @@ class Search:
         if length == 0.0:
             hidden = 0.0
             if tried is not None:
-                hidden = rounding(self.problem, self.trajectory, self.shares, tried, self.along.model)
+                hidden = self.along.rounding(self.shares, tried)
             return Taken(trials=trials, hidden=hidden)
         assert best.attempt is not None
         assert best.shares is not None

@@ -10,12 +10,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from varpin.control.commands import controls_along, first_commands
 from varpin.control.examination import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
 from varpin.control.line_search import ARMIJO, BACKTRACKING
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refinement import SUFFICIENT, refine
+from varpin.control.rollout import controls_along, first_commands
 from varpin.control.search import Report, Search
 from varpin.control.solution import Solution
 from varpin.control.starts import Path, commands_along, path_of

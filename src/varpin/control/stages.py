@@ -1,28 +1,333 @@
-"""The stages along a motion: dynamics, cost and rows as one quadratic program in all decisions.
+"""The stages along a motion: dynamics, costs, noise and rows, expanded for the recursion and for quadratic programs.
 
-Equation (O10) of docs/mathematics.md.
-
-The variables are the changes z = (u_0, x_1, u_1, ..., x_R) of the states before each decision and of the controls; with
-linear controls u_R follows. A control that is held over several steps makes one stage of them. No other file knows
-whether controls are held or linear, or that the state holds momenta.
+Equations (O4), (O9) and (O10) of docs/mathematics.md. No other file knows whether controls are held or linear, or that
+the state holds momenta.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from varpin.arrays import Floats, Integers
-from varpin.control.along import Along
+from varpin.arrays import Floats, Integers, Mask
 from varpin.control.constraints import BoundBetween, BoundConstraint, BoundOnCubics, BoundRate
-from varpin.control.linear_controls import in_step, on_lines
+from varpin.control.costs import CostError, Expansion
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.spread import state_slopes
+from varpin.control.samples import after_impulse, at_samples, beyond_samples
+from varpin.core import stake_of
+from varpin.linearization import Linearization, linearize_steps, velocity_at_nodes
 from varpin.support.frozen import Frozen
 from varpin.trajectory import Trajectory
+
+# Rounding errors of costs and states, in units of the last digit.
+_ROUNDED = 16.0 * float(np.finfo(np.float64).eps)
+
+
+def states(problem: OptimalControlProblem, motion: Trajectory) -> Floats:
+    """X (N + 1, 2n): (q, p) or (q, v)."""
+    return np.concatenate((motion.q, motion.p if problem.integrator.variational else motion.v), axis=1)
+
+
+def in_step(lin: Linearization) -> tuple[Floats, Floats]:
+    """Derivatives (N, 2n, Z) of linearized steps in their variables, and those of the noise's effect (N, 2n, k, Z)."""
+    if lin.ramp is None or lin.Gramp is None:
+        return np.concatenate([lin.A, lin.B], axis=2), np.concatenate([lin.Gx, lin.Gu], axis=3)
+    J = np.concatenate([lin.A, lin.B - lin.ramp, lin.ramp], axis=2)
+    return J, np.concatenate([lin.Gx, lin.Gu - lin.Gramp, lin.Gramp], axis=3)
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """Gains (R, m, 2n) on the state, and (R, m, m) on the previous control where that matters."""
+
+    state: Floats
+    before: Floats | None
+
+
+class Stake(NamedTuple):
+    """The cost at stake along a motion, without constants and noise, (O9).
+
+    For squared distances that the motion can change it is about their value.
+
+    Attributes:
+        free: Decrease of the cost's quadratic models along the motion if each state and control were free; infinite
+            where a model has no minimum, zero where the cost is least.
+        moved: The same, with each model's decrease bounded by its change over the motion's displacement, so that
+            unreachable states do not count. Tolerances are relative to it.
+    """
+
+    free: float
+    moved: float
+
+
+class Terminal(NamedTuple):
+    """The terminal cost in (q, v), its gradient (2n,) and Hessian (2n, 2n) in x, and d(q, v)/dx (2n, 2n)."""
+
+    cost: Expansion
+    gradient: Floats
+    hessian: Floats
+    slopes: Floats
+
+
+class Recursion(NamedTuple):
+    """Steps as the backward recursion takes them, in z = (X, u).
+
+    X is x, or (x, w) where the control w before the decision matters, with a zero state where its size would be odd.
+    Where controls are linear a first step, which takes no time, decides on the first one.
+    """
+
+    J: Floats  # (S, X, Z)
+    gradient: Floats  # (S, Z) of the cost per dt
+    hessian: Floats  # (S, Z, Z)
+    G: Floats  # (S, X, k)
+    Gz: Floats  # (S, X, k, Z)
+
+    def without(self, fixed: Mask) -> Recursion:
+        """The steps with controls (S, m) that change nothing, and have a minimum of their own at zero."""
+        free = np.ones_like(self.gradient)
+        free[:, -fixed.shape[1] :] = ~fixed
+        hessian = self.hessian * free[:, :, None] * free[:, None]
+        own = np.arange(free.shape[1])
+        hessian[:, own, own] += 1.0 - free
+        return Recursion(self.J * free[:, None], self.gradient * free, hessian, self.G, self.Gz * free[:, None, None])
+
+
+class Steps:
+    """The steps of a motion; each expansion is made when it is first needed.
+
+    The variables of a step are (x, u), or (x, w, u) with the controls w and u at its ends where they are linear.
+
+    Raises:
+        CostError: An expansion of the running cost is not finite; as the attributes are made.
+        LinearizationError: A step has no derivative; likewise.
+    """
+
+    def __init__(self, problem: OptimalControlProblem, trajectory: Trajectory) -> None:
+        self.problem, self.trajectory = problem, trajectory
+
+    @cached_property
+    def lin(self) -> Linearization:
+        """The linearized steps."""
+        problem = self.problem
+        return linearize_steps(problem.scene, self.trajectory, problem.integrator, problem.q0, ramps=problem.linear)
+
+    @cached_property
+    def _in_step(self) -> tuple[Floats, Floats]:
+        return in_step(self.lin)
+
+    @property
+    def J(self) -> Floats:
+        """Derivatives of the state after each step in its variables (N, 2n, Z)."""
+        return self._in_step[0]
+
+    @property
+    def Gz(self) -> Floats:
+        """Derivatives of the noise's effect in the variables (N, 2n, k, Z)."""
+        return self._in_step[1]
+
+    @cached_property
+    def _velocity(self) -> Floats:
+        """dv/dx at the nodes (N + 1, n, 2n), with x = (q, p)."""
+        return velocity_at_nodes(self.problem.scene, self.trajectory.q, self.trajectory.v)
+
+    @cached_property
+    def slopes(self) -> Floats:
+        """d(q, v)/dx at the nodes (N + 1, 2n, 2n)."""
+        n = self.problem.scene.robot.dof
+        found = np.tile(np.eye(2 * n), (len(self.trajectory.q), 1, 1))
+        if self.problem.integrator.variational:
+            found[:, n:] = self._velocity
+        return found
+
+    @cached_property
+    def running(self) -> Expansion:
+        """The running cost at its samples."""
+        found = self.problem.expand_running(self.trajectory)
+        for name, array in (("gradient", found.gradient), ("Hessian", found.hessian)):
+            if not np.isfinite(array).all():
+                raise CostError(repr(self.problem.cost), f"its {name} along the motion is not finite")
+        return found
+
+    @property
+    def _hessians(self) -> Floats:
+        """Hessians (N, s, 2n + m, 2n + m) of the running cost at the samples."""
+        N, samples, size = len(self.trajectory.u), len(self.problem.rule), self.running.hessian.shape[-1]
+        return np.broadcast_to(self.running.hessian, (N * samples, size, size)).reshape(N, samples, size, size)
+
+    @cached_property
+    def terminal(self) -> Terminal:
+        """The terminal cost at the end of the motion."""
+        end, x = self.problem.expand_terminal(self.trajectory), slice(0, 2 * self.problem.scene.robot.dof)
+        # Contiguous, as the core takes them.
+        cost = Expansion(end.gradient[:1, x], np.ascontiguousarray(end.hessian[:1, x, x]))
+        D = self.slopes[-1]
+        return Terminal(cost, D.T @ cost.gradient[0], D.T @ cost.hessian[0] @ D, D)
+
+    @cached_property
+    def rate(self) -> tuple[Floats, Floats]:
+        """Gradients (R, m) and Hessians (R, m, m) of the cost of each change of the controls; empty without one."""
+        problem, m = self.problem, self.problem.scene.controls
+        if problem.rate is None:
+            return np.zeros((0, m)), np.zeros((0, m, m))
+        return problem.rate.expand(problem.decided(self.trajectory), problem.period)
+
+    @cached_property
+    def slack(self) -> Floats:
+        """Distances (R, 2, m) of the controls from their limits."""
+        found: Floats = self.problem.control_limits - self.problem.decided(self.trajectory)[:, None]
+        return found
+
+    @cached_property
+    def costs(self) -> tuple[Floats, Floats]:
+        """Gradients (N, Z) and Hessians (N, Z, Z) of the running cost of each step in its variables."""
+        problem, rule, m = self.problem, self.problem.rule, self.problem.scene.controls
+        N, x, Z = self.J.shape
+        D = np.zeros((N, len(rule), x + m, Z))
+        D[:, :, :x] = at_samples(rule, self.J, self._velocity if problem.integrator.variational else None)
+        late = problem.places if problem.linear else np.ones(len(rule))
+        D[:, :, x:, x : x + m] = (1.0 - late)[:, None, None] * np.eye(m)
+        D[:, :, x:, Z - m :] = late[:, None, None] * np.eye(m)
+        weight = problem.dt * rule[0, 0]  # the same for all samples
+        across = np.swapaxes(D.reshape(N, -1, Z), 1, 2)
+        gradient = weight * (across @ self.running.gradient.reshape(N, -1, 1))[:, :, 0]
+        return gradient, weight * (across @ (self._hessians @ D).reshape(N, -1, Z))
+
+    @cached_property
+    def beyond(self) -> Floats | None:
+        """Of :attr:`kicked` (N, 2n, 2n) per dt what no sample sees, and so no path; None if nothing."""
+        x = 2 * self.problem.scene.robot.dof
+        hessian = self._hessians[:, :, :x, :x]
+        return beyond_samples(self.problem, self.trajectory, self.lin, hessian, self._velocity)
+
+    @cached_property
+    def kicked(self) -> Floats:
+        """Hessians (N, 2n, 2n) of what the noise of a step costs within it, in its effect on the state after it."""
+        x, problem = 2 * self.problem.scene.robot.dof, self.problem
+        velocity = self._velocity if problem.integrator.variational else None
+        found = after_impulse(problem.rule, self._hessians[:, :, :x, :x], velocity, problem.dt)
+        return problem.dt * (found if self.beyond is None else found + self.beyond)
+
+    def of_noise(self, spread: Floats) -> tuple[Floats, Floats]:
+        """Gradients (N, Z) and Hessians (N, Z, Z) of g' S g / 2 with Hessians S (N, 2n, 2n) in the noise's effect g."""
+        N, x, k, Z = self.Gz.shape
+        weighted = (spread @ self.Gz.reshape(N, x, k * Z)).reshape(N, x * k, Z)
+        gradient = (np.swapaxes(weighted, 1, 2) @ self.lin.G.reshape(N, x * k, 1))[:, :, 0]
+        return gradient, np.swapaxes(self.Gz.reshape(N, x * k, Z), 1, 2) @ weighted
+
+    def closed(self, feedback: Feedback, *, halves: bool = False) -> Floats:
+        """Matrices (N, Z, Z) to the variables of each step, from the state before it and the controls of the last one.
+
+        With ``halves`` these are halves of the steps whose linear controls the feedback decides.
+        """
+        (N, x, Z), m = self.J.shape, self.problem.scene.controls
+        begin, own = slice(x, x + m), slice(Z - m, Z)
+        found = np.tile(np.eye(Z), (N, 1, 1))
+        if self.problem.linear:
+            found[:, begin] = np.eye(m, Z, Z - m)
+        decided = slice(None, None, 2 if halves else self.problem.hold)
+        found[decided, own] = 0.0
+        found[decided, own, :x] = feedback.state[int(self.problem.linear) :]
+        if feedback.before is not None:
+            found[decided, own, own] = feedback.before[int(self.problem.linear) :]
+        if halves:
+            # The control in the middle is the mean of those at the ends, and so that at the end follows from it.
+            found[decided, own] = 0.5 * (found[decided, begin] + found[decided, own])
+            found[1::2, own] = 2.0 * np.eye(m, Z, Z - m) - np.eye(m, Z, x)
+        return found
+
+    @property
+    def states(self) -> int:
+        """The number of states X of :class:`Recursion`."""
+        m, x = self.problem.scene.controls, 2 * self.problem.scene.robot.dof
+        return x + m + m % 2 if self.problem.linear or self.problem.rate is not None else x
+
+    @cached_property
+    def _wide(self) -> Recursion:
+        problem, (N, x, _), X = self.problem, self.J.shape, self.states
+        m, first, k = problem.scene.controls, int(problem.linear), self.lin.G.shape[2]
+        w, u, kept = slice(x, x + m), slice(X, X + m), self._places
+        J, G, Gz = (np.zeros((N + first, X, *sizes)) for sizes in ((X + m,), (k,), (k, X + m)))
+        gradient, hessian = np.zeros((N + first, X + m)), np.zeros((N + first, X + m, X + m))
+        J[:first, :x, :x] = np.eye(x)
+        J[first:, :x, kept] = self.J
+        if x < X:
+            J[:, w, u] = np.eye(m)
+        gradient[first:, kept], hessian[first:, kept[:, None], kept] = (part / problem.dt for part in self.costs)
+        if k:
+            G[first:, :x], Gz[first:, :x, :, kept] = self.lin.G, self.Gz
+            slope, bend = self.of_noise(self.kicked / problem.dt)
+            gradient[first:, kept] += slope
+            hessian[first:, kept[:, None], kept] += bend
+        if problem.rate is not None:
+            pull, rate = (part / problem.dt for part in self.rate)
+            decided, later = slice(None, None, problem.hold), slice(first, None, problem.hold)
+            gradient[decided, u] += pull
+            hessian[decided, u, u] += rate
+            gradient[later, w] -= pull[first:]
+            hessian[later, w, w] += rate[first:]
+            hessian[later, w, u] -= rate[first:]
+            hessian[later, u, w] -= rate[first:]
+        found, begin = Recursion(J, gradient, hessian, G, Gz), problem.begin
+        if begin is None:
+            return found
+        fixed = np.zeros((N + first, m), dtype=bool)
+        fixed[0] = ~np.isnan(begin)
+        return found.without(fixed)
+
+    @property
+    def _places(self) -> Integers:
+        """Where the variables of steps are in z of :class:`Recursion`."""
+        m, Z = self.problem.scene.controls, self.J.shape[2]
+        return np.concatenate([np.arange(Z - m), self.states + np.arange(m)])
+
+    def recursion(self, curvature: Floats | None, fixed: Mask | None) -> Recursion:
+        """The steps for the recursion.
+
+        Args:
+            curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
+            fixed: Which controls (R, m) stay as they are.
+        """
+        found, kept = self._wide, self._places
+        if curvature is not None:
+            hessian = found.hessian.copy()
+            hessian[int(self.problem.linear) :, kept[:, None], kept] += curvature / self.problem.dt
+            found = found._replace(hessian=hessian)
+        return found if fixed is None else found.without(np.repeat(fixed, self.problem.hold, axis=0))
+
+    @cached_property
+    def stake(self) -> Stake:
+        """The cost at stake along the motion."""
+        start = np.concatenate([self.problem.q0, self.problem.v0])
+        free = moved = 0.0
+        for factor, expansion, z in self._models:
+            change = z.copy()
+            change[:, : len(start)] -= start
+            could, does = stake_of(expansion.gradient, expansion.hessian, change)
+            free, moved = free + factor * could, moved + factor * does
+        if self.problem.rate is not None:
+            rate = float(self.problem.rate.value(self.problem.decided(self.trajectory), self.problem.period))
+            free, moved = free + rate, moved + rate
+        return Stake(free, moved)
+
+    def rounding(self, here: Floats, there: Floats) -> float:
+        """Rounding error of the difference between the costs of this motion and a neighbour, from their shares."""
+        changed = here != there
+        total = np.abs(here[changed]).sum() + np.abs(there[changed]).sum()
+        for factor, expansion, z in self._models:
+            total += factor * (np.abs(expansion.gradient) * np.abs(z)).sum()
+        return _ROUNDED * float(total)
+
+    @property
+    def _models(self) -> tuple[tuple[float, Expansion, Floats], ...]:
+        """Weights, expansions and variables of the cost at the samples, (q, v, u), and at the end, (q, v)."""
+        problem, motion = self.problem, self.trajectory
+        along = np.concatenate(problem.samples(motion.q, motion.v, problem.control_rows(motion)), axis=1)
+        end = np.concatenate([motion.q[-1:], motion.v[-1:]], axis=1)
+        return (problem.dt * float(problem.rule[0, 0]), self.running, along), (1.0, self.terminal.cost, end)
 
 
 class Layout(NamedTuple):
@@ -41,10 +346,10 @@ class Layout(NamedTuple):
     linear: bool
 
     @classmethod
-    def of(cls, problem: OptimalControlProblem) -> Layout:
-        """The layout of a problem."""
-        scene = problem.scene
-        return cls(2 * scene.robot.dof, scene.controls, problem.steps // problem.hold, problem.linear)
+    def of(cls, problem: OptimalControlProblem, *, single: bool = False) -> Layout:
+        """The layout of a problem; with ``single``, as if each step had a control of its own."""
+        stages = problem.steps if single else problem.steps // problem.hold
+        return cls(2 * problem.scene.robot.dof, problem.scene.controls, stages, problem.linear)
 
     @property
     def size(self) -> int:
@@ -121,92 +426,76 @@ class Stages(Frozen):
     """The expansions along a motion, the matrices of (O10).
 
     Attributes:
+        steps: The steps; a control that is held over several of them makes one stage of these.
         layout: Where the variables are.
         J: Derivatives of the state after each stage in its variables (R, 2n, Z).
         costs: The costs of the stages, of control changes and of the end.
     """
 
+    steps: Steps
     layout: Layout
     J: Floats
     costs: tuple[Cost, ...]
-    _within: Floats  # (N, 2n + .., Z): state and controls of each step in the variables of its stage; empty if hold = 1
-    _velocity: Floats  # d(q, v)/dx at the nodes
+    _within: Floats  # (N, 2n + .., Z): state and controls of each step in the variables of its stage
 
     @classmethod
-    def along(cls, along: Along, spread: Floats | None = None, curvature: Floats | None = None) -> Stages:
-        """The stages of a motion with its expansions.
+    def along(
+        cls, steps: Steps, spread: Floats | None = None, curvature: Floats | None = None, *, single: bool = False
+    ) -> Stages:
+        """The stages of a motion.
 
         Args:
-            along: The expansions.
+            steps: The steps.
             spread: Hessians (N, 2n, 2n) of the cost to go in the state after each step, of which noise costs the half
                 of g' S g; none without noise.
             curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
+            single: Whether each step is a stage, as if it had a control of its own.
         """
-        problem, motion = along.problem, along.trajectory
-        layout, dt, rule = Layout.of(problem), problem.dt, problem.rule
-        lin, velocity = along.linearized(0, problem.steps)
-        J, gz = in_step(lin)
-        N, _, Z = J.shape
-        running, samples = along.running, len(rule)
-        gradient, hessian = np.zeros((N, Z)), np.zeros((N, Z, Z))
-        for s, D in enumerate(on_lines(rule, problem.places, J, velocity, layout.controls, ramps=problem.linear)):
-            across, weight = np.swapaxes(D, 1, 2), dt * rule[s, 0]
-            own = running.hessian[s::samples] if len(running.hessian) > 1 else running.hessian
-            gradient += weight * (across @ running.gradient[s::samples, :, None])[:, :, 0]
-            hessian += weight * (across @ (own @ D))
+        problem, (gradient, hessian) = steps.problem, steps.costs
+        layout, hold = Layout.of(problem, single=single), 1 if single else problem.hold
         if spread is not None:
-            weighted = np.einsum("Nab,Nbkz->Nakz", spread, gz)
-            gradient += np.einsum("Nakz,Nak->Nz", weighted, lin.G)
-            hessian += np.einsum("Nakz,Naky->Nzy", gz, weighted)
+            gradient, hessian = (a + b for a, b in zip((gradient, hessian), steps.of_noise(spread), strict=True))
         if curvature is not None:
-            hessian += curvature
-        within = np.zeros((0, Z, Z))
-        if problem.hold > 1:
-            within, J, gradient, hessian = _condensed(J, gradient, hessian, problem.hold)
-        k = np.arange(layout.stages)
-        costs = [Cost(layout.in_stage(k), gradient, hessian)]
-        end = along.terminal
+            hessian = hessian + curvature
+        within, J, gradient, hessian = _condensed(steps.J, gradient, hessian, hold)
+        costs = [Cost(layout.in_stage(np.arange(layout.stages)), gradient, hessian)]
+        end, (pull, rate) = steps.terminal, steps.rate
         costs.append(Cost(layout.state(np.array([layout.stages])), end.gradient[None], end.hessian[None]))
-        if len(along.rate):
-            k = np.arange(len(along.rate))
+        if len(rate):
+            k = np.arange(len(rate)) * (problem.hold // hold)
             at = np.concatenate([layout.control(k - 1), layout.control(k)], axis=1)
-            pull, rate = along.pull, along.rate
             costs.append(Cost(at, np.concatenate([-pull, pull], axis=1), np.block([[rate, -rate], [-rate, rate]])))
-        return cls(layout, J, tuple(costs), within, state_slopes(problem, motion))
+        return cls(steps, layout, J, tuple(costs), within)
 
-    def rows(self, problem: OptimalControlProblem, motion: Trajectory, bound: BoundConstraint, margin: Floats) -> Rows:
+    def rows(self, bound: BoundConstraint, margin: Floats) -> Rows:
         """The rows of a constraint along the motion, with a margin (K, rows)."""
-        u = problem.control_rows(motion)
+        motion, u = self.steps.trajectory, self.steps.problem.control_rows(self.steps.trajectory)
         values = (bound.value(motion.q, motion.v, u) + margin).ravel() / bound.scale
-        at, slopes = self._rows_in_decisions(problem, motion, bound)
+        at, slopes = self._in_decisions(bound)
         return Rows(values, at, slopes / bound.scale, bound.source.equality)
 
-    def _rows_in_decisions(
-        self, problem: OptimalControlProblem, motion: Trajectory, bound: BoundConstraint
-    ) -> tuple[Integers, Floats]:
+    def _in_decisions(self, bound: BoundConstraint) -> tuple[Integers, Floats]:
         """Indices (P, Z) of the variables of a constraint's rows, and derivatives."""
-        layout = self.layout
+        layout, motion = self.layout, self.steps.trajectory
         if isinstance(bound, BoundRate):
             columns = bound.limited
             at = np.stack([layout.control(bound.places - 1)[:, columns], layout.control(bound.places)[:, columns]], 2)
             pair = np.broadcast_to(np.array([-1.0, 1.0]) / bound.period, at.shape)
             return np.concatenate([at, at], axis=1).reshape(-1, 2), np.concatenate([pair, -pair], 1).reshape(-1, 2)
-        u = problem.control_rows(motion)
         if isinstance(bound, BoundOnCubics):
             parts = bound.by_nodes(bound.jacobian(motion.q, motion.v))
             nodes = bound.places - 1, bound.places
-            found = [self._at_nodes(problem, k, part, None) for k, part in zip(nodes, parts, strict=True)]
+            found = [self._at_nodes(k, part, None) for k, part in zip(nodes, parts, strict=True)]
             return np.concatenate([at for at, _ in found], axis=1), np.concatenate([J for _, J in found], axis=1)
-        slopes = bound.slopes(motion.q, motion.v, u)
+        slopes = bound.slopes(motion.q, motion.v, self.steps.problem.control_rows(motion))
         controls = slopes.by_controls if isinstance(bound, BoundBetween) else None
-        return self._at_nodes(problem, slopes.nodes, slopes.by_state, controls)
+        return self._at_nodes(slopes.nodes, slopes.by_state, controls)
 
-    def _at_nodes(
-        self, problem: OptimalControlProblem, nodes: Integers, by_state: Floats, by_controls: Floats | None
-    ) -> tuple[Integers, Floats]:
+    def _at_nodes(self, nodes: Integers, by_state: Floats, by_controls: Floats | None) -> tuple[Integers, Floats]:
         """Indices and derivatives of rows, each (P, Z), from those (K, rows, 2n) in (q, v) of nodes and of controls."""
-        layout, hold = self.layout, problem.hold
-        of_x = by_state @ self._velocity[nodes]
+        layout, N = self.layout, len(self._within)
+        hold = N // layout.stages
+        of_x = by_state @ self.steps.slopes[nodes]
         whole = by_controls is not None or hold > 1
         # The node at the end of a stage is a variable of its own; at the end of the horizon no stage begins.
         k = np.minimum(nodes // hold, layout.stages - 1) if whole else nodes
@@ -216,10 +505,9 @@ class Stages(Frozen):
         if by_controls is not None:
             J[:, :, layout.states :] = by_controls
         if hold > 1:
-            last = nodes == problem.steps
-            J = J @ np.where(
-                last[:, None, None], np.eye(at.shape[1]), self._within[np.minimum(nodes, problem.steps - 1)]
-            )
+            last = nodes == N
+            inside = self._within[np.minimum(nodes, N - 1)]
+            J = J @ np.where(last[:, None, None], np.eye(at.shape[1]), inside)
             at = np.where(last[:, None], -1, at)
             at[last, : layout.states] = layout.state(np.array([layout.stages]))
         return np.repeat(at, by_state.shape[1], axis=0), J.reshape(-1, at.shape[1])
@@ -235,6 +523,14 @@ class Stages(Frozen):
 
     def slopes(self, rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
         """The gradient of the Lagrangian in the controls (R, m), by costates."""
+        return self.layout.controls_of(self._lagrangian(rows, multipliers))
+
+    def costates(self, rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
+        """Derivatives (R, 2n) of the Lagrangian in the state after each stage."""
+        return self._lagrangian(rows, multipliers)[self.layout.state(np.arange(1, self.layout.stages + 1))]
+
+    def _lagrangian(self, rows: Sequence[Rows], multipliers: Sequence[Floats]) -> Floats:
+        """Derivatives of the Lagrangian in all variables, states after them left free."""
         layout = self.layout
         total = np.zeros(layout.size + 1)
         for at, gradient, _ in self.costs:
@@ -244,7 +540,7 @@ class Stages(Frozen):
         at = layout.in_stage(np.arange(layout.stages))
         for k in range(layout.stages - 1, -1, -1):
             np.add.at(total, at[k], self.J[k].T @ total[layout.state(np.array([k + 1]))[0]])
-        return layout.controls_of(total)
+        return total
 
     def gaps_of(self, z: Floats) -> Floats:
         """What the linearized stages miss the states in z by (R, 2n)."""
