@@ -2,6 +2,8 @@
 
 from varpin.control.examination import looked_at as looked_at
 from varpin.control.history import Iteration as Iteration
+from varpin.control.history import Refined as Refined
+from varpin.control.history import Refinement as Refinement
 from varpin.control.history import SearchState as SearchState
 from varpin.control.history import Status as Status
 from varpin.control.monte_carlo import MonteCarlo as MonteCarlo
@@ -12,8 +14,6 @@ from varpin.control.problem import OptimalControlProblem as OptimalControlProble
 from varpin.control.receding import Kept as Kept
 from varpin.control.receding import kept as kept
 from varpin.control.receding import replan as replan
-from varpin.control.refined import Refined as Refined
-from varpin.control.refined import Refinement as Refinement
 from varpin.control.solution import Solution as Solution
 from varpin.control.solution import Violations as Violations
 from varpin.control.solution_file import solution_trajectory as solution_trajectory

@@ -14,12 +14,11 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.costs import barriers_of
-from varpin.control.history import Iteration, SearchState, Status
+from varpin.control.history import Iteration, Refinement, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
 from varpin.control.noise import left_within_steps
 from varpin.control.problem import OptimalControlProblem
-from varpin.control.refined import Refinement
 from varpin.control.solution_file import read, write
 from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import Verification, verify
