@@ -126,21 +126,6 @@ def test_an_ensemble_stores_the_controls_of_lines() -> None:
         np.testing.assert_allclose(paths.u[path], alone.u, atol=1e-12)
 
 
-def test_lines_over_several_steps_with_fields_in_python() -> None:
-    """Noise that Python evaluates takes lines over several steps as the core does."""
-    problem = reach(vp.AdditiveNoise(0.1), integrator=vp.Gauss(2))
-    plan = vp.solve(problem, check=False)
-    fields = vp.CustomNoise(lambda q, v, u: np.array([[0.2], [1.0]]), 1)
-    own = vp.Scene(vp.planar_chain(2), damping=0.2, noise=fields)
-    given = {"dt": problem.dt / 4, "steps": 4 * problem.steps, "controls": plan.policy, "increments": 0.0}
-    fine = [
-        vp.simulate(scene, problem.q0, problem.v0, integrator=problem.integrator, check=False, **given)
-        for scene in (problem.scene, own)
-    ]
-    np.testing.assert_allclose(fine[0].u_nodes, fine[1].u_nodes, atol=1e-12)
-    np.testing.assert_allclose(fine[0].q, fine[1].q, atol=1e-12)
-
-
 @pytest.mark.parametrize("rate", [0.0, 1e-2])
 def test_the_noise_cost_in_halves_is_that_of_each_impulse(rate: float) -> None:
     """Of a linear system the cost is quadratic in the increments: their second differences are its mean under noise."""
