@@ -10,7 +10,6 @@ import numpy as np
 from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution, rest_of
-from varpin.control.stages import states
 from varpin.core.arrays import Commands
 from varpin.errors import InputError
 from varpin.mechanics.scene import closest_controls
@@ -105,36 +104,10 @@ def _rows_of(problem: OptimalControlProblem, controls: Any) -> Floats:
 
 def shifted_commands(problem: OptimalControlProblem, previous: Solution, decisions: int) -> Commands:
     """The commands of :meth:`Solution.shifted`, with the problem's limits and its previous control."""
-    old, before = previous.problem, None if problem.rate is None else problem.rate.before
-    R, m = problem.decisions, problem.scene.controls
-    same = (
-        old.scene is problem.scene
-        and old.integrator == problem.integrator
-        and old.control_limits is problem.control_limits
-    )
-    if problem.linear:
+    old, means = previous.problem, None
+    if problem.linear and old.constraints and not any(item.of_controls for item in old.bound_constraints):
         # Within constraints the last control often leaps, which does not fit beyond the end, where the motion goes on
         # with the torques that hold the robot there. Limits of their rate keep controls from leaping.
-        leaps = bool(old.constraints) and not any(item.of_controls for item in old.bound_constraints)
-        means = closest_controls(problem.scene, previous.trajectory.q[-1]) if leaps else None
-        return first_commands(problem, rest_of(previous, previous.policy, decisions, before, means=means))
-    if not (same and (old.dt, old.steps, old.hold) == (problem.dt, problem.steps, problem.hold)):
-        return first_commands(problem, previous.shifted(decisions, before))
-    rows = np.minimum(np.arange(R) + decisions, R - 1)
-    u, gains, reference = previous.controls, previous.gains, states(old, previous.trajectory)[: -1 : old.hold]
-    if previous.previous_gains is not None:
-        start = None if old.rate is None else old.rate.before
-        expected = np.vstack([u[:1] if start is None else start, u[:-1]])[rows[:1]]
-        gains = np.concatenate([gains, previous.previous_gains], axis=2)
-        # A repeated control has itself as its previous one.
-        reference = np.hstack([reference[rows], np.vstack([expected, u[rows[:-1]]])])
-    else:
-        reference = reference[rows]
-    return Commands(
-        u=u[rows],
-        gains=gains[rows],
-        reference=reference,
-        hold=problem.hold,
-        limits=problem.control_limits,
-        before=np.zeros((0, m)) if before is None else before[None].copy(),
-    )
+        means = closest_controls(problem.scene, previous.trajectory.q[-1])
+    before = None if problem.rate is None else problem.rate.before
+    return first_commands(problem, rest_of(previous, previous.policy, decisions, before, means=means))
