@@ -155,8 +155,8 @@ def foreseen(steps: Steps, plan: Plan) -> tuple[Floats, bool]:
     expected, moves, after = np.empty((R, Z)), np.empty((R, m)), np.empty((S, X))
     fixed = plan.feedforward, plan.gains, np.zeros((0, m, m)), slack
     limited = core.foresee(problem.hold, A, B, *fixed, np.zeros(Z), expected, moves, after)
-    at_ends = after[problem.hold - 1 :: problem.hold, : layout.states]
-    return layout.joined(np.vstack([np.zeros((1, layout.states)), at_ends])[-layout.stages - 1 :], moves), limited
+    x = np.vstack([np.zeros((1, layout.states)), after[:, : layout.states]])
+    return layout.joined(x[-layout.stages - 1 :], moves), limited
 
 
 def noise_shares(problem: OptimalControlProblem, motion: Trajectory, plan: Plan) -> Floats:

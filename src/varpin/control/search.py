@@ -32,7 +32,7 @@ from varpin.control.riccati import Plan, backward, foreseen, noise_shares
 from varpin.control.rollout import around, held
 from varpin.control.second_order import curvature_along
 from varpin.control.solution import Solution
-from varpin.control.stages import Feedback, Rows, Stages, Steps, states
+from varpin.control.stages import Feedback, Layout, Rows, Stages, Steps, states
 from varpin.control.starts import holding_gains, joint_forces, states_on
 from varpin.control.trials import Attempt, Trials
 from varpin.core.arrays import Commands
@@ -476,13 +476,7 @@ class Search:
         if self._known.minimum is not None or plan is None:
             return None
         z, _ = foreseen(along, plan)
-        stages, padded = Stages.along(along), np.append(z, 0.0)
-        layout = stages.layout
-        moved = padded[layout.in_stage(np.arange(problem.steps) // problem.hold)]
-        moved[: problem.hold, : layout.states] = 0.0
-        x = (stages._within @ moved[:, :, None])[:, : layout.states, 0]
-        x = np.vstack([x, layout.states_of(z)[-1:]])
-        change: Floats = (along.slopes @ x[:, :, None])[:, :, 0]
+        change: Floats = (along.slopes @ Layout.of(problem).states_of(z)[:, :, None])[:, :, 0]
         return change
 
     def _is_free(self, plan: Plan, rows: Sequence[Rows]) -> bool:
@@ -498,7 +492,7 @@ class Search:
         """The changes of the controls in z, without what feedback gives for its states."""
         plan, layout, problem = self.plan, self.stages.layout, self.problem
         assert plan is not None
-        x, u = layout.states_of(z)[:-1], layout.controls_of(z)
+        x, u = layout.states_of(z)[: -1 : problem.hold], layout.controls_of(z)
         before = np.vstack([np.zeros((1, u.shape[1])), u[:-1]])
         if problem.linear:
             # A control reacts to the state where its line begins.
@@ -510,7 +504,7 @@ class Search:
 
     def _costates(self) -> Floats:
         """Derivatives (N, 2n) of the Lagrangian in the state after each step, with the known multipliers."""
-        stages, rows, pushes = Stages.along(self.along, single=True), [], []
+        stages, rows, pushes = Stages.along(self.along), [], []
         for item, margin, push in zip(self.bound, self.backoff, self.multipliers, strict=True):
             if push.any() and not item.of_controls:
                 rows.append(stages.rows(item, margin))
@@ -828,7 +822,7 @@ class Search:
         if step.minimum is None or not self.bound:
             return None
         motion, layout = attempt.trajectory(), self.stages.layout
-        moved = (states(problem, motion) - states(problem, self.trajectory))[:: problem.hold]
+        moved = states(problem, motion) - states(problem, self.trajectory)
         z = layout.joined(moved, problem.decided(motion) - problem.decided(self.trajectory))
         values = [
             there - change for there, change in zip(self._values(motion), self.program.after_rows(z), strict=True)

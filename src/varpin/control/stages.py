@@ -248,20 +248,21 @@ class Steps:
     @cached_property
     def _wide(self) -> Recursion:
         problem, (N, x, _), X = self.problem, self.J.shape, self.states
+        gradient, hessian = (part / problem.dt for part in self.costs)
+        if self.lin.G.shape[2]:
+            slope, bend = self.of_noise(self.kicked / problem.dt)
+            gradient, hessian = gradient + slope, hessian + bend
+        narrow = Recursion(self.J, gradient, hessian, self.lin.G, self.Gz)
+        if x == X:
+            return narrow
         m, first, k = problem.scene.controls, int(problem.linear), self.lin.G.shape[2]
         w, u, kept = slice(x, x + m), slice(X, X + m), self._places
         J, G, Gz = (np.zeros((N + first, X, *sizes)) for sizes in ((X + m,), (k,), (k, X + m)))
         gradient, hessian = np.zeros((N + first, X + m)), np.zeros((N + first, X + m, X + m))
         J[:first, :x, :x] = np.eye(x)
-        J[first:, :x, kept] = self.J
-        if x < X:
-            J[:, w, u] = np.eye(m)
-        gradient[first:, kept], hessian[first:, kept[:, None], kept] = (part / problem.dt for part in self.costs)
-        if k:
-            G[first:, :x], Gz[first:, :x, :, kept] = self.lin.G, self.Gz
-            slope, bend = self.of_noise(self.kicked / problem.dt)
-            gradient[first:, kept] += slope
-            hessian[first:, kept[:, None], kept] += bend
+        J[:, w, u] = np.eye(m)
+        J[first:, :x, kept], G[first:, :x], Gz[first:, :x, :, kept] = narrow.J, narrow.G, narrow.Gz
+        gradient[first:, kept], hessian[first:, kept[:, None], kept] = narrow.gradient, narrow.hessian
         if problem.rate is not None:
             pull, rate = (part / problem.dt for part in self.rate)
             decided, later = slice(None, None, problem.hold), slice(first, None, problem.hold)
@@ -331,44 +332,51 @@ class Steps:
 
 
 class Layout(NamedTuple):
-    """Where the variables of a problem are.
+    """Where the variables of a problem are: z = (u_0, x_1, ..., x_hold, u_1, ...), and at the end a linear control.
 
     Attributes:
         states: 2n.
         controls: m.
-        stages: R, the number of stages with dynamics.
+        stages: N, the number of steps.
+        hold: Steps that share a control.
         linear: Whether there is a control at the end.
     """
 
     states: int
     controls: int
     stages: int
+    hold: int
     linear: bool
 
     @classmethod
-    def of(cls, problem: OptimalControlProblem, *, single: bool = False) -> Layout:
-        """The layout of a problem; with ``single``, as if each step had a control of its own."""
-        stages = problem.steps if single else problem.steps // problem.hold
-        return cls(2 * problem.scene.robot.dof, problem.scene.controls, stages, problem.linear)
+    def of(cls, problem: OptimalControlProblem) -> Layout:
+        """The layout of a problem."""
+        scene = problem.scene
+        return cls(2 * scene.robot.dof, scene.controls, problem.steps, problem.hold, problem.linear)
+
+    @property
+    def _span(self) -> int:
+        """The number of variables of a decision and the states after it."""
+        return self.controls + self.hold * self.states
 
     @property
     def size(self) -> int:
         """The number of variables."""
-        return self.stages * (self.states + self.controls) + self.linear * self.controls
+        return self.stages // self.hold * self._span + self.linear * self.controls
 
     def state(self, k: Integers) -> Integers:
-        """Indices (K, 2n) of states before decisions; -1 for the first one, which is given."""
-        own = (k * (self.states + self.controls) - self.states)[:, None] + np.arange(self.states)
+        """Indices (K, 2n) of states at nodes; -1 for the first one, which is given."""
+        decision, step = np.divmod(k - 1, self.hold)
+        own = (decision * self._span + self.controls + step * self.states)[:, None] + np.arange(self.states)
         return np.where(k[:, None] > 0, own, -1)
 
-    def control(self, k: Integers) -> Integers:
+    def control(self, r: Integers) -> Integers:
         """Indices (K, m) of controls; -1 for that before the horizon."""
-        own = (k * (self.states + self.controls))[:, None] + np.arange(self.controls)
-        return np.where(k[:, None] >= 0, own, -1)
+        return np.where(r[:, None] >= 0, (r * self._span)[:, None] + np.arange(self.controls), -1)
 
     def in_stage(self, k: Integers) -> Integers:
-        """Indices (K, Z) of the variables of stages: (x, u), or (x, w, u) of linear controls."""
-        ends = (k, k + 1) if self.linear else (k,)
+        """Indices (K, Z) of the variables of steps: (x, u), or (x, w, u) of linear controls."""
+        ends = (k, k + 1) if self.linear else (k // self.hold,)
         return np.concatenate([self.state(k), *map(self.control, ends)], axis=1)
 
     def decisions(self, feedback: Floats, previous: Floats | None) -> tuple[Integers, Floats]:
@@ -382,22 +390,22 @@ class Layout(NamedTuple):
             previous: G (R, m, m), or None.
         """
         R, m, _ = feedback.shape
-        k = np.arange(R)
+        r = np.arange(R)
         w = np.zeros((R, m, m)) if previous is None else previous
-        at = np.concatenate([self.state(k - self.linear), self.control(k - 1), self.control(k)], axis=1)
+        at = np.concatenate([self.state((r - self.linear) * self.hold), self.control(r - 1), self.control(r)], axis=1)
         return at, np.concatenate([-feedback, -w, np.broadcast_to(np.eye(m), w.shape)], axis=2)
 
     def controls_of(self, z: Floats) -> Floats:
-        """The changes (R, m), or (R + 1, m), of the controls in z."""
-        return z[self.control(np.arange(self.stages + self.linear))]
+        """The changes of the controls (R, m) in z."""
+        return z[self.control(np.arange(self.stages // self.hold + self.linear))]
 
     def states_of(self, z: Floats) -> Floats:
-        """The changes (R + 1, 2n) of the states in z."""
+        """The changes (N + 1, 2n) of the states in z."""
         at = self.state(np.arange(self.stages + 1))
         return np.where(at >= 0, z[at], 0.0)
 
     def joined(self, states: Floats, controls: Floats) -> Floats:
-        """The variables of changes of the states (R + 1, 2n) and of the controls."""
+        """The variables of changes of the states (N + 1, 2n) and of the controls (R, m)."""
         z = np.empty(self.size)
         z[self.state(np.arange(1, self.stages + 1))] = states[1:]
         z[self.control(np.arange(len(controls)))] = controls
@@ -426,22 +434,22 @@ class Stages(Frozen):
     """The expansions along a motion, the matrices of (O10).
 
     Attributes:
-        steps: The steps; a control that is held over several of them makes one stage of these.
+        steps: The steps.
         layout: Where the variables are.
-        J: Derivatives of the state after each stage in its variables (R, 2n, Z).
-        costs: The costs of the stages, of control changes and of the end.
+        costs: The costs of the steps, of control changes and of the end.
     """
 
     steps: Steps
     layout: Layout
-    J: Floats
     costs: tuple[Cost, ...]
-    _within: Floats  # (N, 2n + .., Z): state and controls of each step in the variables of its stage
+
+    @property
+    def J(self) -> Floats:
+        """Derivatives of the state after each step in its variables (N, 2n, Z)."""
+        return self.steps.J
 
     @classmethod
-    def along(
-        cls, steps: Steps, spread: Floats | None = None, curvature: Floats | None = None, *, single: bool = False
-    ) -> Stages:
+    def along(cls, steps: Steps, spread: Floats | None = None, curvature: Floats | None = None) -> Stages:
         """The stages of a motion.
 
         Args:
@@ -449,23 +457,19 @@ class Stages(Frozen):
             spread: Hessians (N, 2n, 2n) of the cost to go in the state after each step, of which noise costs the half
                 of g' S g; none without noise.
             curvature: Second derivatives (N, Z, Z) of the steps in the cost to go, where they count.
-            single: Whether each step is a stage, as if it had a control of its own.
         """
-        problem, (gradient, hessian) = steps.problem, steps.costs
-        layout, hold = Layout.of(problem, single=single), 1 if single else problem.hold
+        layout, (gradient, hessian) = Layout.of(steps.problem), steps.costs
         if spread is not None:
             gradient, hessian = (a + b for a, b in zip((gradient, hessian), steps.of_noise(spread), strict=True))
         if curvature is not None:
             hessian = hessian + curvature
-        within, J, gradient, hessian = _condensed(steps.J, gradient, hessian, hold)
         costs = [Cost(layout.in_stage(np.arange(layout.stages)), gradient, hessian)]
-        end, (pull, rate) = steps.terminal, steps.rate
+        end, (pull, rate), r = steps.terminal, steps.rate, np.arange(len(steps.rate[0]))
         costs.append(Cost(layout.state(np.array([layout.stages])), end.gradient[None], end.hessian[None]))
         if len(rate):
-            k = np.arange(len(rate)) * (problem.hold // hold)
-            at = np.concatenate([layout.control(k - 1), layout.control(k)], axis=1)
+            at = np.concatenate([layout.control(r - 1), layout.control(r)], axis=1)
             costs.append(Cost(at, np.concatenate([-pull, pull], axis=1), np.block([[rate, -rate], [-rate, rate]])))
-        return cls(steps, layout, J, tuple(costs), within)
+        return cls(steps, layout, tuple(costs))
 
     def rows(self, bound: BoundConstraint, margin: Floats) -> Rows:
         """The rows of a constraint along the motion, with a margin (K, rows)."""
@@ -493,24 +497,12 @@ class Stages(Frozen):
 
     def _at_nodes(self, nodes: Integers, by_state: Floats, by_controls: Floats | None) -> tuple[Integers, Floats]:
         """Indices and derivatives of rows, each (P, Z), from those (K, rows, 2n) in (q, v) of nodes and of controls."""
-        layout, N = self.layout, len(self._within)
-        hold = N // layout.stages
-        of_x = by_state @ self.steps.slopes[nodes]
-        whole = by_controls is not None or hold > 1
-        # The node at the end of a stage is a variable of its own; at the end of the horizon no stage begins.
-        k = np.minimum(nodes // hold, layout.stages - 1) if whole else nodes
-        at = layout.in_stage(k) if whole else layout.state(k)
-        J = np.zeros((*of_x.shape[:2], at.shape[1]))
-        J[:, :, : layout.states] = of_x
-        if by_controls is not None:
-            J[:, :, layout.states :] = by_controls
-        if hold > 1:
-            last = nodes == N
-            inside = self._within[np.minimum(nodes, N - 1)]
-            J = J @ np.where(last[:, None, None], np.eye(at.shape[1]), inside)
-            at = np.where(last[:, None], -1, at)
-            at[last, : layout.states] = layout.state(np.array([layout.stages]))
-        return np.repeat(at, by_state.shape[1], axis=0), J.reshape(-1, at.shape[1])
+        of_x, layout = by_state @ self.steps.slopes[nodes], self.layout
+        if by_controls is None:
+            at, J = layout.state(nodes), of_x
+        else:
+            at, J = layout.in_stage(nodes), np.concatenate([of_x, by_controls], axis=2)
+        return np.repeat(at, J.shape[1], axis=0), J.reshape(-1, J.shape[2])
 
     def change(self, z: Floats) -> tuple[float, float]:
         """The slope of the cost along z, and its change at z by the quadratic model."""
@@ -549,23 +541,3 @@ class Stages(Frozen):
         moved = np.where(at >= 0, padded[at], 0.0)
         found: Floats = (self.J @ moved[:, :, None])[:, :, 0] - z[self.layout.state(k + 1)]
         return found
-
-
-def _condensed(J: Floats, gradient: Floats, hessian: Floats, hold: int) -> tuple[Floats, Floats, Floats, Floats]:
-    """Steps (N, ...) whose control is held over some of them, as stages (R, ...).
-
-    Returns the variables of each step in those of its stage (N, Z, Z), and J, gradient and Hessian of the stages.
-    """
-    N, x, Z = J.shape
-    R = N // hold
-    J, gradient, hessian = (part.reshape(R, hold, *part.shape[1:]) for part in (J, gradient, hessian))
-    within = np.empty((R, hold, Z, Z))
-    T = np.tile(np.eye(Z), (R, 1, 1))
-    total, curved = np.zeros((R, Z)), np.zeros((R, Z, Z))
-    for j in range(hold):
-        within[:, j] = T
-        across = np.swapaxes(T, 1, 2)
-        total += (across @ gradient[:, j, :, None])[:, :, 0]
-        curved += across @ hessian[:, j] @ T
-        T = np.concatenate([J[:, j] @ T, T[:, x:]], axis=1)
-    return within.reshape(N, Z, Z), T[:, :x], total, curved
