@@ -98,7 +98,7 @@ def judge(rng: np.random.Generator) -> Verdict | None:
     if not np.abs(tight - loose).max() <= 0.1 * tolerance:
         return None
     advice = vp.advise(scene, q0, v0, duration=duration, tolerance=tolerance)
-    outcome = setting.run(advice.integrator, advice.steps, repeats=REPEATS)
+    outcome = setting.run(advice.best.integrator, advice.best.steps, repeats=REPEATS)
     best, best_seconds = exhaustive(setting, tight, tolerance, outcome.seconds)
     error = float(np.abs(outcome.motion.q[-1] - tight).max())
     what = f"{name}, {duration:g} s{', damped' if scene.damping.any() else ''}"

@@ -36,7 +36,7 @@ TREES = 200
 RATIOS = (1e-4, 1e-2, 1.0, 1e2, 1e4)
 # Robots of more joints than LARGE, whose motions take minutes, always take turns at the trials.
 LARGE, TURNS = 20, 6
-# A motion or a plan may take this long before it is judged by what there is [s].
+# A motion may take this long before it is judged by what there is [s].
 PATIENCE = 1.0
 
 
@@ -56,7 +56,7 @@ def robot_of(name: str) -> vp.Robot:
     return vp.load_robot(model)
 
 
-def trials_of(name: str, robot: vp.Robot, turns: int = 1) -> list[battery.Trial | battery.Plan]:
+def trials_of(name: str, robot: vp.Robot, turns: int = 1) -> list[battery.Trial]:
     """The battery, of which trees and robots of more than four joints may get each so many-th trial, by turns."""
     trials = battery.trials_on(robot)
     if robot.dof > LARGE:

@@ -63,7 +63,7 @@ def row(name: str, mpc: vp.Mpc, plants: dict[str, vp.Scene], robot: vp.Robot) ->
             run = mpc.run(vp.Plant(scene), duration=4.0, rng=seed)
             off.append(off_target(robot, run.motion))
             seconds.append(run.seconds[1:])
-            misses += run.misses
+            misses += int(run.late.sum())
         spread = f" ± {np.std(off, ddof=1) / np.sqrt(len(off)):.2f}" if len(off) > 1 else ""
         cells.append(f"{np.mean(off):.2f}{spread}")
     took = 1e3 * np.concatenate(seconds)

@@ -12,7 +12,6 @@ import shutil
 import subprocess
 import sysconfig
 import tempfile
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -23,7 +22,6 @@ import numpy as np
 import pinocchio as pin
 
 import varpin as vp
-from varpin.control.costs.base import CostSum, Scaled, Terminal
 
 SCHEMES = ("Euler", "RK2", "RK4")
 
@@ -54,28 +52,15 @@ def joints() -> ModuleType:
     return module
 
 
-def _leaves(cost: vp.Cost, factor: float = 1.0, *, end: bool = False) -> Iterator[tuple[vp.Cost, float, bool]]:
-    """The terms of a cost, their factors, and whether they are terminal."""
-    if isinstance(cost, CostSum):
-        for part in cost.parts:
-            yield from _leaves(part, factor, end=end)
-    elif isinstance(cost, Scaled):
-        yield from _leaves(cost.cost, factor * cost.factor, end=end)
-    elif isinstance(cost, Terminal):
-        yield from _leaves(cost.cost, factor, end=True)
-    else:
-        yield cost, factor, end
-
-
 def costs(problem: vp.OptimalControlProblem, state: crocoddyl.StateMultibody, t: float, *, end: bool) -> Any:
     """The running costs at a time, or the terminal ones. crocoddyl's activations are halved."""
     n, m = problem.scene.robot.dof, problem.scene.controls
     found = crocoddyl.CostModelSum(state, m)
     target, weights = np.zeros(2 * n), np.zeros(2 * n)
-    for cost, factor, terminal in _leaves(problem.cost):
-        if terminal != end:
+    for cost in problem.cost.terms:
+        if cost.at_end != end:
             continue
-        weight = 2.0 * factor * np.asarray(cost.weight)
+        weight = 2.0 * cost.factor * np.asarray(cost.weight)
         if isinstance(cost, vp.TrackingCost):
             target[:n] = cost.reference(t) if callable(cost.reference) else cost.reference
             weights[:n] += weight
@@ -111,7 +96,7 @@ class Dynamics:
             self.actuation = joints().Joints(self.state, scene.actuation.copy(), scene.damping.copy())
         else:
             self.actuation = crocoddyl.ActuationModelFull(self.state)
-        self.timed = any(callable(getattr(cost, "reference", None)) for cost, _, _ in _leaves(problem.cost))
+        self.timed = any(callable(getattr(cost, "reference", None)) for cost in problem.cost.terms)
 
     def at(self, t: float, *, end: bool = False) -> Any:
         sum_ = costs(self.problem, self.state, t, end=end)

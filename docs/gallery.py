@@ -233,10 +233,10 @@ def draw(name: str, scene: vp.SceneFile, plan: vp.Solution) -> None:
 
 def row(scene: vp.SceneFile, plan: vp.Solution) -> str:
     """A line of the table."""
-    spec, truth = scene.spec, plan.verify()
+    name, truth = scene.path.stem, plan.verify()
     numbers = f"{plan.cost:.5g} | {plan.iterations} | {truth.closed_loop_cost:.5g}"
-    size = f"{scene.robot.dof} of {scene.required.described} | {spec.steps} of {spec.dt:g} s"
-    return f"| [{spec.name}](#{spec.name.replace('_', '-')}) | {size} | {numbers} |"
+    size = f"{scene.robot.dof} of {scene.required.described} | {scene.steps} of {scene.dt:g} s"
+    return f"| [{name}](#{name.replace('_', '-')}) | {size} | {numbers} |"
 
 
 def draw_example(name: str) -> None:

@@ -18,7 +18,7 @@ limit = 8.0  # [N m]; holding both links level takes 20
 cost = vp.ControlCost(1e-2) + vp.VelocityCost(1e-2)
 cost += vp.Terminal(vp.TrackingCost(up, 1e3) + vp.VelocityCost(1e2))
 problem = vp.OptimalControlProblem(scene, cost, down, np.zeros(2), dt=0.02, steps=200, control_limits=(-limit, limit))
-plan = vp.solve(problem, backtracking=0.5, max_iterations=300)
+plan = vp.solve(problem, max_iterations=300)
 motion = plan.trajectory
 at_limit = np.abs(plan.controls) == limit
 print(plan)

@@ -16,5 +16,7 @@ for name in sys.argv[1:] or scenes():
     plan.save(out / f"{name}.npz")
     marks = scene.marks()  # targets, references and traces of what the cost is about
     print(
-        vp.replay(scene.robot, plan.trajectory, html=out / f"{name}.html", speed=scene.spec.outputs.speed, marks=marks)
+        vp.replay(
+            scene.robot, plan.trajectory, html=out / f"{name}.html", speed=scene.outputs.get("speed", 1.0), marks=marks
+        )
     )

@@ -26,7 +26,7 @@ cost += vp.Terminal(reached + vp.VelocityCost(10.0))
 problem = vp.OptimalControlProblem(
     scene, cost, begin, np.zeros(6), dt=1e-2, steps=100, control_limits=(-limits, limits)
 )
-plan = vp.solve(problem, backtracking=0.5)
+plan = vp.solve(problem)
 motion = plan.trajectory
 
 data = robot.model.createData()

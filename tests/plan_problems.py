@@ -314,6 +314,7 @@ ARMS: dict[str, Case] = {
 }
 # Those at the edge of what limits allow, where feedback has no room.
 HARD: dict[str, Case] = {
+    "one torque fixed": Case(lambda: reach(speeds(2.2), control_limits=([-40.0, -3.0], [40.0, -3.0])), 50.619309),
     "two links in haste": Case(lambda: hasty([0.38, -1.25], 0.67, 16, 1.71, 43.0), 2.9835572),
     "two links in more haste": Case(lambda: hasty([1.32, 1.05], 0.95, 19, 1.4, 29.0), 0.63806531),
     "Panda, goal at greatest speeds": Case(panda_at_speed, 0.13662213),

@@ -78,7 +78,7 @@ def passes(A, B, gradient, hessian, end_gradient, end_hessian, h):
     steps = core.ExpandedSteps(
         A=A, B=B, G=nothing, Gx=np.zeros((N, x, 0, x)), Gu=np.zeros((N, x, 0, m)), rule=rule,
         gradient=gradient, hessian=hessian, velocity=np.zeros((0, x // 2, x)), curvature=np.zeros((0, x + m, x + m)),
-        slack=np.zeros((0, 2, m)), expected=np.zeros((0, x + m)), rate=np.zeros((0, m, m)), pull=np.zeros((0, m)),
+        rate=np.zeros((0, m, m)), pull=np.zeros((0, m)),
     )  # fmt: skip
     for roots in (False, True):
         feedforward, feedback = np.zeros((N, m)), np.zeros((N, m, x))

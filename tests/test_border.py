@@ -4,6 +4,8 @@ Below the border nothing is checked. Run on a build with sanitizers, as ``.ci/th
 held against reading and writing past an array's end, too.
 """
 
+import threading
+
 import numpy as np
 import pytest
 from refusals import refused
@@ -12,7 +14,7 @@ import varpin as vp
 from varpin import core
 from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.integrators.tableau import gauss_coefficients, lobatto_places
-from varpin.signals.commands import interpolation
+from varpin.signals.commands import interpolation, open_loop
 
 N, P = 4, 2
 NOISE = vp.AdditiveNoise(1e-3) + vp.ControlNoise(0.1) + vp.StateNoise(0.1)
@@ -86,12 +88,13 @@ def roll(rollout):
 
 def variational(scene):
     tableau, guards = core.Tableau.make(**of_tableau()), core.Guards.make(**GUARDS)
-    return core.VariationalRollout(scene.core, tableau, 0.5, guards, 0.5, P)
+    return core.Rollout(scene.core, tableau, 0.5, guards, 0.5, P)
 
 
 def constrained(scene, *, begun=False):
     tableau, guards = core.Tableau.make(**of_tableau()), core.Guards.make(**GUARDS)
-    rollout, n = core.ConstrainedRollout(scene.core, tableau, lobatto_places(2), 0.5, guards, P), scene.robot.dof
+    rollout = core.Rollout(scene.core, tableau, 0.5, guards, 1.0, P, places=lobatto_places(2))
+    n = scene.robot.dof
     assert not begun or rollout.begin(draw(P, n), draw(P, n))
     return rollout
 
@@ -118,6 +121,7 @@ def steps(scene):
         **{"q": draw(N, n), "p": 0.1 * draw(N, n), "force": draw(N, 1, n)},
         "substeps": np.array([1, 1, 2, 4]),
         "halvings": np.array([1, 1, 2, 2, 2, 2], dtype=np.uint8),
+        "guess": np.zeros((N, 2, n)),
     }
 
 
@@ -157,11 +161,8 @@ def calls():
         yield f"roll, feedback of {feedback}", roll(begun(own)), of_roll(own, feedback)
         for method in core.ExplicitMethod:
             yield f"{method}, feedback of {feedback}", roll(explicit(own, method)), of_roll(own, feedback)
-    guess = np.zeros((N, 2, n))
-    yield "derivatives", core.variational_derivatives, {**steps(own), "guess": guess}
-    yield "curvatures", core.variational_curvatures, {**steps(own), "guess": guess, "z": draw(N, 2 * n)}
-    yield "bends", core.variational_bends, {**steps(own), "guess": guess, "weights": draw(N, 2 * n, 3 * n)}
-    yield "ends", core.variational_ends, steps(own)
+    yield "steps", core.Steps, steps(own)
+    yield "curvatures", core.Steps(**steps(own)).curvatures, {"z": draw(N, 2 * n)}
     yield "inverse dynamics", core.inverse_dynamics, {"mechanism": own.core, **states, "a": draw(N, n)}
     yield "accelerations", core.accelerations, {"mechanism": own.core, **many}
     for method in core.ExplicitMethod:
@@ -174,7 +175,7 @@ def calls():
     yield "begin under constraints", constrained(closed).begin, {"q": draw(P, n), "v": draw(P, n)}
     yield "kick under constraints", constrained(closed, begun=True).kick, {"impulse": draw(P, n)}
     moved = vp.Scene(own.robot, constraints=vp.KinematicInput(own.robot.joint_names[0], "cubic"))
-    again = {**steps(moved), "rates": draw(N, 1), "guess": guess, "places": lobatto_places(2)}
+    again = {"steps": core.Steps(**steps(moved)), "rates": draw(N, 1), "places": lobatto_places(2)}
     yield "derivatives under constraints", core.constrained_derivatives, again
     yield "rate", dynamics.rate, {"x": draw(2 * n), "force": draw(n)}
     yield "node", dynamics.node, {"x": draw(2 * n)}
@@ -189,8 +190,6 @@ def calls():
     yield "expanded changes", core.expand_changes, {**changes, "u": draw(N, m)}
     models = {"gradient": draw(N, m), "hessian": draw(N, m, m), "displacement": draw(N, m)}
     yield "stake", core.stake_of, models
-    box = {"H": np.eye(m), "g": draw(m), "limits": np.array([[-0.1] * m, [0.1] * m]), "guess": np.zeros(m)}
-    yield "box", core.box_minimum, box
 
 
 # Sizes that are the caller's to choose: rows of what is done one by one, a control before that may be left out.
@@ -198,7 +197,7 @@ FREE = {("place a frame", "q", 0), ("changes", "u", 0), ("changes", "u", 1), ("e
 FREE |= {("constraints", "q", 0)}
 FREE |= {("changes", "before", 0), ("expanded changes", "before", 0)}
 # Of two stages: a force for each.
-FREE |= {(name, "force", 1) for name in ("derivatives", "curvatures", "bends", "ends", "derivatives under constraints")}
+FREE |= {("steps", "force", 1)}
 
 
 @pytest.fixture(scope="module")
@@ -241,14 +240,48 @@ def test_halvings_that_cannot_be_counted_are_refused(halvings):
         core.Guards.make(**{**GUARDS, "most_halvings": halvings})
 
 
+@pytest.mark.parametrize("rate", [-2, 1])
+def test_rates_that_are_no_controls_are_refused(rate):
+    own = vp.Scene(vp.planar_chain(1), constraints=vp.KinematicInput("joint1"))
+    rows = own.bound_constraints.rows
+    rows = rows._replace(ties=tuple(tie._replace(rate=rate) for tie in rows.ties))
+    with refused(ValueError, "control"):
+        core.Mechanism.make(**of_mechanism(own) | {"constraints": rows})
+
+
+def test_terms_after_a_watch_are_refused():
+    costs = core.CostTerms.make(1, 1)
+    watch = core.Watch(costs, np.ones((1, 9)), np.zeros((2, 1)), np.zeros((2, 1)), np.zeros((1, 1)), np.zeros((1, 0)))
+    costs.add_term(core.Subject.entries, 0, np.eye(3), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
+    with refused(ValueError, "terms"):
+        watch.after(0, 1)
+
+
 @pytest.mark.parametrize("level", [0, 63])
 def test_parts_that_no_step_has_are_refused(level):
     given = {**steps(scene()), "halvings": np.array([1, 1, 2, 2, 2, level], dtype=np.uint8)}
     with refused(ValueError, "halvings", "62"):
-        core.variational_ends(**given)
+        core.Steps(**given)
 
 
 @pytest.mark.parametrize("path", [-1, P])
 def test_parts_of_a_path_that_is_not_there_are_refused(path):
     with pytest.raises((ValueError, TypeError), match=r"no such path|incompatible"):
         begun(scene()).halvings(path)
+
+
+def test_two_threads_in_forks_of_one_rollout_are_refused():
+    """Forks share the work arrays of a step."""
+    own = vp.Scene(vp.planar_chain(3))
+    rollout = core.Rollout(own.core, core.Tableau.make(**of_tableau()), 0.5, core.Guards.make(**GUARDS), 1.0, 1)
+    assert rollout.begin(np.zeros((1, 3)), np.zeros((1, 3)))
+    other, nodes = rollout.fork(core.Guards.make(**GUARDS)), new_nodes(1, 50_000, 3, 3)
+    nothing = np.zeros((0, 0, 0)), np.zeros((0, 0, 3))
+    thread = threading.Thread(target=rollout.roll, args=(1e-3, open_loop(np.zeros((50_000, 3))), *nothing, nodes))
+    thread.start()
+    with refused(RuntimeError, "two threads"):
+        while thread.is_alive():
+            other.kick(np.zeros((1, 3)))
+    thread.join()
+    assert nodes.done == 50_000
+    other.kick(np.zeros((1, 3)))

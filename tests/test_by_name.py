@@ -8,7 +8,6 @@ import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin.show.replay.annotations import torque_shares
 
 UR5 = vp.load_robot("ur5")
 NAMES = UR5.joint_names
@@ -241,14 +240,6 @@ def test_weights_by_name_are_not_negative():
     cost = vp.ControlCost({"elbow_joint": -1.0})
     with refused(vp.InputError, "ControlCost"):
         vp.OptimalControlProblem(vp.Scene(UR5), cost, ROW, ROW, dt=1e-2, steps=1)
-
-
-def test_a_torque_limit_by_name_leaves_the_others_their_own():
-    torques = np.full((3, 6), 7.0)
-    shares = torque_shares(UR5, torques, vp.Marks(torques=torques, torque_limit={"elbow_joint": 14.0}))
-    own = torque_shares(UR5, torques, vp.Marks(torques=torques))
-    assert shares[:, 2].tolist() == [0.5] * 3
-    np.testing.assert_array_equal(np.delete(shares, 2, axis=1), np.delete(own, 2, axis=1))
 
 
 def test_a_posture_by_its_name_is_told_how_to_be_given():

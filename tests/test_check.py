@@ -437,22 +437,6 @@ def test_a_blow_beside_a_node(early):
     assert motion.v[-1, 0] == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("integrator", "steps", "order"),
-    [(vp.Gauss(s), n, 2 * s) for s, n in ((1, 64), (2, 32), (3, 24), (4, 12))]
-    + [(vp.Radau(s), n, 2 * s - 1) for s, n in ((2, 64), (3, 32), (4, 24))]
-    + [(RK4, 64, 4)],
-    ids=str,
-)
-def test_order(integrator, steps, order):
-    """Functions of time that are smooth keep the order of a method."""
-    options = {"controls": vp.OpenLoop(waves), "check": False}
-    end = moved(FREE, vp.Gauss(6), dt=0.64 / 192, steps=192, **options).q[-1]
-    ends = [moved(FREE, integrator, dt=0.64 / n, steps=n, **options).q[-1] for n in (steps, 2 * steps)]
-    coarse, fine = np.abs(ends - end).max(axis=1)
-    assert np.log2(coarse / fine) > order - 0.5, (coarse, fine)
-
-
 def test_unsettled_functions():
     (told,) = moved(FREE, controls=vp.OpenLoop(lambda t: np.sin(1e9 * t * t) * np.ones(3)), steps=2).warnings
     assert (told.kind, told.value, told.unit) == ("fast controls", 2.0, "steps")

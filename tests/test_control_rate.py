@@ -275,7 +275,7 @@ def test_verification_counts_the_changes_that_are_made():
 def test_sums_scales_and_words():
     own = vp.ControlRateCost(2.0)
     assert own.of_controls
-    assert own.nonnegative
+
     assert repr(0.5 * own + vp.ControlCost()) == "0.5 * ControlRateCost(weight=2.0) + ControlCost(weight=1.0)"
     assert repr(vp.ControlRateCost([1.0, 2.0], 0.5)) == "ControlRateCost(weight=[1.0, 2.0], before=0.5)"
     np.testing.assert_array_equal(linear(vp.ControlRateCost(1.0, 0.5)).rate.before, [0.5, 0.5])

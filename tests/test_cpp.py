@@ -50,6 +50,15 @@ def test_headers_stand_beside_each_other(tmp_path):
         subprocess.run([COMPILER, *FLAGS, "-fsyntax-only", source], check=True)
 
 
+def test_arithmetic_that_is_not_exact_is_refused(tmp_path):
+    source = tmp_path / "fast.cpp"
+    source.write_text('#include "varpin/variational.hpp"\n')
+    command = [COMPILER, *FLAGS, "-ffast-math", "-fsyntax-only", source]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "IEEE" in done.stderr
+
+
 @pytest.fixture
 def configured(tmp_path):
     """Configures the example in a folder of that name, and returns the folder."""
@@ -136,8 +145,6 @@ def planned():
             hessian=hessian[None],
             velocity=np.zeros((0, n, 2 * n)),
             curvature=np.zeros((0, 2 * n + m, 2 * n + m)),
-            slack=np.zeros((0, 2, m)),
-            expected=np.zeros((0, 2 * n + m)),
             rate=np.zeros((0, m, m)),
             pull=np.zeros((0, m)),
         )

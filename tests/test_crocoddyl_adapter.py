@@ -128,24 +128,15 @@ def test_box_fddp_keeps_control_limits(lower, upper):
     assert (pushed <= upper).all()
 
 
-def test_actions_without_limits():
-    shooting = shooting_problem(PROBLEMS["midpoint"]())
-    assert not any(model.has_control_limits for model in shooting.runningModels)
-
-
-def test_held_controls_are_refused():
-    problem = PROBLEMS["midpoint"]().at(hold=5)
-    with refused(vp.InputError, "controls", "5"):
-        shooting_problem(problem)
-
-
-def test_the_rate_of_controls_is_refused():
+def test_what_crocoddyl_has_not_is_refused():
     problem = PROBLEMS["midpoint"]()
+    assert not any(model.has_control_limits for model in shooting_problem(problem).runningModels)
     rated = vp.OptimalControlProblem(
         problem.scene, problem.cost + vp.ControlRateCost(), problem.q0, problem.v0, dt=problem.dt, steps=problem.steps
     )
-    with refused(vp.InputError, "ControlRateCost"):
-        shooting_problem(rated)
+    for other, facts in ((problem.at(hold=5), ("controls", "5")), (rated, ("ControlRateCost",))):
+        with refused(vp.InputError, *facts):
+            shooting_problem(other)
 
 
 def test_a_step_that_fails_shortens_the_line_search(caplog):

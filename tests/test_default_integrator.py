@@ -173,18 +173,3 @@ def test_a_plant_takes_that_of_simulate(scene, rng, chosen):
     named = replace(plant, integrator=vp.RungeKutta4(), substeps=50)
     if chosen != "Radau(stages=4)":
         assert vp.Mpc(problem).run(named, duration=0.1, rng=rng).motion.integrator == "RungeKutta4"
-
-
-def test_a_plant_is_as_accurate_as_simulate():
-    """Velocities at ticks that a feedback reads: Gauss(2) rings on dampers 40 times as fast as the step."""
-    damped = vp.Scene(CHAIN, gravity=False, damping=[0.3, 200.0])
-    cost = vp.TrackingCost(lambda t: [np.sin(5.0 * t), 0.3 * np.sin(9.0 * t)], 300.0) + vp.ControlCost(1e-5)
-    problem = vp.OptimalControlProblem(vp.Scene(CHAIN, gravity=False), cost, [0, 0], [0, 0], dt=0.04, steps=10)
-    found = {}
-    for name, integrator in (("usual", None), ("two stages", vp.Gauss(2))):
-        motion = vp.Mpc(problem).run(vp.Plant(damped, integrator, substeps=2), duration=0.4).motion
-        fine = {"dt": motion.dt / 32, "steps": 32 * motion.steps, "controls": np.repeat(motion.u, 32, axis=0)}
-        true = vp.simulate(damped, motion.q[0], motion.v[0], **fine, integrator=vp.Radau(3), check=False)
-        found[name] = float(np.abs(motion.v - true.v[::32]).max() / np.abs(true.v).max())
-    assert found["usual"] < 0.01
-    assert found["two stages"] > 5.0 * found["usual"]

@@ -12,7 +12,7 @@ from refusals import refused, unnamed
 import varpin as vp
 from varpin.cli import main
 from varpin.control.hints import hints
-from varpin.model import degrees_hint, degrees_per_second_hint
+from varpin.model import degrees_hint
 
 HOME = np.array([0.0, -90.0, 90.0, 0.0, 45.0, 0.0])
 FACTS = ("'shoulder_lift_joint'", "-90 rad", "14 turns", "looks like degrees", "np.deg2rad")
@@ -33,45 +33,6 @@ def test_a_start_in_degrees(scene, capsys):
     assert not unnamed(ensemble.warnings[0], FACTS)
     assert main(["simulate", "ur5", "--steps", "2", "--q0", *map(str, HOME)]) == 0
     assert not unnamed(" ".join(capsys.readouterr().err.split()), FACTS)
-
-
-SPIN = np.array([0.0, 45.0, -90.0, 0.0, 30.0, 0.0])
-SPIN_FACTS = ("'elbow_joint'", "-90 rad/s", "28.6 times its limit of 3.15", "degrees per second", "np.deg2rad")
-
-
-def test_a_velocity_in_degrees_per_second(scene, capsys):
-    task = {"dt": 1e-3, "steps": 2}
-    motion = vp.simulate(scene, np.zeros(6), SPIN, **task)
-    assert not unnamed(motion.warnings[0], SPIN_FACTS)
-    ensemble = vp.simulate_ensemble(scene, np.zeros(6), SPIN, **task, paths=2, rng=0, workers=1)
-    assert not unnamed(ensemble.warnings[0], SPIN_FACTS)
-    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), np.zeros(6), SPIN, dt=0.05, steps=4)
-    assert not unnamed(vp.solve(problem, max_iterations=1).warnings[0], SPIN_FACTS)
-    assert main(["simulate", "ur5", "--steps", "2", "--dt", "1e-3", "--v0", *map(str, SPIN)]) == 0
-    assert not unnamed(" ".join(capsys.readouterr().err.split()), SPIN_FACTS)
-
-
-@pytest.mark.parametrize(
-    "v",
-    [
-        np.deg2rad(SPIN),
-        # Fast, as a fall or an impact leaves it: not typed, or too little beyond the limits.
-        SPIN + 1.0 / 7.0,
-        [0.0, 10.0, 0.0, 0.0, 0.0, 0.0],
-        # Beyond the limits in either unit.
-        [0.0, 45.0, 0.0, 0.0, 400.0, 0.0],
-        np.zeros(6),
-    ],
-    ids=["radians", "computed", "three times", "faster than degrees explain", "rest"],
-)
-def test_fast_motions_are_no_mistake(scene, v):
-    assert not degrees_per_second_hint(scene.robot, "v0", np.array(v))
-
-
-def test_velocities_without_limits_are_no_mistake():
-    assert not degrees_per_second_hint(vp.planar_chain(2), "v0", np.array([90.0, 45.0]))
-    slider = vp.load_robot(pin_slider())
-    assert not degrees_per_second_hint(slider, "v0", np.full(slider.dof, 90.0))
 
 
 def test_positions_for_servos_in_degrees(scene):
@@ -106,15 +67,6 @@ def test_a_plan_names_units_before_everything_else(scene):
         assert any(not unnamed(warning, FACTS) for warning in plan.warnings) == told
     problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), HOME, np.zeros(6), dt=0.05, steps=4)
     assert not unnamed(vp.solve(problem).warnings[0], FACTS)
-
-
-@pytest.mark.parametrize(("fastest", "told"), [(60.0, True), (np.deg2rad(60.0), False)])
-def test_limits_of_velocities_in_degrees_per_second(scene, fastest, told):
-    limits = vp.WithinVelocityLimits(scene.robot, (-fastest, fastest))
-    options = {"dt": 0.05, "steps": 4, "constraints": [limits]}
-    problem = vp.OptimalControlProblem(scene, vp.ControlCost(1e-3), np.zeros(6), np.zeros(6), **options)
-    facts = ("WithinVelocityLimits", "60 rad/s", "degrees per second")
-    assert any(not unnamed(warning, facts) for warning in vp.solve(problem, max_iterations=1).warnings) == told
 
 
 def test_a_plan_names_units_before_its_search(scene, caplog):

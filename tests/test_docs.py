@@ -74,7 +74,7 @@ def test_commands_are_ones_that_varpin_has(page):
     for line in "".join(blocks(page, "bash")).splitlines():
         words = shlex.split(line, comments=True)
         if words and words[0] == "varpin":
-            request = command._request(words[1:])
+            request = command._parser().parse_args(words[1:])
             assert callable(request.run), line
 
 

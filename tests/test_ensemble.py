@@ -146,14 +146,6 @@ def test_one_path_has_no_covariance():
     assert (alone.count == 1).all()
 
 
-def test_no_steps():
-    end = run(steps=0)
-    assert end.q.shape == (40, 1, 2)
-    assert end.u.shape == (40, 0, 2)
-    np.testing.assert_array_equal(end.t, [0.0])
-    assert end.statistics.count.tolist() == [40]
-
-
 def feedback(scene, steps, seed=1):
     rng = np.random.default_rng(seed)
     m, n = scene.controls, scene.robot.dof
@@ -212,16 +204,6 @@ def test_a_duration_stands_for_the_step_or_their_number(other):
 def test_policies_that_do_not_fit_together(arguments, facts):
     with refused(vp.InputError, facts):
         vp.LinearPolicy(*arguments)
-
-
-def test_policies_are_copies_and_frozen():
-    u, gains, reference = np.ones((3, 2)), np.ones((3, 2, 4)), np.ones((3, 4))
-    policy = vp.LinearPolicy(u, gains, reference)
-    u[:], gains[:], reference[:] = 2.0, 2.0, 2.0
-    for array in (policy.u, policy.gains, policy.reference):
-        assert (array == 1.0).all()
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 0.0
 
 
 @pytest.mark.parametrize(
@@ -321,22 +303,6 @@ def test_interruption_keeps_what_is_done():
     assert part.statistics.count.tolist() == [kept] * 51
 
 
-def test_interruption_keeps_statistics_of_paths_that_are_not_stored():
-    def interrupt(done, total):
-        raise KeyboardInterrupt
-
-    with pytest.raises(vp.EnsembleInterrupted) as caught:
-        run(paths=3000, progress=interrupt, store=False)
-    part = caught.value.ensemble
-    kept = int(part.statistics.count[0])
-    assert part.q is None
-    assert 80 <= kept < 3000
-    whole = run(paths=kept)
-    np.testing.assert_allclose(part.statistics.mean, whole.statistics.mean, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(part.statistics.covariance, whole.statistics.covariance, rtol=0, atol=1e-13)
-    np.testing.assert_array_equal(part.statistics.quantiles, whole.statistics.quantiles)
-
-
 def test_interruption_before_anything_is_done(monkeypatch):
     def stop(*given):
         raise KeyboardInterrupt
@@ -347,29 +313,13 @@ def test_interruption_before_anything_is_done(monkeypatch):
     assert caught.value.ensemble is None
 
 
-def test_quantiles_of_very_many_paths_are_off_by_no_more_than_they_say(monkeypatch):
-    exact = run(paths=3000, steps=20, quantiles=[0.0, 0.01, 0.5, 0.9, 1.0]).statistics
-    monkeypatch.setattr(varpin.ensemble.statistics, "_EXACT", 1000)
-    rough = run(paths=3000, steps=20, quantiles=[0.0, 0.01, 0.5, 0.9, 1.0], store=False, workers=3).statistics
-    assert not exact.quantile_errors.any()
-    off = np.abs(rough.quantiles - exact.quantiles)
-    deviation = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
-    assert (off <= rough.quantile_errors + 1e-15).all()
-    assert not off[[0, -1]].any()
-    # By far less than paths scatter, but for what these few say of a tail.
-    assert (off[1:4, 1:] < 0.02 * deviation[1:]).all()
-    assert (rough.quantile_errors[2, 1:] < 0.02 * deviation[1:]).all()
-    np.testing.assert_array_equal(rough.quantiles[:, 0], exact.quantiles[:, 0])
-    # The same for any workers, and whatever of the values lies outside the first paths' bins.
-    again = run(paths=3000, steps=20, quantiles=[0.0, 0.01, 0.5, 0.9, 1.0], store=False, workers=1).statistics
-    np.testing.assert_array_equal(again.quantiles, rough.quantiles)
-    q0 = np.zeros((3000, 2))
-    q0[2000:] = np.linspace(1.0, 3.0, 1000)[:, None]
-    monkeypatch.setattr(varpin.ensemble.statistics, "_EXACT", 2**25)
-    exact = run(paths=3000, steps=5, q0=q0, store=False).statistics
-    monkeypatch.setattr(varpin.ensemble.statistics, "_EXACT", 1000)
-    rough = run(paths=3000, steps=5, q0=q0, store=False).statistics
-    assert (np.abs(rough.quantiles - exact.quantiles) <= rough.quantile_errors + 1e-15).all()
+def test_quantiles_of_very_many_paths_are_those_of_the_first(monkeypatch):
+    whole = run(paths=300, steps=20)
+    monkeypatch.setattr(varpin.ensemble.statistics, "_KEPT", 100 * 21 * 4)
+    found = run(paths=300, steps=20, store=False, workers=3).statistics
+    assert (whole.statistics.quantile_paths, found.quantile_paths) == (300, 100)
+    np.testing.assert_array_equal(found.quantiles, run(paths=100, steps=20).statistics.quantiles)
+    np.testing.assert_array_equal(found.mean, whole.statistics.mean)
 
 
 def test_a_coarse_step_is_told_of(caplog):
@@ -420,18 +370,6 @@ def test_an_interrupted_ensemble_carries_warnings(monkeypatch):
     with pytest.raises(vp.EnsembleInterrupted) as caught:
         run(scene, **COARSE | {"paths": 300}, progress=interrupt)
     assert caught.value.ensemble.warnings == ()
-
-
-def test_the_failures_of_an_interrupted_ensemble_are_told():
-    def interrupt(done, total):
-        raise KeyboardInterrupt
-
-    with pytest.raises(vp.EnsembleInterrupted) as caught:
-        run(fragile_scene(), **FRAGILE | {"paths": 2000, "q0": starts(2000), "v0": np.zeros(3)}, progress=interrupt)
-    part = caught.value.ensemble
-    done, lost = int(part.statistics.count[0]), len(part.failures)
-    assert 0 < lost < done < 2000
-    assert part.warnings[0].startswith(f"{lost} of {done} paths failed, the first at step ")
 
 
 def test_the_paths_that_stand_out_are_looked_at():

@@ -19,7 +19,7 @@ from varpin.core.arrays import Carried, ConstraintRows, Coupling, Diffusion, Ele
 from varpin.integrators import registry
 from varpin.integrators.collocation import Collocation
 from varpin.integrators.tableau import midpoint
-from varpin.io.scenefile.tables import CONSTRAINTS
+from varpin.io.scenefile.kinds import CONSTRAINTS
 from varpin.mechanics import constraints, forces
 from varpin.mechanics.forces import point_of
 from varpin.mechanics.noise import CompiledFields
@@ -74,7 +74,7 @@ def test_a_constraint_moves_as_the_plane_that_it_is(guided):
 
 def test_scene_files_name_every_constraint_without_a_function():
     kinds = {kind for kind in constraints.Constraint.__subclasses__() if kind.__module__ == constraints.__name__}
-    assert set(CONSTRAINTS.values()) == kinds - {vp.CustomConstraint}
+    assert kinds - set(CONSTRAINTS.values()) == {vp.CustomConstraint}
     assert CONSTRAINTS["point_on_line"] is vp.PointOnLine
 
 

@@ -12,8 +12,6 @@ import pinocchio as pin
 import pytest
 from battery import Setup, Trial
 from battery.exact import exact_motion, period_error
-from battery.plans import Task, changes, cost_error, judge_plan, part_left
-from findings import about
 from mechanisms import slider
 from refusals import refused
 
@@ -27,7 +25,7 @@ from varpin.study import extremes as robot_checks
 from varpin.study.checks import LEVELS
 from varpin.study.extremes import INTEGRATORS, Kind
 
-BY_NAME = {trial.name: trial for trial in (*battery.TRIALS, *battery.PLANS)}
+BY_NAME = {trial.name: trial for trial in battery.TRIALS}
 MEASURES = ("error", "joint", "velocity", "period", "energy", "momentum", "reversal", "symplecticity", "record")
 
 
@@ -328,82 +326,16 @@ def test_a_motion_that_takes_too_long_is_judged_by_what_there_is(hasty):
     assert cell.kind is Kind.ACCURATE
 
 
-# --- plans ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def small_plan():
-    plan = BY_NAME["10 nodes"]
-    task = plan.build()
-    return task, vp.solve(task.problem(plan.dt, plan.steps, vp.Midpoint()))
-
-
-def test_a_plan_is_an_optimum_and_its_cost_its_own(small_plan):
-    task, solution = small_plan
-    assert cost_error(task, solution) < 1e-12
-    assert part_left(task, solution) < 1e-6
-
-
-def test_a_plan_that_is_no_optimum_is_found(small_plan):
-    task, solution = small_plan
-    problem = solution.problem
-    worse = vp.simulate(
-        problem.scene, problem.q0, problem.v0, dt=problem.dt, steps=10, controls=solution.controls + 5.0
-    )
-    assert part_left(task, dataclasses.replace(solution, trajectory=worse)) > 0.01
-    assert cost_error(task, dataclasses.replace(solution, trajectory=worse)) > 0.01
-
-
-def test_a_plan_of_nan_is_silent_wrong(monkeypatch, small_plan):
-    _, solution = small_plan
-    monkeypatch.setattr("battery.plans.solve", lambda *_, **__: dataclasses.replace(solution, cost=math.nan))
-    outcome = judge_plan(BY_NAME["10 nodes"], vp.Midpoint())
-    assert outcome.kind is Kind.WRONG
-    assert "cost off by" in outcome.found[0]
-
-
-def test_a_plan_that_whirls_with_nothing_said_is_silent_wrong(monkeypatch, small_plan):
-    """Ten steps of a motion that goes to and fro in each, whose cost is its own."""
-    task, solution = small_plan
-    v = solution.trajectory.v + np.abs(solution.trajectory.v).max() * (-1.0) ** np.arange(11)[:, None]
-    motion = dataclasses.replace(solution.trajectory, v=v)
-    assert changes(solution.trajectory) <= 2
-    assert changes(motion) >= 7
-    whirling = dataclasses.replace(solution, trajectory=motion, cost=task.cost(motion))
-    monkeypatch.setattr("battery.plans.solve", lambda *_, **__: whirling)
-    # Ten steps have no more than nine changes.
-    monkeypatch.setattr("battery.plans._FEW", 4)
-    outcome = judge_plan(BY_NAME["10 nodes"], vp.Midpoint())
-    assert outcome.kind is Kind.WRONG
-    assert about(outcome.found, "restless velocities")
-
-
-def test_added_noise_of_any_strength_hides_nothing():
-    quiet, loud = (judge_plan(BY_NAME[f"added noise of {strength}"], vp.Midpoint()) for strength in ("1e-09", "1e+06"))
-    assert quiet.kind is Kind.ACCURATE
-    # Steps of 10 ms are long for so much noise: in half steps its cost is 10 % less.
-    assert loud.kind is Kind.DEGRADED
-    assert about(loud.said, "noise within steps")
-
-
-def test_the_cost_by_hand_has_the_weights():
-    task = Task(vp.Scene(rod_chain([1.0], [1.0])), np.zeros(1), np.array([2.0]), tracking=3.0, effort=5.0, final=7.0)
-    motion = vp.simulate(task.scene, [0.0], [2.0], dt=0.5, steps=1, controls=[4.0])
-    motion = dataclasses.replace(motion, q=np.array([[0.0], [1.0]]), v=np.array([[2.0], [2.0]]))
-    # One step of 1/2 from 0 to 1 at a constant velocity under u = 4: off by 2 at first and by 1 at the end.
-    assert task.cost(motion) == pytest.approx(0.5 * (3 * 7 / 3 + 5 * 16) + 7, rel=1e-14)
-
-
 # --- the record ----------------------------------------------------------------------------------------------------
 
 
 def small_battery(load):
     trials = battery.trials_on(load("finger"))
-    return [trial for trial in trials if trial.name in ("falls, dt = 0.5 s", "1 node")]
+    return [trial for trial in trials if trial.name == "falls, dt = 0.5 s"]
 
 
 def test_every_trial_has_a_name_of_its_own(load):
-    for trials in ((*battery.TRIALS, *battery.PLANS), battery.trials_on(load("finger"))):
+    for trials in (battery.TRIALS, battery.trials_on(load("finger"))):
         names = [trial.name for trial in trials]
         assert len(set(names)) == len(names)
     assert len({repr(member) for member in INTEGRATORS}) == len(INTEGRATORS) == 11
@@ -545,7 +477,7 @@ def test_random_trees_are_many_kinds(benchmark):
 
 def test_the_table_of_robots_counts_every_cell(benchmark, load, tmp_path):
     robot, members = load("finger"), [vp.Midpoint(), vp.RungeKutta4()]
-    record = battery.run(robot, trials=small_battery(load)[:1], integrators=members)
+    record = battery.run(robot, trials=small_battery(load), integrators=members)
     rows = list(benchmark.table([("finger", robot, record), ("tree1", robot, record), ("twin", robot, "finger")]))
     assert rows[2].startswith("| finger | 3 | 2 | ")
     assert rows[3].startswith("| twin | 3 | the same mechanism as finger |")

@@ -6,13 +6,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from findings import about
-from naive import directional, gradient, joint_axis, rotation
+from naive import gradient, joint_axis, rotation
 from refusals import refused
-from test_elimination import rolled
 from test_groups import forest
 
 import varpin as vp
-from varpin.core import Elimination, Solver
 
 # Tip and a frame before it, or on another branch.
 ROBOTS = {
@@ -53,19 +51,6 @@ def placed(robot, frame, q):
     return R @ found.placement.rotation, x + R @ found.placement.translation
 
 
-def point(robot, at, q):
-    """Where a point of a force is."""
-    if not isinstance(at, str | tuple):
-        return np.asarray(at) + 0.0 * q[..., :1]
-    frame, offset = at if isinstance(at, tuple) else (at, np.zeros(3))
-    R, x = placed(robot, frame, q)
-    return x + R @ offset
-
-
-def jacobian(robot, at, q):
-    return np.stack([gradient(lambda y, k=k: point(robot, at, y)[..., k], q) for k in range(3)])
-
-
 def spins(robot, frame, q):
     """Angular velocity (3, n) that each coordinate gives to a frame, of dR/dq R'."""
     R = placed(robot, frame, q)[0]
@@ -75,52 +60,11 @@ def spins(robot, frame, q):
     return np.stack([turn[2, 1], turn[0, 2], turn[1, 0]])
 
 
-def axes_of(robot, at, q):
-    """The axes (..., 3, 3) of an end of a force; the world's for a place there."""
-    if not isinstance(at, str | tuple):
-        return np.eye(3) + 0.0 * q[..., :1, None]
-    return placed(robot, at if isinstance(at, str) else at[0], q)[0]
-
-
 def turns(robot, at, q):
     """Angular velocities (3, n) of an end."""
     if not isinstance(at, str | tuple):
         return np.zeros((3, q.size))
     return spins(robot, at if isinstance(at, str) else at[0], q)
-
-
-def energy(robot, force, q):
-    """The potential energy of one force at complex q (..., n)."""
-    if isinstance(force, vp.FrameWrench):
-        return -point(robot, force.frame, q) @ force.wrench[:3] if force.axes == "world" else 0.0 * q[..., 0]
-    if isinstance(force, vp.FrameDamper):
-        return 0.0 * q[..., 0]
-    d = point(robot, force.a, q) - point(robot, force.b, q)
-    if force.rotational_stiffness is not None:
-        # By the trace: k about each axis has the weight (k_1 + k_2 + k_3) / 2 - k_i.
-        k = np.broadcast_to(force.rotational_stiffness, 3)
-        rest = np.eye(3) if force.rest_rotation is None else force.rest_rotation
-        E = np.swapaxes(axes_of(robot, force.b, q) @ rest, -1, -2) @ axes_of(robot, force.a, q)
-        turning = ((k.sum() / 2 - k) * (1.0 - np.diagonal(E, axis1=-2, axis2=-1))).sum(-1)
-        return turning + 0.5 * (force.stiffness * (d - force.rest) ** 2).sum(-1)
-    if force.rest.ndim == 0 and force.rest > 0.0:
-        return 0.5 * force.stiffness * (np.sqrt((d**2).sum(-1)) - force.rest) ** 2
-    return 0.5 * (force.stiffness * (d - force.rest) ** 2).sum(-1)
-
-
-def push(robot, force, q, v):
-    """The force (n,) beside that of the energy."""
-    if isinstance(force, vp.FrameWrench):
-        frame = force.frame if isinstance(force.frame, str) else force.frame[0]
-        J, W, R = jacobian(robot, force.frame, q), spins(robot, frame, q), placed(robot, frame, q)[0]
-        f, m = np.split(force.wrench, 2)
-        return J.T @ R @ f + W.T @ R @ m if force.axes == "frame" else W.T @ m
-    if isinstance(force, vp.FrameDamper):
-        J = jacobian(robot, force.a, q) - jacobian(robot, force.b, q)
-        W = turns(robot, force.a, q) - turns(robot, force.b, q)
-        turning = 0.0 if force.rotational_damping is None else force.rotational_damping
-        return -J.T @ (force.damping * (J @ v)) - W.T @ (turning * (W @ v))
-    return np.zeros_like(q)
 
 
 def forces(tip, other, scale=1.0):
@@ -150,39 +94,6 @@ def state(robot):
     return rng.normal(size=robot.dof), rng.normal(size=robot.dof)
 
 
-@pytest.mark.parametrize("kind", range(13))
-@pytest.mark.parametrize("name", ROBOTS)
-def test_each_against_its_formula(name, kind):
-    robot, tip, other = robot_of(name)
-    given, (q, v) = forces(tip, other)[kind], state(robot)
-    scene, bare = vp.Scene(robot, damping=0.0, forces=given), vp.Scene(robot, damping=0.0)
-    own, before = vp.lagrangian_jet(scene, q, v), vp.lagrangian_jet(bare, q, v)
-    size = 1.0 + abs(energy(robot, given, q))
-    assert pytest.approx(energy(robot, given, q), rel=1e-11, abs=1e-11 * (size + abs(own.L))) == before.L - own.L
-
-    def slope(x):
-        return gradient(lambda y: energy(robot, given, y), x)
-
-    np.testing.assert_allclose(before.Lq - own.Lq, slope(q), rtol=1e-10, atol=1e-11 * (1 + np.abs(own.Lq).max()))
-    curvature = directional(slope, q, np.eye(robot.dof))
-    np.testing.assert_allclose(before.Lqq - own.Lqq, curvature, rtol=1e-8, atol=1e-9 * (1 + np.abs(own.Lqq).max()))
-    for name_ in ("Lv", "Lvq", "Lvv"):
-        assert getattr(own, name_).tobytes() == getattr(before, name_).tobytes()
-    value, by_q, by_v = (array[0] for array in scene.core.coupled_forces(q[None], v[None]))
-    expected = push(robot, given, q, v)
-    np.testing.assert_allclose(value, expected, rtol=1e-10, atol=1e-12 * (1 + np.abs(expected).max()))
-    for found, move in ((by_q, lambda y: (y, v)), (by_v, lambda y: (q, y))):
-        at = q if found is by_q else v
-        slopes = directional(
-            lambda y, move=move: np.array([push(robot, given, *move(x)) for x in y]), at, np.eye(at.size)
-        )
-        np.testing.assert_allclose(found, slopes.T, rtol=1e-8, atol=1e-9 * (1 + np.abs(slopes).max()))
-    all_, _, _, lost = scene.core.forces(q[None], v[None], np.zeros((1, robot.dof)))
-    np.testing.assert_array_equal(all_[0], value)
-    heat = -expected @ v if isinstance(given, vp.FrameDamper) else 0.0
-    assert lost.sum() == pytest.approx(heat, rel=1e-12, abs=1e-15)
-
-
 def test_a_wrench_is_what_pinocchio_makes_of_it():
     robot, tip, _ = robot_of("ur5")
     q, v = state(robot)
@@ -210,19 +121,6 @@ def test_groups_that_couplings_join():
     # Errors of the energy that passes between arms are no errors.
     motion = vp.simulate(scene, q, np.zeros(7), dt=1e-3, steps=300, integrator=vp.RungeKutta4())
     assert not about(motion.warnings, "error")
-
-
-def test_elimination_leaves_steps_with_couplings_to_the_dense_solver():
-    robot = vp.planar_chain(20)
-    q, v = np.linspace(-0.5, 0.5, 20), np.linspace(1.0, -1.0, 20)
-    scene = vp.Scene(
-        robot, forces=[vp.FrameSpring("joint20", [1.0, 0.0, 0.0], 30.0), vp.FrameDamper("joint20", "joint2", 0.5)]
-    )
-    ways = [rolled(scene, q, v, 1e-3, 10, way, vp.Gauss(2)) for way in (Solver.dense, Solver.elimination)]
-    for name in ("q", "p", "energy"):
-        np.testing.assert_allclose(getattr(ways[0], name), getattr(ways[1], name), rtol=1e-9, atol=1e-9)
-    with refused(ValueError, "couplings"):
-        Elimination(scene.core, q, v)
 
 
 def test_a_hanging_spring_finds_its_rest():
@@ -266,28 +164,18 @@ def test_scenes_with_frame_forces_travel_and_are_told_apart(tmp_path):
     assert repr(back.forces) == repr(scene.forces)
     assert "FrameSpring(a='tool0', b=('forearm_link', [0.05, 0.1, 0.0]), stiffness=8.0, rest=0.0)" in repr(scene.forces)
     assert "FrameWrench, FrameSpring, FrameDamper" in repr(scene)
-    assert "FrameSpring on" in scene._repr_html_()
+    assert "FrameSpring" in scene._repr_html_()
     motions = [vp.simulate(own, np.zeros(6), np.ones(6), dt=1e-3, steps=20) for own in (scene, back)]
     assert motions[0].q.tobytes() == motions[1].q.tobytes()
     motions[0].save(tmp_path / "motion.npz")
     loaded = vp.Trajectory.load(tmp_path / "motion.npz")
     np.testing.assert_array_equal(loaded.scene_values["FrameDamper"], scene.values["FrameDamper"])
     bare = vp.Scene(robot, damping=0.1)
-    with refused(vp.InputError, "FrameSpring"):
+    with refused(vp.InputError, "FrameLoad", "none in the scene"):
         vp.linearize(bare, loaded)
-    with refused(vp.InputError, "also", "FrameSpring"):
+    with refused(vp.InputError, "FrameLoad", "none in the motion"):
         vp.linearize(scene, vp.simulate(bare, np.zeros(6), np.ones(6), dt=1e-3, steps=5))
     assert not [name for name in bare.values if name.startswith("Frame")]
-
-
-def test_plans_with_a_spring_on_the_tool():
-    """S-DDP, second order too: the plan's derivatives are those of what it steps through."""
-    scene = vp.Scene(vp.planar_chain(2), damping=0.1, forces=forces("joint2", "joint1"))
-    cost = vp.ControlCost(1e-2) + vp.Terminal(vp.TrackingCost([0.5, 0.3], 50.0))
-    problem = vp.OptimalControlProblem(scene, cost, [0, 0], [0, 0], dt=0.02, steps=20)
-    plans = [vp.solve(problem, second_order=second) for second in (False, True)]
-    assert all(plan.status.converged for plan in plans)
-    assert plans[0].cost == pytest.approx(plans[1].cost, rel=1e-6)
 
 
 @pytest.mark.parametrize(

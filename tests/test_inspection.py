@@ -84,10 +84,6 @@ def test_report_and_its_joints_are_frozen(tmp_path):
             ("masses", "'link1'", "'link2'", "2e+03", "0.0005 kg"),
         ),
         (
-            (ROD, inertial(1e-2, 1e-8, 1e-8, 1e-8)),
-            ("moments of inertia", "'link1'", "'link2'", "8e+06"),
-        ),
-        (
             (ROD, inertial(1, 0.08, 0.08, 0.08, x=500)),
             ("centre of mass", "'link2'", "500 m", "1 m"),
         ),
@@ -106,7 +102,7 @@ def test_faulty_link_is_named(tmp_path, links, facts):
 def test_inertia_that_its_shape_cannot_have():
     """A published UR5 gives its wrists a radius of gyration of 0.42 m, and they are as large as a hand."""
     (warning,) = [text for text in inspect_robot("ur5").warnings if "implausibly large inertia" in text]
-    assert not unnamed(warning, "'wrist_1_link'", "'wrist_2_link'", "'wrist_3_link'", "0.424 m", "0.15 m")
+    assert not unnamed(warning, "'wrist_1_link'", "'wrist_2_link'", "'wrist_3_link'", "0.424 m", "0.14 m")
     assert not [text for text in inspect_robot("ur10").warnings if "inertia" in text]
 
 
@@ -169,8 +165,10 @@ def test_ill_conditioned_mass_matrix_is_said(tmp_path):
 def test_limits_that_are_missing_or_leave_no_room(tmp_path):
     zeros = '<limit lower="0" upper="0" effort="0" velocity="0"/>'
     for bare in (write_arm(tmp_path, ROD, ROD, joint=zeros), vp.planar_chain(2)):
-        (warning,) = inspect_robot(bare).warnings
-        assert not unnamed(warning, "count as none", "position, velocity, effort of 'joint1', 'joint2'")
+        report = inspect_robot(bare)
+        assert not report.warnings
+        assert str(report).count(" free ") == 2
+        assert str(report).count("none") == 4
     tight = inspect_robot(
         write_arm(tmp_path, ROD, ROD, joint='<limit lower="0.2" upper="0.2" effort="1" velocity="1"/>')
     )
@@ -187,11 +185,9 @@ def test_mimic_joints_locked_joints_and_damping_are_said():
     mimic = next(joint for joint in report.joints if joint.kind == "mimic")
     assert (mimic.name, mimic.follows, mimic.unit) == ("panda_finger_joint2", "1 * panda_finger_joint1", "m")
     assert not naming(report.warnings, "'panda_joint7'", "locked")
-    assert naming(report.warnings, "'panda_finger_joint2'", "mimic")
-    assert naming(report.warnings, "damping='robot'", "'panda_joint1' 0.003")
-    free = inspect_robot("panda", mimic="free")
-    assert free.robot.dof == 9
-    assert naming(free.warnings, "'panda_finger_joint1'", "free")
+    assert "1 * panda_finger_joint1" in str(report)
+    assert naming(report.warnings, "damping='robot'")
+    assert inspect_robot("panda", mimic="free").robot.dof == 9
 
 
 def test_mimic_leader_that_does_not_exist_is_named(tmp_path):
@@ -200,9 +196,7 @@ def test_mimic_leader_that_does_not_exist_is_named(tmp_path):
     follower += f'<origin xyz="1 0 0"/><mimic joint="nobody"/>{LIMIT}</joint>'
     report = inspect_robot(write_arm(tmp_path, ROD, extra=follower))
     assert report.robot.dof == 2
-    assert (
-        "joint 'follower' mimics 'nobody', which is not a moving joint of the robot: it stays free" in report.warnings
-    )
+    assert naming(report.warnings, "'follower' of 'nobody'", "free")
 
 
 def test_continuous_and_prismatic_joints_are_told_apart(tmp_path):

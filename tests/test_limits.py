@@ -90,27 +90,6 @@ def test_angles_are_continuous_over_turns():
     np.testing.assert_allclose(motion.q[:, 0], 0.1 + 300.0 * motion.t, rtol=4 * EPS)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)])
-def test_energy_of_the_free_spinning_chain_after_a_million_turns(integrator):
-    """Three links stretched out, 20 rad a step: 3.2e5 steps are a million turns."""
-    scene = vp.Scene(vp.planar_chain(3), gravity=False)
-    motion = vp.simulate(scene, [0.0] * 3, [40.0, 0.0, 0.0], dt=0.5, steps=320_000, integrator=integrator)
-    assert motion.q[-1, 0] > 1e6 * 2.0 * np.pi
-    assert np.abs(motion.energy / motion.energy[0] - 1.0).max() < 1e-12
-
-
-@pytest.mark.slow
-def test_pendulum_round_off_over_ten_million_steps():
-    """Where the rule's own oscillation is at its flat bottom only rounding is left."""
-    scene = vp.Scene(vp.planar_chain(1))
-    motion = vp.simulate(scene, [0.3], [0.5], dt=1e-3, steps=10_000_000)
-    assert motion.statistics.split_steps == 0
-    error = (motion.energy - motion.energy[0]) / GRAVITY
-    lowest = error[1:].reshape(1000, -1).min(axis=1)
-    assert np.abs(lowest - lowest[0]).max() < 1e-13
-
-
 @pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2), vp.Gauss(3)])
 @pytest.mark.parametrize("up", [False, True])
 def test_mass_ratio_of_a_million(up, integrator):

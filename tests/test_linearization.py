@@ -209,7 +209,7 @@ def test_what_is_no_covariance_is_refused():
         (-np.eye(2), ("positive semidefinite", "-1")),
         ([[1.0, 2.0], [2.0, 1.0]], ("positive semidefinite", "-1")),
         ([[0.0, 1.0], [1.0, 0.0]], "positive semidefinite"),
-        ([[1.0, 0.5], [0.4, 1.0]], ("symmetric", "0.1")),
+        ([[1.0, 0.5], [0.4, 1.0]], "symmetric"),
     ):
         with refused(vp.InputError, facts):
             vp.propagate_moments(lin, covariance=wrong)

@@ -1,7 +1,6 @@
 """Searches that start on states: where they end, in how many iterations, and what they refuse."""
 
 import contextlib
-import logging
 
 import numpy as np
 import pinocchio as pin
@@ -9,7 +8,6 @@ import pytest
 from refusals import naming, refused
 
 import varpin as vp
-from varpin.control import Status
 
 STEPS = 50
 
@@ -109,60 +107,13 @@ def test_around_an_obstacle():
     assert found.status.converged
     assert found.violation <= 1e-6
     assert found.cost < 2.0
-    with refused(vp.InputError, "states", "resume"):
-        vp.solve(problem, resume=found, states=line([1.0, 0.5]))
-
-
-def test_interrupted_while_gaps_are_closed():
-    problem = reach(scene=vp.Scene(vp.planar_chain(2), damping=0.1, actuation=["joint1"]))
-
-    def stop(row):
-        assert row.index == 0
-        raise KeyboardInterrupt
-
-    found = vp.solve(problem, states=line([1.0, 0.5]), callback=stop, check=False)
-    assert found.status is Status.INTERRUPTED
-    assert len(found.history) == 1
-    assert problem.cost_of(problem.simulate(found.controls)) < np.inf
-    assert vp.solve(problem, resume=found, check=False).status.converged
-
-
-def test_paths_beyond_limits_are_told_of(caplog):
-    robot = vp.load_robot("ur5")
-    cost = vp.ControlCost(1e-3) + vp.Terminal(vp.TrackingCost(np.zeros(6), 10.0))
-    problem = vp.OptimalControlProblem(vp.Scene(robot), cost, np.zeros(6), np.zeros(6), dt=0.02, steps=10)
-    path = np.zeros((11, 6))
-    path[5, 2] = 9.0
-    with caplog.at_level(logging.WARNING):
-        vp.solve(problem, states=path, max_iterations=0, check=False)
-    assert naming(caplog.messages, "'elbow_joint'", "node 5")
-
-
-@pytest.mark.parametrize(
-    ("states", "facts"),
-    [
-        (line([1.0, 0.5], 20), ("51", "21")),
-        (np.zeros((51, 3)), ("states", "(51, 2)")),
-        (np.full((51, 2), np.nan), "states"),
-        (line([1.0, 0.5]) + np.array([0.0, 0.1]), ("q0", "'joint2'", "0.1")),
-        ((np.zeros((51, 2)),), ("(q, v)", "1")),
-        ((np.zeros((51, 2)), np.zeros((50, 2))), ("states", "v", "51")),
-        ("path", "states"),
-    ],
-)
-def test_refused_states(states, facts):
-    with refused(vp.InputError, facts):
-        vp.solve(reach(), states=states)
 
 
 def test_states_in_degrees_are_told_of(caplog):
-    """Where they begin at q0, as from zero, by the log; else by the error."""
     # The motion along them may fail.
     with contextlib.suppress(vp.VarpinError):
         vp.solve(reach(), states=line([90.0, 45.0]), max_iterations=0)
     assert naming(caplog.messages, "states", "'joint1'", "90", "degrees")
-    with refused(vp.InputError, "q0", "degrees"):
-        vp.solve(reach(), states=line([90.0, 45.0]) + 30.0)
 
 
 def test_linear_controls_within_rate_limits_and_a_first_control():
@@ -174,16 +125,27 @@ def test_linear_controls_within_rate_limits_and_a_first_control():
     assert np.abs(np.diff(found.controls, axis=0)).max() <= 60.0 * problem.dt * (1.0 + 1e-6)
 
 
-def test_refused_beside_states():
-    problem = reach()
-    plan = vp.solve(problem, max_iterations=0, check=False)
-    with refused(vp.InputError, "states"):
-        vp.solve(problem, plan, states=line([1.0, 0.5]))
-    with refused(vp.InputError, "states", "resume"):
-        vp.solve(problem, resume=plan, states=line([1.0, 0.5]))
-    other = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.0], [0.0], dt=0.01, steps=3)
-    with refused(vp.InputError, "joints"):
-        vp.solve(problem, states=other)
-    slower = vp.simulate(problem.scene, problem.q0, [0.0, 0.0], dt=2.0 * problem.dt, steps=problem.steps)
-    with refused(vp.InputError, "dt"):
-        vp.solve(problem, states=slower)
+OTHER = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.0], [0.0], dt=0.01, steps=3)
+SLOWER = vp.simulate(reach().scene, [0.0, 0.0], [0.0, 0.0], dt=2.4 / STEPS, steps=STEPS)
+
+
+@pytest.mark.parametrize(
+    ("states", "options", "facts"),
+    [
+        (line([1.0, 0.5], 20), {}, ("(51, 2)", "(21, 2)")),
+        (np.zeros((51, 3)), {}, ("states", "(51, 2)")),
+        (np.full((51, 2), np.nan), {}, "states"),
+        (line([1.0, 0.5]) + np.array([0.0, 0.1]), {}, ("q0", "'joint2'", "0.1")),
+        (line([90.0, 45.0]) + 30.0, {}, ("q0", "degrees")),
+        ((np.zeros((51, 2)),), {}, ("(q, v)", "1")),
+        ((np.zeros((51, 2)), np.zeros((50, 2))), {}, ("states", "v", "51")),
+        ("path", {}, "states"),
+        (OTHER, {}, "joints"),
+        (SLOWER, {}, "dt"),
+        (line([1.0, 0.5]), {"controls": reach().holding_policy()}, "states"),
+        (line([1.0, 0.5]), {"resume": reach()}, ("states", "resume")),
+    ],
+)
+def test_refused_states(states, options, facts):
+    with refused(vp.InputError, facts):
+        vp.solve(reach(), states=states, **options)

@@ -216,7 +216,7 @@ def test_a_wrong_derivative_is_named(wrong):
         return values
 
     noise = vp.CustomNoise(right.field, 3, **{**slots, wrong: off}, check=True)
-    with refused(vp.InputError, f"CustomNoise {wrong}(q, v, u)[:, :, 1]", "0.001"):
+    with refused(vp.InputError, f"CustomNoise {wrong}(q, v, u)", "[:, :, 1]", "0.001"):
         vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=noise)
     unchecked = vp.CustomNoise(right.field, 3, **{**slots, wrong: off})
     assert vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=unchecked).processes == 3
@@ -226,7 +226,7 @@ def test_a_wrong_derivative_is_named(wrong):
 def test_a_derivative_left_out_is_found_missing(missing):
     right = own_noise()
     slots = {name: getattr(right, name) for name in ("dq", "dv", "du") if name != missing}
-    with refused(vp.InputError, f"CustomNoise {missing}(q, v, u)[:, :, 0]"):
+    with refused(vp.InputError, f"CustomNoise {missing}(q, v, u)", "[:, :, 0]"):
         vp.Scene(vp.planar_chain(3), actuation=ACTUATION, noise=vp.CustomNoise(right.field, 3, **slots, check=True))
 
 
@@ -308,14 +308,6 @@ def test_ctrl_c_in_a_field_is_no_noise_error():
     with pytest.raises(vp.Interrupted) as info:
         vp.simulate(chain(vp.CustomNoise(field, 2)), [0, 0], [0, 0], dt=0.01, steps=20, rng=0)
     assert info.value.trajectory.steps == 3
-
-
-def test_a_field_that_raises_is_named_when_it_is_checked():
-    def field(q, v, u):
-        raise ZeroDivisionError("no field")
-
-    with refused(vp.NoiseFieldError, "CustomNoise field", "ZeroDivisionError('no field')"):
-        chain(vp.CustomNoise(field, 2, check=True))
 
 
 def test_a_field_cannot_reach_into_the_motion():

@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import varpin as vp
-
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from paper import cases, experiments
 from paper.__main__ import reproduce
 from paper.cases import CASES, COARSE, COARSEST, MAIN, METHODS, VARIATIONS
-from paper.claims import Claim, assess, free_motions, series, verdict
+from paper.claims import Claim, assess, free_motions
 from paper.experiments import OPTIMUM, PLAIN, STOCHASTIC, Cell, Store, Task, fill, run, tasks
 from paper.figures import draw
 from paper.report import write
@@ -118,13 +116,6 @@ def test_the_problem_is_the_papers():
     np.testing.assert_allclose(cases.reference(1.5), [1.0, 0.0, 0.0], atol=1e-12)
 
 
-def test_heavier_fingers_are_heavier():
-    q = np.array([0.4, 0.3, 0.2])
-    light, heavy = (vp.lagrangian_jet(vp.Scene(cases.finger(x)), q, np.ones(3)) for x in (1.0, 1000.0))
-    np.testing.assert_allclose(heavy.Lvv, 1000.0 * light.Lvv, rtol=1e-12)
-    np.testing.assert_allclose(heavy.Lq, 1000.0 * light.Lq, rtol=1e-12)
-
-
 def test_a_coarse_cell_is_what_it_says():
     cell = run(Task(MAIN, CASES[1], "variational", COARSE))
     assert (cell.setting, cell.case, cell.method, cell.dt) == ("main", "2", "variational", COARSE)
@@ -175,14 +166,6 @@ def test_a_damaged_cell_is_computed_again(tmp_path, caplog, counted, damage):
     assert_same(Store(tmp_path).load(task), made_up(task))
 
 
-def test_cells_of_another_version_are_computed_again(tmp_path, monkeypatch, counted):
-    fill(Store(tmp_path), quick=True)
-    monkeypatch.setattr(experiments, "__version__", "0.0.0")
-    counted.clear()
-    fill(Store(tmp_path), quick=True)
-    assert counted == [task.name for task in tasks(quick=True)]
-
-
 def test_a_second_fill_computes_nothing(tmp_path, counted):
     seen = []
     first = fill(Store(tmp_path), quick=True, progress=lambda done, cells, name: seen.append((done, cells, name)))
@@ -193,32 +176,6 @@ def test_a_second_fill_computes_nothing(tmp_path, counted):
     assert counted == names
     for name in names:
         assert_same(first[name], second[name])
-
-
-def test_an_interrupted_fill_goes_on_where_it_was(tmp_path, monkeypatch):
-    asked = []
-
-    def interrupted(task):
-        asked.append(task.name)
-        if len(asked) == 4:
-            raise KeyboardInterrupt
-        return made_up(task)
-
-    monkeypatch.setattr(experiments, "run", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        fill(Store(tmp_path), quick=True)
-    names = [task.name for task in tasks(quick=True)]
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{name}.npz" for name in names[:3])
-    found = fill(Store(tmp_path), quick=True)
-    assert asked == names[:4] + names[3:]
-    assert list(found) == names
-
-
-def test_verdicts():
-    assert verdict(True, True) == "holds"
-    assert verdict(True, False) == "holds in part"
-    assert verdict(False, False) == "does not hold"
-    assert verdict() == "not measured"
 
 
 def test_claims_hold_where_the_paper_is_right_and_not_where_euler_is_better(cells, motions):
@@ -248,149 +205,6 @@ def of(claims, words):
     return one
 
 
-def with_costs(cells, case, own, other):
-    """The cells, with expected costs at 6 ms that have grown by these factors; the mean motion's as they were."""
-    cells = dict(cells)
-    for method, factor in (("variational", own), ("Euler", other)):
-        fine, coarse = (f"main_{case}_{method}_{dt:g}" for dt in (cases.FINE, COARSE))
-        total = factor * (cells[fine].cost + cells[fine].noise_cost)
-        cells[coarse] = dataclasses.replace(cells[coarse], noise_cost=total - cells[coarse].cost)
-    return cells
-
-
-def test_figure_1_in_the_papers_own_start(motions):
-    """Over the whole 1.5 s in the horizontal plane, against DOP853: what no step is taken in parts for."""
-    scene = vp.Scene(cases.finger(), gravity=MAIN.gravity)
-    exact = vp.simulate(scene, [np.pi / 2, 0.0, 0.0], [0.0, 0.0, 1.0], dt=COARSEST, steps=75, integrator=vp.Reference())
-    errors = {}
-    for method in METHODS:
-        motion = motions[method, COARSEST]
-        assert (motion.steps, motion.statistics.split_steps) == (75, 0)
-        errors[method] = np.abs(motion.q[:, 0] - exact.q[:, 0]).max()
-    assert errors["variational"] == pytest.approx(2.2e-7, rel=0.02)
-    assert errors["Euler"] == pytest.approx(2.0e-4, rel=0.02)
-    assert "2.2e-07 rad" in of(assess({}, motions), "figure 1").measured
-    # Energy and momentum, and the order, of the same motions.
-    for words in ("figure 1", "strongly enforce", "second order"):
-        assert of(assess({}, motions), words).verdict == "holds"
-    swapped = {
-        (m if m == "reference" else ("Euler" if m == "variational" else "variational"), dt): motion
-        for (m, dt), motion in motions.items()
-    }
-    for words in ("figure 1", "strongly enforce", "second order"):
-        assert of(assess({}, swapped), words).verdict == "does not hold"
-
-
-def test_what_was_not_run_is_not_measured(cells, motions):
-    of_the_motions = {"paper, figure 1", "paper, section 1.1"}
-    for claim in assess({}, motions):
-        assert (claim.verdict == "not measured") == (claim.source not in of_the_motions), claim
-    quick = {task.name: cells[task.name] for task in tasks(quick=True)}
-    assert of(assess(quick, motions), "gains").verdict == "not measured"
-    for part in (quick, cells):
-        found = assess(part, motions)
-        for words in ("real-time", "not limited to S-DDP"):
-            assert of(found, words).verdict == "not measured"
-    without = {name: cell for name, cell in cells.items() if cell.method != OPTIMUM}
-    assert of(assess(without, motions), "bandwidth").verdict == "not measured"
-    assert of(assess(without, motions), "plan with the midpoint").verdict == "not measured"
-
-
-@pytest.mark.parametrize(
-    ("own", "other", "expected"), [(9.73, 11.1, "does not hold"), (1.44, 4.59, "holds"), (4.59, 1.44, "does not hold")]
-)
-@pytest.mark.parametrize("case", ["2", "3"])
-def test_far_greater_is_more_than_greater(cells, motions, case, own, other, expected):
-    place = {"2": "figure 5b, case 2", "3": "table 1, case 3"}[case]
-    claim = of(assess(with_costs(cells, case, own, other), motions), place)
-    assert claim.verdict == expected
-    assert f"{own} (variational) and {other} (Euler)" in claim.measured
-
-
-@pytest.mark.parametrize(
-    ("own", "other", "expected"),
-    [((2, 2), (1, 2), "holds in part"), ((2, 3), (2, 40), "holds"), ((2, 40), (2, 2), "does not hold"),
-     ((2, 40), (2, 50), "holds in part")],
-)  # fmt: skip
-def test_iterations_of_both_may_be_predictable(cells, motions, own, other, expected):
-    cells = dict(cells)
-    for method, counts in (("variational", own), ("Euler", other)):
-        for dt, number in zip((cases.FINE, COARSE), counts, strict=True):
-            name = f"main_1_{method}_{dt:g}"
-            cells[name] = dataclasses.replace(cells[name], iterations=number)
-    assert of(assess(cells, motions), "algorithm iterations").verdict == expected
-
-
-def moved(cells, name, by):
-    """The cells, one of them with other configurations."""
-    return {**cells, name: dataclasses.replace(cells[name], q=cells[name].q + by)}
-
-
-def test_solutions_depend_on_the_step(cells, motions):
-    apart = moved(cells, f"main_2_Euler_{COARSE:g}", 0.1)
-    assert "0.1 rad (Euler)" in of(assess(apart, motions), "figures 3a and 3b").measured
-    both = moved(apart, f"main_2_variational_{COARSE:g}", 0.1)
-    assert of(assess(both, motions), "figures 3a and 3b").verdict == "does not hold"
-    # The trajectory of case 3: as it is, by the step alone, and by the noise.
-    name = f"_variational_{COARSE:g}"
-    assert of(assess(cells, motions), "figure 4, case 3").verdict == "holds in part"
-    off = cells
-    for case in "03":
-        for dt in (cases.FINE, COARSE):
-            off = moved(off, f"main_{case}_variational_{dt:g}", 0.1)
-    assert of(assess(off, motions), "figure 4, case 3").verdict == "does not hold"
-    own = moved(cells, f"main_3{name}", 0.1)
-    assert of(assess(own, motions), "figure 4, case 3").verdict == "holds"
-    assert of(assess(moved(own, f"main_0{name}", 0.1), motions), "figure 4, case 3").verdict == "holds in part"
-
-
-def test_controls_of_case_2_depend_on_the_step(cells, motions):
-    """Held controls are held against the means of finer ones."""
-
-    def with_controls(cells, case, factor):
-        name = f"main_{case}_variational_{COARSEST:g}"
-        return {**cells, name: dataclasses.replace(cells[name], u=factor * cells[name].u)}
-
-    words = "figure 3c, case 2"
-    smooth = dict(cells)
-    for case in "02":
-        for dt in (cases.FINE, COARSEST):
-            name = f"main_{case}_variational_{dt:g}"
-            t = cells[name].t
-            u = (np.cos(20.0 * t[:-1]) - np.cos(20.0 * t[1:])) / np.diff(t) / 20.0  # means of sin 20 t
-            smooth[name] = dataclasses.replace(cells[name], u=np.tile(u[:, None], 3))
-    assert of(assess(smooth, motions), words).verdict == "does not hold"
-    assert of(assess(with_controls(smooth, "2", 0.5), motions), words).verdict == "holds"
-    both = with_controls(with_controls(smooth, "2", 0.5), "0", 0.5)
-    assert of(assess(both, motions), words).verdict == "holds in part"
-
-
-def test_true_costs_are_named(cells, motions):
-    """Of a plan that is good open loop and runs away with feedback, and the reverse."""
-    name = f"{VARIATIONS[0].key}_0_variational_{COARSE:g}"
-    own = {**cells, name: dataclasses.replace(cells[name], open_loop=3e-4, closed_loop=np.nan)}
-    claim = of(assess(own, motions), VARIATIONS[0].title + ".")
-    assert "0.0003 open loop and (runs away) with feedback" in claim.measured
-
-
-def test_the_experiments_name_their_discretization():
-    """No default of the library decides what is measured."""
-    expected = {
-        "variational": (vp.Midpoint(), "midpoint"),
-        "Euler": (vp.ExplicitEuler(), "midpoint"),
-        cases.FOURTH_ORDER: (vp.Gauss(2), "gauss"),
-    }
-    for method, pair in expected.items():
-        problem = cases.problem(MAIN, None, method, COARSEST)
-        assert (problem.integrator, problem.sampling) == pair
-
-
-def test_series_run_from_fine_to_coarse(cells):
-    own = series(cells, MAIN, "0", "Euler")
-    assert [cell.dt for cell in own] == sorted(cases.STEPS)
-    assert {(cell.setting, cell.case, cell.method) for cell in own} == {("main", "0", "Euler")}
-
-
 def test_report_has_every_figure_and_every_cell(tmp_path, cells, motions, figures):
     own = {task.name: cells[task.name] for task in tasks(quick=True)}
     assert list(figures) == FIGURES
@@ -413,18 +227,6 @@ def test_report_has_every_figure_and_every_cell(tmp_path, cells, motions, figure
     with (tmp_path / "claims.csv").open(newline="") as stream:
         claims = list(csv.DictReader(stream))
     assert list(claims[0].values()) == [claim.source, claim.sentence, claim.measured, claim.verdict]
-
-
-def test_legends_cover_no_curve(figures):
-    for name, (figure, _) in figures.items():
-        figure.draw_without_rendering()
-        for axes in figure.axes:
-            outside = [legend.get_window_extent() for legend in figure.legends]
-            assert not any(box.overlaps(axes.get_window_extent()) for box in outside), name
-            legend = axes.get_legend()
-            for line in axes.lines if legend is not None else ():
-                points = axes.transData.transform(line.get_xydata())
-                assert not any(legend.get_window_extent().contains(*point) for point in points), name
 
 
 def test_reproduce_returns_the_claims(tmp_path, monkeypatch, counted):

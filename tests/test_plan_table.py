@@ -369,8 +369,8 @@ def swing(
 def test_a_controller_within_limits_and_constraints(controls: str) -> None:
     problem = swing(speeds(1.0), controls=controls, control_limits=([-20.0, -6.0], [20.0, 6.0]))
     run = vp.Mpc(problem).run(duration=0.9)
-    assert not run.failures
-    assert not run.infeasible
+    assert not run.failed.any()
+    assert not run.infeasible.any()
     u = run.motion.u
     assert (np.abs(u) <= [20.0, 6.0]).all()
     assert (np.abs(u) > [19.9, 5.9]).any()
@@ -388,7 +388,7 @@ def test_a_controllers_rates() -> None:
     applied = np.vstack([[14.0, 4.0], run.motion.u[::substeps]])
     # The feedback acts within a tick about the plan made at its beginning: its first control is the plan's.
     assert np.abs(np.diff(applied, axis=0)).max() <= 100.0 * 0.03 + 1e-4
-    assert not run.failures
+    assert not run.failed.any()
 
 
 def test_torques_of_a_loop_with_a_limit_of_the_rate_do_not_jump():
@@ -427,10 +427,10 @@ def test_a_deadline() -> None:
     mpc = vp.Mpc(swing(speeds(1.0)), budget=1e-9)
     run = mpc.run(duration=0.3)
     assert run.late[1:].all()
-    assert run.misses == len(run.plans) - 1
+    assert run.late.sum() == len(run.plans) - 1
     assert all(plan is run.plans[0] for plan in run.plans)
     usual = vp.Mpc(swing(speeds(1.0)), budget=5.0).run(duration=0.3)
-    assert not usual.misses
+    assert not usual.late.any()
     # Nothing disturbs the plant: the first plan is almost as good.
     assert np.abs(run.motion.q - usual.motion.q).max() < 2e-2
 

@@ -81,8 +81,7 @@ def test_prismatic_joints_are_in_metres_and_mixed_ones_say_which():
     _, axes = plots.plot_joints(trajectory, robot=robot)
     assert axes.get_ylabel() == "position [rad, m]"
     names = list(drawn(axes))
-    assert names[-1] == "panda_finger_joint1 [m]"
-    assert names[0] == "panda_joint1"
+    assert (names[0], names[-1]) == ("panda_joint1 [rad]", "panda_finger_joint1 [m]")
     _, axes = plots.plot_controls(trajectory, robot=robot)
     assert axes.get_ylabel() == "control [N m, N]"
 
@@ -99,8 +98,8 @@ def test_controls_are_steps_held_to_the_end_of_the_last_interval():
     _, axes = plots.plot_controls(trajectory)
     line = drawn(axes)["joint1"]
     assert line.get_drawstyle() == "steps-post"
-    np.testing.assert_allclose(line.get_xdata(), [0.0, 0.02, 0.03, 0.04])
-    np.testing.assert_array_equal(line.get_ydata(), [1.0, -2.0, 0.5, 0.5])
+    np.testing.assert_allclose(line.get_xdata(), [0.0, 0.01, 0.02, 0.03, 0.04])
+    np.testing.assert_array_equal(line.get_ydata(), [1.0, 1.0, -2.0, 0.5, 0.5])
 
 
 def test_linear_controls_are_lines_through_the_nodes():
@@ -114,17 +113,12 @@ def test_linear_controls_are_lines_through_the_nodes():
     np.testing.assert_allclose(line.get_xydata(), np.column_stack([motion.t, nodes]), atol=1e-12)
 
 
-def test_controls_that_are_no_joints_have_their_own_names():
+def test_controls_have_the_names_of_the_joints_that_they_move():
     robot = vp.planar_chain(3)
-    scene = vp.Scene(robot, actuation=["joint1", "joint3"])
-    trajectory = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.01, steps=3, controls=[1.0, 2.0])
-    _, axes = plots.plot_controls(trajectory, robot=robot)
-    assert list(drawn(axes)) == ["u1", "u2"]
-    assert axes.get_ylabel() == "control [units of each]"
-    _, axes = plots.plot_controls(trajectory, labels=["shoulder", "wrist"])
-    assert list(drawn(axes)) == ["shoulder", "wrist"]
-    with refused(vp.InputError, "labels", "2", "3"):
-        plots.plot_controls(trajectory, labels=["a", "b", "c"])
+    for actuation, names in ((["joint1", "joint3"], ["joint1", "joint3"]), (np.ones((3, 2)), ["u1", "u2"])):
+        scene = vp.Scene(robot, actuation=actuation)
+        trajectory = vp.simulate(scene, np.zeros(3), np.zeros(3), dt=0.01, steps=3, controls=[1.0, 2.0], check=False)
+        assert list(drawn(plots.plot_controls(trajectory, robot=robot)[1])) == names
 
 
 def test_controls_of_joints_moved_by_hand_are_positions_and_velocities():
@@ -138,9 +132,10 @@ def test_controls_of_joints_moved_by_hand_are_positions_and_velocities():
     driven = {"actuation": ["joint1"]}
     assert of(2, **driven) == ("commanded position [rad]", ["joint1"])
     # As many controls as joints, and none of them a torque.
-    two = ["u1, commanded position [rad]", "u2, velocity [rad/s]"]
-    assert of(2, "cubic", **driven) == ("control [units of each]", two)
-    assert of(2) == ("control [units of each]", ["joint1, commanded position [rad]", "joint2"])
+    two = ["joint1, commanded position [rad]", "joint1, velocity [rad/s]"]
+    assert of(2, "cubic", **driven) == ("control [rad, rad/s]", two)
+    both = ["joint1, commanded position [rad]", "joint2, control [N m]"]
+    assert of(2) == ("control [rad, N m]", both)
     assert of(1, "linear") == ("commanded position [rad]", ["joint1"])
 
 
@@ -167,15 +162,12 @@ def test_controls_of_servos_are_commanded_positions():
     assert (axes.get_ylabel(), list(drawn(axes))) == ("commanded position [rad]", ["joint1", "joint2"])
     mixed, _ = drawn_with({"joint2": 50.0})
     _, axes = plots.plot_controls(mixed, robot=robot)
-    assert list(drawn(axes)) == ["joint1", "joint2, commanded position [rad]"]
-    assert axes.get_ylabel() == "control [units of each]"
+    assert list(drawn(axes)) == ["joint1, control [N m]", "joint2, commanded position [rad]"]
     _, axes = plots.plot_trajectory(mixed, robot=robot)
     assert axes[2].get_legend() is not None
     some, axes = drawn_with({"joint2": 50.0}, ["joint2"])
     _, axes = plots.plot_controls(some, robot=robot)
     assert (axes.get_ylabel(), axes.get_legend()) == ("commanded position [rad]", None)
-    _, axes = plots.plot_controls(some, labels=["hinge"])
-    assert list(drawn(axes)) == ["hinge"]
 
 
 def test_energy_error_in_joules_or_relative_to_the_initial_energy():
@@ -238,7 +230,7 @@ def test_robot_of_another_motion_is_refused():
         plots.plot_joints(trajectory, robot=vp.planar_chain(3))
 
 
-def test_what_is_no_motion_record_robot_axes_or_label_is_refused():
+def test_what_is_no_motion_record_robot_or_axes_is_refused():
     robot, trajectory = swing(links=2, steps=3, controls=[0.1, 0.2])
     of_motions = [plots.plot_trajectory, *SINGLE.values()]
     for value in (None, 3, "motion.npz", robot):
@@ -255,10 +247,6 @@ def test_what_is_no_motion_record_robot_axes_or_label_is_refused():
     for draw in (plots.plot_trajectory, plots.plot_joints, plots.plot_velocities, plots.plot_controls):
         with refused(vp.InputError, "robot", "load_robot", "str"):
             draw(trajectory, robot="ur5")
-    for draw in (plots.plot_trajectory, plots.plot_controls):
-        for labels in (3, "ab", [1, 2]):
-            with refused(vp.InputError, "labels", "2", repr(labels)):
-                draw(trajectory, labels=labels)
 
 
 def test_plans_and_runs_are_drawn_as_their_motions():
@@ -309,18 +297,6 @@ def test_overview_is_written_in_each_format(tmp_path, kind):
     path = tmp_path / f"motion.{kind}"
     figure.savefig(path)
     assert path.stat().st_size > 5000
-
-
-def test_long_lines_are_thinned_to_their_extremes():
-    rng = np.random.default_rng(0)
-    t, values = np.arange(1_000_001) * 1e-3, rng.normal(size=1_000_001)
-    values[123_456], values[765_432] = 50.0, -60.0
-    thin_t, thin = plots._thin(t, values)
-    assert len(thin) <= 2 * plots._POINTS
-    assert (np.diff(thin_t) > 0.0).all()
-    assert (thin_t[0], thin_t[-1]) == (t[0], t[-1])
-    assert (thin.max(), thin.min()) == (50.0, -60.0)
-    assert set(thin) <= set(values)
 
 
 def test_start_without_steps_is_drawn():

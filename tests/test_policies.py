@@ -120,10 +120,3 @@ def test_the_control_before_a_plan_by_name():
         assert np.abs(named.controls - mpc.plan(0.0, Q0, REST, previous).controls).max() > 1e-3
     plan = mpc.plan(0.0, Q0, REST)
     np.testing.assert_array_equal(plan.shifted(2, {"joint1": 1.0}).before, [1.0, 0.0])
-
-
-def test_limits_may_be_one_array():
-    rows = np.array([[-0.5, -0.2], [0.5, 0.2]])
-    one, two = policy(limits=rows), policy(limits=([-0.5, -0.2], [0.5, 0.2]))
-    np.testing.assert_array_equal(one.limits, two.limits)
-    np.testing.assert_array_equal(policy(limits=policy().limits).limits, policy().limits)

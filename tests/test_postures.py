@@ -48,13 +48,6 @@ def test_published_postures_are_pinocchio_s(load, name):
             )
 
 
-def test_no_other_robot_has_postures(load):
-    """Also not Baxter, whose file gives its joints names that they do not have."""
-    for name in vp.robot_names():
-        if name not in PUBLISHED:
-            assert load(name).postures == (), name
-
-
 SRDF = """<robot name="made_up">
 <group_state name="home" group="arm"><joint name="j1" value="0.5"/><joint name="j2" value="9"/></group_state>
 <group_state name="home" group="hand"><joint name="j3" value="-0.25"/>
@@ -120,12 +113,6 @@ def test_where_the_file_is_looked_for(urdf, tmp_path, place, name, found):
     file.write_text(SRDF.replace("made_up", name))
     assert bool(vp.load_robot(urdf).postures) == found
     assert vp.load_robot(urdf, srdf=str(file)).postures == ("home", "there")
-
-
-def test_two_files_for_a_robot_of_its_name_are_none(urdf):
-    for name in ("a", "b"):
-        (urdf.parent / f"{name}.srdf").write_text(SRDF)
-    assert vp.load_robot(urdf).postures == ()
 
 
 BAD = {

@@ -52,7 +52,7 @@ def test_frames_are_at_exact_times(browser, chain, tmp_path):
 
 def test_an_mp4_and_its_page(browser, chain, tmp_path):
     path, page = tmp_path / "chain.mp4", tmp_path / "chain.html"
-    assert replay(chain, Q, dt=0.1, html=page, video=path, fps=5.0, size=(320, 240), loop=False, speed=2.0) == path
+    assert replay(chain, Q, dt=0.1, html=page, video=path, fps=5.0, size=(320, 240), speed=2.0) == path
     film = imageio.imread(path, plugin="FFMPEG").astype(float)
     assert film.shape == (3, 240, 320, 3)
     assert (np.abs(film[2] - film[0]).max(axis=-1) > 40.0).mean() > 1e-3

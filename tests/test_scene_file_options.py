@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 
 import numpy as np
@@ -12,8 +11,6 @@ from refusals import refused, unnamed
 
 import varpin as vp
 from varpin.cli import main
-from varpin.io.scenefile.reading import rules_of
-from varpin.io.scenefile.tables import ActuationTable, RobotTable, SceneTables, SpringTable
 
 SRDF = """<robot name="made_up">
 <group_state name="home" group="arm"><joint name="j1" value="0.5"/><joint name="j2" value="-0.3"/></group_state>
@@ -38,16 +35,6 @@ def load(path, text):
     file = path.parent / "scene.toml"
     file.write_text(text)
     return vp.load_scene(file, required_only=False)
-
-
-def test_every_option_has_a_key():
-    assert set(inspect.signature(vp.load_robot).parameters) == set(rules_of(RobotTable))
-    keys = set(rules_of(SceneTables))
-    elsewhere = {"forces": "force", "constraints": "constraint"}
-    springs, actuation = set(rules_of(SpringTable)), set(rules_of(ActuationTable))
-    for option in inspect.signature(vp.Scene).parameters:
-        assert elsewhere.get(option, option) in keys | springs, option
-    assert {"joints", "gear"} < actuation
 
 
 @pytest.mark.parametrize(
@@ -88,7 +75,7 @@ def test_friction_is_short_for_a_force(arm):
 
 
 @pytest.mark.parametrize(
-    ("keys", "messages"), [("", 1), ("damping = 0.0", 0), ('damping = "robot"\nfriction = 0.0', 0)]
+    ("keys", "messages"), [("", 2), ("damping = 0.0", 0), ('damping = "robot"\nfriction = 0.0', 0)]
 )
 def test_what_a_file_leaves_out_is_logged_once(arm, caplog, keys, messages):
     with caplog.at_level(logging.WARNING):
@@ -125,7 +112,7 @@ hold = "home"
     np.testing.assert_array_equal(file.scene.rest, [0.1, 0.0])
     np.testing.assert_array_equal(file.scene.values["noise.center"].ravel()[::2], [0.2, 0.4])
     tracking, control = file.problem.cost.terms
-    np.testing.assert_array_equal(tracking.cost.reference, [0.5, -0.3])
+    np.testing.assert_array_equal(tracking.reference, [0.5, -0.3])
     np.testing.assert_allclose(control.reference, file.scene.holding_torque(file.q0), rtol=1e-12)
     with refused(vp.SceneFileError, "initial.q", "'hom'", "home", "folded"):
         load(arm, text.replace('q = "home"', 'q = "hom"'))

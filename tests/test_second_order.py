@@ -1,35 +1,9 @@
-"""Second derivatives of steps: sums of rows, and what cannot be done."""
+"""Second derivatives of steps: many at once, and what cannot be done."""
 
 import numpy as np
-import pytest
 from refusals import refused
 
 import varpin as vp
-from varpin.model.chain import planar_chain
-
-
-def tip_on_a_spring():
-    """Forces of joints, servos and frames, with second derivatives in positions, velocities and commands."""
-    robot = planar_chain(3)
-    servos = vp.PositionServo([0.0, 40.0, 0.0], [0.0, 3.0, 0.0], [np.inf, 9.0, np.inf])
-    return vp.Scene(robot, damping=0.3, friction=0.2, forces=[servos, vp.FrameSpring("tip", [0.5, 0.0, -1.0], 30.0)])
-
-
-@pytest.mark.parametrize("dt", [0.005, 0.1])
-@pytest.mark.parametrize("integrator", [vp.Midpoint(), vp.Gauss(2)], ids=str)
-@pytest.mark.parametrize("scene", [vp.Scene(planar_chain(3)), tip_on_a_spring()], ids=["free", "forces"])
-def test_a_matrix_of_weights_is_the_sum_over_its_rows(scene, integrator, dt):
-    """Also through steps in parts."""
-    motion = vp.simulate(
-        scene, [0.3, 0.8, -1.0], [6.0, -5.0, 9.0], dt=dt, steps=3, controls=[0.1, 0.2, -0.3], integrator=integrator
-    )
-    assert (motion.statistics.substeps > 1).any() == (dt > 0.05)
-    weights = np.random.default_rng(0).normal(size=(3, 6, 9))
-    expected = np.zeros((3, 9))
-    for a in range(6):
-        H = integrator.contract(scene, motion, np.tile(np.eye(6)[a], (3, 1)))
-        expected += np.einsum("Nyz,Ny->Nz", H, weights[:, a])
-    np.testing.assert_allclose(integrator.bend(scene, motion, weights), expected, atol=1e-11 * np.abs(expected).max())
 
 
 def test_many_steps_and_one_vector_for_all():

@@ -54,18 +54,6 @@ def test_joints_locked_outside_their_limits_are_told_of(gripper, caplog):
     assert naming(caplog.messages, "lock['panda_joint4'] = 1", "limits", "-3.0718")
 
 
-def mpc():
-    scene = vp.Scene(vp.planar_chain(1), gravity=False, damping=0.1)
-    cost = vp.TrackingCost([0.2], 10.0) + vp.ControlCost(1e-2)
-    return vp.Mpc(vp.OptimalControlProblem(scene, cost, [0.0], [0.0], dt=0.05, steps=5), iterations=1)
-
-
-def test_runs_that_last_another_time_say_so():
-    told = about(mpc().run(duration=0.12).warnings, "rounded duration")
-    assert len(told) == len(naming(told, "0.12 s", "0.05 s", "2", "0.1 s")) == 1
-    assert not about(mpc().run(duration=0.1).warnings, "rounded duration")
-
-
 def test_a_checked_linearization_has_a_verdict():
     chain, q, v = vp.planar_chain(2), [0.3, -0.2], [1.0, 0.5]
     good = vp.check_linearization(vp.Scene(chain, damping=0.1), q, v, dt=1e-2)

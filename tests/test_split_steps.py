@@ -9,7 +9,7 @@ from refusals import refused
 
 import varpin as vp
 from varpin import trajectory
-from varpin.core import variational_ends
+from varpin.core import Steps
 from varpin.signals.commands import open_loop
 from varpin.trajectory import chained
 
@@ -253,6 +253,6 @@ def test_a_part_that_noise_alone_could_take_is_halved():
     integrator = vp.Midpoint()
     motion = vp.simulate(scene, q, v, dt=0.03, steps=20, integrator=integrator, rng=3, check=False)
     unguarded = replace(integrator, guard=None)
-    *_, done = variational_ends(**unguarded._steps(scene, motion))
+    *_, done = Steps(**unguarded._steps(scene, motion)).ends()
     assert done < motion.steps
     assert np.isfinite(vp.linearize(scene, motion).A).all()

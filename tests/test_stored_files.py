@@ -34,7 +34,6 @@ def problem() -> vp.OptimalControlProblem:
 
 LOADERS: dict[str, Callable[[Path], Any]] = {
     "trajectory.npz": vp.Trajectory.load,
-    "trajectory_accuracy.npz": vp.Trajectory.load,
     "solution.npz": lambda path: vp.Solution.load(path, problem()),
 }
 
@@ -75,14 +74,6 @@ def test_what_varpin_wrote_is_read(name):
         np.testing.assert_array_equal(found, expected)
         compared += 1
     assert compared >= {"solution.npz": 35}.get(name, 40)
-
-
-def test_accuracy_of_varpin_0_1_is_read():
-    motion = vp.Trajectory.load(DATA / "trajectory_accuracy.npz")
-    numbers = members_of("trajectory_accuracy.npz")["accuracy"]
-    own = motion.accuracy
-    assert [own.tolerance, own.error, own.search_steps, own.search_evaluations] == numbers.tolist()
-    assert (own.integrator, own.dt) == (motion.integrator, motion.dt)
 
 
 def test_a_stored_solution_is_gone_on_from():
@@ -195,19 +186,6 @@ def test_no_file(name, tmp_path):
     unread(name, tmp_path)
     os.mkfifo(tmp_path / "pipe.npz")
     unread(name, tmp_path / "pipe.npz")
-
-
-@pytest.mark.parametrize("name", LOADERS)
-def test_unreadable(name):
-    # A regular file whose every read fails, even for root.
-    unread(name, Path("/proc/self/mem"))
-
-
-@pytest.mark.parametrize("name", LOADERS)
-def test_foreign_archive(name, tmp_path):
-    path = tmp_path / name
-    np.savez(path, q=np.zeros((3, 2)), t=np.zeros(3))
-    unread(name, path, "format")
 
 
 @pytest.mark.parametrize("name", LOADERS)

@@ -16,7 +16,6 @@ import varpin as vp
 from varpin.cli import main
 from varpin.integrators import integrator_of
 from varpin.simulation import tolerance as search
-from varpin.simulation.ladder import Rung, Trial
 
 REST = np.zeros(3)
 
@@ -90,16 +89,6 @@ def test_a_torque_that_jumps_inside_steps_is_not_taken_for_met(jump):
     assert np.abs(motion.q[-1] - true).max() < 1e-6 or about(motion.warnings, "tolerance not met")
 
 
-def test_an_estimate_is_taken_up_with_the_user_s_own_guard_and_by_any_method():
-    scene = chain(damping=1.0)
-    free = vp.simulate(scene, REST, REST, duration=0.5, tolerance=1e-4, integrator=vp.Midpoint(guard=None))
-    again = vp.simulate(scene, REST, REST, duration=0.5, tolerance=free.accuracy, integrator=vp.Midpoint())
-    assert again.accuracy.integrator == str(vp.Midpoint())
-    implicit = vp.simulate(scene, REST, REST, duration=0.5, tolerance=1e-4, integrator=vp.Radau(2))
-    taken = vp.simulate(scene, REST, REST, duration=0.5, tolerance=implicit.accuracy)
-    assert taken.accuracy.integrator == implicit.accuracy.integrator
-
-
 def test_rows_of_controls_are_each_held_over_their_part():
     rows = np.random.default_rng(0).normal(size=(3, 3))
     motion = vp.simulate(chain(), REST, REST, duration=0.6, tolerance=1e-7, controls=rows)
@@ -160,26 +149,6 @@ def test_it_is_the_motion_of_its_integrator_and_step_the_same_each_time():
     assert motion.accuracy == again.accuracy
     assert motion.warnings == fixed.warnings
     assert fixed.accuracy is None
-
-
-def test_what_an_earlier_motion_found_is_tried_first():
-    scene = chain()
-    first = vp.simulate(scene, REST, REST, duration=0.5, tolerance=1e-6)
-    same = vp.simulate(scene, REST, REST, duration=0.5, tolerance=first.accuracy)
-    assert same.q.tobytes() == first.q.tobytes()
-    assert same.accuracy.search_steps == 2 * same.steps
-    other = vp.simulate(scene, REST + 0.05, REST, duration=0.7, tolerance=first.accuracy)
-    assert other.integrator == first.integrator
-    assert first.dt / 2 < other.dt <= first.dt
-    assert other.accuracy.search_steps < 10 * other.steps
-    assert np.abs(other.q - exact(scene, other)).max() <= 1e-6
-    # A faster motion needs more than that, and gets it.
-    fast = vp.simulate(scene, REST, REST + 6.0, duration=0.5, tolerance=first.accuracy)
-    assert fast.accuracy.search_steps > 2 * fast.steps
-    assert np.abs(fast.q - exact(scene, fast)).max() <= 1e-6
-    # Nor is it taken where the user has fixed another integrator.
-    fixed = vp.simulate(scene, REST, REST, duration=0.5, tolerance=first.accuracy, integrator=vp.Midpoint())
-    assert fixed.integrator == "Midpoint(alpha=0.5)"
 
 
 def test_beyond_rounding_it_says_what_is_reached(caplog):
@@ -304,21 +273,6 @@ def test_many_random_motions(script):
     assert len(verdicts) > 25
     assert np.mean([verdict.met for verdict in verdicts]) >= 0.95
     assert np.mean([verdict.ratio <= 2.0 for verdict in verdicts]) >= 0.95
-
-
-@pytest.mark.parametrize("duration", [0.3, 0.7])
-def test_an_earlier_step_that_divides_the_duration_is_taken(duration):
-    steps = next(n for n in range(5, 999) if duration / (duration / n) > n)
-    known = vp.Accuracy(1e-2, 1e-3, "Gauss(stages=3)", duration / steps, 0, 0)
-    motion = vp.simulate(vp.Scene(vp.planar_chain(1)), [0.3], [0.0], duration=duration, tolerance=known)
-    assert motion.steps == steps
-
-
-def test_the_order_is_that_of_the_last_two_trials():
-    rung = Rung(vp.Gauss(2), 8, 1)
-    for steps, error in ((8, 1e-2), (16, 1e-2), (32, 1e-2 / 16)):
-        rung.add(Trial(rung.integrator, steps, error, steps))
-    assert rung.order == pytest.approx(4.0)
 
 
 def test_a_force_that_is_met_within_a_step_is_in_the_motion():

@@ -30,19 +30,6 @@ def arrays_of(record: object) -> dict[str, np.ndarray]:
 
 
 class TestRoundTrip:
-    def test_is_bit_identical(self, trajectory, saved):
-        loaded = vp.Trajectory.load(saved)
-        for a, b in ((trajectory, loaded), (trajectory.statistics, loaded.statistics)):
-            assert arrays_of(a).keys() == arrays_of(b).keys()
-            for name, array in arrays_of(a).items():
-                other = arrays_of(b)[name]
-                assert (other.dtype, other.shape) == (array.dtype, array.shape)
-                assert other.tobytes() == array.tobytes(), name
-        for name in ("dt", "integrator", "robot", "joint_names", "version"):
-            assert getattr(loaded, name) == getattr(trajectory, name)
-            assert type(getattr(loaded, name)) is type(getattr(trajectory, name))
-        assert repr(loaded) == repr(trajectory)
-
     def test_holds_for_no_steps_and_no_controls(self, tmp_path):
         scene = vp.Scene(vp.planar_chain(1), actuation=[])
         still = vp.simulate(scene, [0.3], [0.0], dt=0.01, steps=0)
@@ -75,11 +62,6 @@ class TestRoundTrip:
         away = dataclasses.replace(trajectory, statistics=statistics)
         loaded = vp.Trajectory.load(away.save(tmp_path / "away.npz"))
         assert getattr(loaded.statistics, name).tobytes() == getattr(statistics, name).tobytes()
-
-    def test_returns_the_path_as_given(self, trajectory, tmp_path):
-        path = tmp_path / "no_suffix"
-        assert trajectory.save(str(path)) == path
-        assert path.is_file()
 
     def test_of_a_path_below_home(self, trajectory, tmp_path, monkeypatch):
         monkeypatch.setenv("HOME", str(tmp_path))
@@ -126,13 +108,6 @@ class TestSaving:
             trajectory.save(pipe)
         assert pipe.is_fifo()
 
-    def test_does_not_touch_the_umask_which_other_threads_share(self, trajectory, tmp_path, monkeypatch):
-        def touched(mask):
-            raise AssertionError(mask)
-
-        monkeypatch.setattr(os, "umask", touched)
-        assert trajectory.save(tmp_path / "a.npz").is_file()
-
     def test_replaces_and_keeps_the_umask(self, trajectory, saved):
         old = os.umask(0o027)
         try:
@@ -141,6 +116,15 @@ class TestSaving:
             os.umask(old)
         assert saved.stat().st_mode & 0o777 == 0o640
 
+    def test_to_where_no_file_can_be(self, trajectory, tmp_path):
+        for path, fact in (
+            (tmp_path, "folder"),
+            (tmp_path / "nowhere" / "run.npz", "nowhere"),
+            ("/proc/run.npz", "/proc"),
+        ):
+            with refused(vp.FileError, fact):
+                trajectory.save(path)
+
     def test_through_a_link_writes_what_it_points_to(self, trajectory, tmp_path):
         real, link = tmp_path / "real.npz", tmp_path / "link.npz"
         real.write_bytes(b"old")
@@ -148,18 +132,6 @@ class TestSaving:
         trajectory.save(link)
         assert link.is_symlink()
         assert vp.Trajectory.load(real).steps == 20
-
-    def test_to_a_folder(self, trajectory, tmp_path):
-        with refused(vp.FileError, str(tmp_path), "folder"):
-            trajectory.save(tmp_path)
-
-    def test_to_a_folder_that_is_not_there(self, trajectory, tmp_path):
-        with refused(vp.FileError, "nowhere"):
-            trajectory.save(tmp_path / "nowhere" / "run.npz")
-
-    def test_to_where_nothing_can_be_written(self, trajectory):
-        with refused(vp.FileError, "/proc/run.npz"):
-            trajectory.save("/proc/run.npz")
 
 
 def test_robots_with_joints_of_the_same_names_are_told_apart(tmp_path):

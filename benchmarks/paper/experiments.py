@@ -27,8 +27,8 @@ from varpin.linearization import linearize
 
 Progress = Callable[[int, int, str], None]
 
-# The search's parameters: epsilon, alpha and beta of the paper; epsilon relative to the cost.
-SEARCH = {"tolerance": 1e-4, "armijo": 1e-5, "backtracking": 0.25, "max_iterations": 60}
+# The search's parameters: epsilon of the paper, relative to the cost.
+SEARCH = {"tolerance": 1e-4, "max_iterations": 60}
 # Longest step of the accurate integrator inside an interval, where the sampled-data optimum is computed [s].
 FINEST = 1.25e-4
 OPTIMUM = "optimum"

@@ -5,4 +5,4 @@ from varpin.cli import command
 
 def parser():
     """The whole parser, commands included."""
-    return command._parser()[0]
+    return command._parser()

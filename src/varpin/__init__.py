@@ -99,7 +99,6 @@ from varpin.trajectory import Trajectory as Trajectory
 if TYPE_CHECKING:
     from varpin.control import ConstraintReport as ConstraintReport
     from varpin.control import Iteration as Iteration
-    from varpin.control import Kept as Kept
     from varpin.control import MonteCarlo as MonteCarlo
     from varpin.control import MonteCarloInterrupted as MonteCarloInterrupted
     from varpin.control import Multipliers as Multipliers
@@ -227,7 +226,6 @@ _LATE: dict[str, tuple[str, ...]] = {
     "varpin.io.scenefile": ("SceneFile", "SceneFileError", "load_scene"),
     "varpin.control": (
         "ConstraintReport",
-        "Kept",
         "Iteration",
         "MonteCarlo",
         "MonteCarloInterrupted",

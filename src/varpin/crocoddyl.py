@@ -19,13 +19,13 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem, bind_cost
+from varpin.control.solving import solve
 from varpin.control.stages import states
 from varpin.errors import InputError, VarpinError
 from varpin.linearization import linearize_steps, velocity_at_nodes
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.signals.commands import open_loop
 from varpin.signals.policy import LinearPolicy
-from varpin.simulation.failures import StepFailure
 from varpin.simulation.record import rollout
 from varpin.trajectory import Trajectory
 
@@ -80,8 +80,8 @@ class StepModel(crocoddyl.ActionModelAbstract):
 
     def calcDiff(self, data: Any, x: Floats, u: Floats | None = None) -> None:  # crocoddyl's name
         """Derivatives of the next state and of the cost."""
-        problem = self._problem
-        scene, n, m = problem.scene, problem.scene.robot.dof, problem.scene.controls
+        problem, scene = self._problem, self._problem.scene
+        n, m = scene.robot.dof, scene.controls
         control = np.zeros(m) if u is None else u
         motion = self._step(x, control)
         if motion is None:
@@ -174,7 +174,8 @@ def shooting_problem(problem: OptimalControlProblem) -> crocoddyl.ShootingProble
         raise InputError("crocoddyl's actions hold their control over a step; the problem's are linear between nodes")
     if problem.hold != 1:
         raise InputError(f"crocoddyl decides at every step; the problem holds its controls over {problem.hold}")
-    x0 = _state(problem, problem.q0, problem.v0)
+    q, v = problem.q0, problem.v0
+    x0 = np.concatenate([q, lagrangian_jet(problem.scene, q, v).Lv if problem.integrator.variational else v])
     return crocoddyl.ShootingProblem(x0, [StepModel(problem, k) for k in range(problem.steps)], EndModel(problem))
 
 
@@ -184,11 +185,7 @@ def first_guess(problem: OptimalControlProblem) -> tuple[list[Floats], list[Floa
     Raises:
         StepFailure: That motion cannot be integrated.
     """
-    n, m, variational = problem.scene.robot.dof, problem.scene.controls, problem.integrator.variational
-    commands = problem.holding_policy().commands(problem.steps, m, n, variational)
-    motion, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
-    if failure is not None:
-        raise StepFailure(motion.steps, motion.t[-1], failure, motion)
+    motion = solve(problem, max_iterations=0, check=False).trajectory
     return list(states(problem, motion)), list(motion.u)
 
 
@@ -204,11 +201,6 @@ def policy_of(problem: OptimalControlProblem, solver: Any) -> LinearPolicy:
         period=problem.period,
         joints=problem.scene.control_joints,
     )
-
-
-def _state(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
-    second = lagrangian_jet(problem.scene, q, v).Lv if problem.integrator.variational else v
-    return np.concatenate([q, second])
 
 
 def _configuration_and_velocity(problem: OptimalControlProblem, x: Floats) -> tuple[Floats, Floats]:

@@ -6,7 +6,6 @@ Equation (L3) of docs/mathematics.md; (1.7) and (1.10) of the paper.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,15 +14,15 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.integrators import Integrator, Midpoint, integrator_of
-from varpin.integrators.base import diffusion_and_drift, ends_at, noise_fields
-from varpin.integrators.same_scene import require_motion, require_scene_of
+from varpin.integrators.base import diffusion_and_drift, noise_fields
+from varpin.integrators.registry import require_motion, require_scene_of
 from varpin.mechanics.noise import Fields
 from varpin.mechanics.scene import Scene, require_scene
 from varpin.model import joint_unit
 from varpin.signals.commands import open_line, open_loop
 from varpin.simulation.spectrum import fastest_rate
 from varpin.support.checks import as_floats, finite_array
-from varpin.support.markup import facts, table
+from varpin.support.differences import slopes
 from varpin.trajectory import Trajectory
 
 # Number of steps that are repeated to check the scene of a motion without scene values, and tolerances as shares of
@@ -89,18 +88,11 @@ class Linearization:
     warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        return f"Linearization({self._size()})"
-
-    def _repr_html_(self) -> str:
-        names = ("A", "B", "K", "J", "F", "G", "Gx", "Gu")
-        return facts("Linearization", [("of", self._size())], _sizes({name: getattr(self, name) for name in names}))
-
-    def _size(self) -> str:
         states, controls = self.B.shape[1:]
         x = "(q, p)" if self.variational else "(q, v)"
         return (
-            f"{self.steps} steps of {self.dt:g} s, x = {x} of {states // 2} joints, {controls} controls, "
-            f"{self.F.shape[2]} noise processes"
+            f"Linearization({self.steps} steps of {self.dt:g} s, x = {x} of {states // 2} joints, {controls} controls, "
+            f"{self.F.shape[2]} noise processes)"
         )
 
     @property
@@ -153,9 +145,8 @@ def wrong_variances(scene: Scene, trajectory: Trajectory, integrator: Integrator
     if not rate:
         return ()
     return (
-        f"damping is fast for the step (dt * {rate:.3g}/s = {dt * rate:.2g} > {rates:g}): with {integrator} predicted "
-        "variances of velocities are wrong there, by a tenth and more; those of varpin.Midpoint(kick='held') are right "
-        "in equilibrium at every step, and smaller steps are right throughout",
+        f"damping is fast for the step (dt * {rate:.3g}/s = {dt * rate:.2g} > {rates:g}): variances of velocities are "
+        "wrong by a tenth and more. Use varpin.Midpoint(kick='held'), which is right in equilibrium, or a smaller dt",
     )
 
 
@@ -264,9 +255,6 @@ class Curvature:
     def __repr__(self) -> str:
         steps, m, states = self.ux.shape
         return f"Curvature({steps} steps, {states // 2} joints, {m} controls)"
-
-    def _repr_html_(self) -> str:
-        return facts("Curvature", [("steps", len(self.xx))], _sizes({"xx": self.xx, "ux": self.ux, "uu": self.uu}))
 
 
 def second_order(
@@ -383,39 +371,27 @@ def _drift_derivatives(
     The last ones (N, n, m) are those in a change of the control that grows linearly from 0 over the step. Differences,
     as the drift alone needs second derivatives of diffusion fields, which noise classes do not provide.
     """
-    n, m = scene.robot.dof, scene.controls
-    weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-    in_state, in_control = np.zeros((trajectory.steps, n, 2 * n)), np.zeros((trajectory.steps, n, m))
-    in_ramp = np.zeros_like(in_control)
+    n, m, linear = scene.robot.dof, scene.controls, trajectory.u_nodes.shape[1] > 0
+    found = np.zeros((trajectory.steps, n, 2 * (n + m)))
     for j in range(trajectory.steps):
         # In v even if the state is (q, p): a difference in p that suits the base moves a light wrist by rad/s, and at
         # rest the momentum gives no scale.
-        point, ends = [trajectory.q[j], trajectory.v[j], trajectory.u[j]], ends_at(trajectory, j)
-        slots = [(0, in_state, 0, 0.0), (1, in_state, n, 0.0), (2, in_control, 0, 1.0)]
-        if ends is not None:
-            slots.append((2, in_ramp, 0, 0.0))
-        # `before` is the share of a change of the control at the begin of the step.
-        for slot, target, offset, before in slots:
-            size = 2e-3 * max(1.0, np.abs(point[slot]).max(initial=0.0))
-            for c in range(point[slot].size):
-                for shift, weight in weights.items():
-                    for sign in (1.0, -1.0):
-                        shifted, away = [x.copy() for x in point], sign * shift * size
-                        at = ends
-                        if slot == 2 and ends is not None:
-                            du = away * np.eye(m)[c]
-                            shifted[2] += 0.5 * (1.0 + before) * du
-                            at = ends[0] + before * du, ends[1] + du
-                        else:
-                            shifted[slot][c] += away
-                        drift = diffusion_and_drift(scene, shifted[0], shifted[1], shifted[2], start, at)[1]
-                        target[j, :, offset + c] += sign * weight / size * drift
+        u = trajectory.u[j]
+        parts = trajectory.q[j], trajectory.v[j], *(trajectory.u_nodes[j : j + 2] if linear else (u, u))
+
+        def drift(x: Floats) -> Floats:
+            q, v, begin, end = np.split(x, [n, 2 * n, 2 * n + m])
+            ends = (begin[None], end[None]) if linear else None
+            return diffusion_and_drift(scene, q, v, 0.5 * (begin + end), start, ends)[1]
+
+        sizes = [np.full(part.size, 2e-3 * max(1.0, np.abs(part).max(initial=0.0))) for part in parts]
+        found[j] = slopes(drift, np.concatenate(parts), np.concatenate(sizes))
+    in_state, by_begin, by_end = np.split(found, [2 * n, 2 * n + m], axis=2)
     if variational:
-        rates = velocity_at_nodes(scene, trajectory.q[:-1], trajectory.v[:-1])
         in_velocity = in_state[:, :, n:].copy()
         in_state[:, :, n:] = 0.0
-        in_state += in_velocity @ rates
-    return in_state, in_control, in_ramp if trajectory.u_nodes.shape[1] else 0.5 * in_control
+        in_state += in_velocity @ velocity_at_nodes(scene, trajectory.q[:-1], trajectory.v[:-1])
+    return in_state, by_begin + by_end, by_end
 
 
 def _matching(scene: Scene, trajectory: Trajectory, given: Integrator | None) -> Integrator:
@@ -438,30 +414,26 @@ def _require_steps_of(scene: Scene, trajectory: Trajectory, integrator: Integrat
         InputError: A step differs; the message names it and the difference.
     """
     whole = np.flatnonzero(trajectory.statistics.substeps <= 1)
-    if trajectory.dw.any():
+    if trajectory.noisy:
         whole = whole[whole == 0]
-    if not whole.size:
-        return
-    change, speed = np.abs(np.diff(trajectory.v, axis=0)).max(axis=1), float(np.abs(trajectory.v).max())
-    spread = np.linspace(0, whole.size - 1, _RETAKEN - 1).astype(np.int64)
-    for k in np.unique([*whole[spread], whole[np.argmax(change[whole])]]).tolist():
+    speed = float(np.abs(trajectory.v).max())
+    for k in whole[np.unique(np.linspace(0, whole.size - 1, min(_RETAKEN, whole.size)).astype(np.int64))].tolist():
         state, _ = integrator.start(scene, trajectory.q[k : k + 1].copy(), trajectory.v[k : k + 1].copy())
-        drawn = trajectory.dw[None, k : k + 1] if trajectory.dw.any() else np.zeros((0, 0, scene.processes))
         commands = open_loop(trajectory.u[k : k + 1])
         if trajectory.u_nodes.shape[1]:
             commands = open_line(trajectory.u_nodes[k : k + 2], integrator.stage_times)
         elif trajectory.u_stages.shape[1]:
             commands = commands._replace(within=trajectory.u_stages[k : k + 1])
+        drawn = trajectory.dw[None, k : k + 1] if trajectory.noisy else np.zeros((0, 0, scene.processes))
         (again,) = integrator.rollout(scene, state, commands, drawn, trajectory.dt)
         if again.failure is not None or again.statistics.substeps[0] > 1:
             continue
         off = float(np.abs(again.v[0] - trajectory.v[k + 1]).max())
-        if not off <= _OF_CHANGE * change[k] + _OF_SPEED * speed:
+        change = float(np.abs(trajectory.v[k + 1] - trajectory.v[k]).max())
+        if not off <= _OF_CHANGE * change + _OF_SPEED * speed:
             raise InputError(
-                f"the trajectory was made in another scene than the one given: taken again in this one, step {k} "
-                f"(t = {trajectory.t[k]:.6g} s) ends at velocities that are off by {off:.3g} "
-                f"{joint_unit(scene.robot, speed=True)}. Give the scene that made it, with its damping, gravity, "
-                "springs and inertias, or simulate again in this one"
+                f"the trajectory was made in another scene than the one given: in this one step {k} ends at velocities "
+                f"that are off by {off:.3g} {joint_unit(scene.robot, speed=True)}. Give the scene that made it"
             )
 
 
@@ -510,19 +482,6 @@ class Moments:
         nodes, states = self.mean.shape
         return f"Moments({nodes} nodes, {states // 2} joints)"
 
-    def _repr_html_(self) -> str:
-        half = self.mean.shape[1] // 2
-        deviation = np.sqrt(np.diagonal(self.covariance[-1]))
-        rows = [(j, *(float(x) for x in (self.mean[-1, j], deviation[j]))) for j in range(half)]
-        head = ("coordinate", "mean of dq in the end [rad or m]", "standard deviation")
-        return facts("Moments", [("nodes", len(self.mean))], table(head, rows))
-
-
-def _sizes(arrays: Mapping[str, Floats]) -> str:
-    """A table (HTML) of shapes and largest entries."""
-    rows = [(name, str(array.shape), float(np.abs(array).max(initial=0.0))) for name, array in arrays.items()]
-    return table(("array", "shape", "largest entry"), rows)
-
 
 def propagate_moments(
     linearization: Linearization, mean: ArrayLike | None = None, covariance: ArrayLike | None = None
@@ -558,21 +517,13 @@ def propagate_moments(
 
 
 def _require_covariance(P: Floats) -> Floats:
-    """``P``, refused if it is asymmetric or indefinite beyond rounding.
-
-    P is scaled to a unit diagonal for the check, as the entries of x have different units.
-    """
+    """``P``, refused if it is asymmetric or indefinite beyond rounding in units of its deviations."""
     deviation = np.sqrt(np.maximum(np.diag(P), 0.0))
-    known = deviation > 0.0
-    scale = np.where(known, deviation, 1.0)
+    scale = np.where(deviation > 0.0, deviation, 1.0)
     scaled = P / np.outer(scale, scale)
-    least = np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0]
+    least = float(np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0])
     if np.diag(P).min(initial=0.0) < 0.0 or least < -1e-9:
-        raise InputError(
-            "covariance must be positive semidefinite; with a unit diagonal its least eigenvalue is "
-            f"{least:.3g}, its least variance {np.diag(P).min():.3g}"
-        )
-    asymmetry = float(np.abs(scaled - scaled.T).max())
-    if asymmetry > 1e-9:
-        raise InputError(f"covariance must be symmetric; with a unit diagonal it is off by {asymmetry:.3g}")
+        raise InputError(f"covariance must be positive semidefinite; scaled, its least eigenvalue is {least:.3g}")
+    if not np.abs(scaled - scaled.T).max() <= 1e-9:
+        raise InputError("covariance must be symmetric")
     return P

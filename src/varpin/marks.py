@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 if TYPE_CHECKING:
     from varpin.control import OptimalControlProblem
     from varpin.mechanics.scene import Scene
-    from varpin.support.checks import JointValues
     from varpin.trajectory import Trajectory
 
 
@@ -34,10 +33,9 @@ class Marks:
             planned path of each traced frame as beads. The end of the horizon if left out; 0 to show no plans.
         torques: Colour each link by the torque of the joint that moves it, grey for none, red at its limit: ``True``
             for the controls of the trajectory, one for each joint; or the torques (N, n) themselves [N m or N], of N
-            steps spread evenly over the motion's time.
-        torque_limit: One number, (n,) or by joint name [N m or N]; if left out the control limits of a plan, where
-            ``torques`` is True, and the robot's effort limits where it has none. A joint without a limit is red
-            at its own largest torque.
+            steps spread evenly over the motion's time. The limits are the control limits of a plan, where
+            ``torques`` is True, and the robot's effort limits where it has none; a joint without one is red at its own
+            largest torque.
         constraints: Draw the constraints of the mechanism, and the obstacles, regions and goals of a plan. ``True``
             takes them from a plan or a controller's run, ``False`` draws none. A trajectory or an array does not
             contain them: give its scene or its problem.
@@ -51,5 +49,4 @@ class Marks:
     ghost: Trajectory | ArrayLike | None = None
     ahead: float | None = None
     torques: bool | ArrayLike = False
-    torque_limit: JointValues | None = None
     constraints: bool | Scene | OptimalControlProblem = True

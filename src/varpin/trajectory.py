@@ -28,8 +28,6 @@ Bytes = NDArray[np.uint8]
 FORMAT = "varpin.trajectory/2"
 
 _SEALED = ("t", "q", "v", "p", "u", "dw", "energy", "masses", "constraint_forces", "u_stages", "u_nodes")
-# Number of parts of steps that are checked at a time.
-_AT_A_TIME = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +85,11 @@ class StepStatistics(Frozen):
         counts = self.substeps[self.substeps > 1]
         if counts.size and counts.max() > 1 << MOST_HALVINGS:
             return "statistics.substeps holds numbers of parts that no step has"
-        fits = counts.sum() == halvings.size and (
-            not halvings.size or (halvings.min() >= 1 and halvings.max() <= MOST_HALVINGS and _add_up(counts, halvings))
-        )
+        fits = counts.sum() == halvings.size
+        if fits and halvings.size:
+            units = 1 << (MOST_HALVINGS - np.minimum(halvings, MOST_HALVINGS).astype(np.int64))
+            sums = np.add.reduceat(units, np.cumsum(counts) - counts)
+            fits = 1 <= halvings.min() <= halvings.max() <= MOST_HALVINGS and (sums == 1 << MOST_HALVINGS).all()
         return None if fits else "statistics.halvings does not hold the parts that statistics.substeps counts"
 
 
@@ -110,19 +110,6 @@ def _parts_in(substeps: Integers) -> int:
     return int(substeps[substeps > 1].sum())
 
 
-def _add_up(counts: Integers, halvings: Bytes) -> bool:
-    """Whether the parts of every split step add up to a whole step, computed in blocks to limit memory."""
-    units = 1 << (MOST_HALVINGS - np.arange(MOST_HALVINGS + 1))
-    ends, done = np.cumsum(counts), 0
-    for begin in range(0, halvings.size, _AT_A_TIME):
-        sums = done + np.cumsum(units[halvings[begin : begin + _AT_A_TIME]])
-        first, last = np.searchsorted(ends, [begin, begin + len(sums)], side="right")
-        if not np.array_equal(sums[ends[first:last] - 1 - begin], np.arange(first + 1, last + 1) << MOST_HALVINGS):
-            return False
-        done = int(sums[-1])
-    return True
-
-
 def joined(statistics: Sequence[StepStatistics]) -> StepStatistics:
     """Statistics of successive stretches of steps as one."""
     names = (item.name for item in fields(StepStatistics))
@@ -132,9 +119,6 @@ def joined(statistics: Sequence[StepStatistics]) -> StepStatistics:
 @dataclass(frozen=True)
 class Accuracy:
     """Accuracy of a motion that was simulated with a tolerance, and the search for its integrator and step.
-
-    It can be given as a tolerance: ``simulate(..., tolerance=trajectory.accuracy)`` begins with this integrator and
-    step.
 
     Attributes:
         tolerance: The requested tolerance [rad or m].
@@ -215,8 +199,7 @@ class Trajectory(Frozen):
             is computed on first use where the record alone shows the motion right, see :attr:`error_bound`.
         error_bound: Four times the largest error that the record alone shows, to first order [rad or m]. Errors of 3 in
             100 such motions are larger, in fast chaotic ones up to 16 times. None for motions that were repeated.
-        scene_values: Numbers of its scene, :attr:`varpin.Scene.values`; empty in files of versions that did not store
-            them.
+        scene_values: Numbers of its scene, :attr:`varpin.Scene.values`.
         u_stages: Controls (N, s, m) at the stages of each step, if they change within it (:class:`varpin.OpenLoop` or
             :class:`varpin.FirstOrderHold` with a method of several stages); else (N, 0, m). The motion is that under
             the polynomial through them.
@@ -442,7 +425,7 @@ class Trajectory(Frozen):
         Raises:
             FileError: As for :meth:`load`.
         """
-        found = record_of(cls, _with_accuracy(members, prefix), source, prefix=prefix)
+        found = record_of(cls, members, source, prefix=prefix)
         _require_scene_values(source, found.scene_values, len(found.joint_names))
         # Energies and momenta overflow before q and v do; they may then be infinite.
         if not np.isfinite(found.p[np.isfinite(found.energy)]).all():
@@ -486,17 +469,6 @@ def _require_scene_values(source: Path, values: Mapping[str, Floats], n: int) ->
             raise FileError(f"{source}: scene.{name} has shape {array.shape} instead of {shape}")
         if name in finite and not np.isfinite(array).all():
             raise FileError(f"{source}: scene.{name} holds values that are not finite numbers")
-
-
-def _with_accuracy(members: Mapping[str, Any], prefix: str) -> Mapping[str, Any]:
-    """``members`` with the entries of an accuracy by name; a file of varpin 0.1 has four numbers in one array."""
-    numbers = members.get(f"{prefix}accuracy")
-    if numbers is None or numbers.shape != (4,) or numbers.dtype != np.float64:
-        return members
-    accuracy = {name: members.get(prefix + name) for name in ("integrator", "dt")}
-    accuracy |= dict(zip(("tolerance", "error"), numbers[:2], strict=True))
-    accuracy |= dict(zip(("search_steps", "search_evaluations"), numbers[2:].astype(np.int64), strict=True))
-    return {**members, **{f"{prefix}accuracy.{name}": np.asarray(value) for name, value in accuracy.items()}}
 
 
 def chained(parts: Sequence[Trajectory]) -> Trajectory:

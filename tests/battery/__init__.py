@@ -1,7 +1,5 @@
 """Extreme scenes, each run with every integrator and judged by independent checks: what docs/limits.md reports."""
 
-from battery.plans import PLANS as PLANS
-from battery.plans import Plan as Plan
 from battery.running import measures as measures
 from battery.running import run as run
 from battery.scenes import TRIALS as TRIALS

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 from battery.exact import before_step, exact_motion, period_error
-from battery.plans import PLANS, Plan, judge_plan
 from battery.scenes import TRIALS, trials_on
 from battery.trial import Outcome, Setup, Trial
 from varpin.errors import VarpinError
@@ -30,7 +29,7 @@ def run(
     robot: Robot | None = None,
     *,
     deep: bool = False,
-    trials: Sequence[Trial | Plan] | None = None,
+    trials: Sequence[Trial] | None = None,
     integrators: Sequence[Integrator] | None = None,
     patience: float | None = None,
     progress: Progress | None = None,
@@ -44,29 +43,26 @@ def run(
     Other Args:
         trials: These instead.
         integrators: These instead of all.
-        patience: Processor time that a motion may take before it is judged by what there is [s]; if given, plans get
-            as much.
+        patience: Processor time that a motion may take before it is judged by what there is [s].
         progress: Called with (cells done, cells in all).
 
     Raises:
         StudyInterrupted: Ctrl-C; holds what was done.
     """
     if trials is None:
-        trials = (*TRIALS, *PLANS) if robot is None else trials_on(robot)
+        trials = TRIALS if robot is None else trials_on(robot)
         trials = [trial for trial in trials if deep or not trial.deep]
     members = INTEGRATORS if integrators is None else tuple(integrators)
     limit = positive("patience", patience or (_DEEP_PATIENCE if deep else _PATIENCE), "s")
-    jobs = [(trial, [member for member in members if trial.takes(member)]) for trial in trials]
 
     def cells() -> Iterator[Cell]:
-        for trial, own in jobs:
+        for trial in trials:
             bench = Bench(trial)
-            for member in own:
-                # A plan cut short is another plan; it has its number of iterations.
-                yield bench.run(member, limit if isinstance(trial, Trial) or patience else math.inf)
+            for member in members:
+                yield bench.run(member, limit)
 
     name = "the battery" if robot is None else robot.name
-    return collect(Record((), name), cells(), sum(len(own) for _, own in jobs), progress)
+    return collect(Record((), name), cells(), len(trials) * len(members), progress)
 
 
 def measures(setup: Setup, integrator: Integrator, trajectory: Trajectory, exact: Exact | None) -> dict[str, float]:
@@ -78,20 +74,17 @@ def measures(setup: Setup, integrator: Integrator, trajectory: Trajectory, exact
 class Bench:
     """A trial with what all integrators share of it: its setup and its exact motion."""
 
-    def __init__(self, trial: Trial | Plan) -> None:
+    def __init__(self, trial: Trial) -> None:
         self.trial = trial
         self._exact: dict[float | None, Exact | None] = {}
 
     def run(self, integrator: Integrator, patience: float) -> Cell:
         """The trial with one integrator."""
         trial, begin = self.trial, time.perf_counter()
-        if isinstance(trial, Plan):
-            outcome = judge_plan(trial, integrator, patience)
-        else:
-            try:
-                outcome = self._judge_motion(trial, integrator, patience)
-            except Exception as error:
-                outcome = Outcome.of_error(error, Kind.REFUSED)
+        try:
+            outcome = self._judge_motion(trial, integrator, patience)
+        except Exception as error:
+            outcome = Outcome.of_error(error, Kind.REFUSED)
         return Cell(
             trial=trial.name,
             integrator=str(integrator),
@@ -106,7 +99,6 @@ class Bench:
 
     @cached_property
     def _setup(self) -> Setup:
-        assert isinstance(self.trial, Trial)
         return self.trial.build()
 
     def _judge_motion(self, trial: Trial, integrator: Integrator, patience: float) -> Outcome:

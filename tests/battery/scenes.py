@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from battery.plans import UP, Plan, plans_on
 from battery.trial import ClosedForm, Setup, Trial
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.noise import AdditiveNoise
@@ -24,6 +23,8 @@ Floats = NDArray[np.float64]
 _TURN = 2.0 * math.pi
 # Squared rate of a hanging rod of 1 m [1/s^2].
 _HANGING = 1.5 * 9.81
+
+UP = -0.5 * math.pi
 
 
 def _setup(
@@ -214,12 +215,12 @@ TRIALS: tuple[Trial, ...] = (
 )
 
 
-def trials_on(robot: Robot) -> list[Trial | Plan]:
-    """The motions of ``check_robot``, to be judged all over and with their noise, and plans."""
+def trials_on(robot: Robot) -> list[Trial]:
+    """The motions of ``check_robot``, to be judged all over and with their noise."""
 
     def trial(m: Motion) -> Trial:
         twin = m.scene if m.ahead.any() else None
         setup = Setup(m.scene, m.q0, m.v0, m.controls, m.increments, twin=twin, shift=m.ahead)
         return Trial(m.name, "robot", lambda: setup, m.dt, m.steps, window=m.window)
 
-    return [*map(trial, motions_of(robot)), *plans_on(robot)]
+    return [*map(trial, motions_of(robot))]

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.errors import VarpinError
-from varpin.integrators import Integrator
 from varpin.mechanics.scene import Scene
 from varpin.study.extremes import Kind, line_of
 
@@ -66,14 +65,10 @@ class Trial:
     window: float = 1.0
     deep: bool = False
 
-    def takes(self, integrator: Integrator) -> bool:
-        """Whether it is run with an integrator: with all of them."""
-        return True
-
 
 @dataclass(frozen=True)
 class Outcome:
-    """The judgement of a motion or a plan: a part of a :class:`Cell`, and its measures by name as far as they apply."""
+    """The judgement of a motion: a part of a :class:`Cell`, and its measures by name as far as they apply."""
 
     kind: Kind
     measures: dict[str, float] = field(default_factory=dict)

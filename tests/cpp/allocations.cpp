@@ -12,7 +12,6 @@
 #include "varpin/constrained.hpp"
 #include "varpin/costs.hpp"
 #include "varpin/explicit.hpp"
-#include "varpin/gradient_pass.hpp"
 #include "varpin/linearization.hpp"
 #include "varpin/variational.hpp"
 
@@ -171,11 +170,6 @@ bool allocates_nothing(const varpin::Mechanism& mechanism) {
                          .control_gradient = slopes.data(),
                          .factors = factors.data()}) < 0;
     });
-    varpin::GradientPass gradients(n, n, terminal.data());
-    right &= without_allocation("the pass with gradients alone", [&] {
-        gradients.run(h, 1, 0.0, steps, {.feedforward = k.data(), .feedback = K.data(), .factors = factors.data()});
-        return true;
-    });
     const varpin::Links links{mechanism.tree.bodies, n};
     const varpin::Placement tip{{{1.0, 0.0, 0.0}, {0.0, 1.0, 0.0}, {0.0, 0.0, 1.0}}, {1.0, 0.0, 0.0}};
     const std::vector<double> one{1.0}, three{1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0};
@@ -215,7 +209,7 @@ bool constrained_steps_allocate_nothing() {
     mechanism.constraints = {
         {{{tip}}, {{across}}}, {{.x = 0, .y = 1, .constant = height}}, {}, {}, mechanism.tree.bodies, n};
     varpin::ConstrainedStepper stepper(mechanism, midpoint, {0.0, 1.0}, 0.5, {});
-    varpin::ConstrainedState state(mechanism, 1);
+    varpin::PathState state(mechanism, 1);
     const std::vector<double> force(n);
     const auto steps = [&] {
         for (int s = 0; s < N; ++s) {

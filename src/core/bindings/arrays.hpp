@@ -23,6 +23,8 @@ template <int dimensions>
 using Integers = nb::ndarray<const std::int64_t, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
 template <int dimensions>
 using IntegersInOut = nb::ndarray<std::int64_t, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
+template <int dimensions>
+using Flags = nb::ndarray<const bool, nb::ndim<dimensions>, nb::c_contig, nb::device::cpu>;
 using Bytes = nb::ndarray<const std::uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<nb::numpy, double>;
 using BytesOut = nb::ndarray<nb::numpy, std::uint8_t>;
@@ -55,6 +57,12 @@ inline Out array_for(double*& values, std::initializer_list<std::size_t> shape) 
     values = new double[size]();
     nb::capsule owner(values, [](void* held) noexcept { delete[] static_cast<double*>(held); });
     return Out(values, shape, owner);
+}
+
+// The numbers of an array.
+template <class Array>
+std::vector<double> copied(const Array& array) {
+    return {array.data(), array.data() + array.size()};
 }
 
 // A NumPy array that owns a copy of some bytes.

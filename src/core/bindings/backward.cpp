@@ -9,8 +9,6 @@
 
 #include "arrays.hpp"
 #include "registrations.hpp"
-#include "varpin/box.hpp"
-#include "varpin/gradient_pass.hpp"
 #include "varpin/square_root.hpp"
 #include "varpin/steps.hpp"
 
@@ -41,8 +39,8 @@ std::size_t decisions_of(std::size_t N, int hold) {
 // Steps with references to their arrays; optional arrays may be empty.
 struct HeldSteps {
     HeldSteps(In<3> A_, In<3> B_, In<3> G_, In<4> Gx_, In<4> Gu_, In<2> rule, In<2> gradient_, In<3> hessian_,
-              In<3> velocity_, In<3> curvature_, In<3> slack_, In<2> expected_, In<3> rate_, In<2> pull_,
-              std::optional<In<3>> within_)
+              In<3> velocity_, In<3> curvature_, In<3> rate_, In<2> pull_, std::optional<In<3>> within_,
+              std::optional<Flags<2>> held_)
         : A(A_),
           B(B_),
           G(G_),
@@ -52,13 +50,12 @@ struct HeldSteps {
           hessian(hessian_),
           velocity(velocity_),
           curvature(curvature_),
-          slack(slack_),
-          expected(expected_),
           rate(rate_),
           pull(pull_),
-          within(within_) {
+          within(within_),
+          held(held_) {
         const std::size_t N = A.shape(0), x = A.shape(1), m = B.shape(2), k = G.shape(2), size = x + m;
-        const std::size_t points = N * rule.shape(0), R = slack.shape(0), rated = rate.shape(0);
+        const std::size_t points = N * rule.shape(0), rated = rate.shape(0);
         if (x % 2 != 0) throw std::invalid_argument("A has an odd number of states");
         require(A, "A", {N, x, x});
         require(B, "B", {N, x, m});
@@ -84,8 +81,7 @@ struct HeldSteps {
                  .velocity = given(velocity, "velocity", {N + 1, x / 2, x}) ? velocity.data() : nullptr,
                  .curvature = given(curvature, "curvature", {N, size, size}) ? curvature.data() : nullptr,
                  .within = within && given(*within, "within", {N, x, x}) ? within->data() : nullptr,
-                 .slack = R > 0 && given(slack, "slack", {R, 2, m}) ? slack.data() : nullptr,
-                 .expected = given(expected, "expected", {R, size}) ? expected.data() : nullptr,
+                 .held = held ? held->data() : nullptr,
                  .rate = rated > 0 && given(rate, "rate", {rated, m, m}) ? rate.data() : nullptr,
                  .pull = rated > 0 ? pull.data() : nullptr};
         require(pull, "pull", {rated, m});
@@ -94,27 +90,24 @@ struct HeldSteps {
     In<3> A, B, G;
     In<4> Gx, Gu;
     In<2> gradient;
-    In<3> hessian, velocity, curvature, slack;
-    In<2> expected;
+    In<3> hessian, velocity, curvature;
     In<3> rate;
     In<2> pull;
     std::optional<In<3>> within;
+    std::optional<Flags<2>> held;
     ExpandedSteps steps;
 };
 
 // Arrays of gains to be filled in; unwanted ones are empty.
 struct HeldGains {
     HeldGains(InOut<2> feedforward_, InOut<3> feedback_, InOut<3> previous_, InOut<2> control_gradient_,
-              InOut<2> costate_, InOut<3> spread_, std::optional<InOut<2>> stiffness_,
-              std::optional<InOut<2>> pressure_, std::optional<InOut<3>> factors_)
+              InOut<2> costate_, InOut<3> spread_, std::optional<InOut<3>> factors_)
         : feedforward(feedforward_),
           feedback(feedback_),
           previous(previous_),
           control_gradient(control_gradient_),
           costate(costate_),
           spread(spread_),
-          stiffness(stiffness_),
-          pressure(pressure_),
           factors(factors_) {}
 
     // Views, after a check that the arrays fit these steps, with each control held over `hold` of them.
@@ -122,7 +115,7 @@ struct HeldGains {
         const ExpandedSteps& steps = held.steps;
         const auto N = static_cast<std::size_t>(steps.steps), R = decisions_of(N, hold);
         const auto x = static_cast<std::size_t>(steps.states()), m = static_cast<std::size_t>(steps.controls);
-        given(held.slack, "slack", {R, 2, m});
+        if (held.held) require(*held.held, "held", {R, m});
         if (given(held.rate, "rate", {R, m, m})) require(previous, "previous", {R, m, m});
         if (steps.processes > 0) require(spread, "spread", {N, x, x});
         require(feedforward, "feedforward", {R, m});
@@ -134,8 +127,6 @@ struct HeldGains {
                 .control_gradient = control_gradient.data(),
                 .costate = given(costate, "costate", {N, x}) ? costate.data() : nullptr,
                 .spread = spread.data(),
-                .stiffness = stiffness && given(*stiffness, "stiffness", {R, m}) ? stiffness->data() : nullptr,
-                .pressure = pressure && given(*pressure, "pressure", {R, m}) ? pressure->data() : nullptr,
                 .factors = factors && given(*factors, "factors", {R, m, m}) ? factors->data() : nullptr};
     }
 
@@ -143,7 +134,6 @@ struct HeldGains {
     InOut<3> feedback, previous;
     InOut<2> control_gradient, costate;
     InOut<3> spread;
-    std::optional<InOut<2>> stiffness, pressure;
     std::optional<InOut<3>> factors;
 };
 
@@ -211,18 +201,6 @@ std::ptrdiff_t run_on_roots(RootPass& pass, double h, int hold, double regulariz
     return pass.run(h, hold, regularization, steps, samples, changes, jumps, gains);
 }
 
-// The feed-forward parts of a pass again, with other gradients, from the gradient (2n) of the terminal cost.
-void run_gradients(double h, int hold, double regularization, const HeldSteps& given, const HeldGains& held,
-                   In<1> terminal) {
-    const ExpandedSteps& steps = given.steps;
-    require(terminal, "terminal", {static_cast<std::size_t>(steps.states())});
-    const Gains gains = held.fitting(given, hold);
-    if (!gains.factors) throw std::invalid_argument("gradients alone need the factors of a pass");
-    if (steps.slack) throw std::invalid_argument("gradients alone need a pass without limits");
-    nb::gil_scoped_release release;
-    GradientPass(steps.dof, steps.controls, terminal.data()).run(h, hold, regularization, steps, gains);
-}
-
 // The linearized motion under a plan from `state`, overwritten by that at the end: expected (R, 2n + m), moves (R, m).
 // True where a control reaches a limit.
 bool foresee(int hold, In<3> A, In<3> B, In<2> feedforward, In<3> feedback, In<3> previous, In<3> slack, InOut<1> state,
@@ -259,38 +237,18 @@ void define_results(nb::class_<Pass>& type) {
         .def_prop_ro("loss", [](const Pass& pass) { return pass.found.loss; });
 }
 
-// The minimum, the factors of the Hessian's free part, and the entries at a limit.
-std::optional<std::tuple<Out, Out, nb::ndarray<nb::numpy, bool>>> box_minimum(In<2> H, In<1> g, In<2> limits,
-                                                                              In<1> guess) {
-    const std::size_t m = g.shape(0);
-    require(H, "H", {m, m});
-    require(limits, "limits", {2, m});
-    require(guess, "guess", {m});
-    BoxMinimum box(static_cast<int>(m));
-    double* x = nullptr;
-    Out out = array_for(x, {m});
-    std::copy_n(guess.data(), m, x);
-    if (!box.solve(H.data(), g.data(), limits.data(), limits.data() + m, x)) return std::nullopt;
-    bool* held = new bool[m]();
-    std::copy(box.held.begin(), box.held.end(), held);
-    nb::capsule owner(held, [](void* flags) noexcept { delete[] static_cast<bool*>(flags); });
-    return std::tuple{out, array_of(box.factors.data(), {m, m}), nb::ndarray<nb::numpy, bool>(held, {m}, owner)};
-}
-
 }  // namespace
 
 void register_backward(nb::module_& m) {
     nb::class_<HeldSteps>(m, "ExpandedSteps")
-        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<2>, In<3>, In<3>, In<3>, In<3>, In<2>, In<3>, In<2>,
-                      std::optional<In<3>>>(),
+        .def(nb::init<In<3>, In<3>, In<3>, In<4>, In<4>, In<2>, In<2>, In<3>, In<3>, In<3>, In<3>, In<2>,
+                      std::optional<In<3>>, std::optional<Flags<2>>>(),
              nb::kw_only(), "A"_a, "B"_a, "G"_a, "Gx"_a, "Gu"_a, "rule"_a, "gradient"_a, "hessian"_a, "velocity"_a,
-             "curvature"_a, "slack"_a, "expected"_a, "rate"_a, "pull"_a, "within"_a.none() = nb::none());
+             "curvature"_a, "rate"_a, "pull"_a, "within"_a.none() = nb::none(), "held"_a.none() = nb::none());
     nb::class_<HeldGains>(m, "Gains")
-        .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>, std::optional<InOut<2>>,
-                      std::optional<InOut<2>>, std::optional<InOut<3>>>(),
+        .def(nb::init<InOut<2>, InOut<3>, InOut<3>, InOut<2>, InOut<2>, InOut<3>, std::optional<InOut<3>>>(),
              nb::kw_only(), "feedforward"_a.noconvert(), "feedback"_a.noconvert(), "previous"_a.noconvert(),
              "control_gradient"_a.noconvert(), "costate"_a.noconvert(), "spread"_a.noconvert(),
-             "stiffness"_a.noconvert().none() = nb::none(), "pressure"_a.noconvert().none() = nb::none(),
              "factors"_a.noconvert().none() = nb::none());
     nb::class_<HeldSquares>(m, "Squares").def(nb::init<In<3>, In<2>, In<2>>(), "root"_a, "shift"_a, "linear"_a);
     auto pass = nb::class_<BackwardPass>(m, "BackwardPass");
@@ -302,11 +260,9 @@ void register_backward(nb::module_& m) {
         .def("run", &run_on_roots, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "running"_a,
              "change"_a.none() = nb::none(), "within"_a.none() = nb::none());
     define_results(root_pass);
-    m.def("run_gradients", &run_gradients, "h"_a, "hold"_a, "regularization"_a, "steps"_a, "gains"_a, "terminal"_a);
     m.def("foresee", &foresee, "hold"_a, "A"_a, "B"_a, "feedforward"_a, "feedback"_a, "previous"_a, "slack"_a,
           "state"_a.noconvert(), "expected"_a.noconvert(), "moves"_a.noconvert(),
           "after"_a.noconvert().none() = nb::none());
-    m.def("box_minimum", &box_minimum, "H"_a, "g"_a, "limits"_a, "guess"_a);
 }
 
 }  // namespace varpin::border

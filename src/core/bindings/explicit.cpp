@@ -26,7 +26,7 @@ using SharedMechanism = std::shared_ptr<Mechanism>;
 
 // What works on a mechanism, and keeps it alive.
 struct BoundDynamics {
-    BoundDynamics(SharedMechanism of, Solver solver) : mechanism(std::move(of)), core(*mechanism, false, solver) {}
+    BoundDynamics(SharedMechanism of) : mechanism(std::move(of)), core(*mechanism, false) {}
 
     SharedMechanism mechanism;
     ForwardDynamics core;
@@ -182,7 +182,7 @@ void register_explicit(nb::module_& m) {
         .value("semi_implicit", ExplicitMethod::semi_implicit)
         .value("runge_kutta", ExplicitMethod::runge_kutta);
     nb::class_<BoundDynamics>(m, "ForwardDynamics")
-        .def(nb::init<SharedMechanism, Solver>(), "mechanism"_a, "solver"_a = Solver::automatic)
+        .def(nb::init<SharedMechanism>(), "mechanism"_a)
         .def("rate", &rate, "x"_a, "force"_a)
         .def("node", &node, "x"_a);
     nb::class_<BoundRollout>(m, "ExplicitRollout")

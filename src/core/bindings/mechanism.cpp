@@ -29,11 +29,6 @@ namespace {
 
 using namespace nanobind::literals;
 
-template <class Array>
-std::vector<double> copied(const Array& array) {
-    return {array.data(), array.data() + array.size()};
-}
-
 // Numbers of a member of an element or a coupling.
 template <class Member>
 constexpr std::size_t width = 1;
@@ -159,11 +154,12 @@ CustomRows custom_rows(int rows, const nb::object& value, const nb::object& bend
             }};
 }
 
-Constraints constraints_of(const NamedConstraints& named, const std::vector<Body>& bodies, std::size_t n) {
+Constraints constraints_of(const NamedConstraints& named, const std::vector<Body>& bodies, std::size_t n,
+                           std::size_t controls) {
     const auto& [vectors, products, ties, customs] = named;
     const auto require_below = [](int index, std::size_t count) {
         if (index < 0 || index >= static_cast<int>(count))
-            throw std::invalid_argument("a constraint's vectors or coordinates are out of range");
+            throw std::invalid_argument("a constraint's vectors, coordinates or control are out of range");
     };
     std::vector<VectorSum> sums;
     for (const NamedVector& parts : vectors) {
@@ -184,6 +180,7 @@ Constraints constraints_of(const NamedConstraints& named, const std::vector<Body
     for (const auto& [follower, leader, coefficients, rate] : ties) {
         require_below(follower, n);
         require_below(leader, n);
+        require_below(rate + 1, controls + 1);
         tied.push_back({follower, leader, coefficients, rate});
     }
     std::vector<CustomRows> functions;
@@ -303,7 +300,7 @@ Mechanism mechanism_of(Integers<1> parent, Integers<1> prismatic, In<3> rotation
     out.gravity = {gravity(0), gravity(1), gravity(2)};
     out.forces = forces_of(forces, static_cast<int>(n));
     out.couplings = couplings_of(couplings, out.tree.bodies);
-    out.constraints = constraints_of(constraints, out.tree.bodies, n);
+    out.constraints = constraints_of(constraints, out.tree.bodies, n, m);
     if (!custom.is_none()) out.couplings.take_outer(outer_force_of(std::move(custom), n));
     out.controls = static_cast<int>(m);
     for (std::size_t r = 0; r < n; ++r) {

@@ -7,7 +7,6 @@ NB_MODULE(_core, m) {
     nanobind::set_leak_warnings(false);
     varpin::border::register_mechanism(m);
     varpin::border::register_kinematics(m);
-    varpin::border::register_elimination(m);
     varpin::border::register_explicit(m);
     varpin::border::register_backward(m);
     varpin::border::register_rollouts(m);

@@ -7,7 +7,6 @@ namespace varpin::border {
 
 void register_mechanism(nanobind::module_& m);
 void register_kinematics(nanobind::module_& m);
-void register_elimination(nanobind::module_& m);
 void register_explicit(nanobind::module_& m);
 void register_backward(nanobind::module_& m);
 void register_rollouts(nanobind::module_& m);

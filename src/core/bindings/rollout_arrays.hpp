@@ -4,16 +4,13 @@
 
 #include <cstdint>
 #include <optional>
-#include <span>
 #include <stdexcept>
 #include <string>
 #include <utility>
-#include <vector>
 
 #include "arrays.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/policy.hpp"
-#include "varpin/tableau.hpp"
 
 namespace varpin::border {
 
@@ -185,69 +182,6 @@ void roll_paths(const Mechanism& mechanism, std::size_t paths, int stages, nb::h
     const double* more = drift_of(mechanism, drift, to);
     nb::gil_scoped_release release;
     move(view, dw, more, to.view());
-}
-
-// The arrays from which N steps are repeated.
-class StepsAt {
-  public:
-    StepsAt(const Mechanism& mechanism, const Tableau& tableau, In<2> q, In<2> p, In<3> force, Integers<1> substeps,
-            Bytes halvings)
-        : n(static_cast<std::size_t>(mechanism.dof())),
-          N(q.shape(0)),
-          varies(force.shape(1) != 1),
-          q_(q),
-          p_(p),
-          force_(force),
-          halvings_(halvings),
-          place_(N + 1, 0) {
-        for (const auto& [array, name] : {std::pair{&q, "q"}, {&p, "p"}}) require(*array, name, {N, n});
-        require(force, "force", {N, varies ? static_cast<std::size_t>(tableau.stages) : 1, n});
-        require(substeps, "substeps", {N});
-        for (std::size_t s = 0; s < N; ++s) {
-            const std::int64_t parts = substeps(s);
-            if (parts < 1 || parts > (std::int64_t{1} << 30))
-                throw std::invalid_argument("a step must have from 1 to 2^30 parts");
-            place_[s + 1] = place_[s] + (parts > 1 ? static_cast<std::size_t>(parts) : 0);
-        }
-        require(halvings, "halvings", {place_[N]});
-        for (std::size_t k = 0; k < halvings.size(); ++k) {
-            if (halvings(k) < 1 || halvings(k) > 62)
-                throw std::invalid_argument("parts must have from 1 to 62 halvings");
-        }
-    }
-
-    const std::size_t n, N;
-    const bool varies;  // whether there is a force for each stage
-    const double* q(std::size_t s) const { return q_.data() + s * n; }
-    const double* p(std::size_t s) const { return p_.data() + s * n; }
-    const double* force(std::size_t s) const { return force_.data() + s * force_.shape(1) * n; }
-    // The halvings of the parts of a step; empty for an undivided step.
-    std::span<const std::uint8_t> halvings(std::size_t s) const {
-        return {halvings_.data() + place_[s], place_[s + 1] - place_[s]};
-    }
-    // The number of consecutive undivided steps before a step, up to the number that its guess uses.
-    int past(std::size_t s) const {
-        int found = 0;
-        while (found < 8 && s > static_cast<std::size_t>(found) && place_[s - found - 1] == place_[s]) ++found;
-        return found;
-    }
-
-  private:
-    In<2> q_, p_;
-    In<3> force_;  // (N, 1, n) constant over a step, or (N, s, n)
-    Bytes halvings_;
-    std::vector<std::size_t> place_;  // (N + 1) index of the first part of each step
-};
-
-// The outcome of the first step that was not solved, and the number of steps before it.
-template <class Step>
-std::pair<Outcome, std::size_t> each_step(std::size_t N, const Step& step) {
-    nb::gil_scoped_release release;
-    for (std::size_t s = 0; s < N; ++s) {
-        const Outcome outcome = step(s);
-        if (outcome != Outcome::solved) return {outcome, s};
-    }
-    return {Outcome::solved, N};
 }
 
 }  // namespace varpin::border

@@ -2,16 +2,22 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
 #include <memory>
 #include <optional>
+#include <stdexcept>
 #include <tuple>
+#include <utility>
 #include <vector>
 
 #include "arrays.hpp"
+#include "constrained.hpp"
 #include "registrations.hpp"
-#include "rollout.hpp"
 #include "rollout_arrays.hpp"
 #include "small_arms.hpp"
+#include "steps_at.hpp"
 #include "varpin/linearization.hpp"
 #include "watched.hpp"
 
@@ -29,9 +35,6 @@ Tableau tableau_of(In<2> a, In<2> gradient, In<2> force, In<1> b, In<1> c, In<2>
         require(*array, name, {s, s});
     require(c, "c", {s});
     require(ahead, "ahead", {s, s + 1});
-    const auto copied = [](const auto& array) {
-        return std::vector<double>(array.data(), array.data() + array.size());
-    };
     return {static_cast<int>(s), copied(a), copied(gradient),
             copied(force),       copied(b), copied(c),
             copied(ahead),       reach,     skew,
@@ -43,101 +46,175 @@ Guards guards_of(bool active, double branch_margin, double energy_balance, doubl
     return {active, branch_margin, energy_balance, energy_budget, most_halvings};
 }
 
-class VariationalRollout : public Rollout<VariationalStepper, PathState> {
-  public:
-    VariationalRollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left, std::size_t paths, Solver solver, bool held)
-        : Rollout(mechanism, tableau, guards, paths, held,
-                  std::make_shared<VariationalStepper>(mechanism, tableau, tolerance, guards, left, solver,
-                                                       kernels_of(mechanism))) {}
+// A stepper that the forks of a rollout share; one thread at a time.
+struct SharedStepper {
+    std::unique_ptr<VariationalStepper> stepper;
+    std::atomic<bool> busy = false;
+};
 
-    VariationalRollout fork(const Guards& guards) const { return forked(*this, guards); }
+class Turn {
+  public:
+    explicit Turn(SharedStepper& shared) : shared_(shared) {
+        if (shared.busy.exchange(true))
+            throw std::runtime_error(
+                "two threads advance forks of one rollout at once; each thread needs a rollout of its own");
+    }
+    ~Turn() { shared_.busy = false; }
+    Turn(const Turn&) = delete;
+    Turn& operator=(const Turn&) = delete;
+    VariationalStepper* operator->() const { return shared_.stepper.get(); }
+
+  private:
+    SharedStepper& shared_;
+};
+
+// P paths with the work arrays of a step, the stepper.
+class Rollout {
+  public:
+    Rollout(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double left,
+            std::size_t paths, bool held, const std::optional<In<2>>& places)
+        : mechanism_(&mechanism),
+          shared_(std::make_shared<SharedStepper>()),
+          guards_(guards),
+          stages_(tableau.stages),
+          constrained_(places),
+          states_(paths, PathState(mechanism, tableau.stages)) {
+        if (places) {
+            require(*places, "places", {static_cast<std::size_t>(stages_) + 1, static_cast<std::size_t>(stages_)});
+            shared_->stepper = constrained_stepper(mechanism, tableau, copied(*places), tolerance, guards);
+        } else {
+            shared_->stepper = std::make_unique<VariationalStepper>(mechanism, tableau, tolerance, guards, left,
+                                                                    kernels_of(mechanism));
+        }
+        shared_->stepper->held = held;
+    }
+
+    Rollout fork(const Guards& guards) const {
+        Rollout copy = *this;
+        copy.guards_ = guards;
+        return copy;
+    }
+
+    // Start each path at its row of q and v (P, n); false if an M(q) is not positive definite.
+    bool begin(In<2> q, In<2> v) {
+        const std::size_t n = size();
+        require(q, "q", {states_.size(), n});
+        require(v, "v", {states_.size(), n});
+        const Turn stepper(*shared_);
+        nb::gil_scoped_release release;
+        for (std::size_t i = 0; i < states_.size(); ++i) {
+            if (!stepper->begin(q.data() + i * n, v.data() + i * n, states_[i])) return false;
+        }
+        return true;
+    }
+
+    // Add an impulse (P, n) to the momenta.
+    void kick(In<2> impulse) {
+        require(impulse, "impulse", {states_.size(), size()});
+        const Turn stepper(*shared_);
+        for (std::size_t i = 0; i < states_.size(); ++i) {
+            stepper->look_at(states_[i]);
+            stepper->kick(impulse.data() + i * size(), states_[i]);
+        }
+    }
 
     void roll(double h, nb::handle commands, In<3> increments, In<3> drift, nb::handle nodes, HeldWatch* watch,
               const std::optional<In<4>>& impulses) {
+        const Turn stepper(*shared_);
+        if (impulses && constrained_ && !stepper->held)
+            throw std::invalid_argument("under constraints, impulses have to be held");
         const double* kicks = impulses_of(*mechanism_, impulses, nodes);
         roll_paths(*mechanism_, states_.size(), stages_, commands, increments, drift, nodes,
                    [&](const Commands& by, const double* dw, const double* more, const Nodes& to) {
-                       Watch* watching = watch ? watch->of(to) : nullptr;
-                       stepper_->guards = guards_;
-                       stepper_->roll(h, by, dw, more, kicks, states_, to, watching);
+                       stepper->guards = guards_;
+                       stepper->roll(h, by, dw, more, kicks, states_, to, watch ? watch->of(to) : nullptr);
                    });
+    }
+
+    // Configurations, momenta, velocities (P, n) and energies (P).
+    std::tuple<Out, Out, Out, Out> nodes() const {
+        const std::size_t n = size(), P = states_.size();
+        double *q = nullptr, *p = nullptr, *v = nullptr, *energy = nullptr;
+        const Out Q = array_for(q, {P, n}), MV = array_for(p, {P, n}), V = array_for(v, {P, n});
+        const Out E = array_for(energy, {P});
+        for (std::size_t i = 0; i < P; ++i) {
+            const PathState& path = states_[i];
+            std::copy(path.q.begin(), path.q.end(), q + i * n);
+            std::copy(path.momentum.begin(), path.momentum.end(), p + i * n);
+            std::copy(path.v.begin(), path.v.end(), v + i * n);
+            energy[i] = path.energies.total();
+        }
+        return {Q, MV, V, E};
+    }
+
+    // The halvings of each part of every divided step in the last roll of a path.
+    BytesOut halvings(std::size_t path) const { return array_of(state(path).halvings); }
+
+    // Impulses of the constraints in every step of a path's last roll (steps, m); C' times them act on the joints.
+    Out impulses(std::size_t path) const {
+        const std::vector<double>& all = state(path).impulses;
+        const std::size_t m = state(path).impulse.size();
+        return array_of(all.data(), {m > 0 ? all.size() / m : 0, m});
+    }
+
+    // The constraint row closest to dependence on the others at a path's last state.
+    int weakest(std::size_t path) const { return state(path).weakest; }
+
+  private:
+    const Mechanism* mechanism_;
+    std::shared_ptr<SharedStepper> shared_;
+    Guards guards_;
+    int stages_;
+    bool constrained_;
+    std::vector<PathState> states_;
+
+    std::size_t size() const { return static_cast<std::size_t>(mechanism_->dof()); }
+    const PathState& state(std::size_t path) const {
+        if (path >= states_.size()) throw std::invalid_argument("there is no such path");
+        return states_[path];
     }
 };
 
-std::tuple<Out, Out, Out, std::int64_t, std::size_t> variational_derivatives(
-    const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards, double h, In<2> q,
-    In<2> p, In<3> force, Integers<1> substeps, Bytes halvings, In<3> guess, bool ramp, bool external, Solver solver) {
-    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
+VariationalLinearization linearization(const StepsAt& at) {
+    return {at.mechanism, at.tableau, at.tolerance, at.guards, kernels_of(at.mechanism)};
+}
+
+std::tuple<Out, Out, Out, std::int64_t, std::size_t> derivatives(const StepsAt& at, bool ramp, bool external) {
+    VariationalLinearization work = linearization(at);
     work.varies = at.varies;
     if (external) work.take_external();
-    double* in_ramps = nullptr;
-    const Out R = array_for(in_ramps, {ramp ? at.N : 0, 2 * at.n, at.n});
-    const auto [X, F, outcome, done] =
-        derivatives_of(at, tableau, guess, [&](std::size_t s, const double* next, double* Jx, double* Jf) {
-            double* Jr = ramp ? in_ramps + s * 2 * at.n * at.n : nullptr;
-            return work.first(h, at.q(s), at.p(s), next, at.force(s), at.halvings(s), Jx, Jf, at.past(s), Jr);
-        });
-    return {X, F, R, outcome, done};
+    return at.derivatives(ramp ? at.n : 0, [&](std::size_t s, double* Jx, double* Jf, double* Jr) {
+        return work.first(at.h, at.q(s), at.p(s), at.guess(s), at.force(s), at.halvings(s), Jx, Jf, at.past(s),
+                          ramp ? Jr : nullptr);
+    });
 }
 
 // z . d2(q1, p1)/d(q0, p0, f)2 of each step (N, 3n, 3n), for the rows of z (N, 2n).
-std::tuple<Out, std::int64_t, std::size_t> variational_curvatures(const Mechanism& mechanism, const Tableau& tableau,
-                                                                  double tolerance, const Guards& guards, double h,
-                                                                  In<2> q, In<2> p, In<3> force, Integers<1> substeps,
-                                                                  Bytes halvings, In<3> guess, In<2> z, Solver solver) {
-    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
-    require(guess, "guess", {N, stages, n});
+std::tuple<Out, std::int64_t, std::size_t> curvatures(const StepsAt& at, In<2> z) {
+    const std::size_t N = at.N, n = at.n;
     require(z, "z", {N, 2 * n});
     double* H = nullptr;
-    const Out curvatures = array_for(H, {N, 3 * n, 3 * n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
+    const Out found = array_for(H, {N, 3 * n, 3 * n});
+    VariationalLinearization work = linearization(at);
     work.varies = at.varies;
-    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work.second(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
-                           z.data() + s * 2 * n, H + s * 9 * n * n, at.past(s));
+    const auto [outcome, done] = at.each([&](std::size_t s) {
+        return work.second(at.h, at.q(s), at.p(s), at.guess(s), at.force(s), at.halvings(s), z.data() + s * 2 * n,
+                           H + s * 9 * n * n, at.past(s));
     });
-    return {curvatures, static_cast<std::int64_t>(outcome), done};
-}
-
-// Derivatives in (q0, p0, f) of the sum of weights times d(q1, p1)/d(q0, p0, f) of each step (N, 3n), for weights
-// (N, 2n, 3n).
-std::tuple<Out, std::int64_t, std::size_t> variational_bends(const Mechanism& mechanism, const Tableau& tableau,
-                                                             double tolerance, const Guards& guards, double h, In<2> q,
-                                                             In<2> p, In<3> force, Integers<1> substeps, Bytes halvings,
-                                                             In<3> guess, In<3> weights, Solver solver) {
-    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
-    const std::size_t N = at.N, n = at.n, stages = static_cast<std::size_t>(tableau.stages);
-    require(guess, "guess", {N, stages, n});
-    require(weights, "weights", {N, 2 * n, 3 * n});
-    double* slopes = nullptr;
-    const Out found = array_for(slopes, {N, 3 * n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
-    work.varies = at.varies;
-    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work.bend(h, at.q(s), at.p(s), guess.data() + s * stages * n, at.force(s), at.halvings(s),
-                         weights.data() + s * 6 * n * n, slopes + s * 3 * n, at.past(s));
-    });
-    return {found, static_cast<std::int64_t>(outcome), done};
+    return {found, outcome, done};
 }
 
 // Configurations and velocities (N, n) at the end of each step.
-std::tuple<Out, Out, std::int64_t, std::size_t> variational_ends(const Mechanism& mechanism, const Tableau& tableau,
-                                                                 double tolerance, const Guards& guards, double h,
-                                                                 In<2> q, In<2> p, In<3> force, Integers<1> substeps,
-                                                                 Bytes halvings, Solver solver) {
-    const StepsAt at(mechanism, tableau, q, p, force, substeps, halvings);
+std::tuple<Out, Out, std::int64_t, std::size_t> ends(const StepsAt& at) {
     const std::size_t N = at.N, n = at.n;
     double *q1 = nullptr, *v1 = nullptr;
     const Out Q = array_for(q1, {N, n}), V = array_for(v1, {N, n});
-    VariationalLinearization work(mechanism, tableau, tolerance, guards, solver, kernels_of(mechanism));
+    VariationalLinearization work = linearization(at);
     work.varies = at.varies;
-    const auto [outcome, done] = each_step(N, [&](std::size_t s) {
-        return work.end(h, at.q(s), at.p(s), at.force(s), at.halvings(s), q1 + s * n, v1 + s * n);
+    const auto [outcome, done] = at.each([&](std::size_t s) {
+        return work.end(at.h, at.q(s), at.p(s), at.force(s), at.halvings(s), q1 + s * n, v1 + s * n);
     });
-    return {Q, V, static_cast<std::int64_t>(outcome), done};
+    return {Q, V, outcome, done};
 }
 
 }  // namespace
@@ -149,28 +226,28 @@ void register_rollouts(nb::module_& m) {
     nb::class_<Guards>(m, "Guards")
         .def_static("make", &guards_of, nb::kw_only(), "active"_a, "branch_margin"_a, "energy_balance"_a,
                     "energy_budget"_a, "most_halvings"_a);
-    nb::class_<VariationalRollout>(m, "VariationalRollout")
-        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t, Solver, bool>(),
-             "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "left"_a, "paths"_a, "solver"_a = Solver::automatic,
-             "held"_a = false, nb::keep_alive<1, 2>())
-        .def("fork", &VariationalRollout::fork, "guards"_a, nb::keep_alive<0, 1>())
-        .def("begin", &VariationalRollout::begin, "q"_a, "v"_a)
-        .def("roll", &VariationalRollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,
+    nb::class_<Rollout>(m, "Rollout")
+        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, std::size_t, bool,
+                      std::optional<In<2>>>(),
+             "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "left"_a, "paths"_a, "held"_a = false,
+             "places"_a.none() = nb::none(), nb::keep_alive<1, 2>())
+        .def("fork", &Rollout::fork, "guards"_a, nb::keep_alive<0, 1>())
+        .def("begin", &Rollout::begin, "q"_a, "v"_a)
+        .def("roll", &Rollout::roll, "dt"_a, "commands"_a, "increments"_a, "drift"_a, "nodes"_a,
              "watch"_a.none() = nb::none(), "impulses"_a = nb::none())
-        .def("kick", &VariationalRollout::kick, "impulse"_a)
-        .def("nodes", &VariationalRollout::nodes)
-        .def("halvings", &VariationalRollout::halvings, "path"_a);
-    m.def("variational_derivatives", &variational_derivatives, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "ramp"_a = false,
-          "external"_a = false, "solver"_a = Solver::automatic);
-    m.def("variational_curvatures", &variational_curvatures, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a,
-          "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "z"_a,
-          "solver"_a = Solver::automatic);
-    m.def("variational_bends", &variational_bends, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a,
-          "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "guess"_a, "weights"_a,
-          "solver"_a = Solver::automatic);
-    m.def("variational_ends", &variational_ends, "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a,
-          "p"_a, "force"_a, "substeps"_a, "halvings"_a, nb::kw_only(), "solver"_a = Solver::automatic);
+        .def("kick", &Rollout::kick, "impulse"_a)
+        .def("nodes", &Rollout::nodes)
+        .def("halvings", &Rollout::halvings, "path"_a)
+        .def("impulses", &Rollout::impulses, "path"_a)
+        .def("weakest", &Rollout::weakest, "path"_a);
+    nb::class_<StepsAt>(m, "Steps")
+        .def(nb::init<const Mechanism&, const Tableau&, double, const Guards&, double, In<2>, In<2>, In<3>, Integers<1>,
+                      Bytes, In<3>>(),
+             "mechanism"_a, "tableau"_a, "tolerance"_a, "guards"_a, "dt"_a, "q"_a, "p"_a, "force"_a, "substeps"_a,
+             "halvings"_a, "guess"_a, nb::keep_alive<1, 2>())
+        .def("derivatives", &derivatives, "ramp"_a = false, "external"_a = false)
+        .def("curvatures", &curvatures, "z"_a)
+        .def("ends", &ends);
 }
 
 }  // namespace varpin::border

@@ -2,6 +2,7 @@
 #include "small_arms.hpp"
 
 #include "varpin/guards.hpp"
+#include "varpin/step_equation.hpp"
 
 namespace varpin::border {
 

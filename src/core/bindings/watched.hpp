@@ -13,7 +13,9 @@ namespace varpin::border {
 class HeldWatch {
   public:
     HeldWatch(const CostTerms& costs, In<2> rule, In<2> q, In<2> v, In<2> u, InOut<2> values)
-        : rule_(rule),
+        : costs_(costs),
+          terms_(costs.terms.size()),
+          rule_(rule),
           q_(q),
           v_(v),
           u_(u),
@@ -31,15 +33,24 @@ class HeldWatch {
     Watch* of(const Nodes& nodes) {
         if (nodes.paths != 1 || nodes.steps != static_cast<std::int64_t>(u_.shape(0)))
             throw std::invalid_argument("a watch needs one path and the same number of steps");
+        require_same();
         return &core;
     }
 
     bool after(std::size_t step, std::int64_t parts) {
         if (step >= u_.shape(0)) throw std::invalid_argument("there is no such step");
+        require_same();
         return core.after(static_cast<std::ptrdiff_t>(step), parts);
     }
 
   private:
+    // The work arrays are those of the terms that there were.
+    void require_same() const {
+        if (costs_.terms.size() != terms_) throw std::invalid_argument("terms were added to the costs after the watch");
+    }
+
+    const CostTerms& costs_;
+    std::size_t terms_;
     In<2> rule_, q_, v_, u_;
     InOut<2> values_;
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
-import re
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -122,47 +119,9 @@ def integrator_of_words(text: str) -> Integrator:
         InputError: The name is unknown, or the integrator does not have the option.
     """
     name, bracket, rest = text.strip().partition("(")
-    # Names are compared by letters and digits alone: runge_kutta_4 and RUNGEKUTTA4 are RungeKutta4.
-    plain = {_letters(member): member for member in BY_NAME}
-    if _letters(name) not in plain:
-        matches = difflib.get_close_matches(_letters(name), plain, n=1)
-        hint = f"did you mean {plain[matches[0]]}? " if matches else ""
-        raise InputError(f"there is no integrator {name!r}; {hint}integrators: {', '.join(BY_NAME)}")
-    return integrator_of(plain[_letters(name)] + bracket + rest)
-
-
-def _letters(name: str) -> str:
-    return re.sub(r"[\s_-]", "", name).lower()
-
-
-def simulate_words(request: argparse.Namespace, integrator: Integrator, dt: float, steps: int) -> str:
-    """The command line that simulates the motion of ``request`` with an integrator and a step [s]."""
-    words = ["varpin", "simulate", request.robot, "--integrator", str(integrator), "--dt", repr(dt)]
-    words += ["--steps", str(steps)]
-    if request.lock:
-        words += ["--lock", *(f"{name}={_text(at)}" for name, at in request.lock)]
-    for folder in request.package_dir or ():
-        words += ["--package-dir", folder]
-    words += ["--base", request.base] if request.base is not None else []
-    words += ["--srdf", request.srdf] if request.srdf is not None else []
-    for option in ("armature", "q0", "v0", "damping", "friction", "stiffness", "rest", "torque"):
-        if (given := getattr(request, option)) is not None:
-            words += [f"--{option}", *(_text(item) for item in given)]
-    words += ["--constraints", request.constraints] if request.constraints is not None else []
-    if request.gravity is False:
-        words.append("--no-gravity")
-    elif request.gravity is not True:
-        words += ["--gravity", *(_text(g) for g in request.gravity)]
-    return shlex.join(words)
-
-
-def _text(value: object) -> str:
-    """An option's value as a word of the command line: a number, several with commas, or JOINT=VALUE."""
-    if isinstance(value, tuple):
-        return f"{value[0]}={_text(value[1])}"
-    if isinstance(value, list):
-        return ",".join(map(_text, value))
-    return value if isinstance(value, str) else repr(value)
+    # runge_kutta_4 and RUNGEKUTTA4 are RungeKutta4.
+    plain = {member.lower(): member for member in BY_NAME}
+    return integrator_of(plain.get(name.replace("_", "").lower(), name) + bracket + rest)
 
 
 def add_gravity(group: argparse._ActionsContainer) -> None:
@@ -283,8 +242,7 @@ def scene_file(request: argparse.Namespace, word: str, *given: str) -> SceneFile
             option = name.replace("_", "-") if getattr(request, name) is not False else f"no-{name}"
             raise InputError(f"--{option} cannot be given with a scene file: {command} {word} takes it from the file")
     scene = load_scene(word)
-    outputs = scene.spec.outputs
-    for name in ("save", "plot", "html", "speed"):
-        if hasattr(request, name) and getattr(request, name) is None:
-            setattr(request, name, getattr(outputs, name))
+    for name, value in scene.outputs.items():
+        if getattr(request, name, value) is None:
+            setattr(request, name, value)
     return scene

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import logging
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -20,7 +21,11 @@ INTERVAL = 10.0
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, without a list of options."""
+    """A parser whose errors are one line, without a list of options, and which knows numbers such as -1e-3."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._negative_number_matcher = re.compile(r"-(\d|\.\d|inf|nan)")
 
     def error(self, message: str) -> NoReturn:
         """Print the error and a hint at --help; exit with status 2."""

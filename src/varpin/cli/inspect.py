@@ -18,7 +18,7 @@ from varpin.cli.arguments import (
     values_of,
 )
 from varpin.cli.console import show
-from varpin.model import build_robot, robot_names
+from varpin.model import load_robot, robot_names
 from varpin.show.inspection import inspect_robot
 from varpin.support.tables import Table
 
@@ -39,10 +39,9 @@ def add_inspect(parser: argparse.ArgumentParser) -> None:
 
 def _inspect_scene(request: argparse.Namespace) -> int:
     file = scene_file(request, request.robot, "inspect", *ROBOT_OPTIONS, "gravity", "q", "v")
-    spec, required = file.spec, file.required
-    rows = [("robot", file.robot.name), *required.rows]
-    rows.append(("horizon", f"{spec.steps} steps of {spec.dt:g} s, {file.integrator}"))
-    show(Table(f"{spec.title} ({spec.path.name})", (), rows))
+    rows = [("robot", file.robot.name), *file.required.rows]
+    rows.append(("horizon", f"{file.steps} steps of {file.dt:g} s, {file.integrator}"))
+    show(Table(f"{file.title} ({file.path.name})", (), rows))
     return 0
 
 
@@ -65,6 +64,6 @@ def add_robots(parser: argparse.ArgumentParser) -> None:
 
 
 def _robots(_request: argparse.Namespace, _errors: Console) -> int:
-    show(Table("Robots", ("name", "joints"), [(name, build_robot(name).dof) for name in robot_names()]))
+    show(Table("Robots", ("name", "joints"), [(name, load_robot(name).dof) for name in robot_names()]))
     show("joints without mimic joints; --lock locks some of them")
     return 0

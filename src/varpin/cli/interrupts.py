@@ -1,4 +1,4 @@
-"""Ctrl-C: the first stops the run and keeps its results, the second waits for files in progress, the third ends all."""
+"""Ctrl-C: the first stops the run and keeps its results, the second ends all."""
 
 from __future__ import annotations
 
@@ -14,36 +14,40 @@ from rich.console import Console
 from varpin.cli.console import say
 
 _STOPPING = "Ctrl-C: stopping"
-_KEEPING = "Ctrl-C: stopping; what is done is kept"
-_WAIT = "Ctrl-C again: what is done is being kept, which takes a moment; a third one ends without it"
-_ENDING = "Ctrl-C a third time: ending"
+_KEEPING = "Ctrl-C: stopping; what is done is kept, and a second one ends without it"
+_ENDING = "Ctrl-C again: ending"
 
 
 class Interrupts:
     """Handler of SIGINT within a ``with`` block in the main thread.
 
     Python calls a signal handler between two of its instructions, and a call of the core may last for seconds. A thread
-    therefore prints an answer at once; the handler acts later. Outside :meth:`keeping` every Ctrl-C raises
-    KeyboardInterrupt. Within it the first one does, unless a file is being :meth:`written`; the second one sets
-    ``wanted``, and the third one raises again.
+    therefore prints an answer at once; the handler acts later. Every Ctrl-C raises KeyboardInterrupt, but for a first
+    one while a file is being :meth:`written`, which sets ``wanted``.
 
     Attributes:
         wanted: Whether to finish the current file and write no other.
-        ended: Whether to write nothing more.
     """
 
     def __init__(self, console: Console) -> None:
-        self.wanted = self.ended = False
+        self.wanted = False
         self._console = console
         self._keeping = self._writing = False
         self._received = self._handled = 0
-        self._raised = False
         self._undo = contextlib.ExitStack()
 
     def __enter__(self) -> Interrupts:
         main = threading.current_thread() is threading.main_thread()
         if main and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-            self._listen()
+            reader, writer = os.pipe()
+            os.set_blocking(writer, False)
+            thread = threading.Thread(target=self._answer, args=(reader,), daemon=True)
+            thread.start()
+            self._undo.callback(os.close, reader)
+            self._undo.callback(thread.join)
+            self._undo.callback(os.close, writer)
+            self._undo.callback(signal.set_wakeup_fd, signal.set_wakeup_fd(writer, warn_on_full_buffer=False))
+            self._undo.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, self._handle))
         return self
 
     def __exit__(
@@ -63,41 +67,26 @@ class Interrupts:
     @contextlib.contextmanager
     def written(self) -> Iterator[None]:
         """A block within :meth:`keeping` that writes one file."""
+        # Python handles several signals within one call of the core as one.
+        if self._received > max(1, self._handled):
+            raise KeyboardInterrupt
         self._writing = True
         try:
             yield
         finally:
             self._writing = False
 
-    def _listen(self) -> None:
-        reader, writer = os.pipe()
-        os.set_blocking(writer, False)
-        thread = threading.Thread(target=self._answer, args=(reader,), daemon=True)
-        thread.start()
-        self._undo.callback(os.close, reader)
-        self._undo.callback(thread.join)
-        self._undo.callback(os.close, writer)
-        before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-        self._undo.callback(signal.set_wakeup_fd, before)
-        self._undo.callback(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, self._handle))
-
     def _answer(self, reader: int) -> None:
         """Print an answer to each SIGINT at once, even while the main thread is in the core."""
         while number := os.read(reader, 1):
             if number[0] == signal.SIGINT:
                 self._received += 1
-                answer = _STOPPING
-                if self._keeping:
-                    answer = {1: _KEEPING, 2: _WAIT}.get(self._received, _ENDING)
-                say(self._console, answer)
+                first = _KEEPING if self._keeping else _STOPPING
+                say(self._console, first if self._received == 1 else _ENDING)
 
     def _handle(self, _number: int, _frame: FrameType | None) -> None:
-        # Python handles several signals within one call of the core as one.
-        self._handled = max(self._handled + 1, self._received)
-        if self._keeping:
-            self.ended = self._handled > 2
-            self.wanted = self.ended or self._handled == 2 or self._writing
-            if not self.ended and (self._raised or self._writing):
-                return
-            self._raised = True
-        raise KeyboardInterrupt
+        self._handled += 1
+        if self._writing and self._handled == 1:
+            self.wanted = True
+        else:
+            raise KeyboardInterrupt

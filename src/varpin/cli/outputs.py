@@ -14,7 +14,6 @@ from varpin.cli.exits import INTERRUPTED, MISTAKE
 from varpin.cli.interrupts import Interrupts
 from varpin.errors import FileError, InputError, VarpinError
 from varpin.io.archive import atomic_file
-from varpin.io.scenefile.tables import FIGURES
 from varpin.marks import Marks
 from varpin.model import Robot
 from varpin.show.replay.video import FORMATS, check_film
@@ -66,7 +65,7 @@ def writers_of(request: argparse.Namespace, marks: MarksOf | None = None) -> Wri
     found: Writers = {}
     for option, endings, make in (
         ("save", (".npz",), _record),
-        ("plot", FIGURES, _figure),
+        ("plot", (".png", ".pdf", ".svg"), _figure),
         ("html", (".html", ".htm"), _replay),
         ("video", FORMATS, _replay),
     ):
@@ -109,8 +108,7 @@ def _replay(
 
         task = Marks() if marks is None else marks(trajectory.duration)
         shown, files = replace(task, trace=request.trace or task.trace), {option: path}
-        loop, html, video = not getattr(request, "once", False), files.get("html"), files.get("video")
-        replay(robot, trajectory, html=html, video=video, speed=speed, loop=loop, marks=shown)
+        replay(robot, trajectory, html=files.get("html"), video=files.get("video"), speed=speed, marks=shown)
 
     return write
 
@@ -130,7 +128,7 @@ def write_all(
     written: list[Path] = []
     status = 0
     for path, write in files.items():
-        if interrupts.ended or (interrupts.wanted and (written or status)):
+        if interrupts.wanted:
             complain(errors, f"{path} was not written: interrupted")
             continue
         try:

@@ -46,7 +46,6 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     outputs.add_argument("--ghost", type=Path, metavar="NPZ", help="a second motion of the robot, drawn translucent")
     outputs.add_argument("--frames", nargs="+", default=[], metavar="FRAME", help="draw frames as triads")
     outputs.add_argument("--torques", action="store_true", help="colour links by the torques of their joints")
-    outputs.add_argument("--once", action="store_true", help="stop at the end, instead of starting again")
 
 
 def _replay(request: argparse.Namespace, errors: Console) -> int:
@@ -77,7 +76,7 @@ def _window(request: argparse.Namespace, errors: Console, robot: Robot, motion: 
     """Show the motion in a live window, until Ctrl-C."""
     from varpin.show.replay.motion import replay  # noqa: PLC0415 - meshcat is slow to import
 
-    viewer = replay(robot, motion, open=True, speed=speed_of(request), loop=not request.once, marks=marks)
+    viewer = replay(robot, motion, open=True, speed=speed_of(request), marks=marks)
     say(errors, f"{motion!r} at {viewer.url()}; Ctrl-C ends it")  # type: ignore[union-attr]
     try:
         while True:

@@ -30,7 +30,7 @@ from varpin.mechanics.scene import Scene
 from varpin.show.given import frame_names
 from varpin.simulation.failures import Interrupted, StepFailure
 from varpin.simulation.simulate import simulate
-from varpin.simulation.time_steps import time_steps
+from varpin.simulation.start import time_steps
 from varpin.support.checks import count, positive
 from varpin.support.tables import Table
 from varpin.trajectory import Trajectory
@@ -76,9 +76,8 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
 def _simulate(request: argparse.Namespace, errors: Console) -> int:
     if names_scene(request.robot):
         file = scene_file(request, request.robot, "simulate", *_OF_MOTIONS)
-        driven = bool(not file.scene.conservative or file.controls() is not None or file.spec.simulate.seed is not None)
         outputs = writers_of(request, file.marks)
-        return _run(request, errors, file.scene, driven, file.spec.steps, lambda p: file.simulate(progress=p), outputs)
+        return _run(request, errors, file.scene, file.driven, file.steps, lambda p: file.simulate(progress=p), outputs)
     outputs = writers_of(request)
     steps = _steps(request)
     integrator = None if request.integrator is None else integrator_of_words(request.integrator)

@@ -110,7 +110,7 @@ def _plan_table(file: SceneFile, solution: Solution, told: str, wall_time: float
     unit = "own units" if file.scene.inputs or values["PositionServo"].size else "N m or N"
     most = np.abs(solution.trajectory.u).max(axis=0, initial=0.0)
     return Table(
-        file.spec.title,
+        file.title,
         (),
         [
             *rows,

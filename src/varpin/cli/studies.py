@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from rich.console import Console
 
-from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options, simulate_words
+from varpin.cli.arguments import add_motion, add_robot, motion_of, robot_options
 from varpin.cli.console import progress_bar, say, show
 from varpin.cli.exits import FAULTY, INTERRUPTED, STEP_FAILED
 from varpin.cli.outputs import folder_at
@@ -83,7 +84,9 @@ def _advise(request: argparse.Namespace, errors: Console) -> int:
     options = {"controls": torque, "tolerance": request.tolerance, "budget": request.budget}
     advice = advise(scene, q0, v0, duration=request.duration, **options)
     show("\n".join(advice.notes))
-    show(f"run it: {simulate_words(request, advice.integrator, advice.dt, advice.steps)}")
+    best = advice.best
+    words = ["--integrator", str(best.integrator), "--dt", repr(best.dt), "--steps", str(best.steps)]
+    show(f"run it: varpin simulate {shlex.quote(request.robot)} {shlex.join(words)}, and the same start and forces")
     show(advice.table("The best of each method"))
     show(f"(found in {advice.calibration:.2g} s)")
     goal = f"{advice.tolerance:g} in q" if advice.tolerance is not None else f"{advice.budget:g} s"

@@ -11,9 +11,6 @@ from varpin.control.monte_carlo import MonteCarloInterrupted as MonteCarloInterr
 from varpin.control.multipliers import ConstraintReport as ConstraintReport
 from varpin.control.multipliers import Multipliers as Multipliers
 from varpin.control.problem import OptimalControlProblem as OptimalControlProblem
-from varpin.control.receding import Kept as Kept
-from varpin.control.receding import kept as kept
-from varpin.control.receding import replan as replan
 from varpin.control.solution import Solution as Solution
 from varpin.control.solution import Violations as Violations
 from varpin.control.solution_file import solution_trajectory as solution_trajectory

@@ -34,6 +34,9 @@ _OUTSIDE = 1e-6
 _SAME = 1e-3
 # Distance of a peak from its bound up to which it gets a row, too, relative to the constraint's scale.
 _NEAR = 1e-3
+# Violation between nodes from which rows are added: where the problem asks for them, and in tenths of a constraint's
+# range with linear controls, which lead around nodes.
+_BETWEEN, _SHARE = 1e-6, 1e-3
 # Marks a row that is not enforced, in the place of its moment.
 UNUSED = -1.0
 
@@ -203,6 +206,28 @@ def seen(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats | No
             c[0][:, c[0, 0] > _OUTSIDE] = -np.inf
             found[i] = c
     return found
+
+
+def followed(problem: OptimalControlProblem, instants: Instants, motion: Trajectory, backoff: list[Floats]) -> Instants:
+    """The instants, and those at peaks of a motion that violates constraints between its nodes; itself if none does.
+
+    Args:
+        problem: The problem, without rows between nodes.
+        instants: Those so far.
+        motion: The motion.
+        backoff: Margins of all constraints at the nodes (K, rows).
+    """
+    if not any(watched(problem)) or not (problem.linear or problem.between_nodes):
+        return instants
+    values = seen(problem, motion)
+    if values is None:
+        return instants
+    most = [_BETWEEN if problem.between_nodes else _SHARE * item.scale for item in problem.bound_constraints]
+    if not (beyond(values, backoff) > np.array(most)).any():
+        return instants
+    made = extended(problem, instants, values, backoff)
+    same = np.array_equal(made.rows, instants.rows) and np.array_equal(made.moments, instants.moments)
+    return instants if same else made
 
 
 def extended(

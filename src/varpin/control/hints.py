@@ -18,10 +18,8 @@ from varpin.control.constraints import (
     PlanConstraint,
     ReachFrame,
     WithinJointLimits,
-    WithinVelocityLimits,
 )
-from varpin.control.costs import Cost, FramePositionCost, Terminal, TrackingCost
-from varpin.control.costs.base import Scaled, weight_matrix
+from varpin.control.costs import Cost, FramePositionCost, TrackingCost, weight_matrix
 from varpin.control.problem import OptimalControlProblem
 from varpin.finding import Finding
 from varpin.mechanics.scene import closest_controls
@@ -32,7 +30,6 @@ from varpin.model import (
     IN_MILLIMETRES,
     Robot,
     degrees_hint,
-    degrees_per_second_hint,
     joint_unit,
     looks_like_degrees,
     millimetres_hint,
@@ -63,7 +60,7 @@ _SAME = 1e-6
 
 def hints(problem: OptimalControlProblem) -> list[Finding]:
     """Findings about constraints that no motion satisfies, and about values that look like degrees or millimetres."""
-    found = [*in_other_units(problem.scene, problem.q0, problem.v0)]
+    found = [*in_other_units(problem.scene, problem.q0)]
     found += [*_goals(problem), *_targets(problem), *_limits(problem), *_ends(problem), *_places(problem)]
     found += _weights(problem)
     for bound in problem.bound_constraints:
@@ -146,7 +143,7 @@ def _goals(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _targets(problem: OptimalControlProblem) -> Iterator[Finding]:
     """Targets of costs on a frame's position that are out of reach, or look like millimetres."""
     robot, named = problem.scene.robot, set()
-    for term in _parts(problem.cost):
+    for term in problem.cost.terms:
         if not isinstance(term, FramePositionCost) or callable(term.target) or term.frame in named:
             continue
         frame = frame_kinematics(robot, term.frame)
@@ -165,21 +162,15 @@ def _targets(problem: OptimalControlProblem) -> Iterator[Finding]:
 def _away(term: FramePositionCost, root: Floats) -> float:
     """Largest distance of a target from the root in the directions that have a weight [m]."""
     off = np.atleast_2d(np.asarray(term.target)) - root
-    strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, term.size))
+    strengths, axes = np.linalg.eigh(weight_matrix("FramePositionCost", term.weight, 3))
     off = off @ axes[:, strengths > _SAME * strengths[-1]]
     return float(np.linalg.norm(off, axis=1).max())
 
 
 def _limits(problem: OptimalControlProblem) -> Iterator[Finding]:
-    """Limits of joints that look like degrees, and those of velocities that look like degrees per second."""
+    """Limits of joints that look like degrees."""
     turning = _turning(problem.scene.robot)
     for limits in problem.constraints:
-        if isinstance(limits, WithinVelocityLimits):
-            given = np.isfinite(limits.limits) & (np.abs(limits.limits) != limits.robot.velocity_limit)
-            fast = np.where(given, np.abs(limits.limits), 0.0).max(axis=0)
-            sentence = degrees_per_second_hint(limits.robot, f"{limits.label}: limit", fast)
-            if sentence:
-                yield Finding("limits in degrees", sentence)
         if not isinstance(limits, WithinJointLimits):
             continue
         # Limits of the robot's description are in radians, however wide.
@@ -322,20 +313,5 @@ def _turning(robot: Robot) -> Floats:
 
 
 def _last(cost: Cost) -> Iterator[Cost]:
-    """The terminal costs, without factors."""
-    return (part for part, at_end in _parts_of(cost) if at_end)
-
-
-def _parts(cost: Cost) -> Iterator[Cost]:
-    """The running and terminal costs, without factors."""
-    return (part for part, _ in _parts_of(cost))
-
-
-def _parts_of(cost: Cost) -> Iterator[tuple[Cost, bool]]:
-    """The terms of a cost without factors, and whether each is terminal."""
-    for term in cost.terms:
-        inner, at_end = term, False
-        while isinstance(inner, Terminal | Scaled):
-            at_end = at_end or isinstance(inner, Terminal)
-            inner = inner.cost
-        yield from ((part.cost if isinstance(part, Scaled) else part, at_end) for part in inner.terms)
+    """The terminal costs."""
+    return (term for term in cost.terms if term.at_end)

@@ -52,14 +52,15 @@ class Iteration:
         index: Number of the iteration, from 0.
         cost: Cost of the motion after the iteration, without noise.
         noise_cost: Cost added by noise to the motion before the iteration.
+        violation: Sum of all violations of constraints by that motion, margins included, in tenths of their ranges.
         expected_decrease: Decrease of the expected cost by the quadratic model with a full step.
         decrease: Actual decrease of the expected cost, with the plan's model of the noise; 0 without a step.
         step: Length of the accepted step, 0 if there is none; 4 or more of one that was extended as the cost fell on
-            beyond. Of a step along foreseen states it is the share of their changes.
+            beyond.
         regularization: Relative to the diagonal of Quu.
         gradient: Largest entry of the gradient in the controls, with the multipliers of constraints.
         backward_passes: Number of backward passes: with different regularizations, and for goals and noise.
-        rollouts: Number of trials of the line search, one along foreseen states included.
+        rollouts: Number of trials of the line search.
         seconds: Time of the iteration [s].
         second_order: Whether second derivatives of the dynamics were used.
     """
@@ -67,6 +68,7 @@ class Iteration:
     index: int
     cost: float
     noise_cost: float
+    violation: float
     expected_decrease: float
     decrease: float
     step: float
@@ -97,6 +99,7 @@ class SearchState:
         growth: Last factor of the regularization.
         first: Cost at stake on the first motion; -1 before it is known.
         counts: How often margins have been widened by counting motions.
+        since: Number of iterations before rows between nodes or margins were last widened.
         second_order: Whether it uses second derivatives of the steps.
         iterations: Number of entries of the history that were made before.
     """
@@ -106,6 +109,7 @@ class SearchState:
     growth: float
     first: float
     counts: int
+    since: int
     second_order: bool
     iterations: int
 

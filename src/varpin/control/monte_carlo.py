@@ -132,7 +132,7 @@ class MonteCarloInterrupted(KeyboardInterrupt):
     """Ctrl-C during :meth:`Solution.monte_carlo`.
 
     Attributes:
-        result: The result of the paths done, and of those that threads had begun; None if there are fewer than two.
+        result: The result of the paths done; None if there are fewer than two.
     """
 
     def __init__(self, result: MonteCarlo | None) -> None:

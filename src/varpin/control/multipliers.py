@@ -113,7 +113,8 @@ class ConstraintReport(Frozen):
         most = float(np.abs(self.multipliers).max(initial=0.0))
         worst = f"violated by {self.violation:.1e} {self.unit} at most"
         worst += f" ({self.where})" if self.violation > FEASIBLE else ""
-        return f"{self.label}: {worst}, {held} of {self.values.size} bounds active, multipliers up to {most:.3g}"
+        active = f", {held} of {self.values.size} bounds active, multipliers up to {most:.3g}" if held else ""
+        return f"{self.label}: {worst}{active}"
 
     __repr__ = __str__
 

@@ -37,12 +37,7 @@ class Program:
     """The program (O10) of one motion; :meth:`minimum` solves it, with other values of its rows for corrections."""
 
     def __init__(
-        self,
-        stages: Stages,
-        rows: Sequence[Rows],
-        limits: tuple[Floats, Floats],
-        plan: Plan,
-        regularization: float,
+        self, stages: Stages, rows: Sequence[Rows], limits: tuple[Floats, Floats], plan: Plan, regularization: float
     ) -> None:
         """Assemble the matrices.
 
@@ -58,47 +53,32 @@ class Program:
             regularization: A further cost of half the squares of the controls' changes, relative to the diagonal of
                 Quu.
         """
-        self.rows, layout = tuple(rows), stages.layout
-        self.layout, size = layout, layout.size
+        layout = stages.layout
+        self._layout, self._equalities = layout, [row.equality for row in rows]
+        self._forms: dict[float | None, _Form] = {}  # by the weight of the rows
         at, beside = layout.decisions(plan.feedback, plan.previous)
         Quu = _products(plan.factors)
+        diagonal = np.diagonal(Quu, axis1=1, axis2=2)
         pull = np.swapaxes(beside, 1, 2) @ Quu
         hessian = pull @ beside
         own = np.arange(-Quu.shape[1], 0)
-        hessian[:, own, own] += regularization * np.diagonal(Quu, axis1=1, axis2=2)
-        self._P = _matrix([_square(at, hessian)], (size, size))
+        hessian[:, own, own] += regularization * diagonal
         # Largest cost of a control's change by one.
-        self.stiffness = float(np.diagonal(Quu, axis1=1, axis2=2).max())
+        self.stiffness = float(diagonal.max())
         gradient = -(pull @ plan.feedforward[:, :, None])[:, :, 0]
-        self._gradient = np.zeros(size)
-        np.add.at(self._gradient, at[at >= 0], gradient[at >= 0])
         # The scale of the cost, to which the solver's residuals are relative.
         self._scale = float(np.abs(gradient).max()) or float(np.abs(hessian).max()) or 1.0
-        k = np.arange(layout.stages)
-        after, controls = layout.state(k + 1), layout.control(np.arange(len(plan.feedforward)))
-        numbers = np.arange(after.size).reshape(after.shape)
-        self._dynamics = _matrix(
-            [_rectangle(numbers, layout.in_stage(k), stages.J), (numbers.ravel(), after.ravel(), -np.ones(after.size))],
-            (after.size, size),
-        )
-        self._lower, self._upper = np.full(size, -np.inf), np.full(size, np.inf)
+        self._gradient = np.zeros(layout.size)
+        np.add.at(self._gradient, at[at >= 0], gradient[at >= 0] / self._scale)
+        self._lower, self._upper = np.full(layout.size, -np.inf), np.full(layout.size, np.inf)
+        controls = layout.control(np.arange(len(plan.feedforward)))
         self._lower[controls], self._upper[controls] = limits
-        self._blocks = [self._of_rows(row, size) for row in self.rows]
-
-    @staticmethod
-    def _of_rows(rows: Rows, size: int) -> sp.csc_matrix:
-        count, width = rows.at.shape
-        numbers = np.repeat(np.arange(count), width)
-        return _matrix([(numbers, rows.at.ravel(), rows.slopes.ravel())], (count, size))
-
-    def _slacks(self, equal: Sequence[int], other: Sequence[int]) -> list[Floats]:
-        """Where the slacks of rows belong among the variables: the two of each equality, then those of other rows."""
-        last = [self.rows[i].at.max(axis=1).astype(float) for i in (*equal, *other)]
-        return [*last[: len(equal)], *last[: len(equal)], *last[len(equal) :]]
-
-    def after_rows(self, z: Floats) -> list[Floats]:
-        """Changes (P,) of the values of all rows at z."""
-        return [block @ z for block in self._blocks]
+        k = np.arange(layout.stages)
+        after = layout.state(k + 1)
+        numbers = np.arange(after.size).reshape(after.shape)
+        self._hessian = _rectangle(at, at, hessian / self._scale)
+        self._dynamics = [_rectangle(numbers, layout.in_stage(k), stages.J), (numbers, after, -np.ones(after.shape))]
+        self._rows = [(row.at, row.slopes) for row in rows]
 
     def minimum(
         self, values: Sequence[Floats], gaps: Floats | None = None, weight: float | None = None
@@ -110,72 +90,97 @@ class Program:
             gaps: What the stages miss the states by at z = 0 (R, 2n); zero by default.
             weight: Cost of a violation of each row by one; by default rows are hard.
         """
-        equal = [i for i, rows in enumerate(self.rows) if rows.equality]
-        other = [i for i, rows in enumerate(self.rows) if not rows.equality]
-        A = sp.vstack([self._dynamics, *(self._blocks[i] for i in equal)], format="csc")
-        b = np.concatenate(
-            [np.zeros(self._dynamics.shape[0]) if gaps is None else gaps.ravel(), *(-values[i] for i in equal)]
-        )
-        P, c, lower, upper = self._P / self._scale, self._gradient / self._scale, self._lower, self._upper
-        G = sp.vstack([self._blocks[i] for i in other], format="csc") if other else None
-        h = np.concatenate([-values[i] for i in other]) if other else None
-        size = len(c)
-        if weight is not None:
-            of_equal, of_other = len(b) - self._dynamics.shape[0], 0 if h is None else len(h)
-            slack = 2 * of_equal + of_other
-            cost = weight / self._scale
-            P = sp.block_diag([P, _UNIQUE * cost * sp.eye(slack)], format="csc")
-            c, lower = np.append(c, np.full(slack, cost)), np.append(lower, np.zeros(slack))
-            upper = np.append(upper, np.full(slack, np.inf))
-            one, other_one = sp.eye(of_equal), sp.eye(of_other)
-            both = sp.hstack([one, -one, sp.csc_matrix((of_equal, of_other))])
-            none = sp.csc_matrix((self._dynamics.shape[0], slack))
-            A = sp.hstack([A, sp.vstack([none, both])], format="csc")
-            if G is not None:
-                G = sp.hstack([G, sp.csc_matrix((of_other, 2 * of_equal)), -other_one], format="csc")
-        # The solver factors stage by stage, if the slacks of rows are where their stages are.
-        order = np.argsort(
-            np.concatenate([np.arange(size), *self._slacks(equal, other)]) if weight is not None else np.arange(size),
-            kind="stable",
-        )
-        P, A, G = P[order][:, order], A[:, order], None if G is None else G[:, order]
-        found = _solved(P, c[order], A, b, G, h, lower[order], upper[order])
+        layout = self._layout
+        still = np.zeros(layout.stages * layout.states) if gaps is None else gaps.ravel()
+        b, h = [still], [np.zeros(0)]
+        for equality, c in zip(self._equalities, values, strict=True):
+            (b if equality else h).append(-c)
+        if weight not in self._forms:
+            self._forms[weight] = self._form(weight)
+        form = self._forms[weight]
+        found = form.solve(np.concatenate(b), np.concatenate(h))
         if found is None:
             return None
-        z = np.empty(len(order))
-        z[order] = found.x
-        y = self._scale * found.y
-        own = iter(np.split(y[self._dynamics.shape[0] :], np.cumsum([len(values[i]) for i in equal])[:-1]))
-        push = iter(np.split(self._scale * found.z_u, np.cumsum([len(values[i]) for i in other])[:-1]) if other else ())
-        multipliers = tuple(next(own) if rows.equality else next(push) for rows in self.rows)
-        return Minimum(z[:size], multipliers, float(z[size:].sum()))
+        z, (own, push) = (
+            found.x[form.rank],
+            (
+                iter(np.split(self._scale * part, np.cumsum([len(piece) for piece in some[:-1]]))[1:])
+                for part, some in ((found.y, b), (found.z_u, h))
+            ),
+        )
+        multipliers = tuple(next(own) if equality else next(push) for equality in self._equalities)
+        return Minimum(z[: layout.size], multipliers, float(z[layout.size :].sum()))
+
+    def _form(self, weight: float | None) -> _Form:
+        """The matrices of the program with hard rows, or of a weight."""
+        size, first = self._layout.size, [self._layout.stages * self._layout.states, 0]
+        parts, slacks, places = [list(self._dynamics), list[_Entries]()], list[_Entries](), [np.arange(size)]
+        for equality, (at, slopes) in zip(self._equalities, self._rows, strict=True):
+            i, kind = np.arange(len(at))[:, None], 0 if equality else 1
+            parts[kind].append((first[kind] + i, at, slopes))
+            for sign in () if weight is None else (1.0, -1.0) if equality else (-1.0,):
+                parts[kind].append((first[kind] + i, size + i, np.full(i.shape, sign)))
+                slacks.append((size + i, size + i, np.full(i.shape, _UNIQUE)))
+                places.append(at.max(axis=1))
+                size += len(i)
+            first[kind] += len(i)
+        # The solver factors stage by stage: slacks belong where their stages are, of an equality two.
+        order = np.argsort(np.concatenate(places), kind="stable")
+        rank = np.append(np.argsort(order), -1)
+        cost, slack = (weight or 0.0) / self._scale, size - self._layout.size
+        squares = [self._hessian, *((i, j, cost * part) for i, j, part in slacks)]
+        c = np.append(self._gradient, np.full(slack, cost))[order]
+        lower = np.append(self._lower, np.zeros(slack))[order]
+        upper = np.append(self._upper, np.full(slack, np.inf))[order]
+        P = _matrix([(rank[i], j, part) for i, j, part in squares], size, rank)
+        A, G = (_matrix(own, count, rank) if own else None for own, count in zip(parts, first, strict=True))
+        return _Form(P, c, A, G, lower, upper, rank[:-1])
 
 
-def _solved(
-    P: sp.csc_matrix,
-    c: Floats,
-    A: sp.csc_matrix,
-    b: Floats,
-    G: sp.csc_matrix | None,
-    h: Floats | None,
-    lower: Floats,
-    upper: Floats,
-) -> Any:
-    """PIQP's result; None where there is no minimum or the solver fails."""
-    # Stage by stage is faster, the factors of the whole matrix are more accurate.
-    for kind in (piqp.KKTSolver.sparse_multistage, piqp.KKTSolver.sparse_ldlt):
-        solver = piqp.SparseSolver()
-        settings = solver.settings
-        settings.kkt_solver = kind
-        settings.eps_abs, settings.eps_rel, settings.max_iter = _ABSOLUTE, _RELATIVE, _STEPS
-        solver.setup(P, c, A, b, G, None, h, lower, upper)
-        status, known = solver.solve(), solver.result.info
-        rounded = status == piqp.PIQP_MAX_ITER_REACHED and max(known.primal_res, known.dual_res) <= _ROUNDED
-        if status == piqp.PIQP_SOLVED or rounded:
-            return solver.result
-        if status == piqp.PIQP_PRIMAL_INFEASIBLE:
-            return None
-    return None
+class _Form:
+    """A program whose right sides may change."""
+
+    def __init__(
+        self,
+        P: sp.csc_matrix,
+        c: Floats,
+        A: sp.csc_matrix | None,
+        G: sp.csc_matrix | None,
+        lower: Floats,
+        upper: Floats,
+        rank: Integers,
+    ) -> None:
+        self._given, self.rank = (P, c, A, G, lower, upper), rank
+        self._solvers: dict[Any, Any] = {}
+
+    def solve(self, b: Floats, h: Floats) -> Any:
+        """PIQP's result; None where there is no minimum or the solver fails."""
+        P, c, A, G, lower, upper = self._given
+        most = None if G is None else h
+        # Stage by stage is faster, the factors of the whole matrix are more accurate.
+        for kind in (piqp.KKTSolver.sparse_multistage, piqp.KKTSolver.sparse_ldlt):
+            if kind in self._solvers:
+                solver = self._solvers[kind]
+                solver.update(b=b, h_u=most)
+            else:
+                solver = self._solvers[kind] = piqp.SparseSolver()
+                settings = solver.settings
+                settings.kkt_solver = kind
+                settings.eps_abs, settings.eps_rel, settings.max_iter = _ABSOLUTE, _RELATIVE, _STEPS
+                solver.setup(P, c, A, b, G, None, most, lower, upper)
+            status, known = solver.solve(), solver.result.info
+            rounded = status == piqp.PIQP_MAX_ITER_REACHED and max(known.primal_res, known.dual_res) <= _ROUNDED
+            if status == piqp.PIQP_SOLVED or rounded:
+                return solver.result
+            if status == piqp.PIQP_PRIMAL_INFEASIBLE:
+                return None
+        return None
+
+
+def changes(rows: Sequence[Rows], z: Floats) -> list[Floats]:
+    """Changes (P,) of the values of all rows at z."""
+    padded = np.append(z, 0.0)
+    return [(row.slopes * padded[row.at]).sum(axis=1) for row in rows]
 
 
 def _products(factors: Floats) -> Floats:
@@ -188,20 +193,15 @@ def _products(factors: Floats) -> Floats:
 _Entries = tuple[Integers, Integers, Floats]
 
 
-def _square(at: Integers, blocks: Floats) -> _Entries:
-    """The entries of blocks (K, Z, Z) at variables (K, Z)."""
-    return _rectangle(at, at, blocks)
-
-
 def _rectangle(rows: Integers, columns: Integers, blocks: Floats) -> _Entries:
     """The entries of blocks (K, A, B) at rows (K, A) and columns (K, B)."""
-    shape = blocks.shape
-    i, j = np.broadcast_to(rows[:, :, None], shape), np.broadcast_to(columns[:, None, :], shape)
-    return i.ravel(), j.ravel(), blocks.ravel()
+    return rows[:, :, None], columns[:, None, :], blocks
 
 
-def _matrix(entries: Sequence[_Entries], shape: tuple[int, int]) -> sp.csc_matrix:
-    """A sparse matrix of entries, those of variables that are given left out."""
-    i, j, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+def _matrix(entries: Sequence[_Entries], height: int, rank: Integers) -> sp.csc_matrix:
+    """A sparse matrix of entries, with columns at their rank; those of variables that are given are left out."""
+    parts = [[np.ravel(part) for part in np.broadcast_arrays(*some)] for some in entries]
+    i, j, values = (np.concatenate(some) for some in zip(*parts, strict=True))
+    j = rank[j]
     kept = (i >= 0) & (j >= 0) & (values != 0.0)
-    return sp.csc_matrix((values[kept], (i[kept], j[kept])), shape=shape)
+    return sp.csc_matrix((values[kept], (i[kept], j[kept])), shape=(height, len(rank) - 1))

@@ -116,8 +116,6 @@ def _pass(steps: Steps, given: Recursion, regularization: float, *, second: bool
             hessian=given.hessian,
             velocity=np.zeros((0, X // 2, X)),
             curvature=np.zeros((0, Z, Z)),
-            slack=np.zeros((0, 2, m)),
-            expected=np.zeros((0, Z)),
             rate=np.zeros((0, m, m)),
             pull=np.zeros((0, m)),
         ),

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.costs import barriers_of
+from varpin.control.costs import JointLimitBarrier, VelocityLimitBarrier
 from varpin.control.history import Iteration, Refinement, SearchState, Status
 from varpin.control.monte_carlo import MonteCarlo, monte_carlo
 from varpin.control.multipliers import ConstraintReport, Multipliers, reports
@@ -146,10 +146,12 @@ class Solution(Frozen):
     def violations(self) -> Violations:
         """Violations of the joint limits, in the cost or not, and of the control limits."""
         robot, motion, speed = self.problem.scene.robot, self.trajectory, self.problem.scene.robot.velocity_limit
-        joints, speeds = barriers_of(self.problem.cost)
+        terms = self.problem.cost.terms
+        joints = (term.limits for term in terms if isinstance(term, JointLimitBarrier))
+        speeds = (term.limits for term in terms if isinstance(term, VelocityLimitBarrier))
         return Violations(
-            position=_beyond(motion.q, [robot.position_limits, *(term.limits for term in joints)]),
-            velocity=_beyond(motion.v, [(-speed, speed), *(term.limits for term in speeds)]),
+            position=_beyond(motion.q, [robot.position_limits, *joints]),
+            velocity=_beyond(motion.v, [(-speed, speed), *speeds]),
             control=_beyond(self.problem.control_rows(motion), [self.problem.control_limits]),
         )
 

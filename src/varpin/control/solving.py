@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from varpin.control.examination import foreseen, looked_at
 from varpin.control.history import ITERATIONS, Iteration, Status
-from varpin.control.line_search import ARMIJO, BACKTRACKING
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.refine import SUFFICIENT, refine
 from varpin.control.rollout import controls_along, first_commands
@@ -22,7 +21,7 @@ from varpin.control.starts import Path, commands_along, path_of
 from varpin.errors import InputError
 from varpin.finding import announce
 from varpin.signals.policy import LinearPolicy
-from varpin.support.checks import JointValues, count, flag, fraction, is_one_of, positive, real, takes, told_motion
+from varpin.support.checks import JointValues, count, flag, positive, real, takes, told_motion
 from varpin.support.one_thread import one_thread
 from varpin.trajectory import Trajectory
 
@@ -39,9 +38,6 @@ def solve(
     tolerance: float = 1e-7,
     max_iterations: int = ITERATIONS,
     second_order: bool = False,
-    forward: Literal["closed", "open"] = "closed",
-    armijo: float = ARMIJO,
-    backtracking: float = BACKTRACKING,
     regularization: float = 0.0,
     time_limit: float = np.inf,
     callback: Callback | None = None,
@@ -86,11 +82,6 @@ def solve(
     Other Args:
         second_order: Full differential dynamic programming: second derivatives of the dynamics too, wherever the
             model stays convex. Converges quadratically; needs an integrator that has them (:class:`Midpoint`).
-        forward: ``"closed"``: the feedback gains act in the line search. ``"open"``: only the feed-forward part, as in
-            the paper; it diverges where the open loop is unstable over the horizon.
-        armijo: Least share of the expected decrease that a step must reach (the paper's alpha).
-        backtracking: Factor between the trials of the line search (the paper's beta), in (0, 1). Where the parabola
-            through a trial's cost and the slope has its minimum far below the next length, that length is left out.
         regularization: Initial value, relative to the diagonal of Quu; it increases and decreases as needed.
         time_limit: No iteration begins after this time since the call [s]. The result then depends on the machine.
         callback: Called with each :class:`Iteration`; ``callback=print`` prints the rows of :meth:`Solution.table`. The
@@ -131,17 +122,12 @@ def solve(
     """
     if not isinstance(problem, OptimalControlProblem):
         raise InputError(f"problem must be an OptimalControlProblem, got {type(problem).__name__}")
-    if not is_one_of(forward, ("closed", "open")):
-        raise InputError(f"forward must be 'closed' or 'open', got {forward!r}")
-    if not 0.0 < real("backtracking", backtracking) < 1.0:
-        raise InputError(f"backtracking must be in (0, 1), got {backtracking}")
     if not real("regularization", regularization) >= 0.0:
         raise InputError(f"regularization must be >= 0, got {regularization}")
     second_order, check = flag("second_order", second_order), flag("check", check)
     report_all = require_reports(callback, progress)
     positive("tolerance", tolerance, "1")
     deadline = time.perf_counter() + checked_time(time_limit)
-    fraction("armijo", armijo)
     most = count("max_iterations", max_iterations)
     if resume is not None and true_cost is not None:
         raise InputError("true_cost begins with a search of its own: leave out either resume or true_cost")
@@ -159,14 +145,7 @@ def solve(
         path: Path | None = None,
         tolerance: float = tolerance,
     ) -> Solution:
-        search = Search(
-            problem,
-            second_order=second_order,
-            closed=forward == "closed",
-            armijo=armijo,
-            backtracking=backtracking,
-            regularization=regularization,
-        )
+        search = Search(problem, second_order=second_order, regularization=regularization)
         if resume is not None:
             _require_resumable(problem, controls, resume)
             search.resume(resume)
@@ -186,6 +165,8 @@ def solve(
             status = search.run(tolerance, most, deadline, report)
         except KeyboardInterrupt:
             status, search.reason = Status.INTERRUPTED, f"in iteration {len(search.history)}"
+        if status is Status.INFEASIBLE and not (controls is None and path is None):
+            search.reason += "; the default start, without controls= and states=, may have a plan"
         return search.solution(status)
 
     with one_thread():
@@ -195,7 +176,7 @@ def solve(
             wish = positive("true_cost", true_cost, "1")
 
             def once(finer: OptimalControlProblem, start: Trajectory | None) -> Solution:
-                given, on = (controls, path) if start is None else (finer.decided(start), Path(start.q, start.v))
+                given, on = (controls, path) if start is None else (finer.decided(start), (start.q, start.v))
                 return searched(finer, given, None, on, max(tolerance, SUFFICIENT * wish))
 
             solution = refine(problem, once, wish, lambda: deadline - time.perf_counter())

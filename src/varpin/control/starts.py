@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,61 +11,52 @@ from varpin import core
 from varpin.arrays import Floats
 from varpin.control.problem import OptimalControlProblem
 from varpin.control.rollout import around
-from varpin.control.trials import Trials
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, VarpinError
 from varpin.linearization import node_jets
 from varpin.mechanics.lagrangian import lagrangian_jet
-from varpin.model import degrees_hint, joint_unit
+from varpin.model import degrees_hint
 from varpin.signals.inputs import as_moved, with_ends
-from varpin.support.checks import as_floats, finite_array
+from varpin.simulation.record import rollout
+from varpin.support.checks import finite_array
 from varpin.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 
-# Greatest distance of the first state from the problem's [rad or m], and beyond a limit without a warning.
+# Greatest distance of the first state from the problem's [rad or m].
 _SAME = 1e-6
-# Natural frequency of the feedback that holds a motion on its states, times the decision period.
+# Natural frequency of the feedback that holds a motion on its states, times the decision period; from 0.1 to 0.5.
 _HOLDING_FREQUENCY = 0.25
 
-
-@dataclass(frozen=True, eq=False)
-class Path:
-    """States at the problem's nodes: q (N + 1, n) [rad or m] and v (N + 1, n) [rad/s or m/s]."""
-
-    q: Floats
-    v: Floats
+# States at a problem's nodes: q (N + 1, n) [rad or m] and v (N + 1, n) [rad/s or m/s].
+Path = tuple[Floats, Floats]
 
 
-def path_of(problem: OptimalControlProblem, given: object) -> Path:
+def path_of(problem: OptimalControlProblem, given: Any) -> Path:
     """Check the states that a search starts from.
 
     Raises:
         InputError: The states do not fit the problem, or do not begin at its q0.
     """
-    n, nodes, names = problem.scene.robot.dof, problem.steps + 1, problem.scene.robot.joint_names
-    q: object = given
-    v: object = None
+    robot, shape = problem.scene.robot, (problem.steps + 1, problem.scene.robot.dof)
+    names, q, v = robot.joint_names, given, None
     if isinstance(given, Trajectory):
         if given.joint_names != names:
-            raise InputError(
-                f"states: the motion is of joints {', '.join(given.joint_names)}, the problem of {', '.join(names)}"
-            )
+            raise InputError(f"states: the motion is of joints {given.joint_names}, the problem of {names}")
         if given.steps == problem.steps and not np.isclose(given.dt, problem.dt, rtol=1e-6):
             raise InputError(
-                f"states: the motion has dt = {given.dt:g} s, the problem {problem.dt:g} s; give states=motion.q to "
-                "follow its path at the problem's pace"
+                f"states: the motion has dt = {given.dt:g} s, the problem {problem.dt:g} s; states=motion.q follows "
+                "its path at the problem's pace"
             )
         q, v = given.q, given.v
     elif isinstance(given, tuple):
         if len(given) != 2:
             raise InputError(f"states must be q, or a pair (q, v), got {len(given)} arrays")
         q, v = given
-    positions = _rows("states", q, (nodes, n))
-    farthest = positions[int(np.argmax(np.abs(positions).max(axis=1)))]
-    units = degrees_hint(problem.scene.robot, "states: the position", farthest)
+    positions = finite_array("states", q, shape).copy()
+    units = degrees_hint(robot, "states: the position", positions[int(np.abs(positions).max(axis=1).argmax())])
     off = np.abs(positions[0] - problem.q0)
-    joint = int(np.argmax(off))
+    joint = int(off.argmax())
     if off[joint] > _SAME:
         raise InputError(
             f"states must begin at the problem's q0: joint {names[joint]!r} is at {positions[0, joint]:.6g} in their "
@@ -73,30 +64,9 @@ def path_of(problem: OptimalControlProblem, given: object) -> Path:
         )
     if units:
         logger.warning("%s", units)
-    lower, upper = problem.scene.robot.position_limits
-    beyond = np.maximum(positions - upper, lower - positions)
-    if beyond.max() > _SAME:
-        node, joint = divmod(int(np.argmax(beyond)), beyond.shape[1])
-        logger.warning(
-            "states: joint %r is %.4g %s beyond its limit at node %d",
-            names[joint],
-            beyond[node, joint],
-            joint_unit(problem.scene.robot, joint),
-            node,
-        )
-    speeds = np.gradient(positions, problem.dt, axis=0) if v is None else _rows("states: v", v, (nodes, n))
+    speeds = np.gradient(positions, problem.dt, axis=0) if v is None else finite_array("states: v", v, shape).copy()
     speeds[0] = problem.v0
-    return Path(positions, speeds)
-
-
-def _rows(name: str, given: object, shape: tuple[int, int]) -> Floats:
-    array = as_floats(name, given)
-    if array.ndim == 2 and array.shape[1] == shape[1] and array.shape[0] != shape[0]:
-        raise InputError(
-            f"{name} must have a row for each of {shape[0]} nodes, the first and the last included, got "
-            f"{array.shape[0]}: resample them, for example with numpy.interp"
-        )
-    return finite_array(name, array, shape).copy()
+    return positions, speeds
 
 
 def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats | None) -> Commands:
@@ -107,16 +77,14 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
         path: The states.
         controls: Controls (R, m) along them; by default those of the inverse dynamics, clipped to their limits.
     """
-    scene, hold = problem.scene, problem.hold
+    scene, hold, (q, v), u = problem.scene, problem.hold, path, controls
     m = scene.controls
-    u = controls
     if u is None:
-        needed = joint_forces(problem, path.q, path.v)
-        u = as_moved(scene, path.q[hold::hold], path.v[hold::hold], needed @ scene.allocation.T)
+        u = as_moved(scene, q[hold::hold], v[hold::hold], _joint_forces(problem, q, v) @ scene.allocation.T)
         u = np.clip(u, *problem.control_limits)
-    gains = holding_gains(problem)
+    gains = _holding_gains(problem)
     gains[scene.prescribed] = 0.0
-    q, v = path.q[:-1:hold], path.v[:-1:hold]
+    q, v = q[:-1:hold], v[:-1:hold]
     if problem.integrator.variational:
         v = (node_jets(scene, q, v)[0] @ v[:, :, None])[:, :, 0]
     x = np.hstack([q, v])
@@ -134,7 +102,7 @@ def commands_along(problem: OptimalControlProblem, path: Path, controls: Floats 
     return min(tries, key=lambda commands: _cost_under(problem, commands))
 
 
-def holding_gains(problem: OptimalControlProblem) -> Floats:
+def _holding_gains(problem: OptimalControlProblem) -> Floats:
     """Gains (m, 2n) of the controls that hold a motion on states, (q, p) or (q, v)."""
     scene, n = problem.scene, problem.scene.robot.dof
     M = lagrangian_jet(scene, problem.q0, np.zeros(n)).Lvv
@@ -144,32 +112,22 @@ def holding_gains(problem: OptimalControlProblem) -> Floats:
     return found
 
 
-def states_on(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
-    """The states (R, 2n) before each decision, (q, p) or (q, v), of q and v (N + 1, n) at the nodes."""
-    q, v = q[: -1 : problem.hold], v[: -1 : problem.hold]
-    if problem.integrator.variational:
-        v = (node_jets(problem.scene, q, v)[0] @ v[:, :, None])[:, :, 0]
-    return np.hstack([q, v])
-
-
 def _cost_under(problem: OptimalControlProblem, commands: Commands) -> float:
     """The cost of the motion under commands; infinite where it fails."""
     try:
-        attempt = Trials(problem).attempt(commands)
-        return float(attempt.shares().sum()) if attempt.whole else np.inf
+        motion, failure = rollout(problem.scene, problem.integrator, problem.q0, problem.v0, commands, problem.dt)
+        return problem.cost_of(motion) if failure is None else np.inf
     except VarpinError:
         return np.inf
 
 
-def joint_forces(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
-    """The joint forces (..., R, n) that controls have to give over each decision, on q and v (..., N + 1, n)."""
+def _joint_forces(problem: OptimalControlProblem, q: Floats, v: Floats) -> Floats:
+    """The joint forces (R, n) that controls have to give over each decision, on q and v (N + 1, n)."""
     scene, period = problem.scene, problem.period
-    q, v = q[..., :: problem.hold, :], v[..., :: problem.hold, :]
-    before, after = (..., slice(None, -1), slice(None)), (..., slice(1, None), slice(None))
-    shape, n = q[before].shape, q.shape[-1]
-    at = (0.5 * (q[before] + q[after])).reshape(-1, n)
-    rate, acceleration = (((x[after] - x[before]) / period).reshape(-1, n) for x in (q, v))
+    q, v = q[:: problem.hold], v[:: problem.hold]
+    at = 0.5 * (q[:-1] + q[1:])
+    rate, acceleration = np.diff(q, axis=0) / period, np.diff(v, axis=0) / period
     # A servo commanded to its present position exerts no spring force.
     still = at @ scene.holding.T @ scene.actuation.T
     needed: Floats = core.inverse_dynamics(scene.core, at, rate, acceleration) + still
-    return (needed - scene.core.forces(at, rate, still)[0]).reshape(shape)
+    return needed - scene.core.forces(at, rate, still)[0]

@@ -1,9 +1,7 @@
 """The compiled core. Its C++ is in ``src/core``, one header for each idea, and is built with the package."""
 
 from varpin.core._core import BackwardPass as BackwardPass
-from varpin.core._core import ConstrainedRollout as ConstrainedRollout
 from varpin.core._core import CostTerms as CostTerms
-from varpin.core._core import Elimination as Elimination
 from varpin.core._core import ExpandedSteps as ExpandedSteps
 from varpin.core._core import ExplicitMethod as ExplicitMethod
 from varpin.core._core import ExplicitRollout as ExplicitRollout
@@ -13,16 +11,15 @@ from varpin.core._core import Guards as Guards
 from varpin.core._core import Links as Links
 from varpin.core._core import Mechanism as Mechanism
 from varpin.core._core import Outcome as Outcome
+from varpin.core._core import Rollout as Rollout
 from varpin.core._core import RootPass as RootPass
-from varpin.core._core import Solver as Solver
 from varpin.core._core import Squares as Squares
+from varpin.core._core import Steps as Steps
 from varpin.core._core import Stretch as Stretch
 from varpin.core._core import Subject as Subject
 from varpin.core._core import Tableau as Tableau
-from varpin.core._core import VariationalRollout as VariationalRollout
 from varpin.core._core import Watch as Watch
 from varpin.core._core import accelerations as accelerations
-from varpin.core._core import box_minimum as box_minimum
 from varpin.core._core import change_values as change_values
 from varpin.core._core import constrained_derivatives as constrained_derivatives
 from varpin.core._core import coupling_kinds as coupling_kinds
@@ -36,10 +33,5 @@ from varpin.core._core import linearize_explicit as linearize_explicit
 from varpin.core._core import longest_alternation as longest_alternation
 from varpin.core._core import propagated_errors as propagated_errors
 from varpin.core._core import pulls_fast as pulls_fast
-from varpin.core._core import run_gradients as run_gradients
 from varpin.core._core import sample_steps as sample_steps
 from varpin.core._core import stake_of as stake_of
-from varpin.core._core import variational_bends as variational_bends
-from varpin.core._core import variational_curvatures as variational_curvatures
-from varpin.core._core import variational_derivatives as variational_derivatives
-from varpin.core._core import variational_ends as variational_ends

@@ -79,36 +79,6 @@ class Mechanism:
     def jets_along(self, q: Floats, v: Floats, alpha: Floats, beta: Floats) -> tuple[Floats, Floats, Floats]:
         """Derivatives of M, L_vq and L_qq (N, n, n) at rows of q and v along rows of alpha and beta (N, n)."""
 
-class Solver(Enum):
-    """Linear solver of a variational step; see src/core/include/varpin/elimination.hpp."""
-
-    automatic = ...
-    dense = ...
-    elimination = ...
-
-class Elimination:
-    """Solves at one (q, v) by elimination from the leaves to the roots; see src/core/include/varpin/elimination.hpp.
-
-    Raises ValueError for a mechanism with couplings.
-    """
-
-    def __init__(self, mechanism: Mechanism, q: Floats, v: Floats) -> None: ...
-    def step(self, ahead: float, behind: float, diagonal: Floats, b: Floats) -> tuple[Floats, Floats, float, bool]:
-        """X with N x = b, (A' + ahead L_qq) x, x' M x, and whether all pivots of N are positive.
-
-        N = M + ahead A - behind A' - ahead behind L_qq + diag(diagonal - armature + ahead behind stiffness), with
-        springs in L_qq.
-        """
-
-    def least_pivot_ratio(self, coupling: float, curvature: float, diagonal: Floats) -> float:
-        """The smallest ratio of a pivot of M + coupling (A + A') - curvature L_qq to the same pivot of M.
-
-        It is 0 if a pivot is not positive. ``diagonal`` as in :meth:`step`.
-        """
-
-    def mass(self, b: Floats) -> tuple[Floats, Floats, bool]:
-        """X = M^-1 b, the shares of coordinates in b . x / 2, and whether M is positive definite."""
-
 class Tableau:
     """Collocation over a step of unit length; see src/core/include/varpin/tableau.hpp."""
 
@@ -161,26 +131,12 @@ class Watch:
     @property
     def verdict(self) -> Verdict: ...
 
-class _Rollout:
-    """Common interface of the rollouts of variational integrators; it exists in this file only.
+class Rollout:
+    """Paths of a variational integrator, under constraints where ``places`` are given.
 
-    A rollout has paths and the work arrays of a step. Forks share the work arrays: only one of them advances at a time.
+    A rollout has paths and the work arrays of a step. Forks share the work arrays: one thread at a time advances one of
+    them, and another raises RuntimeError.
     """
-
-    def begin(self, q: Floats, v: Floats) -> bool:
-        """Start each path at its row of q and v (P, n); False if an M(q) is not positive definite."""
-
-    def kick(self, impulse: Floats) -> None:
-        """Add an impulse (P, n) to the momenta; constraints absorb its normal component."""
-
-    def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Configurations, momenta and velocities (P, n), and energies (P,)."""
-
-    def halvings(self, path: int) -> Bytes:
-        """The halvings of each part of every divided step in the last roll of a path, in order."""
-
-class VariationalRollout(_Rollout):
-    """Paths without constraints."""
 
     def __init__(
         self,
@@ -190,11 +146,14 @@ class VariationalRollout(_Rollout):
         guards: Guards,
         left: float,
         paths: int,
-        solver: Solver = Solver.automatic,
         held: bool = False,
+        places: Floats | None = None,
     ) -> None: ...
-    def fork(self, guards: Guards) -> VariationalRollout:
+    def fork(self, guards: Guards) -> Rollout:
         """An independent copy of the paths."""
+
+    def begin(self, q: Floats, v: Floats) -> bool:
+        """Start each path at its row of q and v (P, n); False if an M(q) is not positive definite."""
 
     def roll(
         self,
@@ -209,38 +168,17 @@ class VariationalRollout(_Rollout):
         """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays.
 
         A watch may stop a single path. ``impulses`` (P, N, 2, n), in addition to noise, are added to the momenta before
-        and after each step, or held over it as the noise.
+        and after each step, or held over it as the noise; under constraints they have to be held.
         """
 
-class ConstrainedRollout(_Rollout):
-    """Paths under constraints."""
+    def kick(self, impulse: Floats) -> None:
+        """Add an impulse (P, n) to the momenta; constraints absorb its normal component."""
 
-    def __init__(
-        self,
-        mechanism: Mechanism,
-        tableau: Tableau,
-        places: Floats,
-        tolerance: float,
-        guards: Guards,
-        paths: int,
-        held: bool = False,
-    ) -> None: ...
-    def fork(self, guards: Guards) -> ConstrainedRollout:
-        """An independent copy of the paths."""
+    def nodes(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Configurations, momenta and velocities (P, n), and energies (P,)."""
 
-    def roll(
-        self,
-        dt: float,
-        commands: Commands,
-        increments: Floats,
-        drift: Floats,
-        nodes: RolloutArrays,
-        impulses: Floats | None = None,
-    ) -> None:
-        """Take the steps of the commands, and write them into the nodes; both are named tuples of arrays.
-
-        ``impulses`` (P, N, 2, n), in addition to noise, have to be held over the steps.
-        """
+    def halvings(self, path: int) -> Bytes:
+        """The halvings of each part of every divided step in the last roll of a path, in order."""
 
     def impulses(self, path: int) -> Floats:
         """Constraint impulses (steps, c) in each step of the last roll of a path; joints feel dg/dq' times them."""
@@ -248,112 +186,51 @@ class ConstrainedRollout(_Rollout):
     def weakest(self, path: int) -> int:
         """The constraint row that was closest to dependence on the others at the end of a path."""
 
+class Steps:
+    """The steps of a trajectory, to be repeated at dw = 0.
+
+    ``force`` is (N, 1, n), constant over each step, or (N, s, n) at its stages. ``halvings`` are those of the parts of
+    all steps with more than one of ``substeps``. The same parts are repeated; parts that active ``guards`` refuse are
+    halved. ``guess`` (N, s, n) are stage velocities close to those of each step.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        tableau: Tableau,
+        tolerance: float,
+        guards: Guards,
+        dt: float,
+        q: Floats,
+        p: Floats,
+        force: Floats,
+        substeps: Integers,
+        halvings: Bytes,
+        guess: Floats,
+    ) -> None:
+        """Raises ValueError for arrays that do not fit each other."""
+
+    def derivatives(self, ramp: bool = False, external: bool = False) -> tuple[Floats, Floats, Floats, int, int]:
+        """Derivatives of steps, the outcome, and the number of steps done.
+
+        They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), and with ``ramp`` in one
+        that grows linearly from 0 at the start of a step to f at its end (N, 2n, n), else (N, 2n, 0). ``external``: f
+        is not the force of the controls, which drives limit, but acts beside it.
+        """
+
+    def curvatures(self, z: Floats) -> tuple[Floats, int, int]:
+        """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n), the outcome, and the number of steps done."""
+
+    def ends(self) -> tuple[Floats, Floats, int, int]:
+        """Configurations and velocities (N, n) at the end of each step, the outcome, and the number of steps done."""
+
 def constrained_derivatives(
-    mechanism: Mechanism,
-    tableau: Tableau,
-    places: Floats,
-    tolerance: float,
-    guards: Guards,
-    dt: float,
-    q: Floats,
-    p: Floats,
-    force: Floats,
-    rates: Floats,
-    substeps: Integers,
-    halvings: Bytes,
-    *,
-    guess: Floats,
-    ramp: bool = False,
-    external: bool = False,
+    steps: Steps, *, places: Floats, rates: Floats, ramp: bool = False, external: bool = False
 ) -> tuple[Floats, Floats, Floats, int, int]:
-    """Derivatives as of variational_derivatives, and (N, 2n, i) in the rates (N, i) of driven joints.
+    """Derivatives as of :meth:`Steps.derivatives`, and (N, 2n, i) in the rates (N, i) of driven joints.
 
     With ``ramp`` those in the force are those in the one that grows.
     """
-
-def variational_derivatives(
-    mechanism: Mechanism,
-    tableau: Tableau,
-    tolerance: float,
-    guards: Guards,
-    dt: float,
-    q: Floats,
-    p: Floats,
-    force: Floats,
-    substeps: Integers,
-    halvings: Bytes,
-    *,
-    guess: Floats,
-    ramp: bool = False,
-    external: bool = False,
-    solver: Solver = Solver.automatic,
-) -> tuple[Floats, Floats, Floats, int, int]:
-    """Derivatives of steps, the outcome, and the number of steps done.
-
-    They are those of (q1, p1) in (q0, p0) (N, 2n, 2n), in a constant force f (N, 2n, n), and with ``ramp`` in one that
-    grows linearly from 0 at the start of a step to f at its end (N, 2n, n), else (0, 2n, n).
-
-    ``force`` is (N, 1, n), constant over each step, or (N, s, n) at its stages. ``external``: f is not the force of the
-    controls, which drives limit, but acts beside it.
-
-    ``halvings`` are those of the parts of all steps with more than one of ``substeps``. The same parts are repeated;
-    parts that active ``guards`` refuse are halved.
-    """
-
-def variational_bends(
-    mechanism: Mechanism,
-    tableau: Tableau,
-    tolerance: float,
-    guards: Guards,
-    dt: float,
-    q: Floats,
-    p: Floats,
-    force: Floats,
-    substeps: Integers,
-    halvings: Bytes,
-    *,
-    guess: Floats,
-    weights: Floats,
-    solver: Solver = Solver.automatic,
-) -> tuple[Floats, int, int]:
-    """Derivatives (N, 3n) of sums of ``weights`` (N, 2n, 3n) times d(q1, p1)/d(q0, p0, f) in (q0, p0, f).
-
-    Also the outcome, and the number of steps done.
-    """
-
-def variational_curvatures(
-    mechanism: Mechanism,
-    tableau: Tableau,
-    tolerance: float,
-    guards: Guards,
-    dt: float,
-    q: Floats,
-    p: Floats,
-    force: Floats,
-    substeps: Integers,
-    halvings: Bytes,
-    *,
-    guess: Floats,
-    z: Floats,
-    solver: Solver = Solver.automatic,
-) -> tuple[Floats, int, int]:
-    """Z . d2(q1, p1)/d(q0, p0, f)2 (N, 3n, 3n) for z (N, 2n), the outcome, and the number of steps done."""
-
-def variational_ends(
-    mechanism: Mechanism,
-    tableau: Tableau,
-    tolerance: float,
-    guards: Guards,
-    dt: float,
-    q: Floats,
-    p: Floats,
-    force: Floats,
-    substeps: Integers,
-    halvings: Bytes,
-    *,
-    solver: Solver = Solver.automatic,
-) -> tuple[Floats, Floats, int, int]:
-    """Configurations and velocities (N, n) at the end of each step, the outcome, and the number of steps done."""
 
 class ExpandedSteps:
     """The linearized dynamics and the expanded costs of N steps; optional arrays may be empty.
@@ -374,11 +251,10 @@ class ExpandedSteps:
         hessian: Floats,
         velocity: Floats,
         curvature: Floats,
-        slack: Floats,
-        expected: Floats,
         rate: Floats,
         pull: Floats,
         within: Floats | None = None,
+        held: NDArray[np.bool_] | None = None,
     ) -> None:
         """Raises ValueError for arrays that do not fit each other."""
 
@@ -387,10 +263,8 @@ class Gains:
 
     ``feedforward`` (R, m), ``feedback`` (R, m, 2n), ``previous`` (R, m, m) on the previous control if its change has a
     cost, ``control_gradient`` (R, m) of the cost, ``costate`` (N, 2n), its gradient in the state after each step, empty
-    if not wanted, and ``spread`` (N, 2n, 2n), S, with noise only. On request ``stiffness`` (R, m), the diagonal of Quu
-    without regularization, and ``pressure`` (R, m), with limits only: the model's gradient in each control at the
-    decision within limits and its expected state, under the later gains, and ``factors`` (R, m, m), L D L' of the
-    regularized Quu, of passes without limits.
+    if not wanted, and ``spread`` (N, 2n, 2n), S, with noise only. On request ``factors`` (R, m, m), L D L' of the
+    regularized Quu.
     """
 
     def __init__(
@@ -402,8 +276,6 @@ class Gains:
         control_gradient: Floats,
         costate: Floats,
         spread: Floats,
-        stiffness: Floats | None = None,
-        pressure: Floats | None = None,
         factors: Floats | None = None,
     ) -> None: ...
 
@@ -456,15 +328,6 @@ class RootPass(_Found):
         ``within`` has those of the noise's jumps where the steps have them.
         """
 
-def run_gradients(
-    h: float, hold: int, regularization: float, steps: ExpandedSteps, gains: Gains, terminal: Floats
-) -> None:
-    """The feed-forward part of a pass without limits, again with other gradients of the cost.
-
-    ``terminal`` (2n,) is that of the terminal cost in x. Overwrites the feed-forward part of ``gains``, whose other
-    arrays are those of the pass.
-    """
-
 def foresee(
     hold: int,
     A: Floats,
@@ -488,13 +351,6 @@ def foresee(
     those at the end. ``expected`` (R, 2n + m) receives those before each decision, ``moves`` (R, m) the changes of the
     controls, and ``after`` (N, 2n) the deviations of the state after each step. The result tells whether a control
     reaches a limit.
-    """
-
-def box_minimum(H: Floats, g: Floats, limits: Floats, guess: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]] | None:
-    """The x (m,) within ``limits`` (2, m) that minimizes g . x + (1/2) x'Hx; None where H is not positive definite.
-
-    Also returns L D L' of H with rows and columns of entries at a limit replaced by those of the identity (unit L below
-    the diagonal, D on it), and which entries are at a limit.
     """
 
 class Links:
@@ -538,7 +394,7 @@ class Outcome(IntEnum):
 class ForwardDynamics:
     """Forward dynamics at single states."""
 
-    def __init__(self, mechanism: Mechanism, solver: Solver = Solver.automatic) -> None: ...
+    def __init__(self, mechanism: Mechanism) -> None: ...
     def rate(self, x: Floats, force: Floats) -> tuple[Floats, bool]:
         """The rate (v, a) of x = (q, v) (2n,) under a force (n,), and whether the mass matrix is positive definite."""
 

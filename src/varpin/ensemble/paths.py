@@ -9,11 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from varpin.arrays import Floats, Integers
 from varpin.core.arrays import Commands
-from varpin.ensemble.histogram import count_in_bins
 from varpin.ensemble.record import PathFailure
 from varpin.errors import VarpinError
 from varpin.integrators import Integrator, Segment
@@ -47,19 +45,23 @@ def without_geometry(scene: Scene) -> Scene:
     return bare
 
 
-def chunks(steps: int, paths: int, *, begin_small: bool = True) -> Iterator[tuple[int, int]]:
-    """The first path of each chunk, and one past its last.
-
-    With ``begin_small`` the first is small and each twice as large as the one before, up to the size of all others, so
-    that some paths are finished soon.
-    """
+def chunk_size(steps: int, paths: int) -> int:
+    """The number of paths of a whole chunk."""
     steps = max(1, steps)
     size = max(math.ceil(paths / _CHUNKS), _LEAST_STEPS // steps)
     size = max(_FEWEST_PATHS, min(size, _MOST_STEPS // steps, _MOST_PATHS))
     if size > _GROUP:
         size = math.ceil(size / _GROUP) * _GROUP
-    now = min(size, max(1, _LEAST_STEPS // steps)) if begin_small else size
-    first = 0
+    return size
+
+
+def chunks(steps: int, paths: int) -> Iterator[tuple[int, int]]:
+    """The first path of each chunk, and one past its last.
+
+    The first is small and each twice as large as the one before, up to the whole size: some paths are finished soon.
+    """
+    size, first = chunk_size(steps, paths), 0
+    now = min(size, max(1, _LEAST_STEPS // max(1, steps)))
     while first < paths:
         last = min(first + now, paths)
         yield first, last
@@ -109,7 +111,6 @@ class Task(Frozen):
         store: Whether to return the paths themselves.
         moments: Whether to return their moments.
         values: Whether to return their states, node by node.
-        grid: Bins in which to count the states: least value and width (2, N + 1, 2n), and the number of bins; or None.
     """
 
     shared: Shared
@@ -119,7 +120,6 @@ class Task(Frozen):
     store: bool = False
     moments: bool = True
     values: bool = False
-    grid: tuple[Floats, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,8 +167,6 @@ class Part(Frozen):
         moments: Moments of the paths.
         stored: Arrays of the paths by name, (C, ...).
         values: x by node (N + 1, 2n, C), NaN after a failure.
-        counts: Paths in each bin (N + 1, 2n, B + 2); the first and the last count those outside the bins.
-        bounds: Least and greatest x (2, N + 1, 2n), together with counts.
     """
 
     first: int
@@ -179,8 +177,6 @@ class Part(Frozen):
     moments: Moments | None
     stored: dict[str, Floats]
     values: Floats | None
-    counts: NDArray[np.uint16] | None
-    bounds: Floats | None
 
 
 def simulate_paths(task: Task) -> Part:
@@ -219,11 +215,6 @@ class _Chunk:
                 np.zeros(N + 1),
             )
         self.values = np.empty((N + 1, 2 * n, self.paths)) if task.values else None
-        self.counts: NDArray[np.uint16] | None = None
-        self.bounds: Floats | None = None
-        if task.grid is not None:
-            self.counts = np.zeros((N + 1, 2 * n, task.grid[1] + 2), dtype=np.uint16)
-            self.bounds = np.empty((2, N + 1, 2 * n))
         self.stored: dict[str, Floats] = {}
         if task.store:
             self.stored = {name: np.full((self.paths, N + 1, n), np.nan) for name in ("q", "v", "p")}
@@ -260,8 +251,6 @@ class _Chunk:
             moments=self.moments,
             stored=self.stored,
             values=self.values,
-            counts=self.counts,
-            bounds=self.bounds,
         )
 
     def _run_group(self, number: int, state: object, begin: int, end: int) -> Integers:
@@ -350,12 +339,6 @@ class _Chunk:
         np.fmax(self.fastest, speed, out=self.fastest)
         if self.values is not None:
             self.values[first : first + length] = self.block[:length, :-1]
-        if self.counts is not None and self.bounds is not None and self.task.grid is not None:
-            (least, width), bins = self.task.grid
-            nodes = slice(first, first + length)
-            count_in_bins(
-                self.block[:length, :-1], least[nodes], width[nodes], bins, self.counts[nodes], self.bounds[:, nodes]
-            )
         if self.moments is None:
             return
         begin = 0

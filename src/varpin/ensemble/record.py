@@ -24,7 +24,7 @@ class EnsembleStatistics(Frozen):
         covariance: Covariance of x (N + 1, 2n, 2n), with P - 1 in the denominator.
         levels: Levels of the quantiles (L,).
         quantiles: Quantiles of x (L, N + 1, 2n).
-        quantile_errors: Bounds of the errors of the quantiles (L, N + 1, 2n); zero where they are exact.
+        quantile_paths: How many of the first paths the quantiles are of: all, unless these were too many to keep.
         energy_mean: Mean energy (N + 1,) [J].
         energy_deviation: Standard deviation of the energy (N + 1,) [J].
         count: Number of paths at each node (N + 1,): those that have not failed before.
@@ -34,7 +34,7 @@ class EnsembleStatistics(Frozen):
     covariance: Floats
     levels: Floats
     quantiles: Floats
-    quantile_errors: Floats
+    quantile_paths: int
     energy_mean: Floats
     energy_deviation: Floats
     count: NDArray[np.int64]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.ensemble.looks import looked_at, looked_at_here
-from varpin.ensemble.paths import Part, Shared, simulate_paths, without_geometry
+from varpin.ensemble.paths import Shared, simulate_paths, without_geometry
 from varpin.ensemble.record import Ensemble, EnsembleInterrupted
 from varpin.ensemble.statistics import Sums
 from varpin.errors import InputError, VarpinError, WorkersLost
@@ -23,8 +22,7 @@ from varpin.mechanics.wiener import children
 from varpin.signals.controls import commands_of
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
 from varpin.simulation.choice import stronger, usual_integrator
-from varpin.simulation.start import in_other_units, on_constraints
-from varpin.simulation.time_steps import time_steps
+from varpin.simulation.start import in_other_units, on_constraints, time_steps
 from varpin.support.checks import (
     JointValues,
     as_floats,
@@ -83,10 +81,9 @@ def simulate_ensemble(
         integrator: If left out, ``Midpoint(kick="held")``. In a scene without noise, the integrator that
             :func:`varpin.simulate` takes for a few of the paths. ``Ensemble.integrator`` says which.
         store: Keep every path. Otherwise only the statistics are kept, and memory does not grow with P N.
-        quantiles: Levels in [0, 1]; with an empty list, workers return moments alone. Quantiles are exact if paths are
-            stored, or if P (N + 1) 2n is at most 33 million. Otherwise they are read from histograms of up to 1000 bins
-            over 2.5 times the range of the first paths (up to 1024), linear within a bin;
-            ``statistics.quantile_errors`` bounds their errors by the width of a bin. Levels 0 and 1 stay exact.
+        quantiles: Levels in [0, 1]; with an empty list, workers return moments alone. Quantiles are of all paths if
+            these are stored, or if P (N + 1) 2n is at most 33 million; otherwise of as many of the first paths,
+            ``statistics.quantile_paths``.
         workers: Number of threads; the number of cores if left out.
         executor: Any ``concurrent.futures.Executor`` instead of threads: a ``ProcessPoolExecutor``, Dask's
             ``client.get_executor()``, an ``mpi4py.futures.MPIPoolExecutor``. It stays open. At most
@@ -101,8 +98,7 @@ def simulate_ensemble(
         AssemblyError: No configuration near q0 satisfies the scene's constraints.
         VarpinError: Every path failed.
         WorkersLost: The executor has lost its workers; holds the finished paths.
-        EnsembleInterrupted: Ctrl-C; holds the finished paths, and those that threads had begun. It is a
-            KeyboardInterrupt.
+        EnsembleInterrupted: Ctrl-C; holds the finished paths. It is a KeyboardInterrupt.
     """
     require_scene(scene)
     dt, steps = time_steps(dt, steps, duration)
@@ -132,7 +128,8 @@ def simulate_ensemble(
         shared = Shared(without_geometry(scene), integrator, commands, dt, steps, children(rng, paths))
         sums = Sums(shared, paths, levels, store=store)
         try:
-            with closing(_parts(pool, sums, start[0], start[1])) as parts:
+            tasks = sums.tasks(start[0], start[1])
+            with closing(in_order(pool, simulate_paths, tasks, result_bytes=sums.part_bytes())) as parts:
                 take_all(parts, sums.add, lambda: progress(sums.done, paths) if progress is not None else None)
             assert sums.done == paths
             found = looked_at(pool, shared, start[0], start[1], sums.extremes)
@@ -146,7 +143,7 @@ def simulate_ensemble(
             raise EnsembleInterrupted(kept) from None
     if len(sums.failures) == paths:
         raise VarpinError(sums.failing())
-    found = (*in_other_units(scene, start[0][0], start[1][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
+    found = (*in_other_units(scene, start[0][0]), *moved, *_alike(scene, start), *sums.lost(), *found)
     announce(logger, scene.announced, dt, found)
     return sums.ensemble(found)
 
@@ -175,14 +172,6 @@ def _alike(scene: Scene, start: Sequence[Floats]) -> tuple[Finding, ...]:
         "varpin.Scene(robot, noise=...) tells them apart"
     )
     return (Finding("paths alike", sentence),)
-
-
-def _parts(pool: Executor, sums: Sums, q0: Floats, v0: Floats) -> Generator[Part, None, None]:
-    """Results of the chunks. Where quantiles are estimated, the first chunk runs alone: it sets the bins."""
-    tasks = sums.tasks(q0, v0)
-    if sums.estimated:
-        yield from in_order(pool, simulate_paths, itertools.islice(tasks, 1))
-    yield from in_order(pool, simulate_paths, tasks, result_bytes=sums.part_bytes())
 
 
 def _require_memory(scene: Scene, steps: int, paths: int, *, store: bool) -> None:

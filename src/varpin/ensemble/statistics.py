@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from varpin.arrays import Floats
-from varpin.ensemble.histogram import Histogram
 from varpin.ensemble.looks import greater
-from varpin.ensemble.paths import Extremes, Moments, Part, Shared, Task, chunks
+from varpin.ensemble.paths import Extremes, Moments, Part, Shared, Task, chunk_size, chunks
 from varpin.ensemble.record import Ensemble, EnsembleStatistics, PathFailure
 from varpin.finding import Finding
 
-# Without stored paths, quantiles are exact up to this many numbers, P (N + 1) 2n.
-_EXACT = 2**25
+# Without stored paths, quantiles are those of as many of the first paths as have this many numbers, P (N + 1) 2n.
+_KEPT = 2**25
 # Quantiles are computed for runs of nodes with up to this many numbers.
 _SPAN = 100_000
 
@@ -38,36 +36,30 @@ class Sums:
         if store:
             self.stored = {name: np.empty((paths, N + 1, n)) for name in ("q", "v", "p")}
             self.stored |= {"energy": np.empty((paths, N + 1)), "u": np.empty((paths, N, m))}
-        exact = paths * (N + 1) * 2 * n <= _EXACT
-        self.values = np.empty((N + 1, 2 * n, paths)) if len(levels) and exact and not store else None
-        self.histogram: Histogram | None = None
-        self.estimated = bool(len(levels)) and not exact and not store
+        self.known = paths if store else min(paths, max(1, _KEPT // ((N + 1) * 2 * n))) if len(levels) else 0
+        self.values = None if store else np.empty((N + 1, 2 * n, self.known))
 
     def tasks(self, q0: Floats, v0: Floats) -> Iterator[Task]:
-        """The chunks. Where quantiles are estimated, the first one has to be added before the second is requested."""
-        for first, last in chunks(self.shared.steps, self.paths, begin_small=not self.estimated):
+        """The chunks."""
+        for first, last in chunks(self.shared.steps, self.paths):
             yield Task(
                 self.shared,
                 first,
                 q0[first:last].copy(),
                 v0[first:last].copy(),
                 store=self.store,
-                values=self.values is not None or (self.estimated and self.histogram is None),
-                grid=None if self.histogram is None else self.histogram.grid,
+                values=not self.store and first < self.known,
             )
 
     def part_bytes(self) -> int:
         """Size of a chunk's result [bytes], arrays alone."""
         nodes, size = self.shared.steps + 1, 2 * self.shared.scene.robot.dof
-        _, paths = next(chunks(self.shared.steps, self.paths, begin_small=False))
+        paths = chunk_size(self.shared.steps, self.paths)
         numbers = nodes * (size**2 + size + 3) + paths
         if self.store:
             numbers += paths * (nodes * (3 * size // 2 + 1) + self.shared.steps * self.shared.scene.controls)
-        if self.values is not None:
+        elif self.known:
             numbers += paths * nodes * size
-        if self.histogram is not None:
-            bins = self.histogram.grid[1] + 2
-            numbers += nodes * size * (2 + math.ceil(bins / 4))
         return 8 * numbers
 
     def add(self, part: Part) -> None:
@@ -82,13 +74,9 @@ class Sums:
         self.nodes[here] = part.nodes
         for name, array in self.stored.items():
             array[here] = part.stored[name]
-        if self.estimated:
-            if self.histogram is None and part.values is not None:
-                self.histogram = Histogram(part.values)
-            elif self.histogram is not None and part.counts is not None and part.bounds is not None:
-                self.histogram.add(part.counts, part.bounds)
-        elif self.values is not None and part.values is not None:
-            self.values[:, :, here] = part.values
+        if self.values is not None and part.values is not None:
+            room = self.values[:, :, here]
+            room[:] = part.values[:, :, : room.shape[2]]
         self.done = here.stop
 
     def lost(self) -> tuple[Finding, ...]:
@@ -112,7 +100,6 @@ class Sums:
         assert moments is not None
         there = moments.count > 0
         degrees = np.maximum(moments.count - 1, 1)
-        quantiles, errors = self._quantiles()
         stored = {name: array[: self.done] for name, array in self.stored.items()}
         return Ensemble(
             t=np.arange(self.shared.steps + 1, dtype=np.float64) * self.shared.dt,
@@ -120,8 +107,8 @@ class Sums:
                 mean=np.where(there[:, None], moments.mean[:, :n2], np.nan),
                 covariance=np.where(there[:, None, None], moments.squares / degrees[:, None, None], np.nan),
                 levels=self.levels,
-                quantiles=quantiles,
-                quantile_errors=errors,
+                quantiles=self._quantiles(),
+                quantile_paths=min(self.known, self.done),
                 energy_mean=np.where(there, moments.mean[:, n2], np.nan),
                 energy_deviation=np.where(there, np.sqrt(moments.energy / degrees), np.nan),
                 count=moments.count,
@@ -136,14 +123,12 @@ class Sums:
             integrator=str(self.shared.integrator),
         )
 
-    def _quantiles(self) -> tuple[Floats, Floats]:
+    def _quantiles(self) -> Floats:
         shape = (len(self.levels), self.shared.steps + 1, 2 * self.shared.scene.robot.dof)
-        if self.histogram is not None:
-            return self.histogram.quantiles(self.levels)
-        found = np.full(shape, np.nan)
+        found, paths = np.full(shape, np.nan), min(self.known, self.done)
         if not len(self.levels):
-            return found, np.zeros(shape)
-        size, nodes = max(1, _SPAN // (self.done * shape[2])), self.nodes[: self.done]
+            return found
+        size, nodes = max(1, _SPAN // (paths * shape[2])), self.nodes[:paths]
         spans, begin = [], 0
         # Between two nodes at which paths fail, the set of paths is the same.
         for end in np.unique(nodes).tolist():
@@ -157,12 +142,12 @@ class Sums:
 
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             list(pool.map(take, spans))
-        return found, np.zeros(shape)
+        return found
 
     def _states(self, first: int, last: int) -> Floats:
         """States x at nodes ``first`` .. ``last`` (k, 2n, P)."""
         if self.values is not None:
-            return self.values[first:last, :, : self.done]
+            return self.values[first:last, :, : min(self.known, self.done)]
         second = self.stored["p" if self.shared.integrator.variational else "v"]
         parts = [array[: self.done, first:last].transpose(1, 2, 0) for array in (self.stored["q"], second)]
         return np.concatenate(parts, axis=1)

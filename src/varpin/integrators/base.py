@@ -14,7 +14,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from varpin.arrays import Floats, Integers
-from varpin.core import Watch
 from varpin.core.arrays import Commands, RolloutArrays, new_nodes
 from varpin.errors import InputError, SingularMassMatrix
 from varpin.mechanics.lagrangian import lagrangian_jet
@@ -159,49 +158,6 @@ class Integrator(ABC):
         """
         return self.rollout_compiled(scene, state, contiguous(commands), increments, scene.no_drift, dt)
 
-    def watched(
-        self,
-        scene: Scene,
-        state: Any,
-        commands: Commands,
-        dt: float,
-        nodes: RolloutArrays,
-        watch: Watch,
-        impulses: Floats | None = None,
-    ) -> tuple[Failure | None, Bytes]:
-        """:meth:`rollout` of one path without noise into ``nodes``, until the ``watch`` stops it.
-
-        Constraint impulses (N, c) are written to ``impulses``, if given.
-
-        Returns the failure, if any, and the halvings of the divided steps.
-        """
-        decisions, done = len(commands.u), 0
-        halvings = [np.zeros(0, dtype=np.uint8)]
-        # In thirds, since the watch may stop it early.
-        ends = sorted({decisions // 3, 2 * decisions // 3, decisions} - {0})
-        for begin, end in zip([0, *ends], ends, strict=False):
-            block = rows(commands, begin, end, nodes.u[0, done - 1 : done] if done else None)
-            segment = self.rollout(scene, state, block, scene.silence, dt)[0]
-            statistics, taken = segment.statistics, slice(done, done + len(segment.u))
-            for name in _ARRAYS:
-                getattr(nodes, name)[0, taken] = getattr(segment, name)
-            nodes.tally[0, taken] = np.stack(
-                [statistics.newton_iterations, statistics.jets, statistics.sweeps, statistics.substeps], axis=1
-            )
-            if impulses is not None and segment.impulses is not None:
-                impulses[taken] = segment.impulses
-            nodes.quality[0, taken] = np.stack(
-                [statistics.residual, statistics.branch_margin, statistics.energy_defect], axis=1
-            )
-            for step, parts in enumerate(statistics.substeps.tolist()):
-                done = nodes.done[0] = taken.start + step + 1
-                if not watch.after(taken.start + step, parts):
-                    return None, np.concatenate([*halvings, statistics.part(0, step + 1).halvings])
-            halvings.append(statistics.halvings)
-            if segment.failure is not None:
-                return segment.failure, np.concatenate(halvings)
-        return None, np.concatenate(halvings)
-
     @abstractmethod
     def rollout_compiled(
         self,
@@ -281,17 +237,11 @@ class Integrator(ABC):
 
 @dataclass(frozen=True)
 class Run:
-    """State of a rollout in the core.
+    """State of a rollout in the core."""
 
-    Attributes:
-        paths: The paths, with their work arrays.
-        start: Initial configurations (P, n) [rad or m].
-        driven: Whether the scene has kinematic inputs.
-    """
-
-    paths: Any
-    start: Floats
-    driven: bool = False
+    paths: Any  # with their work arrays
+    start: Floats  # initial configurations (P, n) [rad or m]
+    driven: bool = False  # whether the scene has kinematic inputs
 
 
 class Compiled(Integrator):
@@ -314,7 +264,6 @@ class Compiled(Integrator):
         """One step of the only path under a drift (n,), with a noise impulse (n,) or its first part."""
 
     def rollout(self, scene: Scene, state: Run, commands: Commands, increments: Floats, dt: float) -> list[Segment]:
-        """See :meth:`Integrator.rollout`."""
         if scene.noise.diffusion is not None:
             return super().rollout(scene, state, commands, increments, dt)
         segments: list[Segment] = []
@@ -363,7 +312,6 @@ class Compiled(Integrator):
         dt: float,
         impulses: Floats | None = None,
     ) -> list[Segment]:
-        """See :meth:`Integrator.rollout_compiled`."""
         nodes = new_nodes(len(state.start), steps_of(commands), scene.robot.dof, scene.controls)
         state.paths.roll(dt, commands, increments, drift, nodes, impulses=impulses)
         return self._segments(scene, state.paths, nodes)
@@ -372,27 +320,9 @@ class Compiled(Integrator):
         """A segment for each of the core's paths, which have written ``nodes``."""
         return segments_of(nodes, self.reasons, paths)
 
-    def watched(
-        self,
-        scene: Scene,
-        state: Run,
-        commands: Commands,
-        dt: float,
-        nodes: RolloutArrays,
-        watch: Watch,
-        impulses: Floats | None = None,
-    ) -> tuple[Failure | None, Bytes]:
-        """See :meth:`Integrator.watched`."""
-        if scene.noise.diffusion is None or scene.constraints:
-            return super().watched(scene, state, commands, dt, nodes, watch, impulses)
-        state.paths.roll(dt, contiguous(commands), scene.silence, scene.no_drift, nodes, watch)
-        done = int(nodes.done[0])
-        return failure_of(nodes, 0, done, self.reasons), parts_of(nodes, 0, done, state.paths)
-
     def motions(
         self, scene: Scene, q0: Floats, v0: Floats, commands: Commands, dt: float
     ) -> tuple[Floats, Floats] | None:
-        """See :meth:`Integrator.motions`."""
         try:
             state = self.begun(scene, q0, v0)
         except SingularMassMatrix:

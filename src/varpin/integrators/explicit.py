@@ -40,7 +40,6 @@ class _Explicit(Compiled):
     reasons = dict.fromkeys(REASONS, REASONS[Outcome.not_finite])
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[Run, list[Segment]]:
-        """See :meth:`Integrator.start`."""
         refuse_constraints(scene, self)
         if scene.custom is not None:
             scene.custom.check(q0, v0)
@@ -52,11 +51,9 @@ class _Explicit(Compiled):
         return run, first_nodes(q, p, v, energy, scene.controls)
 
     def begun(self, scene: Scene, q0: Floats, v0: Floats) -> Run:
-        """See :meth:`Compiled.begun`."""
         return Run(core.ExplicitRollout.start(scene.core, self.method, q0, v0), q0.copy())
 
     def fork(self, state: Run) -> Run:
-        """See :meth:`Integrator.fork`."""
         return replace(state, paths=state.paths.copy())
 
     def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
@@ -145,5 +142,4 @@ class RungeKutta4(_Explicit):
     stage_times = (0.0, 0.5, 1.0)
 
     def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        """See :meth:`Integrator.linearize_with_ramps`."""
         return *self.linearize(scene, trajectory), self._derivatives(scene, trajectory, ramp=True)[1]

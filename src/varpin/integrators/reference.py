@@ -81,7 +81,6 @@ class Reference(Integrator):
 
     @property
     def stage_times(self) -> tuple[float, ...]:
-        """See :attr:`Integrator.stage_times`."""
         return tuple(gauss_coefficients(_POINTS)[2].tolist())
 
     def start(self, scene: Scene, q0: Floats, v0: Floats) -> tuple[ReferenceRun, list[Segment]]:
@@ -107,7 +106,6 @@ class Reference(Integrator):
         return run, segments_of(nodes, REASONS)
 
     def fork(self, state: ReferenceRun) -> ReferenceRun:
-        """See :meth:`Integrator.fork`."""
         return replace(state, x=state.x.copy())
 
     def rollout_compiled(
@@ -203,7 +201,6 @@ class Reference(Integrator):
         return J[:, :, : 2 * n], J[:, :, 2 * n :], J[:, :, n : 2 * n]
 
     def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        """See :meth:`Integrator.linearize_with_ramps`."""
         in_ramp = self._linearized(scene, trajectory, ramp=True)[:, :, 2 * scene.robot.dof :]
         return *self.linearize(scene, trajectory), in_ramp
 

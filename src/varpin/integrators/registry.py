@@ -1,4 +1,4 @@
-"""Integrators by name, and from the text that a trajectory stores."""
+"""Integrators by name, and from the text that a trajectory stores; whether a motion is of a scene."""
 
 from __future__ import annotations
 
@@ -10,21 +10,17 @@ from typing import Any
 
 from varpin.errors import InputError
 from varpin.integrators.base import Integrator
+from varpin.integrators.collocation import Gauss, Radau
 from varpin.integrators.explicit import ExplicitEuler, RungeKutta4, SemiImplicitEuler
-from varpin.integrators.gauss import Gauss
 from varpin.integrators.midpoint import Midpoint
-from varpin.integrators.radau import Radau
 from varpin.integrators.reference import Reference
 from varpin.integrators.variational import Guard
+from varpin.mechanics.scene import Scene, differences, same
+from varpin.trajectory import Trajectory, require_trajectory
 
 _OWN: tuple[type[Integrator], ...] = (Midpoint, Gauss, Radau, ExplicitEuler, SemiImplicitEuler, RungeKutta4, Reference)
 # Integrators by class name. A new integrator is added to the tuple above.
 BY_NAME: Mapping[str, type[Integrator]] = MappingProxyType({kind.__name__: kind for kind in _OWN})
-
-
-def options_of(kind: type[Integrator]) -> tuple[str, ...]:
-    """The names of an integrator's options, in order."""
-    return tuple(item.name for item in fields(kind))  # type: ignore[arg-type]
 
 
 def integrator_of(text: str) -> Integrator:
@@ -53,14 +49,18 @@ def integrator_of(text: str) -> Integrator:
         raise InputError(f"an integrator is written as {form}, got {text!r}") from None
     if name not in BY_NAME:
         raise InputError(f"varpin has no integrator {name!r}; it has {', '.join(BY_NAME)}")
-    kind = BY_NAME[name]
-    known = options_of(kind)
-    odd = [option for option in named if option not in known[len(values) :]]
-    if len(values) > len(known) or odd:
-        which = f"no option {odd[0]!r}" if odd and odd[0] not in known else "fewer options than given"
-        has = f"its options are {', '.join(known)}" if known else "it has none"
-        raise InputError(f"{name} has {which}; {has}: {text!r}")
-    return kind(*values, **named)
+    made: Integrator = _made(BY_NAME[name], values, named, text)
+    return made
+
+
+def _made(kind: type[Any], values: list[Any], named: dict[str, Any], text: str) -> Any:
+    """The object of a class with options."""
+    try:
+        return kind(*values, **named)
+    except TypeError:
+        known = ", ".join(item.name for item in fields(kind)) or "none"
+        given = ", ".join([*map(repr, values), *map(repr, named)])
+        raise InputError(f"options of {kind.__name__} are {known}, not {given}: {text!r}") from None
 
 
 def _value(node: ast.expr) -> Any:
@@ -70,10 +70,43 @@ def _value(node: ast.expr) -> Any:
             return name
         case ast.Call(func=ast.Name(id="Guard"), args=[], keywords=keywords):
             given = {str(keyword.arg): _value(keyword.value) for keyword in keywords}
-            if odd := [option for option in given if option not in (known := [item.name for item in fields(Guard)])]:
-                raise InputError(f"Guard has no option {odd[0]!r}; its options are {', '.join(known)}")
-            return Guard(**given)
+            return _made(Guard, [], given, ast.unparse(node))
     try:
         return ast.literal_eval(node)
     except ValueError:
         raise InputError(f"options of an integrator are numbers and words, got {ast.unparse(node)!r}") from None
+
+
+def require_motion(scene: Scene, trajectory: Trajectory) -> None:
+    """Refuse anything but a trajectory of a scene's robot with the scene's number of controls.
+
+    Raises:
+        InputError: It is not one; the message tells the difference.
+    """
+    require_trajectory(trajectory)
+    if trajectory.joint_names != scene.robot.joint_names:
+        raise InputError(
+            f"the trajectory is of joints {', '.join(trajectory.joint_names)}; "
+            f"the scene's robot has {', '.join(scene.robot.joint_names)}"
+        )
+    if trajectory.u.shape[1] != scene.controls:
+        raise InputError(f"the trajectory has {trajectory.u.shape[1]} controls, the scene {scene.controls}")
+
+
+def require_scene_of(scene: Scene, trajectory: Trajectory) -> None:
+    """Refuse a motion of a scene with other numbers, as far as the motion has them.
+
+    Noise is compared only if the motion has increments: a motion without noise does not depend on it.
+
+    Raises:
+        InputError: The scenes differ; the message tells where.
+    """
+    found = differences(scene, trajectory.scene_values, noise=bool(trajectory.dw.any()))
+    if not same(trajectory.masses, scene.robot.tree.mass):
+        found.insert(0, "the robot's masses")
+    if found:
+        more = f" and {len(found) - 2} more" if len(found) > 2 else ""
+        raise InputError(
+            f"the trajectory was made in another scene than the one given, which differs in {', '.join(found[:2])}"
+            f"{more}. Give the scene that made it, or simulate again in this one"
+        )

@@ -11,16 +11,12 @@ import numpy as np
 
 from varpin.arrays import Floats
 from varpin.core import (
-    ConstrainedRollout,
     Guards,
     Outcome,
+    Rollout,
+    Steps,
     Tableau,
-    VariationalRollout,
     constrained_derivatives,
-    variational_bends,
-    variational_curvatures,
-    variational_derivatives,
-    variational_ends,
 )
 from varpin.core.arrays import Commands, RolloutArrays
 from varpin.errors import InputError, LinearizationError, SingularMassMatrix
@@ -39,14 +35,13 @@ from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.scene import Scene, refuse_constraints
 from varpin.signals.commands import cubics
 from varpin.support.checks import count, fraction, is_one_of, positive
+from varpin.support.differences import FOURTH, slopes
 from varpin.trajectory import MOST_HALVINGS, Trajectory
 
 # Tolerance of an energy balance that is not checked.
 _UNCHECKED = 1e300
 
-# Points and weights of fourth-order differences of first derivatives, for second derivatives under constraints.
-_DIFFERENCES = ((1.0, 2.0 / 3.0), (-1.0, -2.0 / 3.0), (2.0, -1.0 / 12.0), (-2.0, 1.0 / 12.0))
-# Unit of the points [rad or m, and for momenta and forces the speeds rad/s or m/s].
+# Steps of differences for second derivatives under constraints [rad or m, and of momenta and forces by speeds].
 _SHIFT = 2.5e-4
 
 REASONS: dict[int, str] = {
@@ -122,17 +117,14 @@ class Variational(Compiled):
 
     @property
     def left(self) -> float:
-        """See :attr:`Integrator.left`."""
         return 0.5 if self.kick == "split" else 1.0
 
     @property
     def holds_noise(self) -> bool:
-        """See :attr:`Integrator.holds_noise`."""
         return self.kick == "held"
 
     @property
     def keeps_constraints(self) -> bool:
-        """See :attr:`Integrator.keeps_constraints`."""
         return self._constraint_places() is not None
 
     @abstractmethod
@@ -197,36 +189,29 @@ class Variational(Compiled):
         Raises:
             SingularMassMatrix: M(q0) is not positive definite.
         """
-        rollout: VariationalRollout | ConstrainedRollout
-        method = scene.core, self._tableau()
-        options = float(self.tolerance), self._guards(energy=not scene.inputs)
-        if scene.constraints:
-            rollout = ConstrainedRollout(*method, self._places(scene), *options, len(q0), self.holds_noise)
-        else:
-            rollout = VariationalRollout(*method, *options, self.left, len(q0), held=self.holds_noise)
+        guards, places = self._guards(energy=not scene.inputs), self._places(scene) if scene.constraints else None
+        method = scene.core, self._tableau(), float(self.tolerance), guards, self.left
+        rollout = Rollout(*method, len(q0), self.holds_noise, places)
         if not rollout.begin(q0, v0):
             raise SingularMassMatrix(scene.robot.joint_names, q0)
         return Run(rollout, q0.copy(), bool(scene.inputs))
 
     def fork(self, state: Run) -> Run:
-        """See :meth:`Integrator.fork`."""
         return replace(state, paths=state.paths.fork(self._guards(energy=not state.driven)))
 
     def _segments(self, scene: Scene, paths: Any, nodes: RolloutArrays) -> list[Segment]:
         found = super()._segments(scene, paths, nodes)
-        if not isinstance(paths, ConstrainedRollout):
+        if not scene.constraints:
             return found
         return [_constrained(scene, paths, i, segment) for i, segment in enumerate(found)]
 
     def state_of(self, state: Run) -> tuple[Floats, Floats, Floats]:
-        """See :meth:`Compiled.state_of`."""
         q, p, v, _ = state.paths.nodes()
         return q[0], p[0], v[0]
 
     def kicked(
         self, scene: Scene, state: Run, command: Commands, drift: Floats, impulse: Floats | None, dt: float
     ) -> Segment:
-        """See :meth:`Compiled.kicked`."""
         held = None
         if impulse is not None and self.holds_noise:
             held = np.stack([impulse, np.zeros_like(impulse)])[None, None]
@@ -243,7 +228,6 @@ class Variational(Compiled):
         return Jx, Jf, self._kicks(scene, trajectory, Jx, Jf)
 
     def linearize_with_ramps(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-        """See :meth:`Integrator.linearize_with_ramps`."""
         if not self.stage_times:
             return super().linearize_with_ramps(scene, trajectory)
         Jx, Jf, Jr = self._derivatives(scene, trajectory, ramp=True)
@@ -271,23 +255,17 @@ class Variational(Compiled):
         Without ``ramp`` the last array is empty. With ``external`` the force is one that drives do not limit. The
         columns of velocities of cubic inputs follow those of the force, as in :attr:`Scene.transmission`.
         """
-        steps = self._steps(scene, trajectory)
-        guess = np.ascontiguousarray(self._guess(trajectory))
+        steps = Steps(**self._steps(scene, trajectory))
         if scene.constraints:
             rates, cubic = _rates(scene, trajectory)
-            given: dict[str, Any] = {
-                "rates": rates,
-                "places": self._places(scene),
-                "guess": guess,
-                "external": external,
-            }
+            given: dict[str, Any] = {"rates": rates, "places": self._places(scene), "external": external}
             found = []
             for growing in (False, True) if ramp else (False,):
-                Jx, Jf, by_rate, outcome, done = constrained_derivatives(**steps, **given, ramp=growing)
+                Jx, Jf, by_rate, outcome, done = constrained_derivatives(steps, **given, ramp=growing)
                 _require_solved(trajectory, outcome, done)
                 found.append(np.concatenate([Jf, by_rate[:, :, cubic]], axis=2) if cubic else Jf)
             return Jx, found[0], found[1] if ramp else Jf[:0]
-        Jx, Jf, Jr, outcome, done = variational_derivatives(**steps, guess=guess, ramp=ramp, external=external)
+        Jx, Jf, Jr, outcome, done = steps.derivatives(ramp, external)
         _require_solved(trajectory, outcome, done)
         return Jx, Jf, Jr
 
@@ -300,7 +278,6 @@ class Variational(Compiled):
         n, N = scene.robot.dof, trajectory.steps
         rates, cubic = _rates(scene, trajectory)
         wide = 3 * n + len(cubic)
-        steps, guess = self._steps(scene, trajectory), np.ascontiguousarray(self._guess(trajectory))
         M, _ = scene.core.jets(np.ascontiguousarray(trajectory.q[:-1]), np.ascontiguousarray(trajectory.v[:-1]))
         S = np.zeros((N, wide, wide))
         S[:] = np.eye(wide)
@@ -310,26 +287,21 @@ class Variational(Compiled):
             # The control of a kinematic input is a position, not a force.
             S[:, 2 * n + c, 2 * n : 3 * n] = S[:, 2 * n : 3 * n, 2 * n + c] = 0.0
             S[:, 2 * n + c, 2 * n + c] = 1.0
-        copies = len(_DIFFERENCES)
-        whole = {name: np.concatenate([steps[name]] * copies) for name in ("substeps", "halvings")}
-        whole |= {"guess": np.concatenate([guess] * copies), "places": self._places(scene)}
-        towards = np.empty((N, wide, wide))
-        for d in range(wide):
-            shift = np.concatenate([_SHIFT * share * S[:, :, d] for share, _ in _DIFFERENCES])
-            given = dict(steps)
-            given["q"] = np.concatenate([steps["q"]] * copies) + shift[:, :n]
-            given["p"] = np.concatenate([steps["p"]] * copies) + shift[:, n : 2 * n]
+        steps, places = self._steps(scene, trajectory), self._places(scene)
+
+        def gradients(y: Floats) -> Floats:
+            shift, by = S @ y, rates.copy()
+            by[:, cubic] += shift[:, 3 * n :]
+            at = {"q": steps["q"] + shift[:, :n], "p": steps["p"] + shift[:, n : 2 * n]}
             force = shift[:, 2 * n : 3 * n]
-            given["force"] = np.concatenate([steps["force"]] * copies)
-            given["force"] = given["force"] + (force if given["force"].ndim == 2 else force[:, None])
-            moved = np.concatenate([rates] * copies)
-            moved[:, cubic] += shift[:, 3 * n :]
-            Jx, Jf, Jr, outcome, done = constrained_derivatives(**(given | whole), rates=moved, ramp=False)
-            if outcome in REASONS:
-                raise LinearizationError(done % N, done % N * trajectory.dt, REASONS[outcome])
-            J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2).reshape(copies, N, 2 * n, wide)
-            weights = np.array([weight for _, weight in _DIFFERENCES]) / _SHIFT
-            towards[:, :, d] = np.einsum("k,Na,kNab->Nb", weights, z, J)
+            at["force"] = steps["force"] + (force if steps["force"].ndim == 2 else force[:, None])
+            Jx, Jf, Jr, outcome, done = constrained_derivatives(Steps(**(steps | at)), places=places, rates=by)
+            _require_solved(trajectory, outcome, done)
+            J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2)
+            found: Floats = np.einsum("Na,Nab->Nb", z, J)
+            return found
+
+        towards = slopes(gradients, np.zeros(wide), _SHIFT, FOURTH)
         H = np.swapaxes(np.linalg.solve(np.swapaxes(S, 1, 2), np.swapaxes(towards, 1, 2)), 1, 2)
         symmetric: Floats = 0.5 * (H + np.swapaxes(H, 1, 2))
         return symmetric
@@ -340,30 +312,13 @@ class Variational(Compiled):
             raise InputError("second derivatives are not there for a scene with a CustomForce")
         if scene.constraints:
             return self._contract_by_differences(scene, trajectory, z)
-        steps = self._steps(scene, trajectory)
-        H, outcome, done = variational_curvatures(
-            **steps, guess=np.ascontiguousarray(self._guess(trajectory)), z=np.ascontiguousarray(z)
-        )
+        H, outcome, done = Steps(**self._steps(scene, trajectory)).curvatures(np.ascontiguousarray(z))
         _require_solved(trajectory, outcome, done)
         return H
 
-    def bend(self, scene: Scene, trajectory: Trajectory, weights: Floats) -> Floats:
-        """Derivatives (N, 3n) in (q, p, force) of sums of ``weights`` (N, 2n, 3n) times first derivatives of steps.
-
-        These are :meth:`contract`'s second derivatives times a matrix, for scenes without custom forces, constraints
-        and kinematic inputs.
-        """
-        found, outcome, done = variational_bends(
-            **self._steps(scene, trajectory),
-            guess=np.ascontiguousarray(self._guess(trajectory)),
-            weights=np.ascontiguousarray(weights),
-        )
-        _require_solved(trajectory, outcome, done)
-        return found
-
     def quiet_ends(self, scene: Scene, trajectory: Trajectory) -> tuple[Floats, Floats]:
         """See :meth:`Integrator.quiet_ends`; the steps are those that :meth:`linearize` differentiates."""
-        q, v, outcome, done = variational_ends(**self._steps(scene, trajectory))
+        q, v, outcome, done = Steps(**self._steps(scene, trajectory)).ends()
         _require_solved(trajectory, outcome, done)
         return q, v
 
@@ -384,6 +339,7 @@ class Variational(Compiled):
             "force": force,
             "substeps": statistics.substeps,
             "halvings": statistics.halvings,
+            "guess": self._guess(trajectory),
         }
         return {
             "mechanism": scene.core,
@@ -413,7 +369,7 @@ class Variational(Compiled):
         """Times of the stages in a unit step (s,)."""
 
 
-def _constrained(scene: Scene, paths: ConstrainedRollout, i: int, segment: Segment) -> Segment:
+def _constrained(scene: Scene, paths: Rollout, i: int, segment: Segment) -> Segment:
     """The segment with the impulses of path ``i`` and, in its failure, the constraint that stopped the path."""
     failure = segment.failure
     if failure is not None and failure.reason in (REASONS[Outcome.toggle], REASONS[Outcome.assembly]):

@@ -23,6 +23,7 @@ from varpin.errors import InputError, UnknownJoint
 from varpin.mechanics.forces import Described, Point, point_of, require_index, require_movable, shown
 from varpin.model import Robot
 from varpin.support.checks import as_floats, count, finite, finite_array, is_one_of, positive, returned, tuple_of
+from varpin.support.differences import slopes
 
 _AXES = "xyz"
 
@@ -95,7 +96,6 @@ class PointOnPoint(Constraint):
     axes: str = "xyz"
 
     def bind(self, robot: Robot) -> Bound:
-        """See :meth:`Constraint.bind`."""
         axes = self.axes
         if not (isinstance(axes, str) and axes and set(axes) <= set(_AXES) and len(set(axes)) == len(axes)):
             raise InputError(f"axes must be some of 'xyz', each once, got {axes!r}")
@@ -123,7 +123,6 @@ class FrameOnFrame(Constraint):
     placement: ArrayLike | None = None
 
     def bind(self, robot: Robot) -> Bound:
-        """See :meth:`Constraint.bind`."""
         for name in ("a", "b"):
             if not isinstance(getattr(self, name), str):
                 raise InputError(f"FrameOnFrame: {name} must be a frame's name, got {shown(getattr(self, name))}")
@@ -162,7 +161,6 @@ class PointOnPlane(Constraint):
     normal: ArrayLike
 
     def bind(self, robot: Robot) -> Bound:
-        """See :meth:`Constraint.bind`."""
         a, b, turned = _ends(self, robot)
         normal = turned @ _unit("normal", self.normal)
         vectors = ((a, b), (Carried(b.body, True, _row(normal)),))
@@ -184,7 +182,6 @@ class PointOnLine(Constraint):
     direction: ArrayLike
 
     def bind(self, robot: Robot) -> Bound:
-        """See :meth:`Constraint.bind`."""
         a, b, turned = _ends(self, robot)
         along = _unit("direction", self.direction)
         first = np.cross(along, np.eye(3)[int(np.argmin(np.abs(along)))])
@@ -212,7 +209,6 @@ class Distance(Constraint):
     length: float
 
     def bind(self, robot: Robot) -> Bound:
-        """See :meth:`Constraint.bind`."""
         a, b, _ = _ends(self, robot)
         length = positive("length", _number(self.length), "m")
         return Bound(ConstraintRows(((a, b),), (Product(0, 0, 0.5 / length, 0.5 * length),)), (f"{self!r}",))
@@ -235,7 +231,6 @@ class JointTie(Constraint):
     coefficients: ArrayLike = (0.0, 1.0)
 
     def bind(self, robot: Robot) -> Bound:
-        """See :meth:`Constraint.bind`."""
         for name in (self.joint, self.leader):
             if name not in robot.joint_names:
                 raise UnknownJoint(str(name), robot.joint_names, "JointTie")
@@ -274,7 +269,6 @@ class KinematicInput(Constraint):
         return f"KinematicInput(joint={self.joint!r}{shape})"
 
     def bind(self, robot: Robot) -> Bound:
-        """See :meth:`Constraint.bind`."""
         if not isinstance(self.joint, str):
             raise InputError(f"KinematicInput takes the name of a joint, got {self.joint!r}")
         if self.joint not in robot.joint_names:
@@ -313,7 +307,6 @@ class CustomConstraint(Constraint):
             raise InputError(f"CustomConstraint: curvature must be a function of q and weights, got {self.curvature!r}")
 
     def bind(self, robot: Robot) -> Bound:
-        """See :meth:`Constraint.bind`."""
         n, r = robot.dof, int(self.rows)
         custom = CustomRows(r, _Values(self, n), _Curvature(self, n))
         return Bound(ConstraintRows(customs=(custom,)), tuple(f"{self!r}, row {k}" for k in range(r)))
@@ -360,13 +353,8 @@ class _Curvature:
         curvature = self.custom.curvature
         if curvature is not None:
             return _called("curvature", lambda: curvature(q, weights), (n, n), q)
-        slope = _Values(self.custom, n).jacobian
-        H = np.empty((n, n))
-        for c in range(n):
-            size = 1e-3 * max(1.0, abs(q[c]))
-            step = size * np.eye(n)[c]
-            parts = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-            H[c] = sum(w * (weights @ (slope(q + k * step) - slope(q - k * step))) for k, w in parts.items()) / size
+        jacobian = _Values(self.custom, n).jacobian
+        H = slopes(lambda at: weights @ jacobian(at), q, 1e-3 * np.maximum(1.0, np.abs(q)))
         symmetric: Floats = 0.5 * (H + H.T)
         return symmetric
 

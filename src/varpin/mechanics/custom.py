@@ -16,13 +16,13 @@ from varpin.errors import InputError
 from varpin.mechanics.forces import Force
 from varpin.model import Robot
 from varpin.support.checks import returned
+from varpin.support.differences import EIGHTH
 from varpin.support.frozen import Frozen
 
 Field: TypeAlias = Callable[[Floats, Floats], ArrayLike]
 Slopes: TypeAlias = Callable[[Floats, Floats], tuple[ArrayLike, ArrayLike]]
 
-# Weights of central differences of eighth order, and of sixth order at the same points.
-_WEIGHTS = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+# Weights of central differences of sixth order at the points of those of eighth order.
 _LOWER = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60, 4: 0.0}
 # Largest difference of the two orders that needs no smaller step, relative to the derivative and the force.
 _SMOOTH = 1e-8
@@ -131,7 +131,7 @@ class CustomForce(Force):
         for share in _STEPS:
             size = share * max(1.0, abs(float((q, v)[moved][c])))
             high, low, force = np.zeros_like(q), np.zeros_like(q), 0.0
-            for steps, weight in _WEIGHTS.items():
+            for steps, weight in EIGHTH.items():
                 for side in (1.0, -1.0):
                     state = [q.copy(), v.copy()]
                     state[moved][c] += side * steps * size

@@ -147,7 +147,6 @@ class JointSpring(Force):
     rest: JointValues = 0.0
 
     def bind(self, robot: Robot) -> tuple[Element, ...]:
-        """See :meth:`Force.bind`."""
         stiffness = not_negative("stiffness", self.stiffness, robot)
         rest = joint_array("rest", self.rest, robot.joint_names, uniform=True)
         return tuple(_elements("JointSpring", stiffness > 0.0, stiffness, rest))
@@ -164,7 +163,6 @@ class JointDamper(Force):
     damping: JointValues
 
     def bind(self, robot: Robot) -> tuple[Element, ...]:
-        """See :meth:`Force.bind`."""
         damping = not_negative("damping", self.damping, robot)
         return tuple(_elements("JointDamper", damping > 0.0, damping))
 
@@ -180,7 +178,6 @@ class Armature(Force):
     inertia: JointValues
 
     def bind(self, robot: Robot) -> tuple[Element, ...]:
-        """See :meth:`Force.bind`."""
         inertia = not_negative("inertia", self.inertia, robot)
         return tuple(_elements("Armature", inertia > 0.0, inertia))
 
@@ -207,7 +204,6 @@ class CoulombFriction(Force):
     stribeck_velocity: JointValues | None = None
 
     def bind(self, robot: Robot) -> tuple[Element, ...]:
-        """See :meth:`Force.bind`."""
         if (self.breakaway is None) != (self.stribeck_velocity is None):
             raise InputError("breakaway and stribeck_velocity belong together: give both or neither")
         level = not_negative("level", self.level, robot)
@@ -246,7 +242,6 @@ class JointStop(Force):
     width: JointValues = 0.01
 
     def bind(self, robot: Robot) -> tuple[Element, ...]:
-        """See :meth:`Force.bind`."""
         stiffness = not_negative("stiffness", self.stiffness, robot)
         damping = not_negative("damping", self.damping, robot)
         own_lower, own_upper = robot.position_limits
@@ -290,7 +285,6 @@ class PositionServo(Force):
     effort: JointValues = np.inf
 
     def bind(self, robot: Robot) -> tuple[Element, ...]:
-        """See :meth:`Force.bind`."""
         stiffness = not_negative("stiffness", self.stiffness, robot)
         damping = not_negative("damping", self.damping, robot)
         effort = _ends("effort", self.effort, robot, np.inf)
@@ -317,7 +311,6 @@ class FrameWrench(Force):
     axes: Literal["world", "frame"] = "world"
 
     def bind(self, robot: Robot) -> tuple[Coupling, ...]:
-        """See :meth:`Force.bind`."""
         if not is_one_of(self.axes, ("world", "frame")):
             raise InputError(f"axes must be 'world' or 'frame', got {self.axes!r}")
         wrench = finite_array("wrench", self.wrench, (6,))
@@ -369,7 +362,6 @@ class FrameSpring(Force):
     rest_rotation: ArrayLike | None = None
 
     def bind(self, robot: Robot) -> tuple[Coupling, ...]:
-        """See :meth:`Force.bind`."""
         return (*self._of_points(robot), *self._of_turning(robot))
 
     def _of_turning(self, robot: Robot) -> tuple[Coupling, ...]:
@@ -427,7 +419,6 @@ class FrameDamper(Force):
     rotational_damping: ArrayLike | None = None
 
     def bind(self, robot: Robot) -> tuple[Coupling, ...]:
-        """See :meth:`Force.bind`."""
         bodies, places = _ends_of(self, robot)
         found = []
         for kind, name, given in (

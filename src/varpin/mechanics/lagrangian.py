@@ -15,7 +15,6 @@ from varpin.arrays import Floats
 from varpin.errors import InputError
 from varpin.mechanics.forces import ELEMENTS, keeps_energy, of_kind
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
-from varpin.model.tree import joint_axis, z_to
 from varpin.support.checks import JointValues, fraction, joint_array, positive
 from varpin.textbook import rigid_body_Lqq
 
@@ -54,7 +53,8 @@ def lagrangian_jet(
         q: Configuration, (n,) or by joint name [rad or m].
         v: Velocity, (n,) or by joint name [rad/s or m/s].
         backend: ``"compiled"`` takes one sweep over the tree (see ``docs/mathematics.md``); ``"pinocchio"`` puts
-            the same together from Pinocchio's algorithms, slowly, as a reference.
+            the same together from Pinocchio's algorithms, slowly, as a reference, without stops and springs between
+            frames.
 
     Raises:
         InputError: Wrong shapes, values that are not finite, or an unknown backend, or a force that the backend lacks.
@@ -73,7 +73,8 @@ def _compiled(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
 
 
 def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
-    missing = {each.kind for each in scene.elements if ELEMENTS[each.kind].potential} - {"JointSpring", "JointStop"}
+    missing = {each.kind for each in scene.elements if ELEMENTS[each.kind].potential} - {"JointSpring"}
+    missing |= {each.kind for each in scene.couplings if keeps_energy(each)}
     if missing:
         raise InputError(f"backend='pinocchio' has no {', '.join(sorted(missing))}; backend='compiled' has")
     robot = scene.robot
@@ -95,96 +96,15 @@ def _from_pinocchio(scene: Scene, q: Floats, v: Floats) -> LagrangianJet:
     gravity = pin.computeGeneralizedGravity(model, data, full_q).copy()
     M += np.diag(own_armature)
     added = np.diag(scene.armature - robot.tree.armature)
-    energy, force, curvature = _stops(scene, q)
 
     deflection = q - scene.rest
     Lvv = G.T @ M @ G + added
-    Lq = G.T @ (C.T @ full_v - gravity) - scene.stiffness * deflection + force
-    Lqq = G.T @ rigid_body_Lqq(model, full_q, full_v) @ G - np.diag(scene.stiffness) + np.diag(curvature)
-    potential = pin.computePotentialEnergy(model, data, full_q) + energy
+    Lq = G.T @ (C.T @ full_v - gravity) - scene.stiffness * deflection
+    Lqq = G.T @ rigid_body_Lqq(model, full_q, full_v) @ G - np.diag(scene.stiffness)
+    potential = pin.computePotentialEnergy(model, data, full_q)
     springs = of_kind(scene.elements, "JointSpring")
     potential += sum(0.5 * spring.values[0] * (q[spring.coordinate] - spring.values[1]) ** 2 for spring in springs)
-    coupled, pull, bend = _coupled(scene, model, full_q, G)
-    potential, Lq, Lqq = potential + coupled, Lq - pull, Lqq - bend
     return LagrangianJet(float(0.5 * v @ Lvv @ v - potential), Lq, Lvv @ v, Lqq, G.T @ A @ G, Lvv)
-
-
-def _coupled(scene: Scene, model: pin.Model, full_q: Floats, G: Floats) -> tuple[float, Floats, Floats]:
-    """The potential energy V of all couplings, with dV/dq (n,) and d2V/dq2 (n, n)."""
-    n = G.shape[1]
-    data = model.createData()
-    pin.forwardKinematics(model, data, full_q)
-    energy, slope, curvature = 0.0, np.zeros(n), np.zeros((n, n))
-    for coupling in scene.couplings:
-        if not keeps_energy(coupling):
-            continue
-        d, J, H = np.zeros(3), np.zeros((3, n)), np.zeros((n, 3, n))
-        numbers = np.array(coupling.values)
-        ends = [(1.0, coupling.a, numbers[:3]), (-1.0, coupling.b, numbers[3:6])]
-        if coupling.kind == "FrameTurnSpring":
-            # This kind couples directions, differences from the origins of their bodies.
-            ends += [(-side, body, np.zeros(3)) for side, body, _ in ends]
-        for side, body, at_body in ends:
-            if body < 0:
-                d += side * at_body
-                continue
-            joint = body + 1
-            point = pin.SE3(np.eye(3), z_to(joint_axis(model, joint)[1]) @ at_body)
-            here = data.oMi[joint] * point
-            d += side * here.translation
-            for i, rates in enumerate(G.T):
-                pin.computeForwardKinematicsDerivatives(model, data, full_q, rates, np.zeros(model.nv))
-                by_q, by_v = pin.getFrameVelocityDerivatives(model, data, joint, point, pin.LOCAL)
-                velocity = by_v[:3] @ rates
-                J[:, i] += side * here.rotation @ velocity
-                # The derivative of R v_local is R (d v_local + w x v_local).
-                H[i] += side * here.rotation @ (by_q[:3] + np.cross(by_v[3:].T, velocity).T) @ G
-        own_energy, force, stiff = _between(coupling.kind, numbers[6:], d)
-        energy += own_energy
-        slope += J.T @ force
-        curvature += J.T @ stiff @ J + np.einsum("irj,r->ij", H, force)
-    return energy, slope, curvature
-
-
-def _between(kind: str, numbers: Floats, d: Floats) -> tuple[float, Floats, Floats]:
-    """The energy V of a coupling and its derivatives (3,) and (3, 3) in d = x_a - x_b."""
-    if kind == "FrameLoad":
-        return float(-numbers @ d), -numbers, np.zeros((3, 3))
-    if kind == "FrameSpring":
-        stiffness, stretch = numbers[:3], d - numbers[3:]
-        return float(0.5 * stiffness @ stretch**2), stiffness * stretch, np.diag(stiffness)
-    if kind == "FrameTurnSpring":
-        return float(0.5 * numbers[0] * d @ d), numbers[0] * d, numbers[0] * np.eye(3)
-    (stiffness, length), far = numbers, float(np.linalg.norm(d))
-    if far == 0.0:
-        return float(0.5 * stiffness * length**2), np.zeros(3), np.zeros((3, 3))
-    e, stretch = d / far, far - length
-    along = np.outer(e, e)
-    return (
-        float(0.5 * stiffness * stretch**2),
-        stiffness * stretch * e,
-        stiffness * (along + stretch / far * (np.eye(3) - along)),
-    )
-
-
-def _stops(scene: Scene, q: Floats) -> tuple[float, Floats, Floats]:
-    """The potential energy V of all joint stops, with -dV/dq and -d2V/dq2 (n,)."""
-    energy, force, curvature = 0.0, np.zeros_like(q), np.zeros_like(q)
-    # The relative stiffness s(y) = 3 y^2 - 2 y^3 over the first width, and its first and second integrals.
-    rise = np.polynomial.Polynomial([0.0, 0.0, 3.0, -2.0])
-    once, twice = rise.integ(), rise.integ(2)
-    for element in scene.elements:
-        if element.kind != "JointStop":
-            continue
-        lower, upper, stiffness, _, width = element.values
-        c = element.coordinate
-        side = 1.0 if q[c] > upper else -1.0
-        y = max(q[c] - upper, lower - q[c], 0.0) / width
-        past, y = max(y - 1.0, 0.0), min(y, 1.0)
-        energy += stiffness * width**2 * float(twice(y) + once(y) * past + 0.5 * past**2)
-        force[c] -= side * stiffness * width * float(once(y) + past)
-        curvature[c] -= stiffness * float(rise(y))
-    return energy, force, curvature
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ from varpin.support.checks import (
     require_finite,
     returned,
 )
+from varpin.support.differences import slopes
 from varpin.support.frozen import Frozen
 
 
@@ -117,34 +118,24 @@ class CompiledFields(BoundNoise):
 
     @property
     def diffusion(self) -> Diffusion:
-        """See :attr:`BoundNoise.diffusion`."""
         return self.arrays
 
     @property
     def processes(self) -> int:
-        """See :attr:`BoundNoise.processes`."""
         return int(self.arrays.constant.shape[1])
 
     def curvature(self, weight: Floats) -> Floats:
-        """See :meth:`BoundNoise.curvature`."""
         second: Floats = 2.0 * (self.arrays.quadratic * weight).sum(axis=2)
         return second[:, :, None] * np.eye(second.shape[1])
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
-        """See :meth:`BoundNoise.fields`."""
         arrays = self.arrays
         n, k = arrays.constant.shape
-        F, offset = _values(arrays, q, u, start)
+        offset = q[:, :, None] - np.where(np.isnan(arrays.center), start[:, None], arrays.center)
+        F = arrays.constant + np.einsum("ikm,Nm->Nik", arrays.control, u) + arrays.quadratic * offset**2
         Fq = np.zeros((len(q), n, k, n))
         Fq[:, np.arange(n), :, np.arange(n)] = np.moveaxis(2.0 * arrays.quadratic * offset, 1, 0)
         return Fields(F, Fq, None, np.broadcast_to(arrays.control, (len(q), *arrays.control.shape)))
-
-
-def _values(arrays: Diffusion, q: Floats, u: Floats, start: Floats) -> tuple[Floats, Floats]:
-    """The fields F (N, n, k), and the offset of q from their centers (N, n, k)."""
-    offset = q[:, :, None] - np.where(np.isnan(arrays.center), start[:, None], arrays.center)
-    F: Floats = arrays.constant + np.einsum("ikm,Nm->Nik", arrays.control, u) + arrays.quadratic * offset**2
-    return F, offset
 
 
 def over_steps(
@@ -190,22 +181,18 @@ class CompositeFields(BoundNoise):
 
     @property
     def processes(self) -> int:
-        """See :attr:`BoundNoise.processes`."""
         return sum(part.processes for part in self.parts)
 
     @property
     def velocity_dependent(self) -> bool:
-        """See :attr:`BoundNoise.velocity_dependent`."""
         return any(part.velocity_dependent for part in self.parts)
 
     @property
     def sloped(self) -> Integers:
-        """See :attr:`BoundNoise.sloped`."""
         first = np.cumsum([0, *(part.processes for part in self.parts)])
         return np.concatenate([start + part.sloped for start, part in zip(first[:-1], self.parts, strict=True)])
 
     def curvature(self, weight: Floats) -> Floats:
-        """See :meth:`BoundNoise.curvature`."""
         ends = np.cumsum([part.processes for part in self.parts])
         columns = np.split(weight, ends[:-1], axis=2)
         total: Floats = sum(
@@ -215,7 +202,6 @@ class CompositeFields(BoundNoise):
         return total
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:
-        """See :meth:`BoundNoise.fields`."""
         parts = [part.fields(q, v, u, start) for part in self.parts]
         Fv = None
         if any(part.Fv is not None for part in parts):
@@ -228,24 +214,11 @@ class CompositeFields(BoundNoise):
         )
 
 
-def _compiled(
-    n: int,
-    m: int,
-    k: int,
-    *,
-    constant: Floats | None = None,
-    control: Floats | None = None,
-    quadratic: Floats | None = None,
-    center: Floats | None = None,
-) -> CompiledFields:
-    return CompiledFields(
-        Diffusion(
-            np.zeros((n, k)) if constant is None else np.ascontiguousarray(constant),
-            np.zeros((n, k, m)) if control is None else np.ascontiguousarray(control),
-            np.zeros((n, k)) if quadratic is None else np.ascontiguousarray(quadratic),
-            np.zeros((n, k)) if center is None else np.ascontiguousarray(center),
-        )
-    )
+def _compiled(n: int, m: int, k: int, **given: Floats) -> CompiledFields:
+    """Fields in the form of the core, zero where they are not given."""
+    nothing = {"constant": (n, k), "control": (n, k, m), "quadratic": (n, k), "center": (n, k)}
+    values = {name: given.get(name, np.zeros(shape)) for name, shape in nothing.items()}
+    return CompiledFields(Diffusion(**{name: np.ascontiguousarray(value) for name, value in values.items()}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +233,6 @@ class AdditiveNoise(Noise):
     intensity: JointValues
 
     def bind(self, actuation: Floats) -> CompiledFields:
-        """See :meth:`Noise.bind`."""
         n, m = actuation.shape
         values = require_finite("AdditiveNoise intensity", as_floats("AdditiveNoise intensity", self.intensity))
         if values.ndim == 2:
@@ -282,7 +254,6 @@ class ControlNoise(Noise):
     intensity: ArrayLike
 
     def bind(self, actuation: Floats) -> CompiledFields:
-        """See :meth:`Noise.bind`."""
         n, m = actuation.shape
         values = require_finite("ControlNoise intensity", as_floats("ControlNoise intensity", self.intensity))
         if values.ndim == 3:
@@ -307,7 +278,6 @@ class StateNoise(Noise):
     center: JointValues | None = None
 
     def bind(self, actuation: Floats) -> CompiledFields:
-        """See :meth:`Noise.bind`."""
         n, m = actuation.shape
         strength = np.diag(broadcast_array("StateNoise intensity", self.intensity, n))
         center = np.full(n, np.nan) if self.center is None else broadcast_array("StateNoise center", self.center, n)
@@ -339,7 +309,6 @@ class CustomNoise(Noise):
     check: bool = False
 
     def bind(self, actuation: Floats) -> CustomFields:
-        """See :meth:`Noise.bind`."""
         count("CustomNoise processes", self.processes)
         for name in ("field", "dq", "dv", "du"):
             value = getattr(self, name)
@@ -361,17 +330,14 @@ class CustomFields(BoundNoise):
 
     @property
     def processes(self) -> int:
-        """See :attr:`BoundNoise.processes`."""
         return self.noise.processes
 
     @property
     def velocity_dependent(self) -> bool:
-        """See :attr:`BoundNoise.velocity_dependent`."""
         return self.noise.dv is not None
 
     @property
     def sloped(self) -> Integers:
-        """See :attr:`BoundNoise.sloped`."""
         return np.arange(0 if self.noise.du is None else self.processes)
 
     def fields(self, q: Floats, v: Floats, u: Floats, start: Floats) -> Fields:  # noqa: ARG002
@@ -401,39 +367,31 @@ class CustomFields(BoundNoise):
         return np.array(rows)
 
     def check(self) -> None:
-        """Compare the derivatives with central differences at three seeded random points.
+        """Compare the derivatives with differences at three seeded random points.
 
         Raises:
             InputError: A derivative differs; the message names it, the point and the error.
         """
-        rng = np.random.default_rng(0)
+        rng, n, shape = np.random.default_rng(0), self.n, (self.n, self.processes)
         for _ in range(3):
-            point = [rng.normal(size=(1, size)) for size in (self.n, self.n, self.m)]
-            fields = self.fields(point[0], point[1], point[2], point[0][0])
-            given = {
-                "dq": fields.Fq,
-                "dv": np.zeros_like(fields.Fq) if fields.Fv is None else fields.Fv,
-                "du": fields.Fu,
-            }
-            for slot, (name, derivative) in enumerate(given.items()):
-                for j in range(point[slot].shape[1]):
-                    difference = self._difference(point, slot, j)
-                    error = np.abs(derivative[0, :, :, j] - difference).max()
-                    if error > 1e-6 * max(1.0, np.abs(difference).max()):
-                        raise InputError(
-                            f"CustomNoise {name}(q, v, u)[:, :, {j}] differs from central differences of the field by "
-                            f"{error:.3g} at q = {point[0][0]}, v = {point[1][0]}, u = {point[2][0]}"
-                        )
+            q, v, u = (rng.normal(size=size) for size in (n, n, self.m))
+            given = self.fields(q[None], v[None], u[None], q)
 
-    def _difference(self, point: list[Floats], slot: int, j: int) -> Floats:
-        """dF/d(point[slot][j]) (n, k) by differences of fourth order."""
-        total = np.zeros((self.n, self.processes))
-        for shift, weight in ((1e-3, 8.0), (-1e-3, -8.0), (2e-3, -1.0), (-2e-3, 1.0)):
-            shifted = [x.copy() for x in point]
-            shifted[slot][0, j] += shift
-            q, v, u = (x[0] for x in shifted)
-            total += weight * self._evaluate("field", self.noise.field, [(q, v, u)], total.shape)[0]
-        return total / 12e-3
+            def field(x: Floats) -> Floats:
+                at = x[:n], x[n : 2 * n], x[2 * n :]
+                value: Floats = self._evaluate("field", self.noise.field, [at], shape)[0]
+                return value
+
+            found = np.split(slopes(field, np.concatenate([q, v, u]), 1e-3), [n, 2 * n], axis=2)
+            derivatives = given.Fq, np.zeros_like(given.Fq) if given.Fv is None else given.Fv, given.Fu
+            for name, derivative, differences in zip(("dq", "dv", "du"), derivatives, found, strict=True):
+                off = np.abs(derivative[0] - differences)
+                wrong = off > 1e-6 * np.maximum(1.0, np.abs(differences))
+                if wrong.any():
+                    raise InputError(
+                        f"CustomNoise {name}(q, v, u) differs from differences of the field by {off[wrong].max():.3g} "
+                        f"in [:, :, {int(np.argwhere(wrong)[0, 2])}] at q = {q}, v = {v}, u = {u}"
+                    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,7 +401,6 @@ class NoiseSum(Noise):
     terms: tuple[Noise, ...]
 
     def bind(self, actuation: Floats) -> BoundNoise:
-        """See :meth:`Noise.bind`."""
         return _together([term.bind(actuation) for term in self.terms])
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -12,16 +12,14 @@ from numpy.typing import ArrayLike
 from varpin.arrays import Floats, Integers, Mask
 from varpin.core.arrays import Coupling, Diffusion
 from varpin.errors import InputError, UnknownJoint
-from varpin.mechanics.forces import CoulombFriction, Force, JointDamper, JointSpring, JointStop, of_kind
+from varpin.mechanics.forces import Force, of_kind
 from varpin.mechanics.noise import BoundNoise, CompiledFields, Noise
 from varpin.mechanics.scene import Scene
 from varpin.model import Robot, combine
-from varpin.model.robot import hold_joints
+from varpin.model.loading import hold_joints
 from varpin.support.checks import JointValues, as_floats, joint_array
 from varpin.support.markup import facts, listed
 
-# Forces that act only if the scene has them, by their names in the report.
-_ABSENT: Mapping[str, type[Force]] = {"stops at joint limits": JointStop, "dry friction": CoulombFriction}
 # Share of the largest torque of gravity that is rounding.
 _ROUNDING = 1e-12
 
@@ -101,40 +99,8 @@ def report(part: Scene, whole: Scene, idle: Mapping[str, float]) -> Required:
         idle=idle,
         parts=(names,) if coupled else tuple(parts),
         coupled=coupled,
-        terms=_terms(part),
+        terms=part.terms,
     )
-
-
-def _terms(scene: Scene) -> dict[str, str]:
-    names, kinds = scene.robot.joint_names, list(dict.fromkeys(map(type, scene.forces)))
-    others = [kind.__name__ for kind in kinds if kind not in (JointSpring, JointDamper)]
-    noise = scene.noise.diffusion
-    acting = [f"{scene.processes} processes"] if scene.processes else []
-    if noise is not None:
-        masks = (noise.constant.any(axis=0), noise.control.any(axis=(0, 2)), noise.quadratic.any(axis=0))
-        counts = zip(("additive", "control", "state"), map(np.count_nonzero, masks), strict=True)
-        acting = [f"{kind} ({count} processes)" for kind, count in counts if count]
-    absent = [words for words, kind in _ABSENT.items() if kind not in kinds]
-    terms = {
-        "gravity": f"{', '.join(f'{g:g}' for g in scene.gravity)} m/s^2" if scene.gravity.any() else "none",
-        "damping": joints_with(scene.damping, names),
-        "springs": joints_with(scene.stiffness, names),
-        "noise": ", ".join(acting) or "none",
-        "driven": ", ".join(np.array(names)[scene.actuation.any(axis=1)].tolist()) or "none",
-        "other forces": ", ".join(sorted(others)) or "none",
-        "not modelled": f"{', '.join([*absent, 'contact'])}; shapes are read only for a replay",
-    }
-    if scene.constraints:
-        terms["constraints"] = ", ".join(dict.fromkeys(type(part).__name__ for part in scene.constraints))
-    return terms
-
-
-def joints_with(values: ArrayLike, names: Sequence[str]) -> str:
-    """The joints with values other than 0, in words."""
-    acting = [name for name, value in zip(names, np.asarray(values).tolist(), strict=True) if value]
-    if acting and len(acting) == len(names):
-        return "on every joint"
-    return f"on {', '.join(acting)}" if acting else "none"
 
 
 def idle_joints(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -37,6 +37,7 @@ from varpin.mechanics.forces import (
     Force,
     JointDamper,
     JointSpring,
+    JointStop,
     bound_force,
     dissipates,
     forces_of,
@@ -76,6 +77,8 @@ _RANK = 1e-9
 _NAMED = 7
 _OF_JOINTS = ("damping", "stiffness", "rest", "armature")
 EARTH = (0.0, 0.0, -9.81)
+# Forces that act only if the scene has them, by their names in a report.
+_ABSENT: Mapping[str, type[Force]] = {"stops at joint limits": JointStop, "dry friction": CoulombFriction}
 # Depth to which a joint may press into a stop, in widths of the stop.
 _STOP_DEPTH = 2.0
 
@@ -203,43 +206,42 @@ class Scene(Frozen):
     def __repr__(self) -> str:
         parts = [f"gravity {self.gravity.tolist()}" if self.gravity.any() else "no gravity"]
         parts += [name for name in ("damping", "stiffness") if getattr(self, name).any()]
-        parts += [name for name, _ in self._other_forces()]
+        parts += self._other_forces
         parts += [type(constraint).__name__ for constraint in self.constraints]
         parts += [f"noise of {self.processes} processes"] if self.processes else []
         return f"Scene({self.robot.name}: {', '.join(parts)}, {self.controls} controls)"
 
     def _repr_html_(self) -> str:
-        names, n = self.robot.joint_names, self.robot.dof
+        return facts(f"Scene of {self.robot.name}", [("joints", listed(self.robot.joint_names)), *self.terms.items()])
 
-        def of(values: Floats) -> str:
-            acting = [f"{name} {value:.4g}" for name, value in zip(names, values, strict=True) if value]
-            return f"{values[0]:.4g} on every joint" if len(acting) == n and np.ptp(values) == 0.0 else listed(acting)
+    @property
+    def terms(self) -> dict[str, str]:
+        """What acts in the scene, in words by its subject."""
+        names, kinds = self.robot.joint_names, list(dict.fromkeys(map(type, self.forces)))
+        noise, processes = self.noise.diffusion, f"{self.processes} processes" if self.processes else "none"
+        if noise is not None and self.processes:
+            masks = (noise.constant.any(axis=0), noise.control.any(axis=(0, 2)), noise.quadratic.any(axis=0))
+            counts = zip(("additive", "control", "state"), map(np.count_nonzero, masks), strict=True)
+            processes = ", ".join(f"{kind} ({count} processes)" for kind, count in counts if count) or processes
+        absent = [*(words for words, kind in _ABSENT.items() if kind not in kinds), "contact"]
+        terms = {
+            "gravity": f"{', '.join(f'{g:g}' for g in self.gravity)} m/s^2" if self.gravity.any() else "none",
+            "damping": joints_with(self.damping, names),
+            "springs": joints_with(self.stiffness, names),
+            "noise": processes,
+            "driven": ", ".join(np.array(names)[self.actuation.any(axis=1)].tolist()) or "none",
+            "other forces": ", ".join(sorted(self._other_forces)) or "none",
+            "not modelled": f"{', '.join(absent)}; shapes are read only for a replay",
+        }
+        if self.constraints:
+            terms["constraints"] = ", ".join(dict.fromkeys(type(part).__name__ for part in self.constraints))
+        return terms
 
-        pulls = "none" if not self.gravity.any() else ", ".join(f"{g:g}" for g in self.gravity)
-        driven = [name for name, row in zip(names, self.actuation, strict=True) if row.any()]
-        rows = [
-            ("joints", listed(names)),
-            ("gravity [m/s^2]", pulls),
-            ("damping [N m s/rad or N s/m]", of(self.damping)),
-            ("springs [N m/rad or N/m]", of(self.stiffness)),
-            *((f"{name} on", listed(acting)) for name, acting in self._other_forces()),
-            *(("constraint", repr(constraint)) for constraint in self.constraints),
-            ("driven", f"{listed(driven)} by {self.controls} controls" if driven else "none"),
-            ("noise", f"{self.processes} processes" if self.processes else "none"),
-        ]
-        return facts(f"Scene of {self.robot.name}", rows)
-
-    def _other_forces(self) -> list[tuple[str, list[str]]]:
-        """Kinds of forces other than joint springs and dampers, with the joints that they act on."""
-        acting: dict[str, dict[str, None]] = {}
-        for force in self.forces:
-            if not isinstance(force, JointSpring | JointDamper):
-                joints = acting.setdefault(type(force).__name__, {})
-                if isinstance(force, CustomForce):
-                    joints |= dict.fromkeys(self.robot.joint_names)
-                    continue
-                joints |= dict.fromkeys(self.robot.joint_names[c] for c in self._moved_by(force.bind(self.robot)))
-        return [(kind, list(joints)) for kind, joints in acting.items()]
+    @property
+    def _other_forces(self) -> list[str]:
+        """Kinds of forces other than joint springs and dampers."""
+        kinds = dict.fromkeys(type(force) for force in self.forces)
+        return [kind.__name__ for kind in kinds if kind not in (JointSpring, JointDamper)]
 
     def _moved_by(self, bound: Sequence[Element | Coupling]) -> list[int]:
         """The coordinates that forces act on."""
@@ -393,11 +395,6 @@ class Scene(Frozen):
         """The controls that are positions, and velocities, of kinematic inputs at the ends of steps."""
         positions = [int(np.argmax(self.actuation[c])) for c in self.inputs.values()]
         return np.array([*positions, *(rate for rate in self.rates if rate >= 0)], dtype=np.int64)
-
-    @property
-    def unprescribed(self) -> Integers:
-        """The coordinates without kinematic inputs."""
-        return np.setdiff1d(np.arange(self.robot.dof), list(self.inputs.values()))
 
     @cached_property
     def transmission(self) -> Floats:
@@ -637,18 +634,13 @@ class Scene(Frozen):
 
 def quiet(scene: Scene) -> Scene:
     """The scene without its noise."""
-    return _driven(scene, scene.actuation) if scene.processes else scene
+    return scene.changed(noise=bind(None, scene.actuation)) if scene.processes else scene
 
 
-def _driven(scene: Scene, actuation: Floats) -> Scene:
-    """The scene with another actuation matrix (n, m) and without noise."""
-    actuation = actuation.copy()
-    actuation.setflags(write=False)
-    made = object.__new__(Scene)
-    # The frozen dataclass refuses assignments; cached properties are not copied.
-    values = {item.name: getattr(scene, item.name) for item in fields(Scene)}
-    vars(made).update(values | {"actuation": actuation, "noise": bind(None, actuation)})
-    return made
+def joints_with(values: ArrayLike, names: Sequence[str]) -> str:
+    """The joints with values other than 0, in words."""
+    acting = [name for name, value in zip(names, np.asarray(values).tolist(), strict=True) if value]
+    return "on every joint" if acting and len(acting) == len(names) else f"on {', '.join(acting)}" if acting else "none"
 
 
 def _unowned(rows: ConstraintRows) -> ConstraintRows:
@@ -672,17 +664,11 @@ def _numbers_of(rows: ConstraintRows) -> dict[str, Floats]:
             table.append(numbers)
         found["constraints.between"] = np.array(table)
     if rows.ties:
-        most = max(len(tie.coefficients) for tie in rows.ties)
-        found["constraints.ties"] = np.array(
-            [
-                [tie.follower, tie.leader, *tie.coefficients, *[0.0] * (most - len(tie.coefficients))]
-                for tie in rows.ties
-            ],
-            dtype=np.float64,
-        )
-        if any(tie.rate >= 0 for tie in rows.ties):
-            rates = np.array([[float(tie.rate)] for tie in rows.ties])
-            found["constraints.ties"] = np.hstack([found["constraints.ties"], rates])
+        ties = np.zeros((len(rows.ties), 2 + max(len(tie.coefficients) for tie in rows.ties)))
+        for row, tie in zip(ties, rows.ties, strict=True):
+            row[: 2 + len(tie.coefficients)] = tie.follower, tie.leader, *tie.coefficients
+        rates = np.array([[float(tie.rate)] for tie in rows.ties])
+        found["constraints.ties"] = np.hstack([ties, rates]) if (rates >= 0).any() else ties
     if rows.customs:
         found["constraints.custom"] = np.array([[float(factor.rows)] for factor in rows.customs])
     return found
@@ -762,33 +748,23 @@ def same(one: Floats, other: Floats) -> bool:
 
 
 def differences(scene: Scene, values: Mapping[str, Floats], *, noise: bool) -> list[str]:
-    """Messages on how a scene differs from the one of these :attr:`Scene.values`, with ``noise`` or without."""
-    found: list[str] = []
-    lost: list[str] = []
-    new: list[str] = []
+    """What differs between a scene and the one of these :attr:`Scene.values`, with ``noise`` or without, in words."""
+    found = []
     for name in dict.fromkeys((*values, *scene.values)) if values else ():
-        nothing = np.zeros(0)
-        before, now = values.get(name, nothing), scene.values.get(name, nothing)
+        before, now = (given.get(name, np.zeros(0)) for given in (values, scene.values))
+        lacks = not (before.size and now.size)
         # A CustomNoise has no numbers.
-        if (name.startswith("noise.") and not (noise and now.size and before.size)) or same(before, now):
+        if same(before, now) or (name.startswith("noise.") and (lacks or not noise)):
             continue
         what = _WORDS.get(name, name)
-        if not (before.size and now.size):
-            # Files of earlier versions lack numbers of the robot.
-            if name not in _WORDS:
-                (lost if before.size else new).append(name)
-        elif name == "gravity":
-            then, here = (f"({', '.join(f'{g:g}' for g in x)})" for x in (before, now))
-            found.append(f"gravity was {then} m/s^2, and is {here} in the scene")
-        elif name in _OF_JOINTS and before.shape == now.shape:
-            c = int(np.argmax(np.abs(now - before)))
-            joint = scene.robot.joint_names[c]
-            found.append(f"{name} was {before[c]:.6g} at joint {joint!r}, and is {now[c]:.6g} in the scene")
-        else:
-            found.append(f"{what} differs in the scene".replace("s differs", "s differ"))
-    for has, names in (("no", lost), ("also", new)):
-        if names:
-            found.append(f"the scene has {has} {listed(names)}")
+        if lacks:
+            what += f" (none in the {'motion' if now.size else 'scene'})"
+        elif before.shape == now.shape:
+            off = np.abs(now - before)
+            at = np.unravel_index(int(off.argmax()), off.shape)
+            joint = f" at joint {scene.robot.joint_names[at[0]]!r}" if name in _OF_JOINTS else ""
+            what += f" ({before[at]:.6g} in the motion, {now[at]:.6g} in the scene{joint})"
+        found.append(what)
     return found
 
 
@@ -813,30 +789,18 @@ def _gravity(gravity: ArrayLike | bool, robot: Robot) -> Floats:
     return finite_array("gravity", given, (3,))
 
 
-def resistance(
-    robot: Robot,
-    damping: JointValues | Literal["robot"] | None,
-    friction: JointValues | Literal["robot"] | None,
-    forces: Sequence[Force] = (),
-) -> tuple[Floats, Floats]:
-    """Damping and dry friction (n,), (n,) from the arguments of a scene.
-
-    Logs what the robot's description gives and the scene leaves out.
-    """
-    for name, given in (("damping", damping), ("friction", friction)):
-        if isinstance(given, str) and given != "robot":
-            raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {given!r}")
-    # Numbers for the damping are a decision on the dry friction, too: these scenes log nothing.
-    if damping is None or isinstance(damping, str):
-        damped = damping is not None or any(isinstance(force, JointDamper) for force in forces)
-        dry = friction is not None or any(isinstance(force, CoulombFriction) for force in forces)
-        _log_left_out(robot, damped=damped, dry=dry)
-    for name, given, own in (("damping", damping, robot.damping), ("friction", friction, robot.friction)):
-        if isinstance(given, str) and not own.any():
-            logger.warning("robot %r: %s='robot' is none, because the description gives none", robot.name, name)
-    given_damping = robot.damping if isinstance(damping, str) else 0.0 if damping is None else damping
-    level = robot.friction if isinstance(friction, str) else 0.0 if friction is None else friction
-    return not_negative("damping", given_damping, robot), not_negative("friction", level, robot)
+def _resistance(
+    name: str, given: JointValues | Literal["robot"] | None, own: Floats, robot: Robot, *, decided: bool
+) -> Floats:
+    """Damping or dry friction (n,) from the argument of a scene; the log says where the description's is left out."""
+    if isinstance(given, str) and given != "robot":
+        raise InputError(f"{name} must be numbers, or 'robot' for those of the robot's description, got {given!r}")
+    if isinstance(given, str) and not own.any():
+        logger.warning("robot %r: %s='robot' is none, because the description gives none", robot.name, name)
+    if given is None and own.any() and not decided:
+        message = "robot %r: the scene leaves out the %s of its description: %s='robot' takes it, %s=0 silences this"
+        logger.warning(message, robot.name, name, name, name)
+    return not_negative(name, own if isinstance(given, str) else 0.0 if given is None else given, robot)
 
 
 def given_constraints(
@@ -871,30 +835,6 @@ def given_constraints(
     )
 
 
-def _log_left_out(robot: Robot, *, damped: bool, dry: bool) -> None:
-    """Log damping and dry friction of the description that the scene has none of."""
-    given = (("damping", damped, robot.damping, "s"), ("friction", dry, robot.friction, ""))
-    left_out = [(name, values, per) for name, scene_has, values, per in given if values.any() and not scene_has]
-    if not left_out:
-        return
-    parts = [
-        f"{name} (of {int(np.count_nonzero(values))} joints, up to {values.max():g} {_unit_of(robot, values, per)})"
-        for name, values, per in left_out
-    ]
-    cure = ", ".join(f"{name}='robot'" for name, _, _ in left_out)
-    off = ", ".join(f"{name}=0" for name, _, _ in left_out)
-    message = "robot %r: the scene leaves out the %s of its description: %s takes it, %s silences this"
-    logger.warning(message, robot.name, " and the ".join(parts), cure, off)
-
-
-def _unit_of(robot: Robot, values: Floats, per: str) -> str:
-    """The unit of the largest of some joints' forces, or of forces per velocity (``per`` = "s")."""
-    slides = bool(robot.slides[int(np.argmax(values))])
-    if per:
-        return "N s/m" if slides else "N m s/rad"
-    return "N" if slides else "N m"
-
-
 def _forces(
     robot: Robot,
     forces: Force | Sequence[Force],
@@ -906,7 +846,11 @@ def _forces(
     """The attributes of a scene that follow from its forces, by name."""
     # Both are checked even if they are zero and make no element.
     given = forces_of(forces)
-    viscous, dry = resistance(robot, damping, friction, given)
+    damped, rubs = (any(isinstance(each, kind) for each in given) for kind in (JointDamper, CoulombFriction))
+    viscous = _resistance("damping", damping, robot.damping, robot, decided=damped)
+    # Numbers for the damping are a decision on the dry friction, too.
+    numbers = damping is not None and not isinstance(damping, str)
+    dry = _resistance("friction", friction, robot.friction, robot, decided=rubs or numbers)
     stiff = not_negative("stiffness", stiffness, robot)
     slack = joint_array("rest", rest, robot.joint_names, uniform=True)
     if dry.any():
@@ -963,25 +907,24 @@ def _is_input(tie: Tied) -> bool:
     return tie.follower == tie.leader and not tie.coefficients
 
 
-def _sole_control(actuation: Floats, c: int) -> int | None:
-    """The control that drives coordinate ``c`` alone, with factor 1; None where there is no such control."""
+def _own_control(robot: Robot, actuation: Floats, c: int, what: str) -> int:
+    """The control that drives coordinate ``c`` alone, with factor 1; an InputError if there is none."""
     drives = np.flatnonzero(actuation[c])
-    alone = len(drives) == 1 and actuation[c, drives[0]] == 1.0 and np.count_nonzero(actuation[:, drives[0]]) == 1
-    return int(drives[0]) if alone else None
+    if len(drives) == 1 and actuation[c, drives[0]] == 1.0 and np.count_nonzero(actuation[:, drives[0]]) == 1:
+        return int(drives[0])
+    raise InputError(
+        f"the {what} of joint {robot.joint_names[c]!r} needs a control of its own, and no column of the actuation "
+        "has a 1 at this joint and zeros elsewhere"
+    )
 
 
 def _require_positions(robot: Robot, actuation: Floats, elements: Sequence[Element], bound: Bound) -> None:
     """Refuse a KinematicInput whose joint has no control of its own, or also has a servo."""
     served = {servo.coordinate for servo in of_kind(elements, "PositionServo")}
     for tie in filter(_is_input, bound.rows.ties):
-        c, name = tie.follower, robot.joint_names[tie.follower]
-        if c in served:
-            raise InputError(f"joint {name!r} has both a PositionServo and a KinematicInput")
-        if _sole_control(actuation, c) is None:
-            raise InputError(
-                f"the KinematicInput of joint {name!r} needs a control of its own for its position, and this actuation "
-                "has none; name the joint in the actuation, or give it a column with a 1"
-            )
+        if tie.follower in served:
+            raise InputError(f"joint {robot.joint_names[tie.follower]!r} has both a PositionServo and a KinematicInput")
+        _own_control(robot, actuation, tie.follower, "KinematicInput")
 
 
 def _of_forces(actuation: Floats, bound: Bound) -> Floats:
@@ -1011,19 +954,12 @@ def _served(robot: Robot, actuation: Floats, elements: Sequence[Element]) -> Flo
     Raises:
         InputError: A joint has two servos, or a servo's joint has no control of its own with factor 1.
     """
-    servos = of_kind(elements, "PositionServo")
-    scaled = actuation.copy()
+    servos, scaled = of_kind(elements, "PositionServo"), actuation.copy()
     for servo in servos:
-        c, name = servo.coordinate, robot.joint_names[servo.coordinate]
+        c = servo.coordinate
         if sum(other.coordinate == c for other in servos) > 1:
-            raise InputError(f"joint {name!r} has two position servos")
-        alone = _sole_control(actuation, c)
-        if alone is None:
-            raise InputError(
-                f"the position servo of joint {name!r} needs a control of its own: no control of this actuation drives "
-                "the joint alone, with factor 1"
-            )
-        scaled[c, alone] = servo.values[0]
+            raise InputError(f"joint {robot.joint_names[c]!r} has two position servos")
+        scaled[c, _own_control(robot, actuation, c, "position servo")] = servo.values[0]
     return scaled
 
 

@@ -6,7 +6,6 @@ Those that are refined or summed are of the processes themselves: the first k co
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,34 +68,17 @@ def generator(rng: np.random.Generator | int | None) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class Children:
-    """The children of a random generator, in a few bytes for other processes; generators are made on demand.
-
-    Attributes:
-        kind: Class of the bit generators.
-        entropy: Entropy of the parent's seed sequence.
-        spawn_key: Spawn key of the parent's seed sequence.
-        pool_size: Pool size of the parent's seed sequence.
-        before: Number of children that the parent had spawned before.
-    """
+    """The children of a random generator, in a few bytes for other processes; generators are made on demand."""
 
     kind: type[np.random.BitGenerator]
-    entropy: int | Sequence[int] | None
-    spawn_key: tuple[int, ...]
-    pool_size: int
-    before: int
+    seed: np.random.SeedSequence  # of the parent, as it was before they were spawned
 
     def generators(self, first: int, last: int) -> list[np.random.Generator]:
         """The children first, ..., last - 1, equal to those of ``Generator.spawn``."""
-        return [
-            np.random.Generator(
-                self.kind(
-                    np.random.SeedSequence(
-                        self.entropy, spawn_key=(*self.spawn_key, self.before + i), pool_size=self.pool_size
-                    )
-                )
-            )
-            for i in range(first, last)
-        ]
+        seed, before = self.seed, self.seed.n_children_spawned
+        keys = ((*seed.spawn_key, before + i) for i in range(first, last))
+        own = (np.random.SeedSequence(seed.entropy, spawn_key=key, pool_size=seed.pool_size) for key in keys)
+        return [np.random.Generator(self.kind(child)) for child in own]
 
 
 def children(rng: np.random.Generator | int, number: int) -> Children:
@@ -109,11 +91,13 @@ def children(rng: np.random.Generator | int, number: int) -> Children:
     seed = parent.seed_seq
     if not isinstance(seed, np.random.SeedSequence):
         raise InputError(f"rng must be seeded by a numpy SeedSequence, to have a child for each path; got {seed!r}")
-    children = Children(type(parent), seed.entropy, tuple(seed.spawn_key), seed.pool_size, seed.n_children_spawned)
+    before = np.random.SeedSequence(
+        seed.entropy, spawn_key=seed.spawn_key, pool_size=seed.pool_size, n_children_spawned=seed.n_children_spawned
+    )
     if isinstance(rng, np.random.Generator):
         for first in range(0, number, _BATCH):
             seed.spawn(min(_BATCH, number - first))
-    return children
+    return Children(type(parent), before)
 
 
 def coarsen(increments: ArrayLike, factor: int = 2) -> Floats:

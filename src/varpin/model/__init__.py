@@ -2,12 +2,11 @@
 
 from varpin.model.chain import planar_chain as planar_chain
 from varpin.model.combination import combine as combine
+from varpin.model.loading import load_robot as load_robot
 from varpin.model.payload import Payload as Payload
 from varpin.model.robot import Robot as Robot
-from varpin.model.robot import build_robot as build_robot
 from varpin.model.robot import check_inertia as check_inertia
 from varpin.model.robot import geometry as geometry
-from varpin.model.robot import load_robot as load_robot
 from varpin.model.robot import readable_geometry as readable_geometry
 from varpin.model.robot import require_robot as require_robot
 from varpin.model.sources import bundled_robots as bundled_robots
@@ -18,7 +17,6 @@ from varpin.model.units import AFAR as AFAR
 from varpin.model.units import ASIDE as ASIDE
 from varpin.model.units import IN_MILLIMETRES as IN_MILLIMETRES
 from varpin.model.units import degrees_hint as degrees_hint
-from varpin.model.units import degrees_per_second_hint as degrees_per_second_hint
 from varpin.model.units import joint_unit as joint_unit
 from varpin.model.units import longest_reach as longest_reach
 from varpin.model.units import looks_like_degrees as looks_like_degrees

@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 
 from varpin.errors import InputError
-from varpin.model.robot import Robot, load_robot
+from varpin.model.loading import load_robot
+from varpin.model.robot import Robot
 from varpin.support.checks import count, finite_array, positive
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,6 +16,7 @@ from varpin.arrays import Floats
 from varpin.errors import InputError, RobotError
 from varpin.model.hull import Hull, hull_around, mesh_points
 from varpin.model.kinematics import FrameKinematics, frame_kinematics
+from varpin.model.meshes import shape_points
 from varpin.model.robot import Robot, readable_geometry
 from varpin.model.tree import place_of_frame, z_to
 from varpin.model.urdf import read_xml
@@ -24,7 +24,6 @@ from varpin.support.checks import finite_array, over_time, positive, rotation_ma
 from varpin.support.frozen import Frozen
 
 coal = pin.coal
-logger = logging.getLogger(__name__)
 
 # coal's tolerance; its own of 1e-6 leaves errors of 4e-7 m in distances to some hulls, and of 1e-3 in their direction.
 _TOLERANCE = 1e-10
@@ -407,7 +406,7 @@ def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
     """Pairs of links that an SRDF file excludes from collision checks."""
     if srdf is None:
         return set()
-    root, _ = read_xml(srdf)
+    root = read_xml(srdf)
     pairs = {frozenset((e.get("link1", ""), e.get("link2", ""))) for e in root.findall("disable_collisions")}
     links = {link for pair in pairs for link in pair}
     unknown = sorted(links - {frame.name for frame in robot.free_model.frames})
@@ -417,38 +416,20 @@ def _disabled(robot: Robot, srdf: Path | None) -> set[frozenset[str]]:
             f"{srdf} leaves out no pair of links of robot {robot.name!r}: its disable_collisions are {what}. Give the "
             "robot's own SRDF"
         )
-    if 2 * len(unknown) > len(links):
-        logger.warning(
-            "%s: robot %r does not have %d of the %d links in disable_collisions, such as %r: is it another robot's?",
-            srdf, robot.name, len(unknown), len(links), unknown[0],
-        )  # fmt: skip
     return pairs
 
 
 def _vertices(robot: Robot) -> dict[str, Floats]:
     """Points (N, 3) [m], in each link's axes, whose hull contains the shapes of the link."""
     found: dict[str, list[Floats]] = {}
-    model = robot.free_model
     shapes, faulty = readable_geometry(robot)
     for _, what in faulty.values():
         raise RobotError(what)
     for shape in shapes.geometryObjects:
-        frame = model.frames[shape.parentFrame]
-        place = frame.placement.inverse() * shape.placement
-        corners = _corners(shape.geometry)
-        found.setdefault(frame.name, []).append(corners @ place.rotation.T + place.translation)
+        frame = robot.free_model.frames[shape.parentFrame]
+        place = frame.placement.inverse()
+        found.setdefault(frame.name, []).append(shape_points(shape) @ place.rotation.T + place.translation)
     return {name: np.vstack(parts) for name, parts in found.items()}
-
-
-def _corners(shape: Any) -> Floats:
-    """Points (N, 3) whose hull contains a shape."""
-    if hasattr(shape, "vertices"):
-        return np.asarray(shape.vertices(), dtype=np.float64).reshape(-1, 3)
-    if isinstance(shape, coal.ConvexBase):
-        return np.array([shape.point(i) for i in range(shape.num_points)])
-    box = shape.computeLocalAABB() or shape.aabb_local
-    ends = np.array([box.min_, box.max_])
-    return np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
 def capsule_around(points: Floats) -> tuple[Floats, Floats, float]:

@@ -12,8 +12,8 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from varpin.errors import InputError
-from varpin.model.additions import transform
 from varpin.model.equalities import prefixed
+from varpin.model.loading import transform
 from varpin.model.mimic import rebuild
 from varpin.model.robot import Part, Robot
 

@@ -8,6 +8,7 @@ from importlib import metadata
 from pathlib import Path
 
 from varpin.errors import RobotError
+from varpin.model.packages import Files
 
 DISTRIBUTION = "example-robot-data"
 
@@ -61,6 +62,25 @@ FLOATING_BASE = frozenset([
 ])  # fmt: skip
 
 
+def find(name: str) -> Files | None:
+    """The files of a robot; None if there is none of this name.
+
+    Raises:
+        RobotError: It has no fixed base, or is not installed.
+    """
+    if name in FLOATING_BASE:
+        raise RobotError(
+            f"{name!r} has a free-flyer base in example-robot-data, and varpin models fixed bases; "
+            "to pin its base to the world, load its URDF file by path"
+        )
+    if name not in FIXED_BASE:
+        return None
+    path = locate(FIXED_BASE[name])
+    # The folder in which package://example-robot-data/... is looked up.
+    share = next(folder.parent for folder in path.parents if folder.name == "example-robot-data")
+    return Files(name, path, (str(share),), srdf=locate(SRDF[name]) if name in SRDF else None)
+
+
 def locate(relative: str) -> Path:
     """The installed file at ``relative`` below the robots folder.
 
@@ -99,8 +119,3 @@ def _files(part: str = "") -> list[str]:
     """
     record = metadata.distribution(DISTRIBUTION).read_text("RECORD") or ""
     return [row[0] for row in csv.reader(line for line in record.splitlines() if part in line) if row]
-
-
-def package_dir(urdf: Path) -> Path:
-    """The folder in which ``package://example-robot-data/...`` paths of ``urdf`` are looked up."""
-    return next(parent.parent for parent in urdf.parents if parent.name == "example-robot-data")

@@ -135,3 +135,12 @@ def mass_carriers(robot: Robot) -> Links:
     if not robot.tree.mass.sum() > 0.0:
         raise InputError(f"the links of robot {robot.name!r} have no mass, so there is no centre of mass")
     return links(robot.tree)
+
+
+def require_same(name: str, made_for: Robot, robot: Robot | None) -> None:
+    """Raise an InputError for something, ``name``, that was made for another robot than a problem's."""
+    if robot is not None and not made_for.built_like(robot):
+        raise InputError(
+            f"{name} is for robot {made_for.name!r} with {made_for.dof} coordinates, another one than the problem's "
+            f"{robot.name!r} with {robot.dof}, or one of other lengths; make it with scene.robot"
+        )

@@ -13,6 +13,7 @@ import textwrap
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -342,6 +343,19 @@ def parts_of(shape: pin.GeometryObject, read: Reader = read_mesh) -> tuple[MeshP
     mesh = shape.geometry
     faces = [[triangle[k] for k in range(3)] for triangle in map(mesh.tri_indices, range(mesh.num_tris))]
     return (MeshPart(_floats(mesh.vertices()).reshape(-1, 3), np.array(faces).reshape(-1, 3)),)
+
+
+def shape_points(shape: pin.GeometryObject) -> Floats:
+    """Points (N, 3) [m], in the axes of a shape's joint, whose hull contains the shape."""
+    if isinstance(shape.geometry, coal.BVHModelBase):
+        points = _floats(shape.geometry.vertices()).reshape(-1, 3)
+    elif isinstance(shape.geometry, coal.ConvexBase):
+        points = np.array([shape.geometry.point(i) for i in range(shape.geometry.num_points)])
+    else:
+        shape.geometry.computeLocalAABB()
+        box = shape.geometry.aabb_local
+        points = np.array(list(product(*zip(box.min_, box.max_, strict=True))))
+    return np.asarray(points @ shape.placement.rotation.T + shape.placement.translation)
 
 
 def put_mesh(shape: pin.GeometryObject, path: str, scale: ArrayLike, read: Reader) -> None:

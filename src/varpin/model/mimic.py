@@ -4,7 +4,6 @@ Pinocchio computes no RNEA derivatives of a model with mimic joints. varpin ther
 followers are tied to their leaders, and a free one in which every joint is independent.
 """
 
-import logging
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,9 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from varpin.errors import RobotError
-from varpin.model.urdf import Mimic
-
-logger = logging.getLogger(__name__)
+from varpin.model.urdf import Mimic, listed
 
 _POSITIONS = ("lowerPositionLimit", "upperPositionLimit")
 # Attributes of a pin.Model with one number for each degree of freedom.
@@ -48,27 +45,27 @@ def joint_index(model: pin.Model) -> dict[str, int]:
     return {name: i for i, name in enumerate(model.names) if i > 0}
 
 
-def ties_of(mimics: Mapping[str, Mimic], model: pin.Model) -> tuple[Tie, ...]:
-    """The ties of a URDF's mimic elements.
+def ties_of(mimics: Mapping[str, Mimic], model: pin.Model) -> tuple[tuple[Tie, ...], tuple[str, ...]]:
+    """The ties of a URDF's mimic elements, and a remark on followers whose leaders are not there, which stay free.
 
-    A follower whose leader is not in the robot stays free, with a warning in the log: some published models
-    name leaders that do not exist. Where a leader is itself a follower, the tie is to the leader of that one.
+    Where a leader is itself a follower, the tie is to the leader of that one.
 
     Raises:
         RobotError: Joints follow each other in a loop.
     """
     index = joint_index(model)
     ties: dict[int, Tie] = {}
+    alone = []
     for name, mimic in mimics.items():
         if name not in index:
             continue
         if mimic.leader not in index:
-            logger.warning(
-                "joint %r mimics %r, which is not a moving joint of the robot: it stays free", name, mimic.leader
-            )
+            alone.append(f"{name!r} of {mimic.leader!r}")
             continue
         ties[index[name]] = Tie(index[name], index[mimic.leader], mimic.ratio, mimic.offset)
-    return tuple(_to_free_leader(tie, ties, model) for tie in ties.values())
+    remark = f"mimic joints whose leaders are no moving joints of the robot stay free: {listed(alone, 'joints')}"
+    remarks = (remark,) if alone else ()
+    return tuple(_to_free_leader(tie, ties, model) for tie in ties.values()), remarks
 
 
 def _to_free_leader(tie: Tie, ties: dict[int, Tie], model: pin.Model) -> Tie:

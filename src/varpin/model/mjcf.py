@@ -52,7 +52,7 @@ def root_tag(path: Path) -> str:
         FileError: The file cannot be read.
     """
     try:
-        return read_xml(path)[0].tag
+        return read_xml(path).tag
     except RobotError:
         return ""
 

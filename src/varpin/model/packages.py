@@ -6,8 +6,8 @@ import contextlib
 import os
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -19,6 +19,29 @@ LFS_POINTER = b"version https://git-lfs"
 # A given folder is a package, or contains packages.
 _MANIFESTS = ("package.xml", "*/package.xml")
 _FIND = re.compile(r"\$\(find ([^)]+)\)/?")
+
+
+@dataclass(frozen=True)
+class Files:
+    """The files of a robot, and what they are read with.
+
+    Attributes:
+        name: The robot's name.
+        path: The URDF, xacro or MJCF file.
+        folders: Folders in which packages are looked up.
+        xacro_args: Arguments of a xacro file.
+        packages: Folders of packages by name.
+        srdf: The SRDF file or its xacro file; None for the one beside the robot's file.
+        srdf_args: Arguments of that xacro file.
+    """
+
+    name: str
+    path: Path
+    folders: tuple[str, ...] = ()
+    xacro_args: Mapping[str, object] = field(default_factory=dict)
+    packages: Mapping[str, str] = field(default_factory=dict)
+    srdf: Path | None = None
+    srdf_args: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.errors import InputError
+from varpin.model.inertia import fault, principal_moments
 from varpin.model.tree import frame_index
-from varpin.support.checks import as_floats, finite_array, real, require_finite
+from varpin.support.checks import as_floats, finite_array, positive, require_finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +32,7 @@ class Payload:
     inertia: ArrayLike = 0.0
 
     def __post_init__(self) -> None:
-        mass = real("payload mass", self.mass)
-        if not (np.isfinite(mass) and mass > 0.0):
-            raise InputError(f"payload mass must be positive and finite [kg], got {self.mass}")
+        positive("payload mass", self.mass, "kg")
         finite_array("payload center", self.center, (3,))
         self.moments()
 
@@ -53,12 +52,9 @@ class Payload:
         size = float(np.abs(matrix).max())
         if np.abs(matrix - matrix.T).max() > 1e-9 * size:
             raise InputError("payload inertia must be symmetric")
-        moments = np.linalg.eigvalsh(matrix)
-        if moments[0] < -1e-9 * size or moments[0] + moments[1] < moments[2] - 1e-3 * size:
-            raise InputError(
-                "no rigid body has the payload inertia: principal moments must be >= 0, and none larger than the sum "
-                f"of the other two, got {', '.join(f'{moment:g}' for moment in moments)}"
-            )
+        _, sentence = fault(self.frame, float(self.mass), principal_moments(matrix))
+        if sentence:
+            raise InputError(f"payload inertia: {sentence}")
         return np.asarray(matrix)
 
 

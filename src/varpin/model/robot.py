@@ -1,13 +1,13 @@
 """The robot: a Pinocchio model, its generalized coordinates, and the tree that the core runs on."""
 
-import logging
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -16,40 +16,28 @@ from numpy.typing import ArrayLike, NDArray
 from varpin.arrays import Floats
 from varpin.core.arrays import Tree
 from varpin.errors import InputError, RobotError, SingularMassMatrix, UnknownJoint, UnknownPosture
-from varpin.model.additions import PLANAR, Base, on_base, with_mesh_inertias, with_rotors
 from varpin.model.equalities import Equality
 from varpin.model.inertia import faults
 from varpin.model.kinematics import place_on_body
 from varpin.model.meshes import Reader, read_mesh, with_own_meshes
-from varpin.model.mimic import Tie, joint_index, tied_model
+from varpin.model.mimic import Tie, rebuild, tied_model
 from varpin.model.mjcf import mjcf_shapes
-from varpin.model.payload import Payload, carry
-from varpin.model.sources import Description, describe
-from varpin.model.srdf import Posture, of_joints
-from varpin.model.tree import (
-    flatten,
-    is_unbounded,
-    joint_axis,
-    mechanism,
-    place_of_frame,
-    to_pinocchio,
-)
-from varpin.model.units import ADVICE, NO_LIMIT, looks_like_degrees, slides_hint
-from varpin.model.urdf import build_model, build_shapes, listed, read_urdf
+from varpin.model.srdf import Posture
+from varpin.model.tree import flatten, mechanism, place_of_frame, to_pinocchio
+from varpin.model.units import NO_LIMIT, slides_hint
+from varpin.model.urdf import Inertial, build_shapes, listed, read_urdf
 from varpin.support import markup
-from varpin.support.checks import JointValues, as_floats, is_one_of, joint_array, require_finite
+from varpin.support.checks import JointValues, as_floats, joint_array
 from varpin.support.frozen import Frozen
 
-logger = logging.getLogger(__name__)
-
-# Locking a joint further outside its limits than this gives a warning [rad or m].
-_OUTSIDE = 1e-6
+# A velocity or an effort beyond this is none: files of other programs have the largest double.
+_HUGE = 1e300
 
 
 class Part(NamedTuple):
     """A robot within a combined one."""
 
-    robot: "Robot"
+    robot: Robot
     prefix: str  # of its joint and frame names in the combined model
     place: pin.SE3 | None  # placement of its world in the combined one
 
@@ -76,6 +64,10 @@ class Robot(Frozen):
         loops: Pairs of frames that the description closes to loops (``<loop_joint>`` of a URDF file, ``<connect>`` and
             ``<weld>`` of an MJCF file). The tree leaves them open; constraints of a scene close them.
         equalities: Equality constraints of an MJCF file; ``Scene(constraints="robot")`` takes them.
+        inertials: Inertias of the links of a URDF, which the model merges into bodies.
+        remarks: How the source is read where that is not plain, in words.
+        notes: What of the source has no effect on purpose, likewise.
+        faults: What its masses lack, likewise.
     """
 
     name: str
@@ -91,6 +83,10 @@ class Robot(Frozen):
     parts: tuple[Part, ...] = field(default=(), repr=False)
     loops: tuple[tuple[str, str], ...] = ()
     equalities: tuple[Equality, ...] = field(default=(), repr=False)
+    inertials: tuple[Inertial, ...] = field(default=(), repr=False)
+    remarks: tuple[str, ...] = field(default=(), repr=False)
+    notes: tuple[str, ...] = field(default=(), repr=False)
+    faults: tuple[str, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
         locked = f", {len(self.locked)} locked" if self.locked else ""
@@ -115,6 +111,11 @@ class Robot(Frozen):
         return markup.facts(
             f"Robot {self.name}", rows, markup.table(head, [(name, *map(float, row)) for name, *row in columns])
         )
+
+    def rebuilt(self, **changes: Any) -> Robot:
+        """The robot with its model rebuilt; see :func:`varpin.model.mimic.rebuild`."""
+        new = rebuild(self.free_model, **changes)
+        return self.changed(free_model=new.model, ties=new.ties(self.ties), visuals=new.shapes(self.visuals))
 
     @cached_property
     def model(self) -> pin.Model:
@@ -270,13 +271,8 @@ class Robot(Frozen):
         lower, upper = np.full(self.dof, -np.inf), np.full(self.dof, np.inf)
         tree, model, left_out = self.tree, self.free_model, []
         followers = {tie.follower for tie in self.ties}
-        for body, joint in enumerate(list(model.joints)[1:]):
-            if joint.nq != 1:
-                continue
-            low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-            # No limit is the largest double in Pinocchio, and 0 and 0 in a URDF.
-            none = low == high == 0.0
-            low, high = -np.inf if none or low < -NO_LIMIT else low, np.inf if none or high > NO_LIMIT else high
+        for body in range(model.njoints - 1):
+            low, high = limits_of(model, body + 1)[:2]
             c, ratio = int(tree.coordinate[body]), float(tree.ratio[body])
             if body + 1 in followers:
                 if ratio == 0.0:
@@ -299,7 +295,7 @@ class Robot(Frozen):
 
         The bound of a mimic joint is one of its leader.
         """
-        return self._limit("velocityLimit", -1)
+        return self._limit(2, -1)
 
     @cached_property
     def effort_limit(self) -> Floats:
@@ -307,7 +303,7 @@ class Robot(Frozen):
 
         The bound of a mimic joint is one of its leader: what the leader exerts, the follower has to bear.
         """
-        return self._limit("effortLimit", 1)
+        return self._limit(3, 1)
 
     def limit_remarks(self) -> Iterator[str]:
         """What is odd about limits, one sentence a kind."""
@@ -334,7 +330,7 @@ class Robot(Frozen):
         sliding.setflags(write=False)
         return sliding
 
-    def built_like(self, other: "Robot") -> bool:
+    def built_like(self, other: Robot) -> bool:
         """Whether another robot has the same joints at the same places, up to rounding; masses may differ."""
         mine, its = self.tree, other.tree
         if self is other or mine is its:
@@ -355,17 +351,28 @@ class Robot(Frozen):
         sums = np.bincount(self.tree.coordinate, np.asarray(values, dtype=float) * weights, minlength=self.dof)
         return np.asarray(sums, dtype=np.float64)
 
-    def _limit(self, attribute: str, power: int) -> Floats:
+    def _limit(self, which: int, power: int) -> Floats:
         """The least limit (n,) of the joints that each coordinate moves, times their ratios to a power."""
         limit = np.full(self.dof, np.inf)
-        for body, joint in enumerate(list(self.free_model.joints)[1:]):
-            value, ratio = float(getattr(self.free_model, attribute)[joint.idx_v]), abs(float(self.tree.ratio[body]))
-            # No limit is the largest double or infinity in Pinocchio, and 0 in a URDF.
-            if 0.0 < value < 1e300 and ratio > 0.0:
-                c = int(self.tree.coordinate[body])
-                limit[c] = min(limit[c], value * ratio**power)
+        for body, (c, ratio) in enumerate(zip(self.tree.coordinate, np.abs(self.tree.ratio), strict=True)):
+            if ratio > 0.0:
+                limit[c] = min(limit[c], limits_of(self.free_model, body + 1)[which] * ratio**power)
         limit.setflags(write=False)
         return limit
+
+
+def limits_of(model: pin.Model, joint: int) -> tuple[float, float, float, float]:
+    """Lower, upper, velocity and effort limit of a joint with one axis; infinite where there is none.
+
+    No limit is the largest double or infinity in Pinocchio, and 0 in a URDF.
+    """
+    kind, low, high = model.joints[joint], -np.inf, np.inf
+    if kind.nq == 1:
+        low, high = float(model.lowerPositionLimit[kind.idx_q]), float(model.upperPositionLimit[kind.idx_q])
+        none = low == high == 0.0
+        low, high = -np.inf if none or low < -NO_LIMIT else low, np.inf if none or high > NO_LIMIT else high
+    velocity, effort = (float(values[kind.idx_v]) for values in (model.velocityLimit, model.effortLimit))
+    return low, high, velocity if 0.0 < velocity < _HUGE else np.inf, effort if 0.0 < effort < _HUGE else np.inf
 
 
 def require_robot(robot: object, taker: str = "") -> Robot:
@@ -374,291 +381,6 @@ def require_robot(robot: object, taker: str = "") -> Robot:
         where = f"{taker}: " if taker else ""
         raise InputError(f"{where}robot must come from load_robot, got {type(robot).__name__}")
     return robot
-
-
-def load_robot(
-    source: "str | os.PathLike[str] | pin.Model | pin.RobotWrapper",
-    *,
-    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
-    lock: Mapping[str, ArrayLike] | None = None,
-    keep: Sequence[str] | None = None,
-    mimic: Literal["tied", "free"] = "tied",
-    payload: Payload | Sequence[Payload] = (),
-    xacro_args: Mapping[str, object] | None = None,
-    srdf: str | os.PathLike[str] | None = None,
-    base: Base = None,
-    armature: JointValues | None = None,
-    inertia: Literal["file", "meshes"] = "file",
-    density: float = 1000.0,
-) -> Robot:
-    """Load an arm.
-
-    Any URDF that Pinocchio reads is accepted. The log reports what the file leaves out, and inertias that no body can
-    have, with the link and its numbers.
-
-    Main args:
-        source: Path of a URDF file, of a xacro file (``arm.urdf.xacro``) or of an MJCF file (``arm.xml``); name of a
-            bundled robot (``"finger"``); name of a fixed-base robot of example-robot-data (``"ur5"``); name of a robot
-            of the package robot_descriptions (``"iiwa14_description"``), which downloads it on first use; a
-            ``pin.Model``; or a ``RobotWrapper``. :func:`varpin.robot_names` lists the names that need no download.
-        lock: Joints to lock and their positions by name: ``{"panda_finger_joint1": 0.02}`` [rad or m]. They are removed
-            from the model. A joint with several axes (a free-flyer, say) takes its Pinocchio configuration.
-        keep: Names of the joints that stay: ``["shoulder", "elbow"]``. All others are locked, where ``lock`` says or
-            else at 0, or at the limit that is nearest to 0. Mimic joints stay with their leaders. All stay if left out.
-
-    Other Args:
-        package_dirs: Folders in which ``package://`` mesh paths, and ``$(find package)`` in xacro files, are looked up.
-            The file's own folder, and the folders that contain its ROS packages, are always searched.
-        mimic: ``"tied"`` moves a mimic joint with its leader; ``"free"`` makes it a coordinate of its own.
-        payload: Bodies that the robot carries; they become part of its links.
-        xacro_args: Arguments of a xacro file by name: ``{"prefix": "left_"}``.
-        srdf: The SRDF file, or xacro file of an SRDF, that :meth:`Robot.posture` reads. If left out, the SRDF with the
-            name of the robot's file, in the same folder or in a sibling folder ``srdf``, if there is one.
-        base: Placement of the robot's base in the world, a transform (4, 4) [m] or a ``pin.SE3``; or ``"planar"`` for a
-            moving base, which adds the joints ``base_x``, ``base_y`` [m] and ``base_turn`` [rad] before the robot's own
-            and has the mass of its first link. At the world's origin if left out.
-        armature: Rotor inertia reflected to the joints [kg m^2 or kg], >= 0: a number for all coordinates, (n,), or by
-            joint name. It replaces that of the file; joints that are not named keep theirs.
-        inertia: ``"meshes"`` gives massless links of a URDF the inertia of their visual shapes, which must be closed.
-        density: Density of these shapes [kg/m^3].
-
-    Returns:
-        The robot; its geometry is read when it is needed.
-
-    Raises:
-        RobotNotFound: There is no such file or name; close matches are listed.
-        RobotError: The file is not a URDF, its XML is broken, or a mass, an inertia or a mimic multiplier is not a
-            usable number. Masses and inertias that Pinocchio leaves out of a URDF, and negative ones, are reported in
-            the log instead.
-        UnsupportedJoint: A joint has no single axis (free-flyer, spherical, planar, screw).
-        UnknownJoint: ``lock`` or ``armature`` names a joint that the robot does not have.
-        UnknownFrame: A payload names a frame that the robot does not have.
-        MissingDependency: A xacro file needs the package xacro (extra ``xacro``), an MJCF file mujoco (extra
-            ``mjcf``), a name robot_descriptions (extra ``descriptions``).
-        InputError: A xacro file has no argument of that name, or a base or an armature is invalid.
-        SingularMassMatrix: A joint moves no inertia, or a negative one.
-    """
-    if not is_one_of(inertia, ("file", "meshes")):
-        raise InputError(f"inertia must be 'file' or 'meshes', got {inertia!r}")
-    robot, description = _built(
-        source,
-        package_dirs=package_dirs,
-        lock=lock,
-        keep=keep,
-        mimic=mimic,
-        payload=payload,
-        xacro_args=xacro_args,
-        srdf=srdf,
-        base=base,
-        armature=armature,
-        density=density if inertia == "meshes" else None,
-    )
-    wrong = (*description.faults, *faults(robot.free_model, description.inertials))
-    for remark in (*description.remarks, *wrong, *robot.limit_remarks()):
-        logger.warning("robot %r: %s", robot.name, remark)
-    check_inertia(robot, description.faults)
-    return robot
-
-
-def hold_joints(robot: Robot, positions: Mapping[str, ArrayLike]) -> Robot:
-    """A robot that is no combined one, with further joints locked at ``positions`` by name [rad or m].
-
-    Raises:
-        UnknownJoint: The robot has no such joint.
-        RobotError: No joint is left.
-    """
-    whole = Description(robot.name, robot.free_model, robot.ties, visuals=robot.visuals)
-    description, locked = _lock(whole, positions)
-    left = robot.changed(
-        free_model=description.model,
-        ties=description.ties,
-        locked=MappingProxyType({**robot.locked, **locked}),
-        visuals=description.visuals,
-        loops=_open(robot.loops, description.model),
-    )
-    _require_tree(left)
-    return left
-
-
-def _require_tree(robot: Robot, why: str = "") -> None:
-    """Refuse a robot without a tree; ``why`` none of its joints moves."""
-    if not robot.joint_names:
-        raise RobotError(f"robot {robot.name!r} has no joint that moves{why}")
-    robot.tree  # noqa: B018
-
-
-def build_robot(source: object, **options: Any) -> Robot:
-    """:func:`load_robot` without its checks of inertia, to inspect faulty models."""
-    return _built(source, **options)[0]
-
-
-def _built(
-    source: object,
-    *,
-    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
-    lock: Mapping[str, ArrayLike] | None = None,
-    keep: Sequence[str] | None = None,
-    mimic: Literal["tied", "free"] = "tied",
-    payload: Payload | Sequence[Payload] = (),
-    xacro_args: Mapping[str, object] | None = None,
-    srdf: str | os.PathLike[str] | None = None,
-    base: Base = None,
-    armature: JointValues | None = None,
-    density: float | None = None,
-) -> tuple[Robot, Description]:
-    """The robot, and the description of its source."""
-    if not is_one_of(mimic, ("tied", "free")):
-        raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
-    description = describe(source, package_dirs, mimic=mimic == "tied", xacro_args=xacro_args, srdf=srdf)
-    if density is not None:
-        description = with_mesh_inertias(description, density)
-    description = on_base(description, base)
-    carry(description.model, (payload,) if isinstance(payload, Payload) else payload, description.name)
-    names = list(description.model.names)
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise RobotError(f"robot {description.name!r} has several joints named {', '.join(map(repr, twice))}")
-    if mimic == "free":
-        description = replace(description, ties=())
-    whole, (description, locked) = description, _lock(description, _locks(description, lock, keep))
-    model = description.model
-    with_rotors(model, armature, description.ties, tuple(locked))
-    robot = Robot(
-        description.name,
-        model,
-        description.ties,
-        locked=MappingProxyType(locked),
-        urdf=description.urdf,
-        expanded=description.expanded,
-        mjcf=description.mjcf,
-        package_dirs=description.package_dirs,
-        visuals=description.visuals,
-        group_states=of_joints(description.postures, whole.model.names),
-        loops=_open(description.loops, model),
-        equalities=description.equalities,
-    )
-    _require_tree(robot, "".join(f"; {remark}" for remark in description.remarks[:1]))
-    return robot, description
-
-
-def _locks(
-    description: Description, lock: Mapping[str, ArrayLike] | None, keep: Sequence[str] | None
-) -> Mapping[str, ArrayLike]:
-    """The joints to lock and their positions: those of ``lock``, and those that ``keep`` does not name."""
-    if not (lock is None or isinstance(lock, Mapping)):
-        raise InputError(f"lock must map joint names to positions, as in {{'elbow': 0.5}}, got {lock!r}")
-    given = dict(lock or {})
-    if keep is None:
-        return given
-    if isinstance(keep, str | Mapping) or not isinstance(keep, Iterable):
-        raise InputError(f"keep must be a list of joint names, got {keep!r}")
-    keep = tuple(keep)
-    if not all(isinstance(name, str) for name in keep):
-        raise InputError(f"keep must be a list of joint names, got {keep!r}")
-    model = description.model
-    leaders = {model.names[tie.follower]: model.names[tie.leader] for tie in description.ties}
-    for name in keep:
-        if name not in joint_index(model):
-            raise UnknownJoint(name, joint_index(model), f"keep of robot {description.name!r}")
-        if name in given:
-            raise InputError(f"joint {name!r} is in keep and in lock")
-        if leaders.get(name, name) not in keep:
-            raise InputError(f"keep: joint {name!r} mimics {leaders[name]!r}; keeping {leaders[name]!r} keeps both")
-    neutral = pin.neutral(model)
-    for joint, name in enumerate(model.names):
-        # A planar base was asked for.
-        if joint == 0 or name in (*keep, *PLANAR) or name in leaders or name in given:
-            continue
-        kind = model.joints[joint]
-        at = slice(kind.idx_q, kind.idx_q + kind.nq)
-        if kind.nv > 1:
-            given[name] = neutral[at]
-        elif kind.nq == 2:
-            given[name] = 0.0
-        else:
-            low, high = float(model.lowerPositionLimit[at][0]), float(model.upperPositionLimit[at][0])
-            given[name] = min(max(0.0, low), high) if low < high else 0.0
-    return given
-
-
-def _lock(
-    description: Description, lock: Mapping[str, ArrayLike]
-) -> tuple[Description, dict[str, float | tuple[float, ...]]]:
-    """The robot without the locked joints and the followers of locked leaders, and their positions.
-
-    Continuous joints among leaders and followers become revolute joints without limits: a (cos, sin) pair loses whole
-    turns, which matter to a gear, and Pinocchio cannot tie such a joint to one of another kind.
-    """
-    model = description.model
-    index = joint_index(model)
-    leaders = {tie.follower: tie for tie in description.ties}
-    positions: dict[int, Floats] = {}
-    for name, value in lock.items():
-        if name not in index:
-            raise UnknownJoint(str(name), index, f"lock of robot {description.name!r}")
-        joint = index[name]
-        if joint in leaders:
-            leader = model.names[leaders[joint].leader]
-            raise InputError(f"lock: joint {name!r} mimics {leader!r}; locking {leader!r} locks both")
-        positions[joint] = _locked_position(model, joint, value)
-    for tie in description.ties:
-        if tie.leader in positions:
-            positions[tie.follower] = tie.ratio * positions[tie.leader] + tie.offset
-    held = {joint: _motion(model, joint, position) for joint, position in positions.items()}
-    geared = {joint for tie in description.ties for joint in (tie.leader, tie.follower) if is_unbounded(model, joint)}
-    kinds = {joint: pin.JointModelRevoluteUnaligned(joint_axis(model, joint)[1]) for joint in geared - set(held)}
-    if held or kinds:
-        description = description.rebuilt(held=held, kinds=kinds)
-    locked = {
-        model.names[joint]: float(at[0]) if at.size == 1 else tuple(at.tolist()) for joint, at in positions.items()
-    }
-    return description, locked
-
-
-def _motion(model: pin.Model, joint: int, position: Floats) -> pin.SE3:
-    """The motion of a joint at its position."""
-    kind, q = model.joints[joint], pin.neutral(model)
-    if is_unbounded(model, joint):
-        position = np.array([np.cos(position[0]), np.sin(position[0])])
-    q[kind.idx_q : kind.idx_q + kind.nq] = position
-    data = kind.createData()
-    kind.calc(data, q)
-    return pin.SE3(data.M)
-
-
-def _open(loops: Sequence[tuple[str, str]], model: pin.Model) -> tuple[tuple[str, str], ...]:
-    """The loops that remain: those between frames that a joint of ``model`` moves against each other."""
-
-    def carriers(name: str) -> set[int]:
-        return {frame.parentJoint for frame in model.frames if frame.name == name and frame.type != pin.FrameType.JOINT}
-
-    return tuple((a, b) for a, b in loops if carriers(a).isdisjoint(carriers(b)))
-
-
-def _locked_position(model: pin.Model, joint: int, value: ArrayLike) -> Floats:
-    kind, name = model.joints[joint], f"lock[{model.names[joint]!r}]"
-    size = 1 if kind.nv == 1 else kind.nq
-    position = np.atleast_1d(as_floats(name, value))
-    if position.shape != (size,):
-        raise InputError(f"{name} must have {size} value(s), got shape {position.shape}")
-    require_finite(name, position)
-    if kind.nv == 1 and kind.nq == 1:
-        low, high = (float(limits[kind.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
-        if low < high and not low - _OUTSIDE <= position[0] <= high + _OUTSIDE:
-            units = not joint_axis(model, joint)[0] and looks_like_degrees(position[0])
-            hint = f", and looks like degrees: {ADVICE}" if units else ""
-            logger.warning(
-                "%s = %g locks the joint outside its limits, %g and %g [rad or m]%s", name, position[0], low, high, hint
-            )
-    if kind.nv > 1:
-        reference = pin.neutral(model)
-        reference[kind.idx_q : kind.idx_q + kind.nq] = position
-        if not pin.isNormalized(model, reference, 1e-6):
-            raise InputError(
-                f"{name} must be a configuration of a {kind.shortname()}, its quaternion or (cos, sin) of "
-                f"length 1, got {position}"
-            )
-        position = pin.normalize(model, reference)[kind.idx_q : kind.idx_q + kind.nq]
-    return position
 
 
 def geometry(robot: Robot) -> pin.GeometryModel:
@@ -708,11 +430,10 @@ def readable_geometry(robot: Robot, read: Reader = read_mesh) -> tuple[pin.Geome
         if robot.urdf is None:
             return together, {}
         urdf = read_urdf(robot.urdf, robot.expanded)
-        full = build_model(urdf)
-        shapes, unread = build_shapes(urdf, full, robot.package_dirs, read)
+        shapes, unread = build_shapes(urdf, robot.package_dirs, read)
     except RobotError as error:
         return together, {name: (joint, str(error)) for name, joint in joints.items()}
-    return _hang(robot, full, shapes), {link: (joints[link], what) for link, what in unread.items()}
+    return _hang(robot, urdf.model, shapes), {link: (joints[link], what) for link, what in unread.items()}
 
 
 def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str = "") -> pin.GeometryModel:
@@ -734,12 +455,8 @@ def _hang(robot: Robot, full: pin.Model, shapes: pin.GeometryModel, prefix: str 
     return shapes
 
 
-def check_inertia(robot: Robot, known: Sequence[str] = ()) -> None:
+def check_inertia(robot: Robot) -> None:
     """Refuse a robot whose mass matrix is singular at q = 0 or at a few seeded random configurations.
-
-    Args:
-        robot: The robot.
-        known: What its masses lack, in words.
 
     Raises:
         SingularMassMatrix: The mass matrix is singular; the message names the joints that move no inertia.
@@ -770,5 +487,5 @@ def check_inertia(robot: Robot, known: Sequence[str] = ()) -> None:
         # Beside a link of a billion kg every other inertia is a rounding error.
         heavy = next((text for text in faults(robot.free_model, ()) if " has a mass of " in text), "")
         raise SingularMassMatrix(
-            np.array(robot.joint_names)[faulty].tolist(), negative=negative, cause=heavy, hint="".join(known[:1])
+            np.array(robot.joint_names)[faulty].tolist(), negative=negative, cause=heavy, hint="".join(robot.faults[:1])
         )

@@ -1,11 +1,10 @@
 """Robots of the package robot_descriptions, which downloads their git repositories on first use."""
 
 import importlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from varpin.errors import MissingDependency, RobotError
+from varpin.model.packages import Files
 
 SUFFIX = "_description"
 INSTALL = (
@@ -17,27 +16,6 @@ INSTALL = (
 _FLOATING, _FIXED = {"biped", "drone", "humanoid", "quadruped"}, {"arm", "dual_arm", "end_effector"}
 
 
-@dataclass(frozen=True)
-class Downloaded:
-    """The files of a robot.
-
-    Attributes:
-        path: Path of the URDF, xacro or MJCF file.
-        package_dirs: Folders in which meshes are looked up.
-        xacro_args: Arguments that the package gives to the xacro file.
-        packages: Folders of ROS packages by name.
-        srdf: The SRDF or xacro file of its postures, if it has one.
-        srdf_args: Arguments that the package gives to that xacro file.
-    """
-
-    path: Path
-    package_dirs: tuple[str, ...]
-    xacro_args: Mapping[str, str] = field(default_factory=dict)
-    packages: Mapping[str, str] = field(default_factory=dict)
-    srdf: Path | None = None
-    srdf_args: Mapping[str, str] = field(default_factory=dict)
-
-
 def names() -> tuple[str, ...]:
     """Names of the robots in the installed package; empty if it is not installed."""
     try:
@@ -46,7 +24,7 @@ def names() -> tuple[str, ...]:
         return ()
 
 
-def download(name: str) -> Downloaded:
+def download(name: str) -> Files:
     """The files of one of the robots, from the package's cache or from the network.
 
     Raises:
@@ -78,9 +56,10 @@ def download(name: str) -> Downloaded:
     roots = [Path(value) for key in ("PACKAGE_PATH", "REPOSITORY_PATH") if (value := getattr(module, key, ""))]
     folders = dict.fromkeys(str(folder) for root in roots for folder in (root, root.parent))
     srdf = getattr(module, "SRDF_PATH", "") or getattr(module, "SRDF_XACRO_PATH", "")
-    return Downloaded(
-        path=Path(found),
-        package_dirs=tuple(folders),
+    return Files(
+        name,
+        Path(found),
+        folders=tuple(folders),
         xacro_args=getattr(module, "XACRO_ARGS", {}),
         packages=getattr(module, "XACRO_PACKAGE_PATHS", {}),
         srdf=Path(srdf) if srdf else None,

@@ -5,69 +5,29 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 import pinocchio as pin
 
 from varpin.errors import FileError, InputError, RobotError, RobotNotFound
 from varpin.model import example_robot_data, robot_descriptions
-from varpin.model.equalities import Closure, Equality
-from varpin.model.mimic import JOINT_PARAMETERS, Tie, depth_first, joint_frames, of_mimics, rebuild, ties_of
+from varpin.model.equalities import Closure
+from varpin.model.mimic import JOINT_PARAMETERS, depth_first, joint_frames, of_mimics, ties_of
 from varpin.model.mjcf import is_mjcf, read_mjcf, root_tag
-from varpin.model.packages import Packages
-from varpin.model.srdf import Posture, beside, read_postures, read_rotors, reference_postures
-from varpin.model.urdf import Inertial, compared_model, read_inertials, read_urdf
+from varpin.model.packages import Files, Packages
+from varpin.model.robot import Robot
+from varpin.model.srdf import beside, read_srdf, reference_postures
+from varpin.model.urdf import read_urdf
 from varpin.model.xacro import expand, is_xacro, plain_name
+from varpin.support.checks import is_one_of
 
 logger = logging.getLogger(__name__)
 
 # Suffixes of robots' files.
 _SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
-
-
-@dataclass(frozen=True)
-class Description:
-    """A robot as its source describes it, before joints are locked.
-
-    Attributes:
-        name: Name of the file, the bundled robot or the model.
-        model: The model without mimic joints.
-        ties: Mimic joints.
-        urdf: The URDF or xacro file, if there is one.
-        expanded: The URDF text of a xacro file.
-        mjcf: The MJCF file, if there is one.
-        package_dirs: Folders in which ``package://`` paths are looked up.
-        visuals: Geometry of a RobotWrapper.
-        inertials: Inertias of the links of a URDF, which the model merges into bodies.
-        remarks: What the source leaves out, in words.
-        faults: What its masses lack, in words.
-        postures: Postures of the joints of ``model``.
-        loops: Pairs of frames that the source closes to loops, and the tree leaves open.
-        equalities: Equality constraints of the source.
-    """
-
-    name: str
-    model: pin.Model
-    ties: tuple[Tie, ...] = ()
-    urdf: Path | None = None
-    expanded: str | None = field(default=None, repr=False)
-    mjcf: Path | None = None
-    package_dirs: tuple[str, ...] = ()
-    visuals: pin.GeometryModel | None = None
-    inertials: tuple[Inertial, ...] = ()
-    remarks: tuple[str, ...] = ()
-    faults: tuple[str, ...] = ()
-    postures: tuple[Posture, ...] = ()
-    loops: tuple[tuple[str, str], ...] = ()
-    equalities: tuple[Equality, ...] = ()
-
-    def rebuilt(self, **changes: Any) -> Description:
-        """The robot with its model rebuilt; see :func:`varpin.model.mimic.rebuild`."""
-        new = rebuild(self.model, **changes)
-        return replace(self, model=new.model, ties=new.ties(self.ties), visuals=new.shapes(self.visuals))
 
 
 def models_dir() -> Path:
@@ -92,60 +52,53 @@ def robot_names() -> tuple[str, ...]:
     return (*bundled_robots(), *example_robot_data.installed())
 
 
-@dataclass(frozen=True)
-class _Request:
-    """What a source is read with: options of :func:`varpin.load_robot`, and folders of packages by name.
-
-    Attributes:
-        folders: Folders in which packages are looked up.
-        xacro_args: Arguments of a xacro file.
-        mimic: Whether mimic joints follow their leaders.
-        srdf: The SRDF file or its xacro file; None to take the one beside the robot's file.
-        srdf_args: Arguments of that xacro file.
-        packages: Folders of packages by name.
-    """
-
-    folders: tuple[str, ...]
-    xacro_args: Mapping[str, object]
-    mimic: bool
-    srdf: Path | None
-    srdf_args: Mapping[str, object]
-    packages: Mapping[str, str] = field(default_factory=dict)
-
-
 def describe(
     source: object,
-    package_dirs: Sequence[str | os.PathLike[str]] | None,
+    package_dirs: Sequence[str | os.PathLike[str]] | None = None,
     *,
-    mimic: bool,
+    mimic: Literal["tied", "free"] = "tied",
     xacro_args: Mapping[str, object] | None = None,
     srdf: str | os.PathLike[str] | None = None,
-) -> Description:
-    """Find and parse ``source``; see :func:`varpin.load_robot`."""
+) -> Robot:
+    """Find and parse ``source``; see :func:`varpin.load_robot`.
+
+    Joints of any kind are there, and none is locked.
+    """
+    if not is_one_of(mimic, ("tied", "free")):
+        raise InputError(f"mimic must be 'tied' or 'free', got {mimic!r}")
     if xacro_args is not None and not isinstance(xacro_args, Mapping):
         raise InputError(f"xacro_args must be a mapping of names to values, got {xacro_args!r}")
     if not (srdf is None or isinstance(srdf, str | os.PathLike)):
         raise InputError(f"srdf must be the path of a file, got {type(srdf).__name__}")
-    file, arguments = None if srdf is None else Path(srdf).expanduser(), xacro_args or {}
-    request = _Request(_folders(package_dirs), arguments, mimic, file, arguments)
+    files = Files("", Path())
+    if isinstance(source, str | os.PathLike):
+        files = _find(source)
+    arguments, path = xacro_args or {}, None if srdf is None else Path(srdf).expanduser()
+    files = replace(
+        files,
+        folders=(*_folders(package_dirs), *files.folders),
+        xacro_args={**files.xacro_args, **arguments},
+        srdf=path or files.srdf,
+        srdf_args={**(files.srdf_args if path is None else {}), **arguments},
+    )
     if isinstance(source, pin.Model):
-        description = _of_model(source, source.name or "model", None)
+        robot = _of_model(source, source.name or "model", None)
     elif isinstance(source, pin.RobotWrapper):
-        description = _of_model(source.model, source.model.name or "robot", source.visual_model)
-    elif isinstance(source, str | os.PathLike):
-        description, request = _of_text(source, request)
+        robot = _of_model(source.model, source.model.name or "robot", source.visual_model)
+    elif files.name:
+        robot = _of_files(files, tied=mimic == "tied")
     else:
         raise InputError(
             "source must be a URDF path, a robot's name, a pin.Model or a pin.RobotWrapper, "
             f"got {type(source).__name__}"
         )
-    if xacro_args and (description.urdf is None or description.expanded is None):
-        raise InputError(f"xacro_args need a xacro file; {description.name!r} does not come from one")
-    return _with_srdf(description, request)
+    if xacro_args and robot.expanded is None:
+        raise InputError(f"xacro_args need a xacro file; {robot.name!r} does not come from one")
+    return _with_srdf(robot if mimic == "tied" else robot.changed(ties=()), files)
 
 
-def _of_text(source: str | os.PathLike[str], request: _Request) -> tuple[Description, _Request]:
-    """The robot of a path or a name, and the request with what a package adds to it."""
+def _find(source: str | os.PathLike[str]) -> Files:
+    """The files of a path or a name."""
     text = os.fspath(source)
     if text.lstrip("\ufeff \t\r\n").startswith("<"):
         raise InputError(
@@ -153,36 +106,22 @@ def _of_text(source: str | os.PathLike[str], request: _Request) -> tuple[Descrip
         )
     path = Path(text).expanduser()
     is_path = isinstance(source, os.PathLike) or path.suffix or os.sep in text
-    if is_path and _is_file(path):
-        return _of_file(path.resolve(), plain_name(path), request), request
+    try:
+        if is_path and path.is_file():
+            return Files(plain_name(path), path.resolve())
+    except OSError as error:
+        raise FileError(f"cannot read the URDF file: {error.strerror}: {str(path)[:80]!r}") from None
     bundled = bundled_robots()
     if text in bundled:
-        return _of_urdf(bundled[text], text, request), request
-    if text in example_robot_data.FIXED_BASE:
-        urdf = example_robot_data.locate(example_robot_data.FIXED_BASE[text])
-        request = replace(request, folders=(*request.folders, str(example_robot_data.package_dir(urdf))))
-        if request.srdf is None and text in example_robot_data.SRDF:
-            request = replace(request, srdf=example_robot_data.locate(example_robot_data.SRDF[text]))
-        return _of_urdf(urdf, text, request), request
-    if text in example_robot_data.FLOATING_BASE:
-        raise RobotError(
-            f"{text!r} has a free-flyer base in example-robot-data, and varpin models fixed bases; "
-            "to pin its base to the world, load its URDF file by path"
-        )
+        return Files(text, bundled[text])
+    if found := example_robot_data.find(text):
+        return found
     downloadable = robot_descriptions.names()
     if text in downloadable or (not downloadable and not is_path and text.endswith(robot_descriptions.SUFFIX)):
-        found = robot_descriptions.download(text)
-        request = replace(
-            request,
-            folders=(*request.folders, *found.package_dirs),
-            xacro_args={**found.xacro_args, **request.xacro_args},
-            packages=found.packages,
-        )
-        if request.srdf is None and found.srdf is not None:
-            request = replace(request, srdf=found.srdf, srdf_args={**found.srdf_args, **request.srdf_args})
-        return _of_file(found.path, text, request), request
+        return robot_descriptions.download(text)
     if is_path and path.is_dir():
-        raise RobotError(f"{path} is a folder, not a URDF file; it contains {_urdf_files(path)}")
+        files = ", ".join(sorted(file.name for file in path.glob("*.urdf"))) or "no URDF file"
+        raise RobotError(f"{path} is a folder, not a URDF file; it contains {files}")
     if is_path:
         folder = path.absolute().parent
         if not folder.is_dir():
@@ -191,7 +130,7 @@ def _of_text(source: str | os.PathLike[str], request: _Request) -> tuple[Descrip
         raise RobotNotFound(path.name, there, f" in the folder {folder}")
     # Without the package its names are unknown.
     more = "" if downloadable else robot_descriptions.INSTALL
-    raise RobotNotFound(text, [*bundled, *example_robot_data.installed(), *downloadable], more=more)
+    raise RobotNotFound(text, [*robot_names(), *downloadable], more=more)
 
 
 def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[str] | None) -> tuple[str, ...]:
@@ -203,18 +142,7 @@ def _folders(package_dirs: Sequence[str | os.PathLike[str]] | str | os.PathLike[
         raise InputError(f"package_dirs must be a list of folders, got {package_dirs!r}") from None
 
 
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError as error:
-        raise FileError(f"cannot read the URDF file: {error.strerror}: {str(path)[:80]!r}") from None
-
-
-def _urdf_files(folder: Path) -> str:
-    return ", ".join(sorted(file.name for file in folder.glob("*.urdf"))) or "no URDF file"
-
-
-def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) -> Description:
+def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) -> Robot:
     _check_model(model, name)
     # Copies, so that later changes of the user's model do not change the robot.
     shapes = visuals.copy() if visuals is not None else None
@@ -224,32 +152,28 @@ def _of_model(model: pin.Model, name: str, visuals: pin.GeometryModel | None) ->
                 f"shape {shape.name!r} has the parent joint {shape.parentJoint}, which model {name!r} does not have"
             )
     ties, kinds = of_mimics(model)
-    description = Description(name, model.copy(), ties, visuals=shapes, postures=reference_postures(model))
+    robot = Robot(name, model.copy(), ties, visuals=shapes, group_states=reference_postures(model))
     order = depth_first(model, ties)
     if kinds or order != sorted(order) or len(joint_frames(model)) < model.njoints - 1:
-        description = description.rebuilt(order=order, kinds=kinds)
+        robot = robot.rebuilt(order=order, kinds=kinds)
     if order != sorted(order):
         # Pinocchio accepts joints in any order, but then computes a wrong mass matrix silently.
         logger.warning(
             "the joints of model %r were not added subtree by subtree, as Pinocchio's algorithms need: reordered to %s",
             name,
-            ", ".join(list(description.model.names)[1:]),
+            ", ".join(list(robot.free_model.names)[1:]),
         )
-    frames = description.model.frames
-    for shape in shapes.geometryObjects if (shapes := description.visuals) is not None else ():
+    frames = robot.free_model.frames
+    for shape in shapes.geometryObjects if (shapes := robot.visuals) is not None else ():
         # Where a shape has no frame of its joint, it has the joint's.
         if shape.parentFrame >= len(frames) or frames[shape.parentFrame].parentJoint != shape.parentJoint:
-            joint = description.model.names[shape.parentJoint]
-            shape.parentFrame = description.model.getFrameId(joint, pin.FrameType.JOINT) if shape.parentJoint else 0
-    return description
+            joint = robot.free_model.names[shape.parentJoint]
+            shape.parentFrame = robot.free_model.getFrameId(joint, pin.FrameType.JOINT) if shape.parentJoint else 0
+    return robot
 
 
 def _check_model(model: pin.Model, name: str) -> None:
-    """Refuse an inconsistent model: Pinocchio's algorithms do not check it, and crash the process.
-
-    Raises:
-        RobotError: The model is inconsistent; the message names the attribute.
-    """
+    """Refuse an inconsistent model: Pinocchio's algorithms do not check it, and crash the process."""
     n, nq, nv = model.njoints, model.nq, model.nv
     sizes = dict.fromkeys(("joints", "names", "parents", "inertias", "jointPlacements"), n)
     sizes |= dict.fromkeys(("lowerPositionLimit", "upperPositionLimit"), nq)
@@ -265,23 +189,36 @@ def _check_model(model: pin.Model, name: str) -> None:
             raise RobotError(f"model {name!r} is damaged: the parent of frame {frame.name!r} does not exist")
 
 
-def _of_file(path: Path, name: str, request: _Request) -> Description:
+def _of_files(files: Files, *, tied: bool) -> Robot:
+    path, text = files.path, None
     if is_xacro(path):
-        places = _places(path, request.folders)
-        return _of_urdf(path, name, request, expand(path, request.xacro_args, places, request.packages))
-    if is_mjcf(path):
-        return _of_mjcf(path, name)
-    if path.suffix == ".sdf" or (path.suffix in (".xml", ".world") and root_tag(path) == "sdf"):
+        text = expand(path, files.xacro_args, _places(path, files.folders), files.packages)
+    elif is_mjcf(path):
+        model, remarks, equalities = read_mjcf(path)
+        loops = tuple((each.a.body, each.b.body) for each in equalities if isinstance(each, Closure))
+        robot = _of_model(model, files.name, None)
+        return robot.changed(mjcf=path, remarks=remarks, loops=loops, equalities=equalities)
+    elif path.suffix == ".sdf" or (path.suffix in (".xml", ".world") and root_tag(path) == "sdf"):
         raise RobotError(
             f"{path} is an SDF file, which Pinocchio's package on PyPI cannot read; convert it to a URDF or an MJCF"
         )
-    return _of_urdf(path, name, request)
-
-
-def _of_mjcf(path: Path, name: str) -> Description:
-    model, remarks, equalities = read_mjcf(path)
-    loops = tuple((each.a.body, each.b.body) for each in equalities if isinstance(each, Closure))
-    return replace(_of_model(model, name, None), mjcf=path, remarks=remarks, loops=loops, equalities=equalities)
+    urdf = read_urdf(path, text)
+    ties, alone = ties_of(urdf.mimics, urdf.model) if tied else ((), ())
+    robot = Robot(
+        files.name,
+        urdf.model,
+        ties,
+        urdf=path,
+        expanded=text,
+        package_dirs=_places(path, files.folders),
+        loops=urdf.loops,
+        inertials=urdf.inertials,
+        remarks=(*urdf.remarks, *alone),
+        notes=urdf.notes,
+        faults=urdf.faults,
+    )
+    order = depth_first(urdf.model, ties)
+    return robot if order == sorted(order) else robot.rebuilt(order=order)
 
 
 def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
@@ -290,55 +227,25 @@ def _places(path: Path, folders: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*folders, *around, str(path.parent))))
 
 
-def _of_urdf(path: Path, name: str, request: _Request, expanded: str | None = None) -> Description:
-    urdf = read_urdf(path, expanded)
-    model, differences = compared_model(urdf, expanded)
-    inertials, lacks = read_inertials(urdf, model)
-    remarks = (*urdf.remarks, *filter(None, [urdf.unlimited]), *differences)
-    for note in urdf.notes:
-        logger.info("robot %r: %s", name, note)
-    description = Description(
-        name=name,
-        model=model,
-        ties=ties_of(urdf.mimics, model) if request.mimic else (),
-        urdf=path,
-        expanded=expanded,
-        package_dirs=_places(path, request.folders),
-        inertials=inertials,
-        remarks=remarks,
-        faults=lacks,
-        loops=urdf.loops,
-    )
-    order = depth_first(model, description.ties)
-    return description if order == sorted(order) else description.rebuilt(order=order)
-
-
-def _with_srdf(description: Description, request: _Request) -> Description:
+def _with_srdf(robot: Robot, files: Files) -> Robot:
     """The postures and rotors of the SRDF file that was asked for, or of the one beside the robot's file."""
-    path = request.srdf
-    if path is None and description.urdf is not None:
-        path = beside(description.urdf, description.model.name)
-    if path is None:
-        return description
-    try:
-        text = None
-        if is_xacro(path):
-            # It need not take all of the robot's arguments.
-            places = _places(path, request.folders)
-            text = expand(path, request.srdf_args, places, request.packages, strict=False)
-        postures, rotors = read_postures(path, text), read_rotors(path, text)
-    except (RobotError, FileError) as error:
-        if request.srdf is not None:
-            raise
-        return replace(description, remarks=(*description.remarks, f"the robot has no postures: {error}"))
-    _add_rotors(description.model, rotors)
-    return replace(description, postures=postures)
-
-
-def _add_rotors(model: pin.Model, armature: Mapping[str, float]) -> None:
-    """Set the armature of joints by name [kg m^2 or kg]; names of no joint are ignored."""
-    values = np.array(model.armature)
-    for joint in range(1, model.njoints):
-        if model.names[joint] in armature:
-            values[model.joints[joint].idx_v] = armature[model.names[joint]]
-    model.armature = values
+    path, model = files.srdf, robot.free_model
+    if path is None and robot.urdf is not None:
+        path = beside(robot.urdf, model.name)
+    states = robot.group_states
+    if path is not None:
+        try:
+            # A xacro file need not take all of the robot's arguments.
+            places = _places(path, files.folders)
+            text = expand(path, files.srdf_args, places, files.packages, strict=False) if is_xacro(path) else None
+            states, rotors = read_srdf(path, text)
+        except (RobotError, FileError) as error:
+            if files.srdf is not None:
+                raise
+            return robot.changed(remarks=(*robot.remarks, f"the robot has no postures: {error}"))
+        values = np.array(model.armature)
+        for name in rotors.keys() & set(model.names):
+            values[model.joints[model.getJointId(name)].idx_v] = rotors[name]
+        model.armature = values
+    known = tuple(state for state in states if any(joint in model.names for joint, _ in state.positions))
+    return robot.changed(group_states=known)

@@ -1,8 +1,7 @@
 """Postures of a robot: the group states of an SRDF file, or the reference configurations of a Pinocchio model."""
 
-import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +10,6 @@ import pinocchio as pin
 from varpin.errors import FileError, RobotError
 from varpin.model.urdf import finite_number, read_xml
 from varpin.model.xacro import plain_name
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -43,51 +40,40 @@ def beside(path: Path, robot: str) -> Path | None:
     return named[0] if len(named) == 1 else None
 
 
-def read_rotors(path: Path, text: str | None = None) -> dict[str, float]:
-    """The armature of joints [kg m^2 or kg] in an SRDF file, rotor inertia times squared gear ratio.
-
-    Raises:
-        FileError: The file cannot be read.
-        RobotError: It is not an SRDF, or a number in it is none.
-    """
-    armature = {}
-    for joint in read_xml(path, text)[0].iterfind("rotor_params/joint"):
-        name = joint.get("name", "")
-        mass, ratio = (
-            finite_number(joint.get(key, "0"), f"{path}: {key} of the rotor of joint {name!r}")
-            for key in ("mass", "gear_ratio")
-        )
-        if mass < 0.0:
-            raise RobotError(f"{path}: mass of the rotor of joint {name!r} is negative: {mass:g}")
-        armature[name] = mass * ratio**2
-    return armature
-
-
-def read_postures(path: Path, text: str | None = None) -> tuple[Posture, ...]:
-    """The postures in an SRDF file.
+def read_srdf(path: Path, text: str | None = None) -> tuple[tuple[Posture, ...], dict[str, float]]:
+    """Read an SRDF file.
 
     Args:
         path: Path of the file.
         text: The SRDF text, if not the file's content.
 
+    Returns:
+        Its postures, and the armature of joints by name [kg m^2 or kg]: rotor inertia times squared gear ratio.
+
     Raises:
         FileError: The file cannot be read.
-        RobotError: It is not an SRDF, or a position in it is not a number.
+        RobotError: It is not an SRDF, or a number in it is none.
     """
-    root, _ = read_xml(path, text)
+    root = read_xml(path, text)
     if root.tag != "robot":
         raise RobotError(f"{path} is not an SRDF: its root element is <{root.tag}>, not <robot>")
-    postures = []
+    postures, armature = [], {}
     for state in root.findall("group_state"):
         name, positions = state.get("name", ""), []
         for joint in state.findall("joint"):
             where = f"{path}: posture {name!r}: the position of joint {joint.get('name')!r}"
-            words = joint.get("value", "").split()
-            numbers = [finite_number(word, where) for word in words or [""]]
+            numbers = [finite_number(word, where) for word in joint.get("value", "").split() or [""]]
             if len(numbers) <= 2:  # More numbers belong to a joint with several axes, such as a free-flyer.
                 positions.append((joint.get("name", ""), _angle(numbers)))
         postures.append(Posture(name, state.get("group", ""), tuple(positions)))
-    return tuple(postures)
+    for joint in root.iterfind("rotor_params/joint"):
+        where = f"of the rotor of joint {joint.get('name')!r}"
+        mass = finite_number(joint.get("mass", "0"), f"{path}: mass {where}")
+        if mass < 0.0:
+            raise RobotError(f"{path}: mass {where} is negative: {mass:g}")
+        ratio = finite_number(joint.get("gear_ratio", "0"), f"{path}: gear_ratio {where}")
+        armature[joint.get("name", "")] = mass * ratio**2
+    return tuple(postures), armature
 
 
 def reference_postures(model: pin.Model) -> tuple[Posture, ...]:
@@ -103,11 +89,6 @@ def reference_postures(model: pin.Model) -> tuple[Posture, ...]:
     return tuple(postures)
 
 
-def of_joints(postures: Iterable[Posture], joints: Sequence[str]) -> tuple[Posture, ...]:
-    """The postures that set some of ``joints``."""
-    return tuple(posture for posture in postures if any(joint in joints for joint, _ in posture.positions))
-
-
 def _angle(numbers: Sequence[float]) -> float:
     """The position of a one-axis joint from one number, or from cosine and sine."""
     return float(numbers[0]) if len(numbers) == 1 else math.atan2(numbers[1], numbers[0])
@@ -116,6 +97,6 @@ def _angle(numbers: Sequence[float]) -> float:
 def _robot_of(path: Path) -> str:
     """The name of the robot in a file; empty if the file cannot be read."""
     try:
-        return read_xml(path)[0].get("name", "")
+        return read_xml(path).get("name", "")
     except (RobotError, FileError):
         return ""

@@ -1,6 +1,7 @@
 """A Pinocchio model as flat arrays, with joint frames turned so that every joint axis is z."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -77,60 +78,44 @@ def flatten(model: pin.Model, ties: tuple[Tie, ...], coordinates: tuple[int, ...
         RobotError: A link's mass, centre or inertia is NaN or infinite, or a joint's placement is not a rotation and a
             translation.
     """
-    bodies = model.njoints - 1
     tied = {tie.follower: tie for tie in ties}
     index = {joint: c for c, joint in enumerate(coordinates)}
-    turn = [np.eye(3)]
-    prismatic = np.zeros(bodies, dtype=np.int64)
-    rotation = np.zeros((bodies, 3, 3))
-    translation = np.zeros((bodies, 3))
-    mass = np.zeros(bodies)
-    center = np.zeros((bodies, 3))
-    inertia = np.zeros((bodies, 6))
-    coordinate = np.zeros(bodies, dtype=np.int64)
-    ratio = np.ones(bodies)
-    offset = np.zeros(bodies)
-    for body in range(bodies):
-        joint = body + 1
+    turn, rows = [np.eye(3)], []
+    for joint in range(1, model.njoints):
         slides, axis = joint_axis(model, joint)
         turn.append(z_to(axis))
         before = turn[model.parents[joint]]
         placement = model.jointPlacements[joint]
         if not _is_rigid(placement):
             raise RobotError(f"the placement of joint {model.names[joint]!r} must be a finite rotation and translation")
-        prismatic[body] = slides
-        rotation[body] = before.T @ placement.rotation @ turn[joint]
-        translation[body] = before.T @ placement.translation
         link = model.inertias[joint]
         if not (np.isfinite(link.mass) and np.isfinite(link.lever).all() and np.isfinite(link.inertia).all()):
             raise RobotError(f"the link moved by joint {model.names[joint]!r} has a mass or inertia that is not finite")
-        mass[body] = link.mass
-        center[body] = turn[joint].T @ link.lever
         about_center = turn[joint].T @ link.inertia @ turn[joint]
-        inertia[body] = about_center[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
-        if joint in tied:
-            tie = tied[joint]
-            coordinate[body], ratio[body], offset[body] = index[tie.leader], tie.ratio, tie.offset
-        else:
-            coordinate[body] = index[joint]
-    parent = np.array([model.parents[j] - 1 for j in range(1, model.njoints)], dtype=np.int64)
+        tie = tied.get(joint, Tie(joint, joint, 1.0, 0.0))
+        row = {
+            "parent": model.parents[joint] - 1,
+            "prismatic": int(slides),
+            "rotation": before.T @ placement.rotation @ turn[joint],
+            "translation": before.T @ placement.translation,
+            "mass": link.mass,
+            "center": turn[joint].T @ link.lever,
+            "inertia": about_center[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]],
+            "coordinate": index[tie.leader],
+            "ratio": tie.ratio,
+            "offset": tie.offset,
+        }
+        rows.append(row)
+    bodies: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    parent, coordinate, prismatic = bodies["parent"], bodies["coordinate"], bodies["prismatic"]
     group = independent_groups(parent, coordinate, len(coordinates))
-    loads, carried = light_parts(parent, coordinate, prismatic, translation, mass, center, inertia, len(coordinates))
+    loads, carried = _light_parts(bodies, len(coordinates))
     return Tree(
-        parent=parent,
-        prismatic=prismatic,
-        rotation=rotation,
-        translation=translation,
-        mass=mass,
-        center=center,
-        inertia=inertia,
-        coordinate=coordinate,
-        ratio=ratio,
-        offset=offset,
+        **bodies,
         origin=origins(parent, prismatic),
         loads=loads,
         carried=carried,
-        periodic=periodic_coordinates(coordinate, prismatic, ratio, len(coordinates)),
+        periodic=periodic_coordinates(coordinate, prismatic, bodies["ratio"], len(coordinates)),
         armature=coordinate_armature(model, ties, coordinates),
         group=group,
         groups=int(group.max()) + 1,
@@ -228,44 +213,26 @@ def ancestors(parent: Integers) -> NDArray[np.bool_]:
     return is_ancestor
 
 
-def light_parts(
-    parent: Integers,
-    coordinate: Integers,
-    prismatic: Integers,
-    translation: Floats,
-    mass: Floats,
-    center: Floats,
-    inertia: Floats,
-    dof: int,
-) -> tuple[Integers, Integers]:
+def _light_parts(tree: Mapping[str, Any], dof: int) -> tuple[Integers, Integers]:
     """Light subtrees, whose energy is negligible beside that of the bodies that carry them.
 
     Their inertia is compared with that of their carrier with all joints stretched out, which bounds both.
 
-    Args:
-        parent: Parent of each body (b,), -1 at a root.
-        coordinate: Coordinate that moves each body (b,).
-        prismatic: 1 where the joint of a body is prismatic (b,).
-        translation: Position of each joint in its parent's frame (b, 3) [m].
-        mass: Mass of each body (b,) [kg].
-        center: Centre of mass in each body's frame (b, 3) [m].
-        inertia: Inertia of each body about its centre of mass (b, 6) [kg m^2].
-        dof: n.
-
     Returns:
         The root body of each light subtree (l,), and whether each coordinate moves within it (l, n): 1 or 0.
     """
+    parent, prismatic, mass = tree["parent"], tree["prismatic"], tree["mass"]
     bodies = len(parent)
     is_ancestor = ancestors(parent)
     path = np.zeros(bodies)  # length along the offsets between joints, from the root
     for b in range(bodies):
-        path[b] = np.linalg.norm(translation[b]) + (path[parent[b]] if parent[b] >= 0 else 0.0)
+        path[b] = np.linalg.norm(tree["translation"][b]) + (path[parent[b]] if parent[b] >= 0 else 0.0)
     # [a, b]: inertia of body b about the joint of its ancestor a.
     with np.errstate(over="ignore", invalid="ignore"):
-        reach = np.linalg.norm(center, axis=1) + path - path[:, None]
+        reach = np.linalg.norm(tree["center"], axis=1) + path - path[:, None]
         slides = prismatic[:, None] == 1
         about = mass * np.where(slides, 1.0, reach**2)
-        about += np.where(slides, 0.0, inertia[:, [0, 2, 5]].sum(axis=1) / 2.0)
+        about += np.where(slides, 0.0, tree["inertia"][:, [0, 2, 5]].sum(axis=1) / 2.0)
         about[~is_ancestor.T] = 0.0
         # [a, j]: inertia, about joint a, of all bodies that joint j carries.
         carries = about @ is_ancestor
@@ -273,7 +240,7 @@ def light_parts(
     carrier = np.full(bodies, -1)  # root of the light subtree that a body is in
     joints, rows = [], []
     movers = np.zeros((bodies, dof))
-    movers[np.arange(bodies), coordinate] = 1.0
+    movers[np.arange(bodies), tree["coordinate"]] = 1.0
     movable = is_ancestor.T.astype(float) @ movers  # [j, c]: how many bodies that joint j carries coordinate c moves
     elsewhere = movers.sum(axis=0) - movable
     for j in range(bodies):

@@ -16,10 +16,8 @@ if TYPE_CHECKING:
 
 # Largest plausible angle [rad]: two turns.
 _TURNS = 4.0 * math.pi
-# Degrees up to this are plausible, in degrees or degrees per second.
+# Degrees up to this are plausible.
 _DEGREES = 1e6
-# Velocities beyond this multiple of a joint's limit are implausible in radians.
-_SEVERAL = 6.0
 ADVICE = "angles are in radians, np.deg2rad makes them of degrees"
 
 # A joint whose limit is larger [rad or m] has none: exporters write 1e9, 1e16 or the largest double.
@@ -84,31 +82,6 @@ def degrees_hint(robot: Robot, name: str, q: Floats) -> str:
         return ""
     turns = f"{angles[joint] / (2.0 * math.pi):.0f} turns"
     return f"{name} of {robot.joint_names[joint]!r} is {q[joint]:.4g} rad, {turns}, and looks like degrees: {ADVICE}"
-
-
-def degrees_per_second_hint(robot: Robot, name: str, v: Floats) -> str:
-    """A sentence about the joint of a velocity that looks most like degrees per second; empty if none does.
-
-    That is a number of at most two decimals, several times the joint's limit, where the angles of all joints with
-    limits are within them if they are in degrees per second.
-
-    Args:
-        robot: The robot.
-        name: Name of the velocity, for the sentence.
-        v: Velocity (n,) [rad/s or m/s].
-    """
-    if not v.any():
-        return ""
-    limit = robot.velocity_limit
-    limited = ~robot.slides & np.isfinite(limit) & (limit > 0.0)
-    times = np.where(limited, np.abs(v), 0.0) / np.where(limited, limit, 1.0)
-    joint = int(np.argmax(np.where(_typed(v), times, 0.0)))
-    if not times[joint] > _SEVERAL or np.deg2rad(times.max()) > 1.0:
-        return ""
-    return (
-        f"{name} of {robot.joint_names[joint]!r} is {v[joint]:.4g} rad/s, {times[joint]:.3g} times its limit of "
-        f"{limit[joint]:.4g}, and looks like degrees per second: {ADVICE}"
-    )
 
 
 def _typed(values: Floats) -> NDArray[np.bool_]:

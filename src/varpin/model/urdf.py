@@ -1,4 +1,4 @@
-"""Reading URDF files: Pinocchio's parser builds the model; what it leaves out of a file or refuses is told here.
+"""URDF files: Pinocchio's parser builds the model, and its complaints tell what it leaves out or refuses.
 
 The file is parsed here as well, for what Pinocchio has no word for: mimic elements, loops, textures, the limits that
 exporters write for "none". Everything else, with the version of URDF that it depends on, is Pinocchio's reading.
@@ -30,32 +30,19 @@ from varpin.errors import FileError, RobotError
 from varpin.model.meshes import Reader, put_mesh, read_mesh
 from varpin.model.packages import LFS_POINTER, Packages
 from varpin.model.units import NO_LIMIT, limits_in_degrees
+from varpin.support.frozen import Frozen
 
 logger = logging.getLogger(__name__)
-
-VERSIONS = ("1.0", "1.1", "1.2")  # of URDF, which Pinocchio reads
-# Most links one after another: its parser ends the process on chains of about 4,000.
-_LONGEST = 3000
 
 # A link with less than this share of the mass of all links on its joint is massless, but for rounding.
 _ROUNDING = 1e-12
 
-# The attributes of a URDF that hold numbers, by element.
-_NUMBERS = {
-    "origin": ("xyz", "rpy", "quat_xyzw"),
-    "mass": ("value",),
-    "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
-    "axis": ("xyz",),
-    "limit": ("lower", "upper", "effort", "velocity"),
-    "dynamics": ("damping", "friction"),
-}
-# Those of shapes and of mimic joints.
-_SIZES, _MIMIC = ("size", "radius", "length", "scale"), ("multiplier", "offset")
-_COUNTS = {"xyz": 3, "rpy": 3, "quat_xyzw": 4}
-
 # A bound in words that Pinocchio reads and :class:`varpin.Robot` takes as none.
 _NONE = "1e308"
 _WORDS = ("", "none", "nan")  # by which files say so
+
+# Longest text of Pinocchio's own in a message.
+_COMPLAINT = 150
 
 _COMMENT = re.compile(rb"<!--.*?-->|(<!\[CDATA\[.*?\]\]>)", re.DOTALL)
 
@@ -73,7 +60,7 @@ class Mimic:
 
 
 @dataclass(frozen=True, eq=False)
-class Inertial:
+class Inertial(Frozen):
     """Mass and inertia of a link, as Pinocchio reads them.
 
     Attributes:
@@ -96,20 +83,22 @@ class Urdf:
     Attributes:
         path: Path of the file.
         root: The ``<robot>`` element, with prefixes of names as written.
+        model: Pinocchio's model, in which mimic joints are independent.
         mimics: Mimic elements by joint.
+        inertials: The inertias of the links that have one.
+        faults: What Pinocchio leaves out of links and joints, in words; empty if it leaves out nothing.
         remarks: How the file is read where that is not plain, one sentence a kind.
-        unlimited: A sentence about limits that are read as none; empty if there are none.
         notes: What of the file has no effect on purpose, likewise.
-        plain: Whether nothing in it was tidied or mended: Pinocchio's own reading is varpin's.
     """
 
     path: Path
     root: ET.Element = field(repr=False)
+    model: pin.Model = field(repr=False)
     mimics: Mapping[str, Mimic]
+    inertials: tuple[Inertial, ...] = field(repr=False)
+    faults: tuple[str, ...]
     remarks: tuple[str, ...]
     notes: tuple[str, ...]
-    plain: bool
-    unlimited: str = ""
 
     @property
     def loops(self) -> tuple[tuple[str, str], ...]:
@@ -122,7 +111,7 @@ class Urdf:
 def read_urdf(path: Path, text: str | None = None) -> Urdf:
     """Read a URDF file.
 
-    XML is read leniently: prefixes need no namespace, and comments may contain ``--``.
+    XML is read as leniently as Pinocchio reads it: prefixes need no namespace, and comments may contain ``--``.
 
     Args:
         path: Path of the file.
@@ -130,88 +119,72 @@ def read_urdf(path: Path, text: str | None = None) -> Urdf:
 
     Raises:
         FileError: The file cannot be read.
-        RobotError: It is not a URDF, a link is the child of two joints, or a number in a mimic element is invalid.
+        RobotError: Pinocchio cannot read it, a link is the child of two joints or on a loop, or a number in a mimic
+            element is invalid.
     """
-    root, fault = read_xml(path, text)
-    if root.tag != "robot":
-        raise RobotError(f"{path} is not a URDF: its root element is <{root.tag}>, not <robot>")
-    _require_expanded(root, path)
-    if not root.get("name"):
-        raise RobotError(f"{path} is not a URDF: its <robot> has no name")
-    if root.find("link") is None:
-        raise RobotError(
-            f"{path} is not a URDF: it describes no link" + ("; it has xacro to expand" * bool(_xacro(root)))
-        )
-    if root.get("version", "1.0") not in VERSIONS:
-        raise RobotError(
-            f"{path}: there is no URDF version {root.get('version')!r}; Pinocchio reads {', '.join(VERSIONS)}"
-        )
+    root = read_xml(path, text)
     parent: dict[str, str] = {}
-    for joint in root.findall("joint"):
-        child, name = joint.find("child"), joint.get("name", "")
-        link = "" if child is None else child.get("link", "")
-        if link and parent.setdefault(link, name) != name:
+    for joint in root.findall("joint[child]"):
+        link, name = joint.findall("child")[0].get("link", ""), joint.get("name", "")
+        if parent.setdefault(link, name) != name:
             raise RobotError(
                 f"{path}: link {link!r} is the child of joints {parent[link]!r} and {name!r}: "
                 "varpin takes trees, no closed loops"
             )
-    if (length := _longest_chain(root)) > _LONGEST:
-        raise RobotError(f"{path} has {length} links one after another, and varpin reads {_LONGEST} at most")
-    tidied = False
-    for element in (part for tag in ("link/inertial", "joint") for found in root.iterfind(tag) for part in found):
-        for key in _NUMBERS.get(element.tag, ()):
-            if (words := element.get(key)) is not None and (tidy := " ".join(words.split())) != words:
-                element.set(key, tidy)
-                tidied = True
-    remarks = [*([f"its XML is not well-formed, and was mended: {fault}"] if fault else []), *_remarks(root)]
-    unlimited = _unlimited(root)
     mimics = {joint.get("name", ""): _mimic(joint, path) for joint in root.findall("joint[mimic]")}
+    remarks = *_remarks(root), *_unlimited(root)
     soft = _joints_with(root, "safety_controller")
     notes = (f"soft limits of <safety_controller> have no effect: {listed(soft, 'joints')}",) if soft else ()
-    return Urdf(path, root, mimics, tuple(remarks), notes, not (tidied or remarks or unlimited), unlimited)
+    model, complaint = _model(root, path)
+    faults = (f"Pinocchio reads links in part: {complaint}",) if complaint else ()
+    return Urdf(path, root, model, mimics, _inertials(root, model), faults, remarks, notes)
 
 
-def build_model(urdf: Urdf) -> pin.Model:
-    """Pinocchio's model of a file; mimic joints are independent.
-
-    Raises:
-        RobotError: Pinocchio cannot read the file, or leaves links out.
-    """
-    model = _build(_part(urdf.root, "link/inertial", "joint"))
-    if isinstance(model, str):
-        why = next(_faults(urdf.root), f"Pinocchio cannot read it: {textwrap.shorten(model, 120)}")
-        raise RobotError(f"{urdf.path} is not a URDF: {why}")
-    return _require_all_links(urdf, model)
-
-
-def _require_all_links(urdf: Urdf, model: pin.Model) -> pin.Model:
+def _model(root: ET.Element, path: Path) -> tuple[pin.Model, str]:
+    """Pinocchio's model of a file, and its complaints."""
+    model, complaint = None, ""
+    small = ET.Element("robot" if root.tag == "robot" else "none", _head(root))
+    for part in root.iterfind("*"):
+        if part.tag in ("link", "joint"):
+            kept = ET.SubElement(small, part.tag, part.attrib)
+            kept.extend(part if part.tag == "joint" else part.findall("inertial"))
+    with captured_stderr() as complaints:
+        try:
+            model = pin.buildModelFromXML(ET.tostring(small, encoding="unicode"))
+        except (ValueError, RuntimeError, IndexError) as error:
+            complaint = str(error)
+        complaint = "; ".join(complaints()) or complaint
+    expand = "${" in complaint or "$(" in complaint or (model is None and bool(_xacro(root)))
+    complaint = textwrap.shorten(complaint, _COMPLAINT)
+    if re.search(r"\d,\d", complaint):
+        complaint += " (the decimal sign is a point)"
+    if expand:
+        name = path.name.removesuffix(".xacro").removesuffix(".urdf")
+        raise RobotError(f"{path} is a xacro file, to be expanded: name it {name}.urdf.xacro ({complaint})")
+    if model is None:
+        raise RobotError(f"{path} is not a URDF: {complaint}")
     bodies = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
-    links = [link.get("name", "") for link in urdf.root.findall("link")]
-    if lost := [repr(link) for link in links if link not in bodies]:
-        raise RobotError(f"{urdf.path}: links {listed(lost, 'links')} are on a loop of joints without a root")
-    return model
+    if lost := [repr(link.get("name")) for link in root.findall("link") if link.get("name") not in bodies]:
+        raise RobotError(f"{path}: links {listed(lost, 'links')} are on a loop of joints without a root")
+    return model, complaint
 
 
-def read_inertials(urdf: Urdf, model: pin.Model) -> tuple[tuple[Inertial, ...], tuple[str, ...]]:
-    """The inertias of the links that have one, as Pinocchio reads them, and remarks about those it reads in part."""
-    given = {link.get("name", ""): link for link in urdf.root.findall("link") if link.find("inertial") is not None}
+def _inertials(root: ET.Element, model: pin.Model) -> tuple[Inertial, ...]:
+    """The inertias of the links that have one."""
+    given = {link.get("name", "") for link in root.findall("link[inertial]")}
     # Pinocchio merges links on fixed joints into one body, whose parts are in the frames of these joints.
     fixed = [frame for frame in model.frames if frame.type == pin.FrameType.FIXED_JOINT and frame.inertia.mass]
-    found, remarks = [], []
+    found = []
     for frame in (frame for frame in model.frames if frame.type == pin.FrameType.BODY and frame.name in given):
-        name, link, up = frame.name, given[frame.name], model.frames[frame.parentFrame]
+        up = model.frames[frame.parentFrame]
         body = up.inertia if up.inertia.mass else frame.inertia
         if up.type == pin.FrameType.JOINT:
             body = model.inertias[frame.parentJoint]
             if parts := [part for part in fixed if part.parentJoint == frame.parentJoint]:
                 body = _without(body, [part.placement.act(part.inertia) for part in parts])
-        if fault := next(_faults_of_numbers(link.findall("inertial")[0], required=True), ""):
-            effect = "massless" if body.mass == 0.0 else "a point mass"
-            remarks.append(f"link {name!r} is {effect}, as Pinocchio reads it: {fault}")
         if body.mass or body.inertia.any():
-            found.append(Inertial(name, body.mass, np.array(body.lever), np.array(body.inertia)))
-    more = f" (and {len(remarks) - 1} more)" if len(remarks) > 1 else ""
-    return tuple(found), tuple(remark + more for remark in remarks[:1])
+            found.append(Inertial(frame.name, body.mass, np.array(body.lever), np.array(body.inertia)))
+    return tuple(found)
 
 
 def _without(body: pin.Inertia, parts: Sequence[pin.Inertia]) -> pin.Inertia:
@@ -220,49 +193,13 @@ def _without(body: pin.Inertia, parts: Sequence[pin.Inertia]) -> pin.Inertia:
     return pin.Inertia.FromDynamicParameters(rest) if rest[0] > _ROUNDING * body.mass else pin.Inertia.Zero()
 
 
-def compared_model(urdf: Urdf, text: str | None) -> tuple[pin.Model, tuple[str, ...]]:
-    """Pinocchio's model of a file, and where it is not what Pinocchio reads from the file as it is, if it reads that.
-
-    Args:
-        urdf: The file.
-        text: The URDF text, if not the file's content.
-
-    Raises:
-        RobotError: As for :func:`build_model`.
-    """
-    try:
-        with captured_stderr():
-            own = pin.buildModelFromUrdf(str(urdf.path)) if text is None else pin.buildModelFromXML(text)
-        theirs = list(own.names)[1:]
-    except (ValueError, RuntimeError, IndexError):
-        return build_model(urdf), ()
-    # Pinocchio's parser knows no entities.
-    if urdf.plain and b"<!ENTITY" not in (urdf.path.read_bytes() if text is None else text.encode()):
-        return _require_all_links(urdf, own), ()
-    model = build_model(urdf)
-    if own == model:
-        return model, ()
-    if theirs != list(model.names)[1:]:
-        return model, (f"Pinocchio's own reading of the file has other joints: {listed(theirs, 'joints')}",)
-    odd = [
-        repr(name)
-        for j, name in enumerate(model.names)
-        if model.inertias[j] != own.inertias[j] or model.jointPlacements[j] != own.jointPlacements[j]
-    ]
-    if urdf.unlimited and not odd:
-        return model, ()
-    what = f"in the masses or places of {listed(odd, 'joints')}" if odd else "in limits or frames"
-    return model, (f"Pinocchio's own reading of the file differs {what}: it reads numbers less leniently",)
-
-
 def build_shapes(
-    urdf: Urdf, model: pin.Model, package_dirs: Sequence[str], read: Reader = read_mesh
+    urdf: Urdf, package_dirs: Sequence[str], read: Reader = read_mesh
 ) -> tuple[pin.GeometryModel, dict[str, str]]:
     """The visual geometry in a file, as Pinocchio reads it, except for meshes.
 
     Args:
         urdf: The file.
-        model: From :func:`build_model`.
         package_dirs: Folders in which ``package://`` paths are looked up.
         read: Reads a mesh file.
 
@@ -276,12 +213,12 @@ def build_shapes(
     text = ET.tostring(root, encoding="unicode")
     with captured_stderr() as complaints:
         try:
-            shapes = pin.buildGeomFromUrdfString(model, text, pin.GeometryType.VISUAL, None, [*package_dirs])
+            shapes = pin.buildGeomFromUrdfString(urdf.model, text, pin.GeometryType.VISUAL, None, [*package_dirs])
         except (ValueError, RuntimeError, IndexError) as error:
             raise RobotError(f"the shapes in {urdf.path} cannot be read: {error}") from None
         lines = complaints()
     if lines:
-        logger.warning("%s: shapes are read in part: %s", urdf.path, "; ".join(lines)[:120])
+        logger.warning("%s: shapes are read in part: %s", urdf.path, textwrap.shorten("; ".join(lines), _COMPLAINT))
     packages = Packages(urdf.path, tuple(package_dirs))
     faults = _missing_meshes(urdf, packages)
     for shape in shapes.geometryObjects:
@@ -324,16 +261,8 @@ def _missing_meshes(urdf: Urdf, packages: Packages) -> dict[str, str]:
     return dict.fromkeys(missing, f"{message}looked beside the file and in {places} (package_dirs=[...] adds)")
 
 
-def _mended(content: bytes) -> str:
-    """Text of a file that expat cannot decode, as UTF-8, without its declaration and what follows the root element."""
-    text = content.decode("utf-8", errors="replace").lstrip("\ufeff \t\r\n")
-    text = re.sub(r"^<\?xml.*?\?>", "", text, flags=re.DOTALL)
-    text = re.sub(r"&(?!#?\w+;)", "&amp;", text)
-    return text[: text.rfind("</robot>") + len("</robot>")] if "</robot>" in text else text
-
-
-def read_xml(path: Path, text: str | None = None) -> tuple[ET.Element, str]:
-    """The root element of an XML file, with prefixes as written, and the fault that was mended; empty if none was.
+def read_xml(path: Path, text: str | None = None) -> ET.Element:
+    """The root element of an XML file, with prefixes as written.
 
     Args:
         path: Path of the file.
@@ -354,53 +283,31 @@ def read_xml(path: Path, text: str | None = None) -> tuple[ET.Element, str]:
     # Comments often contain "--", which XML forbids. Their line breaks stay, for line numbers.
     content = _COMMENT.sub(lambda found: found[1] or b"\n" * found[0].count(b"\n"), content.lstrip(b" \t\r\n"))
     try:
-        return _tree(content), ""
+        return _tree(content)
     except (expat.ExpatError, LookupError) as error:
-        fault = str(error)
-    if content[:200].lower().startswith((b"<!doctype html", b"<html")):
-        raise RobotError(f"{path} is a web page, not a robot's file")
+        fault = error
     try:
-        return _tree(_mended(content)), fault
+        return _tree(_mended(content))
     except expat.ExpatError:
-        raise RobotError(f"{path} is not well-formed XML: {fault}") from None
+        page = content[:200].lower().startswith((b"<!doctype html", b"<html"))
+        what = "a web page, not a robot's file" if page else f"not well-formed XML: {fault}"
+        raise RobotError(f"{path} is {what}") from None
+
+
+def _mended(content: bytes) -> str:
+    """A text that expat refuses, for what Pinocchio does not mind: encodings, ``&``, what follows the robot."""
+    text = re.sub(r"^\W*<\?xml.*?\?>", "", content.decode("utf-8", errors="replace"), flags=re.DOTALL)
+    body, end, _ = re.sub(r"&(?!#?\w+;)", "&amp;", text).rpartition("</robot>")
+    return body + end
 
 
 def _tree(content: bytes | str) -> ET.Element:
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
     parser.buffer_text = True
-    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
-    parser.CharacterDataHandler = builder.data
+    parser.StartElementHandler = lambda tag, has: builder.start(tag, {key: text.strip() for key, text in has.items()})
+    parser.EndElementHandler, parser.CharacterDataHandler = builder.end, builder.data
     parser.Parse(content, True)
     return builder.close()
-
-
-def _longest_chain(root: ET.Element) -> int:
-    """The largest number of links one after another."""
-    ends = ([joint.find(tag) for tag in ("parent", "child")] for joint in root.findall("joint"))
-    up = {child.get("link"): parent.get("link") for parent, child in ends if parent is not None and child is not None}
-    depth: dict[str | None, int] = {}
-    for first in up:
-        way: list[str | None] = []
-        link = first
-        while link in up and link not in depth and len(way) <= len(up):
-            way.append(link)
-            link = up[link]
-        for own in reversed(way):
-            depth[own] = depth.get(up[own], 1) + 1
-    return max(depth.values(), default=1)
-
-
-def _require_expanded(root: ET.Element, path: Path) -> None:
-    """Refuse a xacro file that was not expanded: a value that xacro has to fill in is missing."""
-    for element in (part for tag in ("link", "joint") for found in root.iterfind(tag) for part in found.iter()):
-        for key, value in element.items():
-            numbers = (*_NUMBERS.get(element.tag, ()), *_SIZES, *_MIMIC)
-            if key in numbers and ("${" in value or value.startswith("$(")):
-                name = path.name.removesuffix(".xacro").removesuffix(".urdf")
-                raise RobotError(
-                    f"{path} is a xacro file, to be expanded: it has <{element.tag} {key}={value!r}>. Name it "
-                    f"{name}.urdf.xacro, or expand it with xacro {path.name} > {name}.expanded.urdf"
-                )
 
 
 def _xacro(root: ET.Element) -> dict[str, None]:
@@ -409,8 +316,8 @@ def _xacro(root: ET.Element) -> dict[str, None]:
     return dict.fromkeys(f"<{part.tag}>" for part in root.iter() if part.tag.partition(":")[0] in prefixes)
 
 
-def _unlimited(root: ET.Element) -> str:
-    """Replace the limits by which exporters mean none; returns a sentence about them, empty if there are none.
+def _unlimited(root: ET.Element) -> Iterator[str]:
+    """Replace the limits by which exporters mean none, with a sentence about them.
 
     Two bounds of 0 are none as well, as a URDF before version 1.2 without bounds is read.
     """
@@ -428,14 +335,14 @@ def _unlimited(root: ET.Element) -> str:
             if word is None and (stated if drive else bounded or not stated):
                 continue
             value = _number(word)
-            none = word is None or word.strip().lower() in _WORDS or math.isinf(value)
+            none = word is None or word.lower() in _WORDS or math.isinf(value)
             none |= value < 0.0 if drive else minus_one
             if joint.get("type") != "fixed" and (none or (not drive and abs(value) > NO_LIMIT)):
                 told.append(f"no {key} of {name!r}" if word is None else f"{key} {word} of {name!r}")
             if none:
                 limit.set(key, f"-{_NONE}" if key == "lower" else _NONE)
-    what = "limits that are missing, infinite, negative or huge count as none"
-    return f"{what}: {listed(told, 'limits')}" if told else ""
+    if told:
+        yield f"limits that are missing, infinite, negative or huge count as none: {listed(told, 'limits')}"
 
 
 def _remarks(root: ET.Element) -> Iterator[str]:
@@ -466,51 +373,11 @@ def _remarks(root: ET.Element) -> Iterator[str]:
 
 
 def _joints_with(root: ET.Element, tag: str) -> list[str]:
-    return [repr(joint.get("name", "")) for joint in root.findall("joint") if joint.find(tag) is not None]
-
-
-def _faults(root: ET.Element) -> Iterator[str]:
-    """What Pinocchio cannot read in links and joints."""
-    for joint in root.findall("joint"):
-        for fault in _faults_of_numbers(joint):
-            yield f"joint {joint.get('name')!r}: {fault}"
-        for tag in ("parent", "child"):
-            end = joint.find(tag)
-            link = None if end is None else end.get("link")
-            if link not in [known.get("name") for known in root.findall("link")]:
-                yield f"joint {joint.get('name')!r} has the {tag} {link!r}, which is no link of the file"
-
-
-def _faults_of_numbers(parent: ET.Element, *, required: bool = False) -> Iterator[str]:
-    """The numbers in an ``<inertial>`` or ``<joint>`` that Pinocchio cannot read.
-
-    Args:
-        parent: The element.
-        required: Whether mass and moments have to be there.
-    """
-    for tag, keys in _NUMBERS.items():
-        element = parent.find(tag)
-        needed = required and tag in ("mass", "inertia")
-        if element is None and needed:
-            yield f"its <inertial> has no <{tag}>"
-        if element is None:
-            continue
-        for key in keys:
-            words = element.get(key, "").split()
-            if key in element.attrib and not (
-                len(words) == _COUNTS.get(key, 1) and all(math.isfinite(_number(word)) for word in words)
-            ):
-                comma = "; the decimal sign is a point" if "," in element.attrib[key] else ""
-                numbers = "no finite number" if key not in _COUNTS else f"not {_COUNTS[key]} finite numbers"
-                yield f"{key} of <{tag}> is {reprlib.repr(element.attrib[key])}, {numbers}{comma}"
-            elif key not in element.attrib and needed:
-                yield f"<{tag}> of its <inertial> has no {key}"
+    return [repr(joint.get("name", "")) for joint in root.findall(f"joint[{tag}]")]
 
 
 def _mimic(joint: ET.Element, path: Path) -> Mimic:
-    element = joint.find("mimic")
-    assert element is not None
-    where = f"{path}: joint {joint.get('name')!r}: its mimic"
+    element, where = joint.findall("mimic")[0], f"{path}: joint {joint.get('name')!r}: its mimic"
     if not element.get("joint"):
         raise RobotError(f"{where} element names no joint")
     return Mimic(
@@ -521,12 +388,9 @@ def _mimic(joint: ET.Element, path: Path) -> Mimic:
 
 
 def _number(word: str | None) -> float:
-    """A word as a number, as Python and C++ read it alike; NaN if it is none."""
-    # Python also takes digits of other scripts, and underscores.
-    if word is None or not word.isascii() or "_" in word:
-        return math.nan
+    """A word as a number; NaN if it is none."""
     try:
-        return float(word)
+        return float(word or "nan")
     except ValueError:
         return math.nan
 
@@ -591,25 +455,6 @@ def _has_color(material: ET.Element) -> bool:
 
 def _head(root: ET.Element) -> dict[str, str]:
     return {key: root.get(key, "") for key in ("name", "version") if key in root.attrib}
-
-
-def _part(root: ET.Element, *paths: str) -> ET.Element:
-    """A URDF of the links and joints of another, with the children at ``paths`` or, without a child, all of them."""
-    small = ET.Element("robot", _head(root))
-    for part in root:
-        if part.tag in ("link", "joint"):
-            copied = ET.SubElement(small, part.tag, part.attrib)
-            copied.extend(child for child in part if {part.tag, f"{part.tag}/{child.tag}"} & set(paths))
-    return small
-
-
-def _build(root: ET.Element) -> pin.Model | str:
-    """Pinocchio's model of a URDF, or what it says of it if it cannot read it."""
-    with captured_stderr() as complaints:
-        try:
-            return pin.buildModelFromXML(ET.tostring(root, encoding="unicode"))
-        except (ValueError, RuntimeError, IndexError) as error:
-            return "; ".join(complaints()) or str(error)
 
 
 @contextlib.contextmanager

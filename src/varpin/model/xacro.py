@@ -82,7 +82,7 @@ def expand(
         try:
             text = str(xacro.process_file(str(path), mappings=given).toxml())
         except Exception as error:  # Expressions in the file may raise anything.
-            if found := _UNDEFINED.search(", ".join(_messages(error))):
+            if found := _UNDEFINED.search(_told(error)):
                 raise RobotError(
                     f"{path} needs the xacro argument {found[1]!r}, which has no default: "
                     f"give xacro_args={{{found[1]!r}: ...}}"
@@ -91,7 +91,7 @@ def expand(
             xacro.print_location()
             where = "; ".join(line.strip() for line in notes.getvalue()[before:].splitlines())
             where = "" if where == f"when processing file: {path}" else f" ({where})"
-            raise RobotError(f"{path} cannot be expanded: {', '.join(_messages(error))}{where}") from None
+            raise RobotError(f"{path} cannot be expanded: {_told(error)}{where}") from None
     for line in filter(None, map(str.strip, notes.getvalue().splitlines())):
         logger.warning("%s: %s", path, line)
     if strict and (unknown := sorted(set(arguments) - given.used)):
@@ -107,18 +107,11 @@ def _package(path: Path) -> tuple[ModuleType, Any]:
         raise MissingDependency(f"the xacro file {path}", [str(error.name)], 'pip install "varpin[xacro]"') from None
 
 
-def _messages(error: BaseException) -> list[str]:
-    """Messages of an error and of those that it wraps, without duplicates and names of Python classes."""
-    if isinstance(error, OSError) and error.strerror:
-        return [f"{error.strerror}: {error.filename}"]
+def _told(error: Exception) -> str:
+    """What xacro says of an error, without names of Python classes."""
     if isinstance(error, expat.ExpatError):
-        return [f"it is not well-formed XML: {error}"]
-    inner = getattr(error, "exc", None)
-    messages = [str(error.args[0] or "") if error.args else ""] if hasattr(error, "exc") else [str(error)]
-    messages += [] if inner is None else _messages(inner) if isinstance(inner, BaseException) else [str(inner)]
-    messages.append(str(getattr(error, "suffix", None) or ""))
-    plain = [" ".join(re.sub(r"<class '[^']*'>:?", "", words).split()) for words in messages]
-    return list(dict.fromkeys(filter(None, plain))) or [type(error).__name__]
+        return f"it is not well-formed XML: {error}"
+    return " ".join(re.sub(r"<class '[^']*'>:?|^.*\[Errno \d+\]", "", str(error)).split()) or type(error).__name__
 
 
 def _word(value: object) -> str:

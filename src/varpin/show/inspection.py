@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, product
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -17,20 +17,21 @@ from varpin.errors import InputError, RobotError, SingularMassMatrix
 from varpin.integrators import Guard, largest_step
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.model import Robot, build_robot, check_inertia, longest_reach, readable_geometry
-from varpin.model.additions import Base
+from varpin.model import Robot, check_inertia, longest_reach, readable_geometry
 from varpin.model.inertia import fault, inertials_of, one_of_each, principal_moments
+from varpin.model.loading import Base, assemble
+from varpin.model.meshes import shape_points
 from varpin.model.mimic import joint_index
+from varpin.model.robot import limits_of
+from varpin.model.sources import describe
 from varpin.model.tree import is_unbounded, joint_axis
-from varpin.model.units import NO_LIMIT
-from varpin.model.urdf import Inertial, Urdf, build_model, listed, read_inertials, read_urdf
+from varpin.model.urdf import listed
 from varpin.show.inspection_report import FrameKind, FrameReport, JointReport, Kind, LinkReport, RobotReport
 from varpin.support.checks import JointValues, joint_array
 
-# Thresholds of warnings: ratios of masses and of principal moments of neighbouring links, and the condition number of M
-# with a unit diagonal. The largest values among the arms of example-robot-data are 320, 2e5 and 830.
+# Thresholds of warnings: the ratio of masses of neighbouring links, and the condition number of M with a unit diagonal.
+# The largest values among the arms of example-robot-data are 320 and 830.
 MASS_RATIO = 1e3
-INERTIA_RATIO = 1e6
 CONDITION = 1e6
 # Largest plausible radius of gyration and centre of mass distance of a link, as a multiple of the arm's reach, and [m]
 # for an arm with all joints in one place.
@@ -87,9 +88,8 @@ def inspect_robot(
             )
         robot = source
     else:
-        robot = build_robot(
-            source, package_dirs=package_dirs, lock=lock, keep=keep, mimic=mimic, base=base, armature=armature
-        )
+        whole = describe(source, package_dirs, mimic=mimic)
+        robot = assemble(whole, lock=lock, keep=keep, base=base, armature=armature)
     scene = Scene(robot, gravity=gravity, damping=0.0, constraints=())
     configuration = joint_array("q", 0.0 if q is None else q, robot.joint_names, uniform=True)
     velocity = joint_array("v", 0.0 if v is None else v, robot.joint_names, uniform=True)
@@ -99,25 +99,19 @@ def inspect_robot(
         raise RobotError(f"robot {robot.name!r} cannot be inspected: its mass matrix or its derivatives are not finite")
     margin = Guard().branch_margin
     condition, scaled = _condition_numbers(jet.Lvv)
-    urdf = None if robot.urdf is None else read_urdf(robot.urdf, robot.expanded)
-    inertials, lacks = ((), ()) if urdf is None else read_inertials(urdf, build_model(urdf))
-    joints, links, (shapes, unread) = _joints(robot), _links(robot, inertials), readable_geometry(robot)
+    links, (shapes, unread) = _links(robot), readable_geometry(robot)
     warnings = [
-        *(() if urdf is None else (*urdf.remarks, *urdf.notes)),
-        *lacks,
-        *robot.limit_remarks(),
-        *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes), _ratio_warnings(robot))),
+        *(*robot.faults, *robot.remarks, *robot.notes, *robot.limit_remarks()),
+        *one_of_each(chain(_mass_warnings(robot), _inertia_warnings(robot, links, shapes))),
         *_mesh_warnings(robot, shapes),
         *dict.fromkeys(what for _, what in unread.values()),
         *_matrix_warnings(robot, scaled),
-        *one_of_each(_limit_warnings(joints, robot, None if q is None else configuration)),
-        *one_of_each(_mimic_warnings(robot, urdf, joints, tied=mimic == "tied")),
-        *_damping_warnings(robot),
-        *_loop_warnings(robot),
+        *one_of_each(_limit_warnings(robot, configuration)),
+        *_unused(robot),
     ]
     return RobotReport(
         robot=robot,
-        joints=joints,
+        joints=_joints(robot),
         links=links,
         frames=_frames(robot),
         locked=robot.locked,
@@ -149,39 +143,17 @@ def _joints(robot: Robot) -> tuple[JointReport, ...]:
     reports = []
     for joint in range(1, model.njoints):
         slides, axis = joint_axis(model, joint)
-        kind: Kind = "prismatic" if slides else "revolute"
+        kind: Kind = "prismatic" if slides else "continuous" if is_unbounded(model, joint) else "revolute"
         follows = ""
-        lower, upper = -np.inf, np.inf
-        entry = model.joints[joint]
-        if is_unbounded(model, joint):
-            kind = "continuous"
-        else:
-            lower, upper = model.lowerPositionLimit[entry.idx_q], model.upperPositionLimit[entry.idx_q]
         if joint in ties:
             kind, tie = "mimic", ties[joint]
             follows = f"{tie.ratio:g} * {model.names[tie.leader]}" + (f" {tie.offset:+g}" if tie.offset else "")
-        reports.append(
-            JointReport(
-                name=model.names[joint],
-                kind=kind,
-                axis=axis,
-                unit="m" if slides else "rad",
-                lower=_limit(lower, NO_LIMIT),
-                upper=_limit(upper, NO_LIMIT),
-                velocity=_limit(model.velocityLimit[entry.idx_v]),
-                effort=_limit(model.effortLimit[entry.idx_v]),
-                follows=follows,
-            )
-        )
+        limits = limits_of(model, joint)
+        reports.append(JointReport(model.names[joint], kind, axis, "m" if slides else "rad", *limits, follows))
     return tuple(reports)
 
 
-def _limit(value: float, none: float = 1e300) -> float:
-    """A limit; infinite beyond ``none``: the largest double is no limit in Pinocchio."""
-    return float(np.copysign(np.inf, value)) if abs(value) > none else float(value)
-
-
-def _links(robot: Robot, inertials: Sequence[Inertial]) -> tuple[LinkReport, ...]:
+def _links(robot: Robot) -> tuple[LinkReport, ...]:
     # The links of the URDF: Pinocchio merges links on fixed joints into one body, which can hide a faulty inertia.
     model = robot.free_model
     joints = joint_index(model)
@@ -191,11 +163,11 @@ def _links(robot: Robot, inertials: Sequence[Inertial]) -> tuple[LinkReport, ...
             name=link.link,
             joint=model.names[joints[link.link]] if joints[link.link] else "",
             mass=link.mass,
-            center=link.center,
-            inertia=link.inertia,
+            center=link.center.copy(),
+            inertia=link.inertia.copy(),
             moments=principal_moments(link.inertia),
         )
-        for link in inertials or inertials_of(model)
+        for link in robot.inertials or inertials_of(model)
         if link.link in joints
     )
 
@@ -221,30 +193,34 @@ def _frames(robot: Robot) -> tuple[FrameReport, ...]:
     return tuple(reports.values())
 
 
-def _body_name(robot: Robot, joint: int) -> str:
-    """Name of the first link on a joint, or of the joint if the model has no links there."""
-    for frame in robot.free_model.frames:
-        if frame.parentJoint == joint and frame.type == pin.FrameType.BODY:
-            return str(frame.name)
-    return str(robot.free_model.names[joint])
-
-
 def _mass_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
-    for body, mass in enumerate(robot.tree.mass):
-        name, joint = _body_name(robot, body + 1), robot.free_model.names[body + 1]
+    tree, names = robot.tree, [part.link for part in inertials_of(robot.free_model)]
+    for body, mass in enumerate(tree.mass):
+        name, joint = names[body], robot.free_model.names[body + 1]
         if mass == 0.0:
             carries = "only the links that it carries give the joint inertia"
-            if body not in robot.tree.parent:
+            if body not in tree.parent:
                 carries = "and it carries nothing"
             yield "massless", name, f"link {name!r} is massless, yet joint {joint!r} moves it; {carries}"
-        elif not np.array(robot.free_model.inertias[body + 1].inertia).any():
+        elif not tree.inertia[body].any():
             yield "point mass", name, f"link {name!r} has a mass of {mass:g} kg and no rotational inertia: a point mass"
+        parent = int(tree.parent[body])
+        light, heavy = sorted((tree.mass[parent], mass)) if parent >= 0 else (mass, mass)
+        if light > 0.0 and heavy > MASS_RATIO * light:
+            sentence = (
+                f"the masses of neighbouring links {names[parent]!r} and {name!r} differ by a factor "
+                f"of {heavy / light:.1g}: {tree.mass[parent]:.3g} and {mass:.3g} kg"
+            )
+            yield "masses", name, sentence
 
 
 def _inertia_warnings(
     robot: Robot, links: Sequence[LinkReport], shapes: pin.GeometryModel
 ) -> Iterator[tuple[str, str, str]]:
-    length, corners = LENGTH_RATIO * longest_reach(robot, slides=False, centers=False) or LENGTH, _corners(shapes)
+    length = LENGTH_RATIO * longest_reach(robot, slides=False, centers=False) or LENGTH
+    around: dict[int, list[Floats]] = {}
+    for shape in shapes.geometryObjects:
+        around.setdefault(shape.parentJoint, []).append(shape_points(shape))
     frames = {frame.name: frame for frame in robot.free_model.frames if frame.type == pin.FrameType.BODY}
     for link in links:
         if not link.joint or not link.inertia.any():
@@ -257,9 +233,9 @@ def _inertia_warnings(
         # A ball has the least inertia of all bodies of a given mass and density.
         radius = (3.0 * link.mass / (4.0 * np.pi * DENSITY)) ** (1.0 / 3.0)
         gyration, against, size = float(np.sqrt(link.moments[-1] / link.mass)), _against_reach(robot), np.inf
-        near = [points for joint, points in corners if frame is not None and joint == frame.parentJoint]
-        if frame is not None and near:
-            size = float(np.linalg.norm(np.vstack(near) - frame.placement.act(link.center), axis=1).max())
+        if frame is not None and frame.parentJoint in around:
+            points = np.vstack(around[frame.parentJoint])
+            size = float(np.linalg.norm(points - frame.placement.act(link.center), axis=1).max())
         if SIZE_RATIO * size < length:
             against = f"and its body reaches {size:.2g} m from its centre of mass"
         if link.moments.sum() < 1.2 * link.mass * radius**2:
@@ -281,48 +257,9 @@ def _inertia_warnings(
             yield "away", link.name, f"{far}; are these millimetres?"
 
 
-def _corners(shapes: pin.GeometryModel) -> list[tuple[int, Floats]]:
-    """The joint and the corners (8, 3) [m], in the joint's frame, of the box around each shape."""
-    found = []
-    for shape in shapes.geometryObjects:
-        if isinstance(shape.geometry, pin.coal.BVHModelBase):
-            vertices = np.asarray(shape.geometry.vertices(), dtype=np.float64)
-            low, high = vertices.min(axis=0), vertices.max(axis=0)
-        else:
-            shape.geometry.computeLocalAABB()
-            low, high = shape.geometry.aabb_local.min_, shape.geometry.aabb_local.max_
-        corners = np.array(list(product(*zip(low, high, strict=True))))
-        placed = corners @ shape.placement.rotation.T + shape.placement.translation
-        found.append((shape.parentJoint, placed))
-    return found
-
-
 def _against_reach(robot: Robot) -> str:
     reach = longest_reach(robot, slides=False, centers=False)
     return f"where the arm's joints span {reach:.3g} m" if reach > 0.0 else "longer than any arm"
-
-
-def _ratio_warnings(robot: Robot) -> Iterator[tuple[str, str, str]]:
-    tree = robot.tree
-    moments = [np.linalg.eigvalsh(np.array(body.inertia))[-1] for body in list(robot.free_model.inertias)[1:]]
-    for body, parent in enumerate(tree.parent):
-        if parent < 0:
-            continue
-        pair = f"{_body_name(robot, int(parent) + 1)!r} and {_body_name(robot, body + 1)!r}"
-        for what, unit, values, most in (
-            ("masses", "kg", tree.mass, MASS_RATIO),
-            ("moments of inertia", "kg m^2", moments, INERTIA_RATIO),
-        ):
-            light, heavy = sorted((values[parent], values[body]))
-            if light > 0.0 and heavy > most * light:
-                yield (
-                    what,
-                    _body_name(robot, body + 1),
-                    (
-                        f"the {what} of neighbouring links {pair} differ by a factor of {heavy / light:.1g}: "
-                        f"{values[parent]:.3g} and {values[body]:.3g} {unit}"
-                    ),
-                )
 
 
 def _mesh_warnings(robot: Robot, shapes: pin.GeometryModel) -> Iterator[str]:
@@ -356,76 +293,18 @@ def _matrix_warnings(robot: Robot, scaled: float) -> Iterator[str]:
         )
 
 
-def _limit_warnings(joints: Sequence[JointReport], robot: Robot, q: Floats | None) -> Iterator[tuple[str, str, str]]:
-    bounded = [joint for joint in joints if joint.kind in ("revolute", "prismatic")]
-    missing: dict[str, list[str]] = {}
-    for joint in joints:
-        none = {
-            "position": joint in bounded
-            and (joint.lower == joint.upper == 0.0 or not np.isfinite(joint.upper - joint.lower)),
-            "velocity": joint.kind != "mimic" and joint.velocity in (0.0, np.inf),
-            "effort": joint.kind != "mimic" and joint.effort in (0.0, np.inf),
-        }
-        if any(none.values()):
-            missing.setdefault(", ".join(what for what in none if none[what]), []).append(repr(joint.name))
-    if missing:
-        groups = "; ".join(f"{what} of {listed(names, 'joints')}" for what, names in missing.items())
-        yield "unlimited", "", f"limits that are missing, 0, negative or huge count as none: {groups}"
-    at_zero = q is None
-    for name, at, low, high in zip(
-        robot.joint_names, np.zeros(robot.dof) if q is None else q, *robot.position_limits, strict=True
-    ):
+def _limit_warnings(robot: Robot, q: Floats) -> Iterator[tuple[str, str, str]]:
+    for name, at, low, high in zip(robot.joint_names, q, *robot.position_limits, strict=True):
         if low < high and not low <= at <= high:
-            where = f"q = 0 is no posture of joint {name!r}: it is" if at_zero else f"q puts joint {name!r} at {at:g},"
-            yield "outside", name, f"{where} outside its limits {low:g} and {high:g}"
+            yield "outside", name, f"q = {at:g} of joint {name!r} is outside its limits {low:g} and {high:g}"
 
 
-def _mimic_warnings(
-    robot: Robot, urdf: Urdf | None, joints: Sequence[JointReport], *, tied: bool
-) -> Iterator[tuple[str, str, str]]:
-    for joint in joints:
-        if joint.follows:
-            yield (
-                "tied",
-                joint.name,
-                f"mimic joint {joint.name!r} is tied to its leader, as {joint.follows}: no coordinate",
-            )
-    if urdf is None:
-        return
-    index = joint_index(robot.free_model)
-    moving = {joint.get("name") for joint in urdf.root.findall("joint") if joint.get("type") not in (None, "fixed")}
-    for name, mimic in urdf.mimics.items():
-        if name not in index:
-            continue
-        if mimic.leader not in moving:
-            yield (
-                "alone",
-                name,
-                (f"joint {name!r} mimics {mimic.leader!r}, which is not a moving joint of the robot: it stays free"),
-            )
-        elif not tied:
-            yield "free", name, f"joint {name!r} mimics {mimic.leader!r}, but mimic='free' makes it free"
-
-
-def _damping_warnings(robot: Robot) -> Iterator[str]:
-    for what, values, unit, usage in (
-        ("damping", robot.damping, "N m s/rad or N s/m", "which a scene uses with damping='robot'"),
-        (
-            "dry friction",
-            robot.friction,
-            "N m or N",
-            "which a scene uses with friction='robot'",
-        ),
-    ):
-        given = [f"{name!r} {value:g}" for name, value in zip(robot.joint_names, values, strict=True) if value]
-        if given:
-            yield f"the description gives joint {what} [{unit}], {usage}: {listed(given, 'joints')}"
-
-
-def _loop_warnings(robot: Robot) -> Iterator[str]:
+def _unused(robot: Robot) -> Iterator[str]:
+    """What the description gives and a scene takes only if it is told to."""
+    given = {"damping": bool(robot.damping.any()), "friction": bool(robot.friction.any())}
+    given |= {"constraints": bool(robot.equalities)}
+    for what in (what for what in given if given[what]):
+        yield f"the description gives joints {what}, which a scene uses with {what}='robot'"
     if robot.loops:
         pairs = listed((f"{a!r} on {b!r}" for a, b in robot.loops), "pairs")
         yield f"the description has loops, which the tree leaves open for a scene's constraints to close: {pairs}"
-    if robot.equalities:
-        named = listed((equality.name for equality in robot.equalities), "of them")
-        yield f"the description has equality constraints, which a scene uses with constraints='robot': {named}"

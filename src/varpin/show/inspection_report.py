@@ -139,7 +139,7 @@ class RobotReport(Frozen):
                 "-" if j.kind == "mimic" else next(moving),
                 j.kind,
                 _axis(j),
-                "free" if j.kind == "continuous" else f"{j.lower:g} .. {j.upper:g}",
+                j.follows or _range(j),
                 "none" if math.isinf(j.velocity) else f"{j.velocity:g}",
                 "none" if math.isinf(j.effort) else f"{j.effort:g}",
             )
@@ -185,6 +185,11 @@ class RobotReport(Frozen):
         rows += [("warning", warning) for warning in self.warnings]
         folded = (markup.folded(part.title, markup.table(part.columns, part.rows)) for part in (links, frames))
         return markup.facts(f"Robot {self.robot.name}", rows, markup.table(joints.columns, joints.rows), *folded)
+
+
+def _range(joint: JointReport) -> str:
+    free = math.isinf(joint.lower) and math.isinf(joint.upper)
+    return "free" if free else f"{joint.lower:g} .. {joint.upper:g}"
 
 
 def _axis(joint: JointReport) -> str:

@@ -27,19 +27,16 @@ from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
 from varpin.model import joint_unit
-from varpin.signals.commands import changing, in_parts, open_loop, rows
+from varpin.signals.commands import changing, cubics, in_parts, open_loop, rows, shares
 from varpin.signals.controls import Controls, commands_of
 from varpin.signals.functions import Sampled, parts_to_follow
 from varpin.signals.inputs import in_parts_of_steps, prescribing
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.energy import energy_defects
 from varpin.simulation.gate import proven_error
 from varpin.simulation.law import Law, law_of
 from varpin.simulation.limits import beyond_limits
-from varpin.simulation.scales import speed_scales, travel_scales
-from varpin.simulation.short_forces import short_forces
-from varpin.simulation.spectrum import contact_rate, fastest_rate
-from varpin.simulation.time_steps import finer
+from varpin.simulation.spectrum import contact_rate, fastest_rate, speed_scales, travel_scales
+from varpin.simulation.start import finer
 from varpin.trajectory import Trajectory
 
 # Errors from which on a motion is told of: of q as a share of the largest travel of its kind, of v as a share of the
@@ -55,6 +52,8 @@ _MOST_PARTS, _KINKED, _LOST = 10, 2, 0.5 / TOLD
 _RINGS = 2.0
 # Stages of the repetition beyond those of a motion of the same order.
 _MORE = 2
+# Points of a step at which a custom force is looked at: none are more than 8 % of the step's travel apart.
+_POINTS = 20
 # Steps of one joint between two checks for Ctrl-C: a tenth of a second.
 _CHUNK = 100_000
 
@@ -90,10 +89,6 @@ def check(
     limits = beyond_limits(scene, trajectory, extremes)
     if not trajectory.steps:
         known = np.zeros_like(trajectory.q)
-    elif not integrator.variational:
-        defects = energy_defects(scene, integrator, trajectory)
-        defects.setflags(write=False)
-        trajectory = trajectory.changed(statistics=trajectory.statistics.changed(energy_defect=defects))
     if known is not None:
         return trajectory.with_error(known).changed(warnings=tuple(limits))
     held_mean = isinstance(controls, FirstOrderHold) and not integrator.stage_times
@@ -399,3 +394,36 @@ def _cure(
     if times < _MOST_PARTS:
         return f"Use {other} or {smaller}"
     return f"Use {other} and a smaller dt" if excess > _LOST else f"Use {other}"
+
+
+def short_forces(scene: Scene, integrator: Integrator, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """A warning if stages miss the impulse of a custom force along the cubics through the nodes.
+
+    Raises:
+        CustomForceError: The function fails between the nodes.
+    """
+    force = scene.custom
+    if force is None or not trajectory.steps:
+        return ()
+    times = integrator.stage_times or (0.5,)
+    x, weights = np.polynomial.legendre.leggauss(_POINTS)
+    q, v, dt = trajectory.q, trajectory.v, trajectory.dt
+    along = cubics(np.concatenate([np.array(times), 0.5 * (1.0 + x)]), dt)
+    missed = np.zeros((trajectory.steps, q.shape[1]))
+    for k in range(trajectory.steps):
+        ends = np.stack([v[k], q[k + 1] - q[k], v[k + 1]])
+        at, rate = q[k] + along[:, 1:4] @ ends, along[:, 5:] @ ends
+        found = np.array([force(*state, False)[0] for state in zip(at, rate, strict=True)])
+        missed[k] = dt * (0.5 * weights @ found[len(times) :] - shares(times) @ found[: len(times)])
+    speeds = np.abs(np.linalg.solve(scene.core.jets(q[:-1].copy(), v[:-1].copy())[0], missed[:, :, None])[:, :, 0])
+    off = speeds * (trajectory.t[-1] - trajectory.t[:-1, None]) / travel_scales(scene, q)
+    step, joint = divmod(int(off.argmax()), off.shape[1])
+    if not off[step, joint] > TOLD:
+        return ()
+    name, time = trajectory.joint_names[joint], float(trajectory.t[step])
+    value, unit = float(np.abs(missed[step]).max()), "N s" if scene.robot.slides[joint] else "N m s"
+    text = (
+        f"CustomForce {force.names} acts for less than a step on joint {name!r} (t = {time:.3g} s): the stages miss "
+        f"{value:.2g} {unit} of its impulse. Use a smaller dt"
+    )
+    return (Finding("short force", text, name, time=time, value=value, unit=unit),)

@@ -33,10 +33,19 @@ def usual_integrator(scene: Scene, q0: Floats, v0: Floats, dt: float, *, noisy: 
     """
     if noisy:
         return _NOISY
-    # Radau's methods do not keep constraints.
-    chosen: Gauss | Radau = _SWINGING if _swings_faster(scene, q0, _TURNS / dt) else _USUAL
-    if not scene.constraints and _damps_faster(scene, q0, v0, _RINGS / dt):
-        chosen = _STOPPING
+    chosen: Gauss | Radau = _USUAL
+    # Custom forces are called in the motion alone, where an error has its step.
+    if scene.custom is None and len(q0) <= _MOST_JOINTS:
+        q = np.concatenate([np.tile(q0, (2, 1)), stops_ahead(scene, q0)])
+        v = np.zeros_like(q)
+        # At rest servos that hold q0 do not saturate.
+        forces = np.tile(scene.actuation @ scene.holding @ q0, (len(q), 1))
+        if pulls_fast(scene.core, q[1:], v[1:], forces[1:], dt / _TURNS):
+            chosen = _SWINGING
+        # Radau's methods do not keep constraints. Dry friction is steepest at rest.
+        v[0] = v0
+        if scene.dissipates and not scene.constraints and fastest_damping(scene.core, q, v, forces, _RINGS / dt) > 0.0:
+            chosen = _STOPPING
     # A motion without the noise of its scene may be linearized.
     return replace(chosen, kick=usual_kick(scene))
 
@@ -53,25 +62,3 @@ def stronger(chosen: Iterable[Integrator]) -> Integrator:
     """
     ranks = {str(member): rank for rank, member in enumerate((_NOISY, _USUAL, _SWINGING, _STOPPING))}
     return max(chosen, key=lambda own: ranks[str(own)], default=_USUAL)
-
-
-def _damps_faster(scene: Scene, q0: Floats, v0: Floats, rate: float) -> bool:
-    """Whether dampers, dry friction or servos are faster than a rate [1/s] at (q0, v0) or at (q0, 0)."""
-    # Custom forces are called in the motion alone, where an error has its step.
-    if not scene.dissipates or scene.custom is not None or len(q0) > _MOST_JOINTS:
-        return False
-    # At rest dry friction is steepest, and servos that hold q0 do not saturate.
-    q = np.concatenate([np.tile(q0, (2, 1)), stops_ahead(scene, q0)])
-    v = np.zeros_like(q)
-    v[0] = v0
-    forces = np.tile(scene.actuation @ scene.holding @ q0, (len(q), 1))
-    return fastest_damping(scene.core, q, v, forces, rate) > 0.0
-
-
-def _swings_faster(scene: Scene, q0: Floats, rate: float) -> bool:
-    """Whether springs, servos or gravity make a mode faster than a rate [rad/s] at rest at the start."""
-    if scene.custom is not None or len(q0) > _MOST_JOINTS:
-        return False
-    q = np.concatenate([q0[None], stops_ahead(scene, q0)])
-    forces = np.tile(scene.actuation @ scene.holding @ q0, (len(q), 1))
-    return bool(pulls_fast(scene.core, q, np.zeros_like(q), forces, 1.0 / rate))

@@ -18,7 +18,7 @@ from varpin.integrators import Integrator, Reference
 from varpin.mechanics.forces import of_kind
 from varpin.mechanics.scene import Scene
 from varpin.signals.commands import Times, interpolation
-from varpin.simulation.scales import speed_scales, travel_scales
+from varpin.simulation.spectrum import speed_scales, travel_scales
 from varpin.trajectory import Trajectory
 
 # Largest propagated errors of q and v of a motion that is let pass, as shares of the travel and of the largest speed: a

@@ -245,20 +245,23 @@ class Motions:
         commands: Commands,
         *,
         increments: Floats | None = None,
+        integrator: Integrator | None = None,
     ) -> tuple[Trajectory, Failure | None]:
         """The motion, and the failure that stopped it early, if any. No argument is checked.
 
         Args:
             commands: For all of its steps.
             increments: Of its Wiener processes (N, k) [s^0.5]; left out, there is no noise.
+            integrator: The integrator with another guard; by default itself.
 
         Raises:
             ForceError: A function of a CustomForce failed; so for a ConstraintError.
         """
         drawn = np.zeros((0, 0, self.scene.processes)) if increments is None else increments[None]
-        state = self.integrator.fork(self._state)
+        own = integrator or self.integrator
+        state = own.fork(self._state)
         try:
-            (segment,) = self.integrator.rollout(self.scene, state, commands, drawn, self.dt)
+            (segment,) = own.rollout(self.scene, state, commands, drawn, self.dt)
         except (CustomForceError, CustomConstraintError) as error:
             given = self.scene, self.integrator, self._start, commands, self.dt, increments
             raise located(*given, error) from error

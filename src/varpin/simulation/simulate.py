@@ -27,8 +27,13 @@ from varpin.simulation.failures import Interrupted, NoiseError, StepFailure, nam
 from varpin.simulation.loop import outgrown, unstable_loop
 from varpin.simulation.progress import Progress, Reporter
 from varpin.simulation.record import MotionRecord, function_error, next_block
-from varpin.simulation.start import controls_in_degrees, in_other_units, on_constraints
-from varpin.simulation.time_steps import duration_for_tolerance, time_steps
+from varpin.simulation.start import (
+    controls_in_degrees,
+    duration_for_tolerance,
+    in_other_units,
+    on_constraints,
+    time_steps,
+)
 from varpin.simulation.tolerance import steps_for_tolerance
 from varpin.support.checks import JointValues, as_floats, count, flag, joint_array, require_memory
 from varpin.trajectory import STEP_NUMBERS, Accuracy, Trajectory
@@ -47,7 +52,7 @@ def simulate(
     dt: float | None = None,
     steps: int | None = None,
     duration: float | None = None,
-    tolerance: float | Accuracy | None = None,
+    tolerance: float | None = None,
     controls: Controls | ControlLaw = None,
     period: int = 1,
     integrator: Integrator | None = None,
@@ -71,8 +76,7 @@ def simulate(
         duration: steps * dt [s].
         tolerance: The largest error in q allowed at any node [rad or m], in place of ``dt`` and ``steps``.
             ``Trajectory.accuracy`` gives the integrator and step taken, the estimated error and the steps of the
-            search. Given as the ``tolerance`` of the same scene's next motion, its integrator and step are tried
-            first. If the tolerance cannot be met, a warning gives the error that is reached. Rows of controls, (R, m),
+            search. If the tolerance cannot be met, a warning gives the error that is reached. Rows of controls, (R, m),
             are then held over duration / R each, in which joints with prescribed positions move to theirs; the
             intervals of a FirstOrderHold are as long; a LinearPolicy needs its period in seconds; noise and control
             laws are refused.
@@ -132,7 +136,7 @@ def simulate(
     accuracy: Accuracy | None = None
     error: Floats | None = None
     unmet: tuple[Finding, ...] = ()
-    early = in_other_units(scene, q0, v0)
+    early = in_other_units(scene, q0)
     if scene.constraints:
         q0, v0, moved = on_constraints(scene, q0, v0)
         early = (*early, *moved)
@@ -202,7 +206,7 @@ def simulate(
             # Without controls servos hold the start.
             found += controls_in_degrees(scene, motion.u)
         # Values in wrong units explain all else.
-        found.sort(key=lambda told: not told.kind.endswith(("degrees", "degrees per second", "millimetres")))
+        found.sort(key=lambda told: not told.kind.endswith(("degrees", "millimetres")))
         motion = motion.changed(warnings=ranked(found), accuracy=accuracy)
     except KeyboardInterrupt:
         raise Interrupted(motion.changed(accuracy=accuracy)) from None

@@ -1,4 +1,4 @@
-"""The start of a motion, moved onto the constraints of the scene, and units that look wrong."""
+"""What a motion is given: its start, moved onto the constraints, its time step, and units that look wrong."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from varpin.errors import InputError
 from varpin.finding import Finding
 from varpin.mechanics.assembly import along_constraints, dependent_input, missed, nearest
 from varpin.mechanics.scene import CORRECTED, EARTH, Scene
-from varpin.model import degrees_hint, degrees_per_second_hint, joint_unit, millimetres_hint
+from varpin.model import degrees_hint, joint_unit, millimetres_hint
+from varpin.support.checks import count, positive
+from varpin.trajectory import Trajectory
 
 # Shift of a start onto its constraints up to which no warning is given [rad or m]: rounding.
 _ROUNDING = 1e-9
+# Distance of a duration from a multiple of the step, as a share: rounding.
+_MULTIPLE = 1e-9
 # Gravity within this share of a thousand times the Earth's looks like mm/s^2.
 _EARTHLY = 0.01
 _PULL = math.hypot(*EARTH)
@@ -22,11 +26,10 @@ _PULL = math.hypot(*EARTH)
 _SPRINGS = {"FrameSpring": 9, "FrameLengthSpring": 7}
 
 
-def in_other_units(scene: Scene, q0: Floats, v0: Floats) -> tuple[Finding, ...]:
+def in_other_units(scene: Scene, q0: Floats) -> tuple[Finding, ...]:
     """Warnings of an initial state (n,) that looks like degrees, and of millimetres in gravity and springs."""
     told = {
         "start in degrees": degrees_hint(scene.robot, "q0", q0),
-        "start in degrees per second": degrees_per_second_hint(scene.robot, "v0", v0),
         "gravity in millimetres": _gravity_hint(scene),
         "springs in millimetres": _springs_hint(scene),
     }
@@ -96,3 +99,65 @@ def on_constraints(scene: Scene, q0: Floats, v0: Floats) -> tuple[Floats, Floats
         unit = joint_unit(scene.robot, speed=True)
         changes.append(f"v0 was changed by up to {turned:.3g} {unit}, to what the constraints allow")
     return q, v, (Finding("start off the constraints", "; ".join(changes)),) if changes else ()
+
+
+def time_steps(
+    dt: float | None, steps: int | None, duration: float | None, *, choosable: bool = False
+) -> tuple[float, int]:
+    """The time step [s] and the number of steps, from two of the three arguments.
+
+    Args:
+        dt: Time step [s].
+        steps: Number of steps.
+        duration: Their product [s].
+        choosable: Whether a tolerance may be given instead, for the message.
+
+    Raises:
+        InputError: Not two are given, one is invalid, or the duration is no multiple of the step.
+    """
+    given = {name: value for name, value in (("dt", dt), ("steps", steps), ("duration", duration)) if value is not None}
+    if len(given) != 2:
+        got = " and ".join(given) or "none of them"
+        other = ", or duration and tolerance [rad or m], which chooses dt" if choosable else ""
+        raise InputError(
+            f"give two of dt [s], steps and duration [s]{other}; got {got if len(given) < 3 else 'all three'}"
+        )
+    if duration is None:
+        return positive("dt", dt, "s"), count("steps", steps)
+    duration = positive("duration", duration, "s")
+    if dt is None:
+        steps = count("steps", steps, least=1)
+        return duration / steps, steps
+    dt = positive("dt", dt, "s")
+    steps = max(1, round(min(duration / dt, 1e15)))
+    if abs(steps * dt - duration) > _MULTIPLE * duration:
+        raise InputError(
+            f"duration = {duration:g} s is no multiple of dt = {dt:g} s, but of dt = {duration / steps!r} s"
+        )
+    return dt, steps
+
+
+def finer(trajectory: Trajectory, parts: int) -> tuple[int, str]:
+    """At least so many parts of a motion's steps, and the argument that asks for them, for example ``dt = 0.0025 s``.
+
+    The numbers of digits and parts are small: what is written divides the step of the motion. Where no short number
+    does, the argument is the number of steps.
+    """
+    for more in range(parts, 2 * parts + 1):
+        dt = trajectory.dt / more
+        if math.isclose(float(f"{dt:.4g}"), dt, rel_tol=_MULTIPLE):
+            return more, f"dt = {dt:.4g} s"
+    return parts, f"steps = {trajectory.steps * parts}"
+
+
+def duration_for_tolerance(dt: float | None, steps: int | None, duration: float | None) -> float:
+    """The duration of a motion with a tolerance [s]; refuses a given dt or number of steps."""
+    for name, value in (("dt", dt), ("steps", steps)):
+        if value is not None:
+            raise InputError(
+                f"{name} and tolerance do not go together: a tolerance chooses the steps; give duration and tolerance, "
+                f"or {name} without it"
+            )
+    if duration is None:
+        raise InputError("tolerance needs the duration of the motion [s]")
+    return positive("duration", duration, "s")

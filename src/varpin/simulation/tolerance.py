@@ -12,7 +12,7 @@ from varpin.arrays import Floats
 from varpin.core.arrays import Commands
 from varpin.errors import InputError, StepError, VarpinError
 from varpin.finding import Finding
-from varpin.integrators import Integrator, Reference, integrator_of
+from varpin.integrators import Integrator, Reference
 from varpin.mechanics.constraints import CustomConstraintError
 from varpin.mechanics.custom import CustomForceError
 from varpin.mechanics.scene import Scene
@@ -21,18 +21,15 @@ from varpin.signals.controls import Controls, commands_of, control_rows
 from varpin.signals.functions import ControlLaw, Sampled, require_law
 from varpin.signals.inputs import held_in_parts
 from varpin.signals.policy import FirstOrderHold, LinearPolicy, OpenLoop
-from varpin.simulation.check import closer, distance, repeated
+from varpin.simulation.check import closer, distance, repeated, short_forces
 from varpin.simulation.failures import ToleranceError
 from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, candidates, first_steps
 from varpin.simulation.record import Motions
-from varpin.simulation.short_forces import short_forces
 from varpin.support.checks import positive
 from varpin.trajectory import Accuracy
 
 # Number of evaluations, times the number of joints, after which no further trial begins.
 _MOST_WORK = 50_000_000
-# Trials of the integrator and step of an earlier motion.
-_AGAIN = 3
 # Trials in which a user's function fails after which the search ends, if none has passed.
 _RAISES = 24
 
@@ -57,13 +54,13 @@ class _Search:
         self.rows = 1
         if isinstance(controls, LinearPolicy | OpenLoop | FirstOrderHold):
             self.controls = controls
-            if isinstance(controls, LinearPolicy):
-                self.rows = _intervals(controls, duration)
-            elif isinstance(controls, FirstOrderHold):
-                self.rows = len(controls.u) - 1
         else:
             self.controls = control_rows(scene, controls)
             self.rows = len(self.controls)
+        if isinstance(controls, LinearPolicy):
+            self.rows = _intervals(controls, duration)
+        elif isinstance(controls, FirstOrderHold):
+            self.rows = len(controls.u) - 1
         self.most = _MOST_WORK / len(q0)
         self.steps = self.evaluations = 0
         self.errors: dict[tuple[str, int], Floats] = {}
@@ -140,7 +137,7 @@ def steps_for_tolerance(
     q0: Floats,
     v0: Floats,
     duration: float,
-    tolerance: float | Accuracy,
+    tolerance: float,
     wanted: Controls | ControlLaw,
     integrator: Integrator | None,
 ) -> Chosen:
@@ -151,7 +148,7 @@ def steps_for_tolerance(
         q0: Initial configuration (n,) [rad or m].
         v0: Initial velocity (n,) [rad/s or m/s].
         duration: Of the motion [s].
-        tolerance: The largest error in q [rad or m], or the accuracy of an earlier motion.
+        tolerance: The largest error in q [rad or m].
         wanted: The controls.
         integrator: The only one to consider; None for all.
 
@@ -160,35 +157,20 @@ def steps_for_tolerance(
         ToleranceError: No number of steps gives an error below 1 rad or m.
         VarpinError: A user's function fails, or no integrator gets to the end.
     """
-    earlier = tolerance if isinstance(tolerance, Accuracy) else None
-    wish = positive("tolerance", earlier.tolerance if earlier else tolerance, "rad or m")
+    wish = positive("tolerance", tolerance, "rad or m")
     search = _Search(scene, q0, v0, duration, _require_choice(scene, wanted, integrator))
     floor = ROUNDING * max(1.0, float(np.abs(q0).max()))
-    found = None
-    if earlier is not None:
-        known = integrator_of(earlier.integrator)
-        # A given integrator keeps its own guard and solver tolerance.
-        if integrator is None or integrator.same_map(known):
-            first = search.rows * math.ceil(duration / earlier.dt * (1.0 - 1e-9) / search.rows)
-            again = Ladder(search.attempt, [integrator or known], first, search.rows, lambda: False)
-            for _ in range(_AGAIN):
-                (rung,) = again.rungs
-                if rung.met(max(wish, floor)) is None:
-                    again.climb(rung, rung.steps_for(max(wish, floor)))
-            if rung.met(max(wish, floor)) is not None:
-                found = again.for_tolerance(max(wish, floor))[0][0]
-    if found is None:
-        members = (integrator,) if integrator is not None else _members(search)
-        # Raise for a state from which no motion can start.
-        members[0].start(scene, q0[None], v0[None])
-        coarse = first_steps(scene, q0, v0, duration, search.rows)
-        ladder = Ladder(search.attempt, members, coarse, search.rows, lambda: search.evaluations > search.most)
-        try:
-            found = ladder.for_tolerance(max(wish, floor))[0][0]
-        except (StepError, CustomForceError, CustomConstraintError):
-            raise
-        except VarpinError:
-            raise ToleranceError(wish, duration, coarse, math.inf) from None
+    members = (integrator,) if integrator is not None else _members(search)
+    # Raise for a state from which no motion can start.
+    members[0].start(scene, q0[None], v0[None])
+    coarse = first_steps(scene, q0, v0, duration, search.rows)
+    ladder = Ladder(search.attempt, members, coarse, search.rows, lambda: search.evaluations > search.most)
+    try:
+        found = ladder.for_tolerance(max(wish, floor))[0][0]
+    except (StepError, CustomForceError, CustomConstraintError):
+        raise
+    except VarpinError:
+        raise ToleranceError(wish, duration, coarse, math.inf) from None
     if not found.error < SENSIBLE:
         raise ToleranceError(wish, duration, found.steps, found.error)
     record = Accuracy(

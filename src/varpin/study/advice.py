@@ -99,44 +99,19 @@ class Advice(Study[Choice]):
             points,
             [(seconds, error) for _, seconds, error in points[:1]],
             ("predicted wall time [s]", "error in q [rad or m]"),
-            "advised" if math.isfinite(self.error) else "the most accurate",
+            "advised" if math.isfinite(self.best.error) else "the most accurate",
             {name: (axis, value) for name, (axis, value) in wishes.items() if value is not None},
         )
 
     @property
     def best(self) -> Choice:
-        """The choice; its fields are this object's, too."""
+        """The choice."""
         return self.runs[0]
 
     @property
     def alternatives(self) -> tuple[Choice, ...]:
         """The best of every other method that has one."""
         return self.runs[1:]
-
-    @property
-    def integrator(self) -> Integrator:
-        """The method to take."""
-        return self.best.integrator
-
-    @property
-    def dt(self) -> float:
-        """The step to take [s]."""
-        return self.best.dt
-
-    @property
-    def steps(self) -> int:
-        """How many of them."""
-        return self.best.steps
-
-    @property
-    def error(self) -> float:
-        """The largest error in q to expect [rad or m]."""
-        return self.best.error
-
-    @property
-    def seconds(self) -> float:
-        """The wall time to expect [s]."""
-        return self.best.seconds
 
     def __str__(self) -> str:
         return self.reason
@@ -219,21 +194,13 @@ def _reason(
     budget: float | None,
     duration: float,
 ) -> str:
-    best, *others = choices
+    best = choices[0]
     wish = f"an error of {tolerance:g} in q" if tolerance is not None else f"{_time(budget or 0.0)}"
     if not reached:
         lines = [f"{wish} is not within reach of what was tried; the best is {best}"]
-    elif tolerance is not None:
-        # Times are measured, and near ties go to the choice whose error is the safer one.
-        tied = any(other.seconds < best.seconds for other in others[:1])
-        lines = [f"{best}, {'one of the cheapest' if tied else 'the cheapest'} within {wish} after {duration:g} s"]
     else:
-        lines = [f"{best}, the most accurate after {duration:g} s within {wish}"]
-    if others and tolerance is not None and reached:
-        longer = f"{others[0].seconds / best.seconds:.2g}"
-        lines.append(f"next: {others[0]}, {'as long' if longer == '1' else f'{longer} times as long'}")
-    elif others:
-        lines.append(f"next: {others[0]}")
+        what = "of the least time" if tolerance is not None else "the most accurate"
+        lines = [f"{best}, {what} within {wish} after {duration:g} s"]
     if not best.measured:
         lines.append(f"the error is extrapolated from larger steps by the method's order, {best.integrator.order}")
     if not best.integrator.variational:

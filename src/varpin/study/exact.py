@@ -20,8 +20,7 @@ from varpin.integrators import ExplicitEuler, Integrator
 from varpin.mechanics.forces import limited_servos
 from varpin.mechanics.lagrangian import lagrangian_jet
 from varpin.mechanics.scene import Scene
-from varpin.simulation.scales import largest_of_its_kind
-from varpin.simulation.spectrum import masses
+from varpin.simulation.spectrum import largest_of_its_kind, masses
 from varpin.trajectory import Trajectory
 
 _TOLERANCE = 1e-11

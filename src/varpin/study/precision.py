@@ -18,12 +18,12 @@ from varpin.integrators import Gauss, Integrator, Reference
 from varpin.mechanics.scene import Scene, refuse_constraints, require_scene
 from varpin.simulation.check import repeated
 from varpin.simulation.ladder import ROUNDING, SENSIBLE, Ladder, Trial, first_steps
-from varpin.study.motion import Outcome, Setting, integrators_of
+from varpin.study.motion import Setting, integrators_of
 from varpin.study.record import Chart, Progress, Study, collect, pareto_front
 from varpin.support.checks import JointValues, count, positive
 from varpin.support.executors import in_order, require_executor
 
-Quantity = Literal["q", "end", "energy", "tip"]
+Quantity = Literal["q", "energy"]
 
 # The largest of the steps where none are named [s], and the number of its halvings: down to 0.16 ms, from which on
 # methods of fourth order are at the rounding of an arm's motion.
@@ -49,9 +49,7 @@ class WorkPrecisionRun:
         seconds: Wall time, the best of the repetitions [s].
         spread: Distance of the median of the repetitions from the best [s].
         error: Largest error in q over the joints and the record's times [rad or m].
-        end_error: Largest error in q over the joints at the end [rad or m].
         energy_error: Largest distance from the initial energy over all nodes [J]; NaN unless energy is to stay.
-        tip_error: Largest error of the end effector's position over the record's times [m].
         newton_iterations: In all.
         jets: Evaluations of the whole jet.
         sweeps: Evaluations of its first derivatives alone, or of forward dynamics.
@@ -66,9 +64,7 @@ class WorkPrecisionRun:
     seconds: float
     spread: float
     error: float
-    end_error: float
     energy_error: float
-    tip_error: float
     newton_iterations: int
     jets: int
     sweeps: int
@@ -92,7 +88,6 @@ class WorkPrecision(Study[WorkPrecisionRun]):
         reference_error: Largest distance in q of the reference from the same at a ten times looser tolerance, or under
             constraints from its repetition by a better method [rad or m]. It is above the reference's own error; errors
             below it say that, and no more.
-        tip_reference_error: The same of the end effector [m].
         samples: K: errors are taken at K evenly spaced times, the end being the last.
     """
 
@@ -101,7 +96,6 @@ class WorkPrecision(Study[WorkPrecisionRun]):
     duration: float
     reference: str
     reference_error: float
-    tip_reference_error: float
     samples: int
 
     @property
@@ -128,29 +122,18 @@ class WorkPrecision(Study[WorkPrecisionRun]):
 
     def error_of(self, run: WorkPrecisionRun, quantity: Quantity = "q") -> float:
         """The error of a run, not below what the reference can tell; energy errors need no reference."""
-        values = {
-            "q": (run.error, self.reference_error),
-            "end": (run.end_error, self.reference_error),
-            "tip": (run.tip_error, self.tip_reference_error),
-            "energy": (run.energy_error, 0.0),
-        }
-        if quantity not in values:
-            raise InputError(f"quantity must be one of {', '.join(values)}, got {quantity!r}")
-        error, floor = values[quantity]
+        if quantity not in ("q", "energy"):
+            raise InputError(f"quantity must be 'q' or 'energy', got {quantity!r}")
+        error, floor = (run.error, self.reference_error) if quantity == "q" else (run.energy_error, 0.0)
         return max(error, floor) if math.isfinite(error) else math.nan
 
     def chart(self, quantity: Quantity = "q") -> Chart:
-        """An error over wall time: ``"q"``, ``"end"``, ``"tip"`` or ``"energy"``, of a conservative motion."""
-        names = {
-            "q": "largest error in q [rad or m]",
-            "end": "error in q at the end [rad or m]",
-            "energy": "largest energy error [J]",
-            "tip": "largest error of the end effector [m]",
-        }
+        """An error over wall time: ``"q"``, or ``"energy"`` of a conservative motion."""
+        names = {"q": "largest error in q [rad or m]", "energy": "largest energy error [J]"}
         front = [(run.seconds, self.error_of(run, quantity)) for run in self.pareto(quantity)]
         points = [(run.integrator, run.seconds, self.error_of(run, quantity)) for run in self.runs]
-        floor = {"tip": self.tip_reference_error, "energy": 0.0}.get(quantity, self.reference_error)
-        marks = {"error of the reference": ("y", floor)} if floor > 0.0 else {}
+        known = quantity == "q" and self.reference_error > 0.0
+        marks = {"error of the reference": ("y", self.reference_error)} if known else {}
         return Chart(points, front, (f"wall time for {self.duration:g} s [s]", names[quantity]), marks=marks)
 
     def at_floor(self, run: WorkPrecisionRun) -> bool:
@@ -214,26 +197,14 @@ def work_precision(
         reference = Reference(rtol=1e-13)
     grids = _grids(setting, dts)
     jobs = [(member, steps) for member in members for steps in grids]
-    exact = _Exact(setting, reference, _samples(grids, len(setting.controls)))
+    samples = _samples(grids, len(setting.controls))
+    exact, other = _constrained(setting, samples) if reference is None else _by(setting, reference, samples)
     text = f"{_CONSTRAINED} in ever smaller steps" if reference is None else str(reference)
-    base = WorkPrecision((), scene.robot.name, setting.duration, text, exact.error, exact.tip_error, len(exact.q) - 1)
+    error = float(np.abs(exact - other).max())
+    base = WorkPrecision((), scene.robot.name, setting.duration, text, error, samples)
     measure = partial(_measure, setting, exact, repeats)
     runs = (measure(job) for job in jobs) if executor is None else in_order(executor, measure, jobs)
     return collect(base, runs, len(jobs), progress)
-
-
-class _Exact:
-    """The reference's motion at the compared times, and its distance from one less accurate, or more.
-
-    No reference is that of scenes with constraints.
-    """
-
-    def __init__(self, setting: Setting, reference: Reference | None, samples: int) -> None:
-        self.q, other = _constrained(setting, samples) if reference is None else _by(setting, reference, samples)
-        place = setting.scene.robot.frame_positions
-        self.tip = place(self.q)
-        self.error = float(np.abs(self.q - other).max())
-        self.tip_error = _largest(place(other) - self.tip)
 
 
 def _by(setting: Setting, reference: Reference, samples: int) -> tuple[Floats, Floats]:
@@ -289,9 +260,10 @@ def _samples(grids: Sequence[int], rows: int) -> int:
     return rows * max(k for k in range(1, min(shared, most) + 1) if shared % k == 0)
 
 
-def _measure(setting: Setting, exact: _Exact, repeats: int, job: tuple[Integrator, int]) -> WorkPrecisionRun:
+def _measure(setting: Setting, exact: Floats, repeats: int, job: tuple[Integrator, int]) -> WorkPrecisionRun:
+    """A run against the exact motion (K + 1, n)."""
     member, steps = job
-    error = end = tip = energy = seconds = math.nan
+    error = energy = seconds = math.nan
     spread, counts, failure = 0.0, (0, 0, 0, 0), ""
     # An error of one run, whatever it is, does not stop the others.
     try:
@@ -299,26 +271,13 @@ def _measure(setting: Setting, exact: _Exact, repeats: int, job: tuple[Integrato
     except Exception as reason:
         failure = f"{type(reason).__name__}: {reason}"
     else:
-        failure, counts = outcome.failure, _counts(outcome)
+        failure, motion, own = outcome.failure, outcome.motion, outcome.motion.statistics
+        counts = int(own.newton_iterations.sum()), int(own.jets.sum()), int(own.sweeps.sum()), own.split_steps
         if not failure:
             seconds, spread = outcome.seconds, outcome.spread
-            q = outcome.motion.q[:: steps // (len(exact.q) - 1)]
-            error, end = float(np.abs(q - exact.q).max()), float(np.abs(q[-1] - exact.q[-1]).max())
-            tip = _largest(setting.scene.robot.frame_positions(q) - exact.tip)
+            error = float(np.abs(motion.q[:: steps // (len(exact) - 1)] - exact).max())
             if setting.conservative:
-                energy = float(np.abs(outcome.motion.energy - outcome.motion.energy[0]).max())
+                energy = float(np.abs(motion.energy - motion.energy[0]).max())
     return WorkPrecisionRun(
-        str(member), member.order, setting.duration / steps, steps, seconds, spread, error, end, energy, tip, *counts,
-        failure,
-    )  # fmt: skip
-
-
-def _counts(outcome: Outcome) -> tuple[int, int, int, int]:
-    """Newton iterations, jets, sweeps and split steps of a run."""
-    own = outcome.motion.statistics
-    return int(own.newton_iterations.sum()), int(own.jets.sum()), int(own.sweeps.sum()), own.split_steps
-
-
-def _largest(vectors: Floats) -> float:
-    """The length of the longest row."""
-    return float(np.linalg.norm(vectors, axis=1).max())
+        str(member), member.order, setting.duration / steps, steps, seconds, spread, error, energy, *counts, failure
+    )

@@ -26,9 +26,7 @@ _HEADINGS = {
     "seconds": "wall time [s]",
     "spread": "spread of wall time [s]",
     "error": "error in q [rad or m]",
-    "end_error": "error in q at the end [rad or m]",
     "energy_error": "energy error [J]",
-    "tip_error": "end-effector error [m]",
     "open_loop_cost": "true cost, open loop",
     "closed_loop_cost": "true cost, feedback",
 }

@@ -153,11 +153,16 @@ def control_array(
     return array
 
 
-def control_values(name: str, value: JointValues, joints: Sequence[str] | None, size: int) -> Floats:
-    """``value``, (m,) or by joint name, as a new float array (m,); errors as :func:`control_array`."""
+def control_values(
+    name: str, value: JointValues, joints: Sequence[str] | None, size: int, *, uniform: bool = False
+) -> Floats:
+    """``value``, (m,) or by joint name, as a new float array (m,); errors as :func:`control_array`.
+
+    With ``uniform`` it may be one number for all controls.
+    """
     if isinstance(value, Mapping):
         return control_array(name, value, joints)
-    return finite_array(name, value, (size,))
+    return broadcast_array(name, value, size) if uniform else finite_array(name, value, (size,))
 
 
 def checked_limits(name: str, limits: tuple[ArrayLike, ArrayLike] | None, size: int) -> Floats:

@@ -7,7 +7,7 @@ import itertools
 import os
 import pickle
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -55,9 +55,7 @@ def in_order(
     """Results of ``function`` for each task, in the order of the tasks.
 
     The tasks ahead of the awaited result are at most 256, with at most 2 GiB of results, but at least two. Close the
-    iterator to cancel tasks that have not begun. After Ctrl-C, or a KeyboardInterrupt thrown into the iterator, results
-    go on up to the first task that is neither done nor begun in a thread of this process; then the KeyboardInterrupt is
-    raised.
+    iterator to cancel tasks that have not begun.
 
     Args:
         executor: The executor.
@@ -84,15 +82,10 @@ def in_order(
                 if not isinstance(executor, ThreadPoolExecutor):
                     _require_sendable(function, task)
                 raise
-            try:
-                yield result
-            finally:
-                waiting.popleft()
+            waiting.popleft()
+            yield result
     except BrokenExecutor as error:
         raise WorkersLost(error) from error
-    except KeyboardInterrupt:
-        yield from _begun(executor, waiting)
-        raise
     finally:
         for future in waiting:
             future.cancel()
@@ -109,34 +102,10 @@ def _require_sendable(function: Callable[[Task], Result], task: Task) -> None:
         ) from error
 
 
-def _begun(executor: Executor, futures: Sequence[Future[Result]]) -> Iterator[Result]:
-    """Results of the first tasks: of those that are done, and of those that threads of this process are doing."""
-    # From the last to the first, lest a worker takes one with a gap before it.
-    for future in reversed(futures):
-        future.cancel()
-    for future in futures:
-        # Other workers get Ctrl-C themselves, or are too far away to wait for.
-        if future.cancelled() or not (future.done() or isinstance(executor, ThreadPoolExecutor)):
-            return
-        if future.exception() is not None:
-            return
-        yield future.result()
-
-
-def take_all(results: Generator[Result, None, None], take: Callable[[Result], None], tell: Callable[[], None]) -> None:
-    """``take`` each result of :func:`in_order`, and ``tell`` of it; after Ctrl-C also those of tasks that have begun.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C.
-    """
-    # Ctrl-C interrupts the main thread alone: in another one each result is taken wholly or not at all.
+def take_all(results: Iterable[Result], take: Callable[[Result], None], tell: Callable[[], None]) -> None:
+    """``take`` each result, wholly or not at all, and ``tell`` of it."""
+    # Ctrl-C interrupts the main thread alone.
     with ThreadPoolExecutor(1) as taker:
-        try:
-            for result in results:
-                taker.submit(take, result).result()
-                tell()
-        except KeyboardInterrupt as interrupt:
-            result = results.throw(interrupt)
-            while True:
-                taker.submit(take, result).result()
-                result = next(results)
+        for result in results:
+            taker.submit(take, result).result()
+            tell()

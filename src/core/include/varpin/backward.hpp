@@ -1,5 +1,5 @@
 // The backward pass of stochastic differential dynamic programming (Theodorou, Tassa and Todorov 2010).
-// docs/mathematics.md, "The backward pass", "Digits", "Limits" and "Smooth controls".
+// docs/mathematics.md, "The backward pass", "Digits" and "Smooth controls".
 //
 // The value after a step is v0 + Wx . x' + Wu . u + (1/2) (x', u) W (x', u), in deviations from the nominal trajectory;
 // it depends on u only while a control is held over several steps. With x' = A x + B u + sum_i (g_i + Gx_i x + Gu_i u)
@@ -21,7 +21,6 @@
 #include <limits>
 #include <vector>
 
-#include "varpin/box.hpp"
 #include "varpin/dense.hpp"
 #include "varpin/linear_step.hpp"
 #include "varpin/steps.hpp"
@@ -55,9 +54,7 @@ class BackwardPass {
           K(m, x),
           Qux(m, x),
           rest(m, x),
-          residual(m),
-          pulled(m),
-          box(m) {
+          residual(m) {
         for (int i = 0; i < x; ++i) {
             gradient[i] = costate[i] = terminal_gradient[i];
             std::copy_n(terminal_hessian + i * x, x, W[i]);
@@ -255,75 +252,31 @@ class BackwardPass {
     }
 
     // Gains of decision r, and the value under them; false where Quu is not positive definite.
-    //
-    // With limits, the decision minimizes the model at the expected state, and controls at a limit have no feedback
-    // (Tassa, Mansard and Todorov 2014, at the nominal state).
     bool decide(double regularization, const ExpandedSteps& steps, std::ptrdiff_t r, const Gains& gains) {
         const double* rate = steps.rate ? steps.rate + r * m * m : nullptr;
         const double* pull = steps.rate ? steps.pull + r * m : nullptr;
         if (rate) add_rate(rate, pull);
         if (!regularize(regularization)) return false;
         factors = Quu;
+        for (int i = 0; i < m; ++i) {
+            if (!steps.holds(r, i)) continue;
+            for (int j = 0; j < m; ++j) factors[i * m + j] = factors[j * m + i] = i == j ? 1.0 : 0.0;
+        }
         if (!factor_ldl(factors.data(), m, {0, m})) return false;
         double* k = gains.feedforward + r * m;
-        for (int i = 0; i < m; ++i) k[i] = -Qz[x + i];
+        for (int i = 0; i < m; ++i) k[i] = steps.holds(r, i) ? 0.0 : -Qz[x + i];
         solve_ldl(factors.data(), m, {0, m}, k, k);
-        if (steps.slack) {
-            const double* ahead = steps.expected ? steps.expected + r * size : nullptr;
-            double* pressure = gains.pressure ? gains.pressure + r * m : nullptr;
-            if (!keep_within(steps.slack + r * 2 * m, ahead, rate, k, pressure)) return false;
-        }
-        for (int i = 0; gains.stiffness && i < m; ++i) gains.stiffness[r * m + i] = Q[x + i][x + i];
         for (int i = 0; i < m; ++i) {
-            if (box.held[i]) continue;
+            if (steps.holds(r, i)) continue;
             const double largest = std::max(terms[x + i] * terms[x + i], std::abs(Q[x + i][x + i]));
             found.loss = std::max(found.loss, epsilon * largest / factors[i * m + i]);
         }
-        find_feedback();
+        find_feedback(steps, r);
         for (int i = 0; i < m; ++i) std::copy_n(K[i], x, gains.feedback + (r * m + i) * x);
         if (gains.factors) std::copy_n(factors.begin(), m * m, gains.factors + r * m * m);
         std::copy_n(Cz.begin() + x, m, gains.control_gradient + r * m);
         minimized_value(k);
-        if (rate) value_of_previous(rate, pull, k, gains.previous + r * m * m);
-        return true;
-    }
-
-    // k within limits, at deviations `ahead` (2n + m) of the state and the previous control from the nominal
-    // ones, null for zero; the result applies at zero deviation again. Writes the gradient there into `pressure`,
-    // unless null.
-    bool keep_within(const double* slack, const double* ahead, const double* rate, double* k, double* pressure) {
-        const double* Qu = Qz.data() + x;
-        std::copy_n(Qu, m, pulled.data());
-        if (ahead) {
-            for (int i = 0; i < m; ++i) {
-                for (int c = 0; c < x; ++c) pulled[i] += Q[x + i][c] * ahead[c];
-                if (!rate) continue;
-                for (int c = 0; c < m; ++c) pulled[i] -= rate[i * m + c] * ahead[x + c];
-            }
-            for (int i = 0; i < m; ++i) k[i] = -pulled[i];
-            solve_ldl(factors.data(), m, {0, m}, k, k);
-        }
-        if (!box.solve(Quu.data(), pulled.data(), slack, slack + m, k)) return false;
-        for (int i = 0; pressure && i < m; ++i) {
-            pressure[i] = pulled[i];
-            for (int j = 0; j < m; ++j) pressure[i] += Q[x + i][x + j] * k[j];
-        }
-        factors = box.factors;
-        if (!ahead) return true;
-        for (int i = 0; i < m; ++i) {
-            if (box.held[i]) continue;
-            pulled[i] = -Qu[i];
-            for (int j = 0; j < m; ++j) {
-                if (box.held[j]) pulled[i] -= Quu[i * m + j] * k[j];
-            }
-        }
-        for (int i = 0; i < m; ++i) {
-            if (box.held[i]) pulled[i] = k[i];
-        }
-        solve_ldl(factors.data(), m, {0, m}, pulled.data(), k);
-        for (int i = 0; i < m; ++i) {
-            if (box.held[i]) k[i] = pulled[i];
-        }
+        if (rate) value_of_previous(steps, r, k, gains.previous + r * m * m);
         return true;
     }
 
@@ -356,15 +309,12 @@ class BackwardPass {
         return Qz[x + i] == 0.0 && std::all_of(Q[x + i], Q[x + i] + size, [](double entry) { return entry == 0.0; });
     }
 
-    // K, with zero feedback for controls at a limit.
-    void find_feedback() {
+    // K = -Quu^-1 Qux, zero for controls that are held.
+    void find_feedback(const ExpandedSteps& steps, std::ptrdiff_t r) {
         for (int i = 0; i < m; ++i) {
             std::copy_n(Q[x + i], x, Qux[i]);
-            if (box.held[i]) {
-                std::fill_n(K[i], x, 0.0);
-            } else {
-                std::transform(Qux[i], Qux[i] + x, K[i], [](double entry) { return -entry; });
-            }
+            const double sign = steps.holds(r, i) ? 0.0 : -1.0;
+            std::transform(Qux[i], Qux[i] + x, K[i], [sign](double entry) { return sign * entry; });
         }
         solve_ldl_rows(factors.data(), m, K[0], K.stride());
     }
@@ -397,9 +347,10 @@ class BackwardPass {
     }
 
     // Gains G on the previous control of a decision, and the rows and columns of the value in it, (O6).
-    void value_of_previous(const double* R, const double* pull, const double* k, double* G) {
+    void value_of_previous(const ExpandedSteps& steps, std::ptrdiff_t r, const double* k, double* G) {
+        const double *R = steps.rate + r * m * m, *pull = steps.pull + r * m;
         for (int i = 0; i < m; ++i) {
-            for (int c = 0; c < m; ++c) G[i * m + c] = box.held[i] ? 0.0 : R[i * m + c];
+            for (int c = 0; c < m; ++c) G[i * m + c] = steps.holds(r, i) ? 0.0 : R[i * m + c];
         }
         solve_ldl_rows(factors.data(), m, G, m);
         of_control = true;
@@ -454,11 +405,10 @@ class BackwardPass {
     std::vector<double> terms;  // (size) of Q, as the scale of the value
     std::vector<double> row;    // (size) in whole tiles
     // And of a decision.
-    std::vector<double> Quu, factors;  // (m, m) regularized; L D L' of its free part
-    TiledMatrix K, Qux, rest;          // (m, x); the last is Quu K + Qux
-    std::vector<double> residual;      // (m) Quu k + Qu
-    std::vector<double> pulled;        // (m) the gradient at the expected state
-    BoxMinimum box;
+    std::vector<double> Quu,
+        factors;               // (m, m) regularized; L D L' of it, with rows and columns that are held of the identity
+    TiledMatrix K, Qux, rest;  // (m, x); the last is Quu K + Qux
+    std::vector<double> residual;  // (m) Quu k + Qu
 };
 
 }  // namespace varpin

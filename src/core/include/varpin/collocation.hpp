@@ -1,8 +1,8 @@
 // The forced discrete Euler-Lagrange equations of a collocation step: their residual r (`residuals_of`), Newton's
-// iteration on it and its derivatives. docs/mathematics.md, "Solving a step", "Higher order" and "Linearization";
-// constrained.hpp has steps with constraints. The unknowns are the stage velocities V_i (tableau.hpp). With F = f + the
-// forces of elements (forces.hpp), whose derivatives F_q, F_v and F_f - 1 are diagonal, and of couplings
-// (couplings.hpp), whose F_q and F_v are full in their blocks,
+// matrix N (`assemble`) and iteration (`solve`). docs/mathematics.md, "Solving a step" and "Higher order";
+// step_equation.hpp has the derivatives of a step, constrained.hpp steps with constraints. The unknowns are the stage
+// velocities V_i (tableau.hpp). With F = f + the forces of elements (forces.hpp), whose derivatives F_q, F_v and F_f -
+// 1 are diagonal, and of couplings (couplings.hpp), whose F_q and F_v are full in their blocks,
 //
 //     r_i(V) = p0 + h sum_j (abar_ij L_q + f_ij F)(Q_j, V_j) - L_v(Q_i, V_i) = 0
 //     N_im = -dr_i/dV_m = delta_im M_i + h (a_im A_i - abar_im A_m' - f_im F_v,m)
@@ -10,7 +10,7 @@
 //
 // N is block-diagonal, with one matrix for each block of the tree; elimination needs none of them. On the branch of
 // solutions that is connected to h -> 0 its determinant is positive.
-// Equations (D3), (D4), (S1), (C1), (C3), (L1) and (L2) of docs/mathematics.md; (1.8) and (1.9) of the paper.
+// Equations (D3), (D4), (S1), (C1) and (C3) of docs/mathematics.md; (1.8) and (1.9) of the paper.
 #pragma once
 
 #include <algorithm>
@@ -61,8 +61,7 @@ struct Start {
 // The step equation: (D3) with the forces (D4), the paper's (1.8) and (1.9).
 class Collocation {
   public:
-    Collocation(const Mechanism& mechanism, const Tableau& tableau, Solver solver,
-                const Kernels& kernels = kernels_for<>)
+    Collocation(const Mechanism& mechanism, const Tableau& tableau, bool dense, const Kernels& kernels = kernels_for<>)
         : mechanism(mechanism),
           tableau(tableau),
           kernels(kernels),
@@ -74,7 +73,6 @@ class Collocation {
           slope(stages * n),
           slope_rest(stages * n),
           acting(stages * n),
-          weight(stages, 1.0),
           residual(stages * n),
           delta(stages * n),
           next(stages * n) {
@@ -84,7 +82,7 @@ class Collocation {
             coupled_q.resize(entries(stages * n, n));
             coupled_v.resize(stages * n * n);
         }
-        if (stages > StageElimination::most_stages || !eliminates(mechanism, solver, stages)) {
+        if (dense || stages > StageElimination::most_stages || !eliminates(mechanism, stages)) {
             allocate();
             return;
         }
@@ -95,9 +93,6 @@ class Collocation {
         } else {
             stage_elimination.emplace(mechanism, tableau);
         }
-        eliminated_columns = solver == Solver::elimination;
-        for (const Block& block : blocks_of(mechanism.tree, n))
-            eliminated_columns = eliminated_columns || block.end - block.begin >= few_columns;
     }
 
     const Mechanism& mechanism;
@@ -115,21 +110,7 @@ class Collocation {
     std::vector<JointForce<double>> acting;  // (s, n) of elements and couplings; derivatives of elements only
     std::vector<double> coupled_q;           // (s, n, n) dF/dq of couplings, if there are such forces
     std::vector<double> coupled_v;           // (s, n, n) dF/dv
-    std::vector<double> weight;              // (s) factor of the force f at each stage, for derivatives in f
-    bool weighted = false;                   // whether any factor is not 1
     bool by_external = false;                // whether derivatives in f are those in the external force
-
-    // Take derivatives in f for a force that grows linearly from 0 to f over the whole step, of which this is the part
-    // at `begin` with length `share`, both in units of the step.
-    void weigh_ramp(double begin, double share) {
-        weighted = true;
-        for (int i = 0; i < stages; ++i) weight[i] = begin + share * tableau.c[i];
-    }
-    // Take derivatives in f for a constant force again.
-    void weigh_constant() {
-        weighted = false;
-        std::fill(weight.begin(), weight.end(), 1.0);
-    }
 
     // Solve the step equation from the guess in V.
     //
@@ -208,36 +189,6 @@ class Collocation {
         return true;
     }
 
-    // Derivatives at the root, from the jets of its stages: dV (s, n, 3n), and of (q1, p1), all in (q0, p0, f); Jx is
-    // (2n, 2n), Jf (2n, n). Only blocks of dV are written.
-    void derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
-        if (eliminated_columns) return eliminate_derivatives(h, dV, Jx, Jf);
-        if (stages == 1) return kernels.derivatives(*this, h, dV, Jx, Jf);
-        derivatives(n, stages, h, dV, Jx, Jf);
-    }
-
-    // The same by blocks, without elimination. Numbers of joints and stages may be known at compile time, here and in
-    // the three parts of it.
-    template <class Size, class Stages>
-    void derivatives(Size n, Stages stages, double h, std::vector<double>& dV, double* Jx, double* Jf) {
-        const auto& blocks = blocks_of(mechanism.tree, n);
-        if (blocks.size() > 1) {
-            std::fill(Jx, Jx + 4 * n * n, 0.0);
-            std::fill(Jf, Jf + 2 * n * n, 0.0);
-        }
-        factor_blocks(h);
-        const double* matrix = lu.data();
-        const int* rows = order.data();
-        for (const Block& block : blocks) {
-            const int width = block.end - block.begin, size = stages * width;
-            right_sides(n, stages, h, block, dV);
-            solve_columns(n, stages, h, matrix, rows, block, dV);
-            end_derivatives(n, stages, h, block, dV, Jx, Jf);
-            matrix += size * size;
-            rows += size;
-        }
-    }
-
     // x with N x = right (s, n), from the factors of `factor`.
     void solve_factored(const double* right, double* x) {
         if (eliminated()) return elimination ? elimination->solve(right, x) : stage_elimination->solve(right, x);
@@ -247,25 +198,10 @@ class Collocation {
         });
     }
 
-    // x with N' x = right, after `derivatives`.
-    void solve_transposed(double h, const double* right, double* x) {
-        if (eliminated_columns) factor_blocks(h);
-        solve_blocks(right, x, [this](const double* matrix, int size, const int* rows, double* b, double* y) {
-            solve_lu_transposed(matrix, size, stages == 1 ? nullptr : rows, b, y);
-        });
-    }
-
-    // How many of q0, p0 and f need a solve. With one stage, the columns of the force are proportional to those of the
-    // momentum, unless `every_kind` is set.
-    int kinds() const { return stages == 1 && !every_kind ? 2 : 3; }
-    bool every_kind = false;
-
-    // The effect of a force on coordinate c on a single stage, relative to that of a momentum.
-    double by_momentum(double h, int c) const { return h * (weight[0] * tableau.force[0] + changed(0, c)); }
-
   private:
     template <class>
     friend struct Sized;
+    friend class StepEquation;        // adds its derivatives
     friend class ConstrainedStepper;  // adds rows and columns of constraints to the matrix
 
     template <class Solve>
@@ -289,9 +225,6 @@ class Collocation {
     static constexpr int most_approaches = 4;
     static constexpr int most_shortened = 40;
     static constexpr double least_share = 1.0 / 256.0;
-    // Number of columns of a block up to which solving them together with the block's matrix is faster than elimination
-    // column by column. Measured.
-    static constexpr int few_columns = 45;
     // Residuals below this may stagnate, in rounding units; without the scatter of rounding it would be 1.
     static constexpr double stagnation = 100.0;
     // A residual whose estimate is below the tolerance by this factor is not evaluated.
@@ -303,10 +236,9 @@ class Collocation {
     std::vector<double> guess, from, next;  // (s, n) of `approach`
     std::vector<double> lu;                 // the factors of each block, one after another
     std::vector<int> order;                 // permutation of their rows
-    std::vector<double> change, local, columns, gain;
-    bool eliminated_columns = false;  // of derivatives
-    std::vector<double> turning;      // (n) rotation of bodies per unit of a coordinate; infinite for a coordinate that
-                                      // translates a body on a rotating one, where its product is NaN without motion
+    std::vector<double> change, local;
+    std::vector<double> turning;  // (n) rotation of bodies per unit of a coordinate; infinite for a coordinate that
+                                  // translates a body on a rotating one, where its product is NaN without motion
     std::vector<double> element_curvature;  // (s, n) of the elements' potentials, if there is an elimination
     std::vector<double> diagonal;           // (s, s, n) of N, without the contributions of bodies in an elimination
 
@@ -663,77 +595,6 @@ class Collocation {
         }
     }
 
-    // `derivatives` column by column.
-    void eliminate_derivatives(double h, std::vector<double>& dV, double* Jx, double* Jf) {
-        factor(h);
-        columns.resize(stages * n);
-        for (int k = 0; k < n; ++k) {
-            for (int kind = 0; kind < 3; ++kind) {
-                // With one stage the column of the force is proportional to that of the momentum, just solved for.
-                const double scale =
-                    stages == 1 && kind == 2 ? h * weight[0] * tableau.force[0] * (1.0 + acting[k].by_f) : 1.0;
-                if (stages > 1 || kind < 2) {
-                    right_side(h, kind, k);
-                    solve_factored(residual.data(), delta.data());
-                    change_of_slope(h, columns);
-                }
-                double* out = kind == 2 ? Jf + k : Jx + kind * n + k;
-                const int stride = (kind == 2 ? 1 : 2) * n;
-                for (int r = 0; r < n; ++r) {
-                    double q = 0.0, p = 0.0;
-                    for (int i = 0; i < stages; ++i) {
-                        dV[(i * n + r) * 3 * n + kind * n + k] = scale * delta[i * n + r];
-                        q += tableau.b[i] * delta[i * n + r];
-                        p += tableau.b[i] * columns[i * n + r];
-                        if (kind == 0) p += tableau.b[i] * stage[i].Lqq[k * n + r];
-                        if (kind == 0 && r == k) p += tableau.b[i] * acting[i * n + k].by_q;
-                    }
-                    out[r * stride] = h * scale * q;
-                    out[(n + r) * stride] = h * scale * p;
-                }
-                if (kind == 0) out[k * stride] += 1.0;
-                if (kind > 0) out[(n + k) * stride] += kind == 1 ? 1.0 : h * passed(k);
-            }
-        }
-    }
-
-    // Into `residual` dr in one of q0, p0 or f: h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, or h sum_j f_ij w_j
-    // F_f,j with the stages' weights w.
-    void right_side(double h, int kind, int k) {
-        std::fill(residual.begin(), residual.end(), 0.0);
-        for (int i = 0; i < stages; ++i) {
-            double* b = &residual[i * n];
-            double share = 0.0;
-            for (int j = 0; j < stages; ++j) {
-                share += weight[j] * tableau.force[i * stages + j];
-                if (kind > 0) continue;
-                const double* curvature = &stage[j].Lqq[k * n];
-                for (int r = 0; r < n; ++r) b[r] += h * tableau.gradient[i * stages + j] * curvature[r];
-                b[k] += h * tableau.force[i * stages + j] * acting[j * n + k].by_q;
-            }
-            if (kind == 0) {
-                for (int r = 0; r < n; ++r) b[r] -= stage[i].A[r * n + k];
-            } else {
-                b[k] = kind == 1 ? 1.0 : h * share;
-                if (kind == 2) b[k] += h * changed(i, k);
-            }
-        }
-    }
-
-    // sum_j f_ij w_j (F_f,j - 1): the change of a constant force in r_i by elements.
-    double changed(int i, int c) const {
-        double total = 0.0;
-        for (int j = 0; j < stages; ++j) total += weight[j] * tableau.force[i * stages + j] * acting[j * n + c].by_f;
-        return total;
-    }
-    // sum_j b_j w_j F_f,j: the factor of a constant force in p1.
-    double passed(int c) const {
-        double total = weighted ? 0.0 : 1.0;
-        for (int j = 0; j < stages && weighted; ++j) total += weight[j] * tableau.b[j];
-        for (int j = 0; j < stages; ++j) total += weight[j] * tableau.b[j] * acting[j * n + c].by_f;
-        return total;
-    }
-
     // Correct L_q + F of the stages for the step `delta`, to first order, in `slope_rest`. Rounding would take the
     // correction from a sum with `slope`; the errors of guesses have a similar sign in every step, and energy drifts.
     void correct_slopes(double h) {
@@ -774,123 +635,6 @@ class Collocation {
             }
         }
     }
-
-    // dr_i in (q0, p0, f): h sum_j (abar_ij L_qq,j + f_ij F_q,j) - A_i, 1, and h sum_j f_ij w_j F_f,j.
-    template <class Size, class Stages>
-    void right_sides(Size n, Stages stages, double h, Block block, std::vector<double>& dV) const {
-        for (int i = 0; i < stages; ++i) {
-            double share = 0.0;
-            for (int j = 0; j < stages; ++j) share += weight[j] * tableau.force[i * stages + j];
-            for (int r = block.begin; r < block.end; ++r) {
-                double* row = &dV[(i * n + r) * 3 * n];
-                for (int c = block.begin; c < block.end; ++c) {
-                    double total = 0.0;
-                    for (int j = 0; j < stages; ++j)
-                        total += tableau.gradient[i * stages + j] * stage[j].Lqq[r * n + c];
-                    for (int j = 0; j < stages && r == c; ++j)
-                        total += tableau.force[i * stages + j] * acting[j * n + r].by_q;
-                    for (int j = 0; j < stages && coupled(); ++j)
-                        total += tableau.force[i * stages + j] * coupled_q[(j * n + r) * n + c];
-                    row[c] = h * total - stage[i].A[r * n + c];
-                    row[n + c] = r == c ? 1.0 : 0.0;
-                    if (kinds() == 3) row[2 * n + c] = r == c ? h * (share + changed(i, r)) : 0.0;
-                }
-            }
-        }
-    }
-
-    // N dV = dr in place, whole rows at a time.
-    template <class Size, class Stages>
-    void solve_columns(Size n, Stages stages, double h, const double* matrix, const int* rows, Block block,
-                       std::vector<double>& dV) {
-        const int width = block.end - block.begin, size = stages * width;
-        if (stages == 1 && width == n) {
-            solve_lu_rows(matrix, n, {0, n}, dV.data(), 2 * n, 3 * n);
-        } else {
-            const int across = kinds() * width;
-            columns.resize(entries(size, across));
-            // Row k of the block's system, at (stage, coordinate) in dV.
-            const auto line = [&](int k) { return &dV[((k / width) * n + block.begin + k % width) * 3 * n]; };
-            for (int k = 0; k < size; ++k) {
-                const double* from = line(stages == 1 ? k : rows[k]);
-                for (int kind = 0; kind < kinds(); ++kind)
-                    std::copy_n(from + kind * n + block.begin, width, &columns[k * across + kind * width]);
-            }
-            solve_lu_rows(matrix, size, {0, size}, columns.data(), across, across);
-            for (int k = 0; k < size; ++k) {
-                for (int kind = 0; kind < kinds(); ++kind)
-                    std::copy_n(&columns[k * across + kind * width], width, line(k) + kind * n + block.begin);
-            }
-        }
-        if (kinds() == 3) return;
-        for (int r = block.begin; r < block.end; ++r) {
-            double* row = &dV[r * 3 * n];
-            for (int c = block.begin; c < block.end; ++c) row[2 * n + c] = by_momentum(h, c) * row[n + c];
-        }
-    }
-
-    // Equations (L1) and (L2) for any number of stages:
-    // dq1 = dq0 + h sum_i b_i dV_i,  dp1 = dp0 + h F_f df + h sum_i b_i K_i dq0 + sum_j G_j dV_j, with K = L_qq + F_q
-    // and G_j = h b_j (A_j' + F_v,j) + h^2 sum_i b_i a_ij K_i.
-    template <class Size, class Stages>
-    void end_derivatives(Size n, Stages stages, double h, Block block, const std::vector<double>& dV, double* Jx,
-                         double* Jf) {
-        const int width = block.end - block.begin, size = stages * width;
-        gain.resize(size);
-        const auto curvature = [&](int i, int r, int c) {
-            double entry = stage[i].Lqq[r * n + c];
-            if (r == c) entry += acting[i * n + r].by_q;
-            if (coupled()) entry += coupled_q[(i * n + r) * n + c];
-            return entry;
-        };
-        for (int r = block.begin; r < block.end; ++r) {
-            double *q = Jx + r * 2 * n, *p = q + 2 * n * n, *qf = Jf + r * n, *pf = qf + n * n;
-            for (int c = block.begin; c < block.end; ++c) {
-                double by_q = 0.0, by_p = 0.0, by_f = 0.0, bend = 0.0;
-                for (int i = 0; i < stages; ++i) {
-                    const double* dV_entry = &dV[(i * n + r) * 3 * n + c];
-                    by_q += tableau.b[i] * dV_entry[0];
-                    by_p += tableau.b[i] * dV_entry[n];
-                    by_f += tableau.b[i] * dV_entry[2 * n];
-                    bend += tableau.b[i] * curvature(i, r, c);
-                }
-                q[c] = h * by_q + (r == c ? 1.0 : 0.0);
-                q[n + c] = h * by_p;
-                qf[c] = h * by_f;
-                p[c] = h * bend;
-                p[n + c] = pf[c] = 0.0;
-                for (int j = 0; j < stages; ++j) {
-                    double entry = tableau.b[j] * stage[j].A[c * n + r];
-                    if (r == c) entry += tableau.b[j] * acting[j * n + r].by_v;
-                    if (coupled()) entry += tableau.b[j] * coupled_v[(j * n + r) * n + c];
-                    for (int i = 0; i < stages; ++i)
-                        entry += h * tableau.b[i] * tableau.a[i * stages + j] * curvature(i, r, c);
-                    gain[j * width + c - block.begin] = -h * entry;
-                }
-            }
-            const auto add = [&](double* out, int kind, int across) {
-                for (int j = 0; j < stages; ++j) {
-                    const double* from = &dV[(j * n + block.begin) * 3 * n + kind * n + block.begin];
-                    subtract_rows(
-                        out + block.begin, across, 0, width, [&](int m) { return gain[j * width + m]; },
-                        [&](int m) { return from + m * 3 * n; });
-                }
-            };
-            if (width == n) {
-                add(p, 0, 2 * n);
-            } else {
-                add(p, 0, width);
-                add(p + n, 1, width);
-            }
-            if (kinds() == 3) {
-                add(pf, 2, width);
-            } else {
-                for (int c = block.begin; c < block.end; ++c) pf[c] = by_momentum(h, c) * p[n + c];
-            }
-            p[n + r] += 1.0;
-            pf[r] += h * passed(r);
-        }
-    }
 };
 
 template <class Size>
@@ -929,11 +673,6 @@ double Sized<Size>::kinetic_size(const Collocation& step, const double* x) {
     for (const Block& block : blocks_of(step.mechanism.tree, n))
         total += step.tableau.b[0] * quadratic_form(step.stage[0].M.data(), n, block, x);
     return total;
-}
-
-template <class Size>
-void Sized<Size>::derivatives(Collocation& step, double h, std::vector<double>& dV, double* Jx, double* Jf) {
-    step.derivatives(Size(step.n), Known<1>(1), h, dV, Jx, Jf);
 }
 
 }  // namespace varpin

@@ -4,6 +4,10 @@
 // such an angle, so sweeps take it within one turn. Whole turns are counted separately; the reported angle has them.
 #pragma once
 
+#ifdef __FAST_MATH__
+#error "varpin needs IEEE arithmetic: -ffast-math reorders its compensated sums and removes its checks for NaN"
+#endif
+
 #include <cmath>
 #include <numbers>
 

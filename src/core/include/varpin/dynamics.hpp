@@ -75,7 +75,7 @@ constexpr Force<T> operator*(const Coupling& C, const Vec3<T>& b) {
 // them large trees use the articulated body algorithm.
 class ForwardDynamics {
   public:
-    ForwardDynamics(const Mechanism& mechanism, bool derivatives, Solver solver = Solver::automatic)
+    ForwardDynamics(const Mechanism& mechanism, bool derivatives)
         : mechanism_(&mechanism),
           jet_(mechanism.tree, false),
           body_(mechanism.tree.bodies.size()),
@@ -88,7 +88,7 @@ class ForwardDynamics {
           momentum_(jet_.dof) {
         const int n = jet_.dof;
         mechanism.couplings.fit(jet_.couplings);
-        if (!derivatives && eliminates(mechanism.tree, solver)) {
+        if (!derivatives && eliminates(mechanism.tree)) {
             articulated_.emplace(mechanism.tree);
             return;
         }

@@ -33,19 +33,15 @@
 
 namespace varpin {
 
-// Method for solves with M and with the matrix of a step. Elimination cannot take the latter with couplings.
-enum class Solver { automatic, dense, elimination };
-
 // Model of computing times, in units of the time to eliminate a body in a step with one stage. A dense step takes
 // body_cost for each body, pair_cost for each pair of a body and itself or an ancestor, and block_cost times the cubed
 // size of each block. Elimination of a body takes stages_cost with more stages, tied_cost with one stage and ties, and
-// a share of slot_cost more for each slot of ties. Measured with benchmarks/joints.py.
+// a share of slot_cost more for each slot of ties. Measured on chains with and without ties, on hands and on arms.
 inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3, tied_cost = 1.45,
                         slot_cost = 0.1;
 
-inline bool eliminates(const Tree& tree, Solver solver, int stages = 1) {
-    if (solver == Solver::dense) return false;
-    if (solver == Solver::elimination) return true;
+// Whether solves with M, or with the matrix of a step of so many stages, are faster without forming the matrix.
+inline bool eliminates(const Tree& tree, int stages = 1) {
     double dense = body_cost * tree.size();
     std::vector<int> depth(tree.size(), 1);
     for (int j = 0; j < tree.size(); ++j) {
@@ -62,8 +58,8 @@ inline bool eliminates(const Tree& tree, Solver solver, int stages = 1) {
 }
 
 // Couplings fill entries of a step's matrix for which elimination has no form.
-inline bool eliminates(const Mechanism& mechanism, Solver solver, int stages = 1) {
-    return !mechanism.couplings.any() && eliminates(mechanism.tree, solver, stages);
+inline bool eliminates(const Mechanism& mechanism, int stages) {
+    return !mechanism.couplings.any() && eliminates(mechanism.tree, stages);
 }
 
 namespace detail {

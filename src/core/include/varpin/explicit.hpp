@@ -57,11 +57,10 @@ constexpr Nystroem nystroem_of(ExplicitMethod method) {
 // Explicit steps (X1) from any state, with derivatives (X2) in (q, v, force) if `derivatives`.
 class ExplicitStepper {
   public:
-    ExplicitStepper(const Mechanism& mechanism, ExplicitMethod method, bool derivatives,
-                    Solver solver = Solver::automatic)
+    ExplicitStepper(const Mechanism& mechanism, ExplicitMethod method, bool derivatives)
         : q(mechanism.dof()),
           v(mechanism.dof()),
-          dynamics(mechanism, derivatives, solver),
+          dynamics(mechanism, derivatives),
           mechanism_(&mechanism),
           coefficients_(nystroem_of(method)),
           derivatives_(derivatives),

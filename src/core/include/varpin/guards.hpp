@@ -102,7 +102,7 @@ struct Trial {
 
 class EnergyGuard {
   public:
-    EnergyGuard(const Mechanism& mechanism, Solver solver, bool matrices, const Kernels& kernels = kernels_for<>)
+    EnergyGuard(const Mechanism& mechanism, bool dense, bool matrices, const Kernels& kernels = kernels_for<>)
         : mechanism(mechanism),
           kernels(kernels),
           n(mechanism.dof()),
@@ -116,7 +116,7 @@ class EnergyGuard {
           diagonal(n),
           part(Energies(mechanism.tree).part) {
         mechanism.couplings.fit(jet.couplings);
-        if (eliminates(mechanism.tree, solver)) {
+        if (!dense && eliminates(mechanism.tree)) {
             articulated.emplace(mechanism.tree);
         } else {
             jet.M.resize(entries(n, n));

@@ -12,6 +12,7 @@
 namespace varpin {
 
 class Collocation;
+class StepEquation;
 class EnergyGuard;
 struct Guards;
 struct Start;
@@ -24,7 +25,7 @@ struct Kernels {
     bool (*factor)(Collocation& step, double h);
     void (*solve)(const Collocation& step, const double* right, double* x);
     double (*kinetic_size)(const Collocation& step, const double* x);
-    void (*derivatives)(Collocation& step, double h, std::vector<double>& dV, double* Jx, double* Jf);
+    void (*derivatives)(StepEquation& step, double h, std::vector<double>& dV, double* Jx, double* Jf);
     double (*branch_margin)(EnergyGuard& guard, double h, const Guards& guards, const Collocation& step);
     bool (*factor_mass)(EnergyGuard& guard, const double* q);
     void (*velocity)(EnergyGuard& guard, const double* p, double* v);
@@ -32,14 +33,14 @@ struct Kernels {
                             double* slopes);
 };
 
-// What Kernels point to, in collocation.hpp and guards.hpp.
+// What Kernels point to, in collocation.hpp, step_equation.hpp and guards.hpp.
 template <class Size>
 struct Sized {
     static double residuals(Collocation& step, double h, const Start& start);
     static bool factor(Collocation& step, double h);
     static void solve(const Collocation& step, const double* right, double* x);
     static double kinetic_size(const Collocation& step, const double* x);
-    static void derivatives(Collocation& step, double h, std::vector<double>& dV, double* Jx, double* Jf);
+    static void derivatives(StepEquation& step, double h, std::vector<double>& dV, double* Jx, double* Jf);
     static double branch_margin(EnergyGuard& guard, double h, const Guards& guards, const Collocation& step);
     static bool factor_mass(EnergyGuard& guard, const double* q);
     static void velocity(EnergyGuard& guard, const double* p, double* v);

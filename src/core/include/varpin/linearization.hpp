@@ -13,7 +13,6 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <numeric>
 #include <span>
 #include <vector>
 
@@ -27,8 +26,8 @@ class VariationalLinearization {
     // With active guards, a part that they refuse is halved, since a step may need other parts without its noise.
     // Without them, the parts are exactly those given.
     VariationalLinearization(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                             Solver solver = Solver::automatic, const Kernels& kernels = kernels_for<>)
-        : stepper(mechanism, tableau, tolerance, guards, 1.0, solver, kernels),
+                             const Kernels& kernels = kernels_for<>)
+        : stepper(mechanism, tableau, tolerance, guards, 1.0, kernels),
           n(mechanism.dof()),
           stages(tableau.stages),
           state(mechanism, stages),
@@ -55,7 +54,7 @@ class VariationalLinearization {
     bool varies = false;  // each step has forces (s, n) at its stages instead of a constant force (n)
 
     // Take derivatives in an external force in the place of f, which drives limit.
-    void take_external() { stepper.step_equation.by_external = true; }
+    void take_external() { stepper.equation.by_external = true; }
 
     // d(q1, p1)/d(q0, p0) (2n, 2n) and d(q1, p1)/df (2n, n) of one step from (q, p) under a force f, and unless null
     // Jr (2n, n) in a force that grows linearly from 0 at the start of the step to f at its end. An undivided step
@@ -66,7 +65,7 @@ class VariationalLinearization {
         if (halvings.empty() && !stepper.guards.active) {
             const Outcome outcome = root(h, q, p, guess, force, past);
             if (outcome == Outcome::solved) {
-                stepper.step_equation.derivatives(h, dV, Jx, Jf);
+                stepper.equation.derivatives(h, dV, Jx, Jf);
                 if (Jr) ramp_derivatives(h, 0.0, 1.0, Jr);
             }
             return outcome;
@@ -119,35 +118,6 @@ class VariationalLinearization {
         return Outcome::solved;
     }
 
-    // Derivatives (3n) in (q0, p0, f) of the sum of `weights` (2n, 3n) times d(q1, p1)/d(q0, p0, f) of one step, into
-    // `found`. As `second`, with row a of the weights times the second derivatives of entry a of (q1, p1).
-    Outcome bend(double h, const double* q, const double* p, const double* guess, const double* force,
-                 std::span<const std::uint8_t> halvings, const double* weights, double* found, int past = 0) {
-        std::fill(found, found + 3 * n, 0.0);
-        std::vector<double> rows(entries(2 * n, 2 * n), 0.0);
-        for (int a = 0; a < 2 * n; ++a) rows[a * 2 * n + a] = 1.0;
-        if (halvings.empty() && !stepper.guards.active) {
-            const Outcome outcome = root(h, q, p, guess, force, past);
-            if (outcome != Outcome::solved) return outcome;
-            part_derivatives(h);
-            add_bends(h, rows, nullptr, weights, found);
-            return Outcome::solved;
-        }
-        std::vector<Substep> trail;
-        const Outcome outcome = follow(h, q, p, force, halvings, trail);
-        if (outcome != Outcome::solved) return outcome;
-        std::vector<double> before(rows.size());
-        for (std::size_t k = trail.size(); k-- > 0;) {
-            const Outcome again = root_of(h, trail[k]);
-            if (again != Outcome::solved) return again;
-            part_derivatives(trail[k].length);
-            add_bends(trail[k].length, rows, trail[k].start.data(), weights, found);
-            for (int a = 0; a < 2 * n; ++a) back(&rows[a * 2 * n], &before[a * 2 * n]);
-            std::swap(before, rows);
-        }
-        return Outcome::solved;
-    }
-
   private:
     // Factor of the tolerance for derivatives, which need a root to about 1e-10 only.
     static constexpr double loose = 1e6;
@@ -175,10 +145,8 @@ class VariationalLinearization {
     std::vector<double> multiplier, slope;  // (s, n)
     Jet<Dual> direction;
     std::vector<Dual> at_q, at_v;
-    std::vector<double> inner;         // (2n, 3n)
-    std::vector<double> df;            // (n, 3n) of the force
-    std::vector<double> multipliers;   // (2n, s n)
-    std::vector<double> moves, pulls;  // (2n)
+    std::vector<double> inner;  // (2n, 3n)
+    std::vector<double> df;     // (n, 3n) of the force
     std::vector<Dual> at_f;
     std::vector<Dual> coupled_q, coupled_v;                   // (n, n) of couplings, along a direction
     std::vector<JointForce<Dual>> along_q, along_v, along_f;  // (n) of the elements, with derivatives in q, in v, in f
@@ -186,7 +154,7 @@ class VariationalLinearization {
     // The root of an undivided step, from a guess (s, n). If the guess is too far away, for example because friction
     // changes its sign within the step, from the initial velocity, and then by repetition of the steps before.
     Outcome root(double h, const double* q, const double* p, const double* guess, const double* force, int past) {
-        std::copy(guess, guess + stages * n, stepper.step_equation.V.begin());
+        std::copy(guess, guess + stages * n, stepper.equation.V.begin());
         Outcome outcome = root_at(h, q, p, force);
         if (outcome == Outcome::solved) return outcome;
         if (!stepper.begin_at(q, p, state)) return Outcome::singular;
@@ -209,17 +177,16 @@ class VariationalLinearization {
             state.p[i] = {p[i], 0.0};
         }
         stepper.take_force(force, varies);
-        return stepper.step_equation.solve(
-            h, {state.position.data(), state.p.data(), stepper.force.data(), stepper.stride}, loose, true,
-            stepper.effort);
+        return stepper.equation.solve(h, {state.position.data(), state.p.data(), stepper.force.data(), stepper.stride},
+                                      loose, true, stepper.effort);
     }
 
     Outcome root_of(double h, const Substep& part) {
         stepper.force_in_part(part.begin, part.length / h);
-        std::copy(part.V.begin(), part.V.end(), stepper.step_equation.V.begin());
-        return stepper.step_equation.solve(part.length,
-                                           {part.position.data(), part.p.data(), stepper.force.data(), stepper.stride},
-                                           loose, true, stepper.effort);
+        std::copy(part.V.begin(), part.V.end(), stepper.equation.V.begin());
+        return stepper.equation.solve(part.length,
+                                      {part.position.data(), part.p.data(), stepper.force.data(), stepper.stride},
+                                      loose, true, stepper.effort);
     }
 
     // Repeat the parts of a step. After each solved part, with its root in the stepper, calls visit(begin, length),
@@ -244,7 +211,7 @@ class VariationalLinearization {
         std::vector<double> Jx(4 * n * n), Jf(2 * n * n);
         chained.begin(Jx.data(), Jf.data());
         return parts(h, q, p, force, halvings, [&](double begin, double length) {
-            trail.push_back({from, from_p, stepper.step_equation.V, begin, length, joined(Jx, Jf)});
+            trail.push_back({from, from_p, stepper.equation.V, begin, length, joined(Jx, Jf)});
             part_derivatives(length);
             chained.follow(Jx.data(), Jf.data());
         });
@@ -260,14 +227,14 @@ class VariationalLinearization {
 
     // Derivatives (2n, n) in a ramp of the force over the whole step, of the part whose root is in the stepper.
     void ramp_derivatives(double h, double begin, double share, double* Jr) {
-        stepper.step_equation.weigh_ramp(begin, share);
-        stepper.step_equation.derivatives(h, dV, in_ramp.data(), Jr);
-        stepper.step_equation.weigh_constant();
+        stepper.equation.weigh_ramp(begin, share);
+        stepper.equation.derivatives(h, dV, in_ramp.data(), Jr);
+        stepper.equation.weigh_constant();
     }
 
     // Derivatives of the part whose root is in the stepper.
     void part_derivatives(double length) {
-        stepper.step_equation.derivatives(length, dV, chained.part.data(), chained.part_f.data());
+        stepper.equation.derivatives(length, dV, chained.part.data(), chained.part_f.data());
     }
 
     std::vector<double> joined(const std::vector<double>& Jx, const std::vector<double>& Jf) const {
@@ -279,37 +246,21 @@ class VariationalLinearization {
         return both;
     }
 
-    // Changes of Q and V at a stage and of f along w directions, each (n, w).
-    struct Moved {
-        const double *q, *v, *f;
-        int width;
-    };
-    // The sum's derivatives in them along the same directions, each (n, w).
-    struct Pulled {
-        double *q, *v, *f;
-    };
-
     // Add start' (z . d2(q1, p1)) start, (L4), at the stepper's root, after part_derivatives; `start` (2n, 3n) may be
     // null.
     void add_curvature(double h, const double* z, const double* start, double* H) {
-        const Collocation& equation = stepper.step_equation;
-        const Mechanism& mechanism = stepper.mechanism;
+        const Collocation& equation = stepper.equation;
         const int w = 3 * n;
         write_slopes(h, z);
-        stepper.step_equation.solve_transposed(h, slope.data(), multiplier.data());
+        stepper.equation.solve_transposed(h, slope.data(), multiplier.data());
         if (start != nullptr) bring_to_start(start);
         for (int i = 0; i < stages; ++i) {
-            differentiate_along(h, i, z, multiplier.data());
+            differentiate_along(h, i, z);
             move_stage(h, i, start);
             std::fill(inner.begin(), inner.end(), 0.0);
-            const Moved moved{dQ.data(), &dV[i * n * w], df.data(), w};
-            const Pulled pulled{inner.data(), &inner[n * w], H + 2 * n * w};
-            bend_stage(moved, pulled);
-            if (mechanism.forces.any()) {
-                differentiate_elements(i);
-                add_elements(h, i, z, multiplier.data(), moved, pulled);
-            }
-            if (equation.coupled()) add_couplings(h, i, z, multiplier.data(), moved, pulled);
+            bend_stage(i);
+            if (stepper.mechanism.forces.any()) add_elements(h, i, z, H + 2 * n * w);
+            if (equation.coupled()) add_couplings(h, i, z);
             for (int c = 0; c < n; ++c) {
                 const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
                 const double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
@@ -324,47 +275,9 @@ class VariationalLinearization {
         }
     }
 
-    // Add the derivatives of `bend` through one part at the stepper's root, after part_derivatives; the rows (2n, 2n)
-    // are those of the end of the step at the part's end.
-    void add_bends(double h, const std::vector<double>& rows, const double* start, const double* weights,
-                   double* found) {
-        const Collocation& equation = stepper.step_equation;
-        const int w = 3 * n;
-        multipliers.resize(entries(2 * n, stages * n));
-        moves.resize(2 * n);
-        pulls.resize(2 * n);
-        for (int a = 0; a < 2 * n; ++a) {
-            write_slopes(h, &rows[a * 2 * n]);
-            stepper.step_equation.solve_transposed(h, slope.data(), &multipliers[a * stages * n]);
-        }
-        if (start != nullptr) bring_to_start(start);
-        for (int i = 0; i < stages; ++i) {
-            move_stage(h, i, start);
-            if (stepper.mechanism.forces.any()) differentiate_elements(i);
-            std::fill(pulls.begin(), pulls.end(), 0.0);
-            const Pulled pulled{pulls.data(), &pulls[n], found + 2 * n};
-            for (int a = 0; a < 2 * n; ++a) {
-                const double *z = &rows[a * 2 * n], *along = weights + a * w, *by = &multipliers[a * stages * n];
-                for (int c = 0; c < n; ++c) {
-                    moves[c] = std::inner_product(along, along + w, &dQ[c * w], 0.0);
-                    moves[n + c] = std::inner_product(along, along + w, &dV[(i * n + c) * w], 0.0);
-                }
-                const Moved moved{moves.data(), &moves[n], along + 2 * n, 1};
-                differentiate_along(h, i, z, by);
-                bend_stage(moved, pulled);
-                if (stepper.mechanism.forces.any()) add_elements(h, i, z, by, moved, pulled);
-                if (equation.coupled()) add_couplings(h, i, z, by, moved, pulled);
-            }
-            for (int c = 0; c < n; ++c) {
-                const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w];
-                for (int k = 0; k < w; ++k) found[k] += dq[k] * pulls[c] + dv[k] * pulls[n + c];
-            }
-        }
-    }
-
     // dphi/dV_m = h b_m (zq + (A_m + F_v,m) zp) + h^2 sum_i b_i a_im (L_qq,i + F_q,i) zp into `slope`.
     void write_slopes(double h, const double* z) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation& equation = stepper.equation;
         const Tableau& tableau = equation.tableau;
         for (int m = 0; m < stages; ++m) {
             for (int c = 0; c < n; ++c) {
@@ -385,8 +298,8 @@ class VariationalLinearization {
     }
 
     // The jet at stage i and its derivative along (alpha, -multiplier), of which psi is the Lagrangian's share.
-    void differentiate_along(double h, int i, const double* z, const double* multiplier) {
-        const Collocation& equation = stepper.step_equation;
+    void differentiate_along(double h, int i, const double* z) {
+        const Collocation& equation = stepper.equation;
         const Tableau& tableau = equation.tableau;
         for (int c = 0; c < n; ++c) {
             double alpha = tableau.b[i] * z[n + c];
@@ -399,7 +312,7 @@ class VariationalLinearization {
 
     // Derivatives of Q at stage i into dQ.
     void move_stage(double h, int i, const double* start) {
-        const Tableau& tableau = stepper.step_equation.tableau;
+        const Tableau& tableau = stepper.equation.tableau;
         const int w = 3 * n;
         for (int c = 0; c < n; ++c) {
             for (int k = 0; k < w; ++k) {
@@ -410,15 +323,15 @@ class VariationalLinearization {
         }
     }
 
-    // Add (psi_qq dQ + psi_qv dV; psi_vq dQ + psi_vv dV) at the stage of `direction`.
-    void bend_stage(const Moved& moved, const Pulled& pulled) const {
-        const int w = moved.width;
+    // Add (psi_qq dQ + psi_qv dV; psi_vq dQ + psi_vv dV) at stage i, that of `direction`, to `inner`.
+    void bend_stage(int i) {
+        const int w = 3 * n;
         for (int r = 0; r < n; ++r) {
-            double *in_q = pulled.q + r * w, *in_v = pulled.v + r * w;
+            double *in_q = &inner[r * w], *in_v = &inner[(n + r) * w];
             for (int j = 0; j < n; ++j) {
                 const double qq = direction.Lqq[r * n + j].slope, vq = direction.A[r * n + j].slope;
                 const double qv = direction.A[j * n + r].slope, vv = direction.M[r * n + j].slope;
-                const double *dq = moved.q + j * w, *dv = moved.v + j * w;
+                const double *dq = &dQ[j * w], *dv = &dV[(i * n + j) * w];
                 for (int k = 0; k < w; ++k) {
                     in_q[k] += qq * dq[k] + qv * dv[k];
                     in_v[k] += vq * dq[k] + vv * dv[k];
@@ -429,7 +342,7 @@ class VariationalLinearization {
 
     // The elements' forces at stage i, with derivatives in q, in v and in f.
     void differentiate_elements(int i) {
-        const Collocation& equation = stepper.step_equation;
+        const Collocation& equation = stepper.equation;
         for (auto* along : {&along_q, &along_v, &along_f}) {
             for (int c = 0; c < n; ++c) {
                 at_q[c] = {equation.Q[i * n + c], along == &along_q ? 1.0 : 0.0};
@@ -440,17 +353,17 @@ class VariationalLinearization {
         }
     }
 
-    // Add the diagonal second derivatives of gamma . F of the elements that were differentiated at stage i.
-    void add_elements(double h, int i, const double* z, const double* multiplier, const Moved& moved,
-                      const Pulled& pulled) const {
-        const int w = moved.width;
+    // Add the diagonal second derivatives of gamma . F of elements at stage i, those in f to `by_f` (n, 3n).
+    void add_elements(double h, int i, const double* z, double* by_f) {
+        const int w = 3 * n;
+        differentiate_elements(i);
         for (int c = 0; c < n; ++c) {
-            const double gamma = weight(h, i, c, z, multiplier);
+            const double gamma = weight(h, i, c, z);
             const double qq = gamma * along_q[c].by_q.slope, qv = gamma * along_q[c].by_v.slope;
             const double vv = gamma * along_v[c].by_v.slope, ff = gamma * along_f[c].by_f.slope;
             const double qf = gamma * along_f[c].by_q.slope, vf = gamma * along_f[c].by_v.slope;
-            const double *dq = moved.q + c * w, *dv = moved.v + c * w, *of_f = moved.f + c * w;
-            double *in_q = pulled.q + c * w, *in_v = pulled.v + c * w, *in_f = pulled.f + c * w;
+            const double *dq = &dQ[c * w], *dv = &dV[(i * n + c) * w], *of_f = &df[c * w];
+            double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w], *in_f = by_f + c * w;
             for (int k = 0; k < w; ++k) {
                 in_q[k] += qq * dq[k] + qv * dv[k] + qf * of_f[k];
                 in_v[k] += qv * dq[k] + vv * dv[k] + vf * of_f[k];
@@ -460,18 +373,17 @@ class VariationalLinearization {
     }
 
     // The weight gamma of the force of stage i on coordinate c.
-    double weight(double h, int i, int c, const double* z, const double* multiplier) const {
-        const Tableau& tableau = stepper.step_equation.tableau;
+    double weight(double h, int i, int c, const double* z) const {
+        const Tableau& tableau = stepper.equation.tableau;
         double gamma = tableau.b[i] * z[n + c];
         for (int j = 0; j < stages; ++j) gamma += tableau.force[j * stages + i] * multiplier[j * n + c];
         return h * gamma;
     }
 
     // Add the second derivatives of gamma . F of couplings at stage i, by columns of the Hessian.
-    void add_couplings(double h, int i, const double* z, const double* multiplier, const Moved& moved,
-                       const Pulled& pulled) {
-        const Collocation& equation = stepper.step_equation;
-        const int w = moved.width;
+    void add_couplings(double h, int i, const double* z) {
+        const Collocation& equation = stepper.equation;
+        const int w = 3 * n;
         for (auto* matrix : {&coupled_q, &coupled_v}) matrix->resize(n * n);
         for (int along = 0; along < 2 * n; ++along) {
             for (int c = 0; c < n; ++c) {
@@ -481,15 +393,15 @@ class VariationalLinearization {
             std::fill(along_q.begin(), along_q.end(), JointForce<Dual>{});
             stepper.mechanism.couplings.add_forces(n, at_q.data(), at_v.data(), direction.couplings, along_q.data(),
                                                    coupled_q.data(), coupled_v.data());
-            const double* change = along < n ? moved.q + along * w : moved.v + (along - n) * w;
+            const double* change = along < n ? &dQ[along * w] : &dV[(i * n + along - n) * w];
             for (int c = 0; c < n; ++c) {
                 double by_q = 0.0, by_v = 0.0;
                 for (int r = 0; r < n; ++r) {
-                    const double gamma = weight(h, i, r, z, multiplier);
+                    const double gamma = weight(h, i, r, z);
                     by_q += gamma * coupled_q[r * n + c].slope;
                     by_v += gamma * coupled_v[r * n + c].slope;
                 }
-                double *in_q = pulled.q + c * w, *in_v = pulled.v + c * w;
+                double *in_q = &inner[c * w], *in_v = &inner[(n + c) * w];
                 for (int k = 0; k < w; ++k) {
                     in_q[k] += by_q * change[k];
                     in_v[k] += by_v * change[k];

@@ -21,7 +21,6 @@
 #include <limits>
 #include <vector>
 
-#include "varpin/box.hpp"
 #include "varpin/linear_step.hpp"
 #include "varpin/orthogonal.hpp"
 #include "varpin/steps.hpp"
@@ -90,14 +89,9 @@ class RootPass {
           control_norm(m),
           weight(m),
           Qu(m),
-          pulled(m),
-          pressed(m),
           Ruu_k(m),
           forced(m),
-          H(m * m),
-          K(m * size),
-          free(m),
-          box(m) {
+          K(m * size) {
         root.reset(size + 1);
         for (int i = 0; i < x; ++i) {
             double* row = root.push();
@@ -284,13 +278,11 @@ class RootPass {
             Qu[i] = linear[x + i];
             for (int l = 0; l <= i; ++l) Qu[i] += stack[l][i] * shift(l);
         }
-        const bool regular = regularize(regularization, largest);
+        const bool regular = regularize(regularization, largest, steps, r);
         double* k = gains.feedforward + r * m;
-        const double* ahead = steps.expected ? steps.expected + r * size : nullptr;
-        if (!minimize(steps.slack ? steps.slack + r * 2 * m : nullptr, ahead, others, k)) return false;
+        if (!note_loss(steps, r)) return false;
+        solve(steps, r, others, k);
         for (int i = 0; i < m; ++i) {
-            if (gains.stiffness) gains.stiffness[r * m + i] = control_norm[i] * control_norm[i];
-            if (gains.pressure && steps.slack) gains.pressure[r * m + i] = pressed[i];
             std::copy_n(&K[i * others], x, gains.feedback + (r * m + i) * x);
             if (steps.rate) std::copy_n(&K[i * others + x], m, gains.previous + (r * m + i) * m);
             gains.control_gradient[r * m + i] = costate[x + i];
@@ -300,9 +292,8 @@ class RootPass {
             found.curvature += Ruu_k[i] * Ruu_k[i];
         }
         if (gains.factors) write_factors(gains.factors + r * m * m);
-        // The rest of the controls' rows; zero up to rounding without regularization and limits.
-        const bool whole = regular && std::none_of(box.held.begin(), box.held.end(), [](char held) { return held; });
-        minimized_value(others, !whole);
+        // The rest of the controls' rows is zero up to rounding where they are as they were.
+        minimized_value(others, !regular);
         set_control_before(steps, r, others);
         return true;
     }
@@ -321,122 +312,62 @@ class RootPass {
         }
     }
 
-    // Regularize the rows of controls, each in proportion to the norm of its own column. A control without any effect
-    // is not regularized, if there are others. True if there is nothing to add.
-    bool regularize(double regularization, double largest) {
+    // Regularize the rows of controls, each in proportion to the norm of its own column, and replace the columns of
+    // controls that are held by rows of their own. A control without any effect is not regularized, if there are
+    // others. True if there is nothing to do.
+    bool regularize(double regularization, double largest, const ExpandedSteps& steps, std::ptrdiff_t r) {
         bool regular = true;
-        for (int i = 0; i < m; ++i) {
-            const bool idle = control_norm[i] == 0.0 && Qu[i] == 0.0;
-            weight[i] = idle ? largest : std::sqrt(regularization) * control_norm[i];
-            regular = regular && weight[i] == 0.0;
-        }
         firm.reset(stack.width());
         for (int i = 0; i < m; ++i) std::copy_n(stack[i], stack.width(), firm.push());
+        for (int i = 0; i < m; ++i) {
+            const bool held = steps.holds(r, i), idle = control_norm[i] == 0.0 && Qu[i] == 0.0;
+            for (int l = 0; held && l < m; ++l) firm[l][i] = 0.0;
+            weight[i] = held || idle ? largest : std::sqrt(regularization) * control_norm[i];
+            regular = regular && weight[i] == 0.0;
+        }
         if (regular) return true;
         for (int i = 0; i < m; ++i) firm.push()[i] = weight[i];
         firm.triangularize(m);
         return false;
     }
 
-    // k and K (m, others) from the firm rows, within limits if there are any, at the deviation `ahead`, null for zero.
-    bool minimize(const double* slack, const double* ahead, int others, double* k) {
-        std::fill_n(k, m, 0.0);
-        std::fill_n(K.begin(), m * others, 0.0);
-        if (slack && !solve_box(slack, ahead, others, k)) return false;
-        const int count = reduce_to_free(others, k);
-        if (!note_loss(count)) return false;
-        solve_free(count, others, k);
-        if (slack && !ahead) {
-            for (int i = 0; i < m; ++i) k[i] = std::min(std::max(k[i], slack[i]), slack[m + i]);
-        }
-        return true;
-    }
-
-    // The minimum k within limits, of which `box` holds the controls at a limit; false if there is none.
-    bool solve_box(const double* slack, const double* ahead, int others, double* k) {
+    // Add the rounding errors of the firm rows to the loss; false where a control has no minimum.
+    bool note_loss(const ExpandedSteps& steps, std::ptrdiff_t r) {
         for (int i = 0; i < m; ++i) {
-            if (firm[i][i] == 0.0) return false;
-            for (int j = 0; j < m; ++j) {
-                H[i * m + j] = 0.0;
-                for (int l = 0; l <= std::min(i, j); ++l) H[i * m + j] += firm[l][i] * firm[l][j];
-            }
-        }
-        pulled = Qu;
-        for (int i = 0; ahead && i < m; ++i) {
-            for (int l = 0; l <= i; ++l) {
-                for (int c = 0; c < others; ++c) pulled[i] += stack[l][i] * stack[l][m + c] * ahead[c];
-            }
-        }
-        if (!box.solve(H.data(), pulled.data(), slack, slack + m, k)) return false;
-        for (int i = 0; i < m; ++i) {
-            pressed[i] = pulled[i];
-            for (int j = 0; j < m; ++j) {
-                // Without what the regularization adds.
-                for (int l = 0; l <= std::min(i, j); ++l) pressed[i] += stack[l][i] * stack[l][j] * k[j];
-            }
-        }
-        return true;
-    }
-
-    // Write the firm rows of the controls that are free to U, with those at a limit in the shift; returns their number.
-    int reduce_to_free(int others, const double* k) {
-        int count = 0;
-        for (int i = 0; i < m; ++i) {
-            if (!box.held[i]) free[count++] = i;
-        }
-        U.reset(count + others + 1);
-        for (int i = 0; i < m; ++i) {
-            double* row = U.push();
-            for (int j = 0; j < count; ++j) row[j] = firm[i][free[j]];
-            std::copy_n(firm[i] + m, others + 1, row + count);
-            for (int j = 0; j < m; ++j) {
-                if (box.held[j]) row[count + others] += firm[i][j] * k[j];
-            }
-        }
-        U.triangularize(count);
-        return count;
-    }
-
-    // Add the rounding errors of U to the loss; false where a free control has no minimum.
-    bool note_loss(int count) {
-        for (int i = 0; i < count; ++i) {
-            const double pivot = std::abs(U[i][i]);
-            const int control = free[i];
+            const double pivot = std::abs(firm[i][i]);
             if (!(pivot > 0.0)) return false;
-            const bool idle = control_norm[control] == 0.0 && Qu[control] == 0.0;
-            if (!idle)
-                found.loss =
-                    std::max(found.loss, epsilon * std::max(scale[x + control], control_norm[control]) / pivot);
+            if (steps.holds(r, i) || (control_norm[i] == 0.0 && Qu[i] == 0.0)) continue;
+            found.loss = std::max(found.loss, epsilon * std::max(scale[x + i], control_norm[i]) / pivot);
         }
         return true;
     }
 
-    // L D L' of the regularized Quu from its root U, where all controls are free.
+    // L D L' of the regularized Quu from its root.
     void write_factors(double* factors) {
         for (int i = 0; i < m; ++i) {
-            factors[i * m + i] = U[i][i] * U[i][i];
-            for (int j = i + 1; j < m; ++j) factors[j * m + i] = U[i][j] / U[i][i];
+            factors[i * m + i] = firm[i][i] * firm[i][i];
+            for (int j = i + 1; j < m; ++j) factors[j * m + i] = firm[i][j] / firm[i][i];
         }
     }
 
-    // k and K of the free controls: U (k, K) = -(U_shift + U'^-1 linear, U_others).
-    void solve_free(int count, int others, double* k) {
-        for (int i = 0; i < count; ++i) {
-            double total = linear[x + free[i]];
-            for (int j = 0; j < i; ++j) total -= U[j][i] * forced[j];
-            forced[i] = total / U[i][i];
+    // k and K (m, others): R_uu (k, K) = -(shift + R_uu'^-1 linear, R_ux) in the firm rows.
+    void solve(const ExpandedSteps& steps, std::ptrdiff_t r, int others, double* k) {
+        for (int i = 0; i < m; ++i) {
+            double total = steps.holds(r, i) ? 0.0 : linear[x + i];
+            for (int j = 0; j < i; ++j) total -= firm[j][i] * forced[j];
+            forced[i] = total / firm[i][i];
         }
-        for (int i = count - 1; i >= 0; --i) {
-            const double* row = U[i];
-            double* __restrict gains = &K[free[i] * others];
-            double total = -row[count + others] - forced[i];
-            for (int c = 0; c < others; ++c) gains[c] = -row[count + c];
-            for (int j = i + 1; j < count; ++j) {
-                const double* __restrict other = &K[free[j] * others];
-                total -= row[j] * k[free[j]];
+        for (int i = m - 1; i >= 0; --i) {
+            const double* row = firm[i];
+            double* __restrict gains = &K[i * others];
+            double total = -row[m + others] - forced[i];
+            for (int c = 0; c < others; ++c) gains[c] = -row[m + c];
+            for (int j = i + 1; j < m; ++j) {
+                const double* __restrict other = &K[j * others];
+                total -= row[j] * k[j];
                 for (int c = 0; c < others; ++c) gains[c] -= row[j] * other[c];
             }
-            k[free[i]] = total / row[i];
+            k[i] = total / row[i];
             for (int c = 0; c < others; ++c) gains[c] /= row[i];
         }
     }
@@ -496,12 +427,10 @@ class RootPass {
     std::vector<double> gradient;  // (size) the next costate
     std::vector<double> terms;     // (size) the next scale
     // Work arrays of a decision.
-    RowStack firm, U;                          // regularized rows of the controls; rows of the free controls
+    RowStack firm;                             // regularized rows of the controls
     std::vector<double> control_norm, weight;  // (m) norms of the controls' columns; regularization
-    std::vector<double> Qu, pulled, pressed;   // gradient; gradient at the expected state; the same at the minimum
-    std::vector<double> Ruu_k, forced, H, K;   // R_uu k; U'^-1 linear; (m, m); (m, others)
-    std::vector<int> free;
-    BoxMinimum box;
+    std::vector<double> Qu;                    // gradient
+    std::vector<double> Ruu_k, forced, K;      // R_uu k; firm'^-1 linear; (m, others)
 };
 
 }  // namespace varpin

@@ -37,15 +37,13 @@ struct ExpandedSteps {
     const double* curvature = nullptr;  // (N, 2n + m, 2n + m) added to the Hessian in (x, u), or null
     const double* within = nullptr;     // (N, 2n, 2n) Hessian of further costs of the noise's jumps, or null
     // For each of R decisions:
-    const double* slack = nullptr;  // (R, 2, m) lower and upper limit of the change of each control, or null
-    // (R, 2n + m) expected state and previous control, at which controls are kept within their limits; null for the
-    // nominal ones.
-    const double* expected = nullptr;
+    const bool* held = nullptr;    // (R, m) the controls without feed-forward and feedback, or null for none
     const double* rate = nullptr;  // (R, m, m) Hessian of the cost of the change from the previous control, or null
     const double* pull = nullptr;  // (R, m) gradient of this cost in the control
 
     int states() const { return 2 * dof; }
     int size() const { return 2 * dof + controls; }
+    bool holds(std::ptrdiff_t decision, int control) const { return held && held[decision * controls + control]; }
     const double* gradient_at(std::ptrdiff_t point) const { return gradient + point * size(); }
     const double* hessian_at(std::ptrdiff_t point) const {
         return one_hessian ? hessian : hessian + point * size() * size();
@@ -60,9 +58,7 @@ struct Gains {
     double* control_gradient = nullptr;  // (R, m) gradient of the cost in each control
     double* costate = nullptr;           // (N, 2n) gradient of the cost after each step in the state there, or null
     double* spread = nullptr;            // (N, 2n, 2n) S, with noise only
-    double* stiffness = nullptr;         // (R, m) diagonal of Quu without regularization, or null
-    double* pressure = nullptr;          // (R, m) gradient of the model at the decision within limits, or null
-    double* factors = nullptr;           // (R, m, m) L D L' of the regularized Quu without limits, or null
+    double* factors = nullptr;           // (R, m, m) L D L' of the regularized Quu, or null
 };
 
 // A plan on N linearized steps, whose controls are each held over `hold` of them.

@@ -1,6 +1,6 @@
 // The variational stepper: collocation steps that the guards accept or that are halved, repeatedly if need be; noise
-// impulses (kicks) before the step, or one half before and one half after, or held over it as a force.
-// docs/mathematics.md, "The principal branch" and "Noise".
+// impulses (kicks) before the step, or one half before and one half after, or held over it as a force. constrained.hpp
+// overrides what differs under constraints. docs/mathematics.md, "The principal branch" and "Noise".
 // Equations (C2) and (N2) of docs/mathematics.md.
 #pragma once
 
@@ -8,10 +8,10 @@
 #include <cstdint>
 #include <vector>
 
-#include "varpin/collocation.hpp"
 #include "varpin/guards.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/policy.hpp"
+#include "varpin/step_equation.hpp"
 #include "varpin/substeps.hpp"
 #include "varpin/watch.hpp"
 
@@ -33,7 +33,11 @@ struct PathState {
           past(stages * mechanism.dof()),
           miss(most_misses * stages * mechanism.dof()),
           past_end(mechanism.dof()),
-          past_force(mechanism.dof()) {}
+          past_force(mechanism.dof()),
+          rate(mechanism.constraints.rows()),
+          impulse(mechanism.constraints.rows()),
+          past_impulse(stages * mechanism.constraints.rows()),
+          impulse_miss(most_misses * past_impulse.size()) {}
 
     std::vector<Coordinate> position;
     std::vector<Compensated> p;
@@ -51,6 +55,16 @@ struct PathState {
     int trend = 0;                       // number of rows of `miss` that would have predicted the last step best
     int level = 0;                       // halvings of the last step
     std::vector<std::uint8_t> halvings;  // of each part of every divided step in the last `roll`
+
+    // Under constraints with m rows:
+    int rank = -1;                     // of the constraints, for the whole rollout
+    int weakest = 0;                   // the row that a failed step would name
+    std::vector<double> rate;          // (m) rates of kinematic inputs at the node; zero for other rows
+    std::vector<double> impulse;       // (m) impulses of the last step, the negative sum of Lam [N s or N m s]
+    std::vector<double> past_impulse;  // (s, m) Lam of the last whole step
+    std::vector<double> impulse_miss;  // (misses, s, m) errors of its guess, as `miss`
+    int impulse_trend = 0;             // as `trend`
+    std::vector<double> impulses;      // (steps, m) impulses of the last roll
 };
 
 // Writes the error of a guess (size) and its backward differences over `known` guesses into `miss` (misses, size). The
@@ -96,22 +110,9 @@ inline void record_node(const PathState& state, int n, const Nodes& nodes, std::
 class VariationalStepper {
   public:
     VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
-                       double left, Solver solver = Solver::automatic, const Kernels& kernels = kernels_for<>)
-        : guards(guards),
-          mechanism(mechanism),
-          tableau(tableau),
-          tolerance(tolerance),
-          left(left),
-          step_equation(mechanism, this->tableau, solver, kernels),
-          energy_guard(mechanism, solver, !step_equation.eliminated(), kernels),
-          n(mechanism.dof()),
-          force(step_equation.stages * n),
-          trial(n),
-          given(step_equation.stages * n),
-          guess(step_equation.stages * n),
-          bend(2 * n),
-          extras(n),
-          at(n) {}
+                       double left, const Kernels& kernels = kernels_for<>)
+        : VariationalStepper(mechanism, tableau, tolerance, guards, left, kernels, 0) {}
+    virtual ~VariationalStepper() = default;
     VariationalStepper(const VariationalStepper&) = delete;
     VariationalStepper& operator=(const VariationalStepper&) = delete;
 
@@ -121,17 +122,20 @@ class VariationalStepper {
     const Tableau tableau;
     double tolerance;
     double left;  // share of each kick before the step; the rest acts after it
-    Collocation step_equation;
+    StepEquation equation;
     EnergyGuard energy_guard;
     int n;
+    int m;  // rows of constraints
+    int stages;
     std::vector<double> force;           // (n) constant over the step, or (s, n) at the stages of the step or its part
     int stride = 0;                      // distance of rows of `force`; 0 for a constant
     const double* outer = nullptr;       // (n) external force, null for none
     Effort effort;                       // of the last step
     std::vector<std::uint8_t> halvings;  // of each part of the last step; empty for an undivided step
 
-    // Start a path at (q, p) without history; false where M(q) is not positive definite.
-    bool begin_at(const double* q, const double* p, PathState& state) {
+    // Start a path at (q, p) without history; false where M(q) is not positive definite. With `project`, constraints
+    // absorb the part of p that is normal to them.
+    bool begin_at(const double* q, const double* p, PathState& state, bool project = true) {
         for (int i = 0; i < n; ++i) {
             state.position[i] = {{q[i], 0.0}, 0.0};
             unwind(i, state);
@@ -140,47 +144,52 @@ class VariationalStepper {
             state.momentum[i] = p[i];
         }
         diffusion_centers(mechanism, q, state.center.data());
-        state.known = state.level = state.trend = 0;
-        if (!look_at(state)) return false;
+        state.known = state.level = state.trend = state.impulse_trend = 0;
+        if (!enter(state, project)) return false;
         energy_guard.begin(at.data(), state.momentum.data(), state.v.data(), state.energies);
         return true;
     }
 
     // Start a path at (q, v).
     bool begin(const double* q, const double* v, PathState& state) {
-        Jet<double>& jet = step_equation.stage[0];
-        step_equation.kernels.first_order(mechanism, q, v, jet);
+        Jet<double>& jet = equation.stage[0];
+        equation.kernels.first_order(mechanism, q, v, jet);
         if (!begin_at(q, jet.Lv.data(), state)) return false;
-        std::copy(v, v + n, state.v.begin());
+        if (m == 0) std::copy(v, v + n, state.v.begin());
         return true;
     }
 
-    // Factor M at a path's node, for kicks and guesses.
-    bool look_at(PathState& state) {
+    // Factor M at a path's node, for kicks and guesses, and find its constraints.
+    virtual bool look_at(PathState& state) {
         for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
         return energy_guard.node(at.data(), state.momentum.data(), state.v.data());
     }
 
-    // Add an impulse (n) to the momentum. Its change of the energy counts as work, not as an error.
+    // Add an impulse (n) to the momentum; constraints absorb its normal part. Its change of the energy counts as work,
+    // not as an error.
     void kick(const double* impulse, PathState& state) {
         for (int i = 0; i < n; ++i) {
             state.p[i] = state.p[i].plus(impulse[i]);
             state.momentum[i] = state.p[i].high;
             at[i] = state.position[i].value.high;
         }
+        absorb(state);
         energy_guard.kicked(at.data(), state.momentum.data(), state.v.data(), state.energies);
     }
 
-    // Set the force of a step: (n) constant over it, or (s, n) at its stages if it `varies`.
-    void take_force(const double* own, bool varies) {
+    // Set the force of a step: (n) constant over it, or (s, n) at its stages if it `varies`; and the rates of cubic
+    // kinematic inputs at their goals, in the order of their rows, unless null.
+    void take_force(const double* own, bool varies, const double* rates = nullptr) {
         stride = varies ? n : 0;
-        std::copy(own, own + (varies ? step_equation.stages * n : n), force.begin());
+        std::copy(own, own + (varies ? stages * n : n), force.begin());
         if (varies) given = force;
+        take_goals(1);
+        if (rates) take_rates(rates);
     }
 
     // Interpolate a varying force to the stages of the part of the step at `begin` with length `share`, both in units
     // of the step, by the polynomial through the stages of the whole step.
-    void force_in_part(double begin, double share) {
+    virtual void force_in_part(double begin, double share) {
         if (stride != 0) bring_to_part(tableau, n, given.data(), begin, share, force.data());
     }
 
@@ -188,6 +197,7 @@ class VariationalStepper {
     // the extrapolated past, the others from the current velocity.
     Outcome step(double h, PathState& state) {
         effort = {};
+        std::fill(state.impulse.begin(), state.impulse.end(), 0.0);
         const int level = std::max(state.level - 1, 0);
         const auto take = [&](int level, double begin, bool extrapolated) {
             if (extrapolated) {
@@ -211,11 +221,19 @@ class VariationalStepper {
     }
 
     // The part of a step of length h at `begin`, in units of the step, after `level` halvings. The guess is the current
-    // velocity, as for every part. Leaves the jets at the root in step_equation.
+    // velocity, as for every part. Leaves the jets at the root in `equation`.
     Outcome part(double h, int level, double begin, PathState& state) {
         force_in_part(begin, length_of(1.0, level));
         guess_velocity(state);
         return attempt(length_of(h, level), state, true);
+    }
+
+    // A whole step from a guess (s, n) close to its root.
+    Outcome from_guess(double h, const double* V, PathState& state) {
+        std::copy(V, V + stages * n, equation.V.begin());
+        std::fill(impulse.begin(), impulse.end(), 0.0);
+        force_in_part(0.0, 1.0);
+        return attempt(h, state, true);
     }
 
     // Advances every path by N steps. Writes the node after each step, its controls and its statistics into `nodes`. A
@@ -226,18 +244,21 @@ class VariationalStepper {
     void roll(double h, const Commands& commands, const double* increments, const double* drift, const double* impulses,
               std::vector<PathState>& states, const Nodes& nodes, Watch* watch = nullptr) {
         const std::int64_t steps = nodes.steps;
-        const int m = mechanism.controls, stages = step_equation.stages;
+        const int controls = mechanism.controls;
         const std::int64_t width = increments_of_step(mechanism, commands);
         const bool noisy = increments != nullptr && width > 0;
         const bool kicks = noisy && !held;
         const double *pushes = held ? nullptr : impulses, *spread = held ? impulses : nullptr;
         for (std::int64_t path = 0; path < nodes.paths; ++path) {
             PathState& state = states[path];
-            double* u = nodes.u + path * steps * m;
-            look_at(state);
+            double* u = nodes.u + path * steps * controls;
+            const bool regular = look_at(state);
             state.halvings.clear();
-            nodes.ended[path] = static_cast<std::int64_t>(Outcome::solved);
+            state.impulses.clear();
+            state.impulses.reserve(steps * m);
+            nodes.ended[path] = static_cast<std::int64_t>(regular ? Outcome::solved : Outcome::singular);
             nodes.done[path] = 0;
+            if (!regular) continue;
             for (std::int64_t s = 0; s < steps; ++s) {
                 const std::int64_t row = path * steps + s;
                 const double* dw = noisy ? increments + row * width : nullptr;
@@ -251,16 +272,15 @@ class VariationalStepper {
                                state.center.data(), felt, held ? dw : nullptr, extras.data());
                 outer = extra.external;
                 stride = within ? n : 0;
-                if (within) {
-                    stage_forces(mechanism, extra.driven, within, stages, given.data());
-                } else {
-                    constant_force(mechanism, extra.driven, u + s * m, force.data());
-                }
+                constant_force(mechanism, extra.driven, u + s * controls, force.data());
+                if (within) stage_forces(mechanism, extra.driven, within, stages, given.data());
+                take_goals(commands.hold - static_cast<int>(s % commands.hold), u + s * controls);
                 const Outcome outcome = step(h, state);
                 record_effort(effort, nodes, row);
                 nodes.ended[path] = static_cast<std::int64_t>(outcome);
                 if (outcome != Outcome::solved) break;
                 state.halvings.insert(state.halvings.end(), halvings.begin(), halvings.end());
+                state.impulses.insert(state.impulses.end(), state.impulse.begin(), state.impulse.end());
                 if (kicks && left < 1.0) noise_kick(1.0 - left, felt, dw, state);
                 if (pushes) kick(pushes + (2 * row + 1) * n, state);
                 record_node(state, n, nodes, row);
@@ -280,53 +300,120 @@ class VariationalStepper {
         if (unwinds(i)) state.position[i].unwind();
     }
 
-  private:
+  protected:
+    VariationalStepper(const Mechanism& mechanism, const Tableau& tableau, double tolerance, const Guards& guards,
+                       double left, const Kernels& kernels, int rows)
+        : guards(guards),
+          mechanism(mechanism),
+          tableau(tableau),
+          tolerance(tolerance),
+          left(left),
+          equation(mechanism, this->tableau, rows > 0, kernels),
+          energy_guard(mechanism, rows > 0, rows > 0 || !equation.eliminated(), kernels),
+          n(mechanism.dof()),
+          m(rows),
+          stages(tableau.stages),
+          force(stages * n),
+          trial(n),
+          given(stages * n),
+          impulse(stages * m),
+          pushed(m > 0 ? stages * n : 0),
+          push_size(pushed.size()),
+          at(n),
+          guess(stages * n),
+          bend(2 * n),
+          extras(n) {}
+
+    // What differs under constraints.
+
+    // Enter the first node of a path.
+    virtual bool enter(PathState& state, bool project) {
+        static_cast<void>(project);
+        return look_at(state);
+    }
+    // Remove the part of a path's momentum that is normal to the constraints.
+    virtual void absorb(PathState&) {}
+    // Read the goals of kinematic inputs, in `steps` steps, from `force`, and their rates from the controls.
+    virtual void take_goals(int steps, const double* controls = nullptr) {
+        static_cast<void>(steps), static_cast<void>(controls);
+    }
+    virtual void take_rates(const double*) {}
+    // Solve the step equation of a substep from the guess.
+    virtual Outcome solve(double h, PathState& state, bool jets_wanted) {
+        return equation.solve(h, start_of(state), tolerance, jets_wanted, effort);
+    }
+    // The branch margin of the root.
+    virtual Outcome measure_branch(double h, double& margin) {
+        margin = energy_guard.branch_margin(h, guards, equation);
+        return margin > 0.0 ? Outcome::solved : Outcome::fold;
+    }
+    // Finish the node in `trial`.
+    virtual Outcome end(double h, PathState& state, bool jets_wanted) {
+        static_cast<void>(h), static_cast<void>(state), static_cast<void>(jets_wanted);
+        return Outcome::solved;
+    }
+    // Follow a path that has moved to the node; `turned` if whole turns were removed.
+    virtual Outcome arrive(PathState& state, bool turned) {
+        static_cast<void>(state), static_cast<void>(turned);
+        return Outcome::solved;
+    }
+
+    Start start_of(const PathState& state) const {
+        return {state.position.data(), state.p.data(), force.data(), stride, outer};
+    }
+
     Trial trial;
-    std::vector<double> given;   // (s, n) varying force at the stages of the whole step
+    std::vector<double> given;              // (s, n) varying force at the stages of the whole step
+    std::vector<double> impulse;            // (s, m) Lam_k of the constraints, zero for omitted rows
+    std::vector<double> pushed, push_size;  // (s, n) C_k' Lam_k and the size of its terms; empty without constraints
+    std::vector<double> at;                 // (n)
+
+  private:
     std::vector<double> line;    // (s, m) linear controls at these stages
     std::vector<double> seen;    // (2, m) what the noise sees of them
     std::vector<double> guess;   // (s, n) extrapolated stage velocities
     std::vector<double> bend;    // (2, n)
     std::vector<double> extras;  // (n) forces in addition to the controls
-    std::vector<double> at;      // (n)
 
     // The force on coordinate c, without those of elements, if it is constant over the step.
     double constant(int c) const { return outer ? force[c] + outer[c] : force[c]; }
 
     void guess_velocity(const PathState& state) {
-        for (int i = 0; i < step_equation.stages; ++i)
-            std::copy(state.v.begin(), state.v.end(), step_equation.V.begin() + i * n);
+        for (int i = 0; i < stages; ++i) std::copy(state.v.begin(), state.v.end(), equation.V.begin() + i * n);
+        std::fill(impulse.begin(), impulse.end(), 0.0);
     }
 
-    // One substep from the guess in step_equation.V; advances the path only if the substep is accepted.
+    // One substep from the guess in equation.V; advances the path only if the substep is accepted.
     Outcome attempt(double h, PathState& state, bool jets_wanted) {
-        auto& equation = step_equation;
-        const Outcome solved = equation.solve(h, {state.position.data(), state.p.data(), force.data(), stride, outer},
-                                              tolerance, jets_wanted, effort);
-        if (solved != Outcome::solved) return solved;
-        const double margin = guards.active ? energy_guard.branch_margin(h, guards, equation) : infinity;
-        if (!(margin > 0.0)) return Outcome::fold;
-        equation.stages == 1 ? advance(1, h, state) : advance(equation.stages, h, state);
-        const Outcome outcome = energy_guard.accept(guards, tableau, state.energies, state.position, state.v, trial);
+        Outcome outcome = solve(h, state, jets_wanted);
+        double margin = infinity;
+        if (outcome == Outcome::solved && guards.active) outcome = measure_branch(h, margin);
+        if (outcome != Outcome::solved) return outcome;
+        stages == 1 ? advance(1, h, state) : advance(stages, h, state);
+        outcome = end(h, state, jets_wanted);
+        if (outcome != Outcome::solved) return outcome;
+        outcome = energy_guard.accept(guards, tableau, state.energies, state.position, state.v, trial, m > 0);
         if (outcome != Outcome::solved) return outcome;
         effort.branch_margin = std::min(effort.branch_margin, margin);
         ++effort.substeps;
         std::swap(state.position, trial.position);
         std::swap(state.p, trial.p);
+        bool turned = false;
         for (int i = 0; i < n; ++i) {
+            const double turns = state.position[i].turns;
             unwind(i, state);
+            turned = turned || state.position[i].turns != turns;
             state.q[i] = state.position[i].shown();
         }
         std::copy(trial.momentum.begin(), trial.momentum.end(), state.momentum.begin());
         std::copy(trial.v.begin(), trial.v.end(), state.v.begin());
-        return Outcome::solved;
+        return arrive(state, turned);
     }
 
     // The node after the substep, (C2), and the work of forces in it, into `trial`.
     [[gnu::always_inline]] inline void advance(const int stages, double h, const PathState& state) {
-        const auto& equation = step_equation;
         for (int c = 0; c < n; ++c) {
-            double move = 0.0, impulse = 0.0, rest = 0.0;
+            double move = 0.0, momentum = 0.0, rest = 0.0, across_rows = 0.0;
             trial.work[c] = trial.dissipated[c] = trial.magnitude[c] = 0.0;
             // The rounding of q is proportional to its distance from 0, without whole turns.
             const double distance =
@@ -335,7 +422,7 @@ class VariationalStepper {
                 const double share = h * tableau.b[i], velocity = equation.V[i * n + c];
                 const JointForce<double>& element = equation.acting[i * n + c];
                 move += tableau.b[i] * velocity;
-                impulse += tableau.b[i] * equation.slope[i * n + c];
+                momentum += tableau.b[i] * equation.slope[i * n + c];
                 rest += tableau.b[i] * equation.slope_rest[i * n + c];
                 const double given_force = force[i * stride + c];
                 trial.work[c] += share * (given_force + element.value) * velocity;
@@ -344,21 +431,24 @@ class VariationalStepper {
                 // Rounding of the terms that cancel, and change of the potential by rounding of q.
                 trial.magnitude[c] +=
                     share * scale * std::abs(velocity) + tableau.b[i] * std::abs(equation.stage[i].Lq[c]) * distance;
+                if (pushed.empty()) continue;
+                across_rows += pushed[i * n + c];
+                trial.magnitude[c] += push_size[i * n + c] * std::abs(velocity);
             }
             trial.position[c] = {state.position[c].value.plus(h * move), state.position[c].turns};
-            trial.p[c] = state.p[c].plus(h * impulse, h * rest);
+            trial.p[c] = state.p[c].plus(h * momentum - across_rows, h * rest);
         }
     }
 
     // Extrapolate the last whole step to the stage velocities: the polynomial through its stages and its end, shifted
-    // by later kicks of the velocity, and corrected for the change of a constant force. The error of this guess is
+    // by later kicks of the velocity, and without constraints corrected for the change of a constant force; and the
+    // last impulses of constraints. The error of this guess is
     // extrapolated too, by backward differences of the order that would have predicted the last step best.
     void extrapolate(double h, const PathState& state) {
-        const int stages = step_equation.stages;
         double *change = bend.data(), *acceleration = change + n;
         bool changed = false;
         for (int c = 0; c < n; ++c) {
-            change[c] = stride == 0 ? constant(c) - state.past_force[c] : 0.0;
+            change[c] = stride == 0 && m == 0 ? constant(c) - state.past_force[c] : 0.0;
             changed = changed || change[c] != 0.0;
         }
         if (changed) {
@@ -376,17 +466,23 @@ class VariationalStepper {
                 guess[k] = total + h * tableau.c[i] * acceleration[c];
                 double missing = 0.0;
                 for (int r = 0; r < state.trend; ++r) missing += state.miss[r * stages * n + k];
-                step_equation.V[k] = guess[k] + missing;
+                equation.V[k] = guess[k] + missing;
             }
+        }
+        for (int k = 0; k < stages * m; ++k) {
+            impulse[k] = state.past_impulse[k];
+            for (int r = 0; r < state.impulse_trend; ++r) impulse[k] += state.impulse_miss[r * stages * m + k];
         }
     }
 
     void remember(PathState& state) {
-        std::copy(step_equation.V.begin(), step_equation.V.end(), state.past.begin());
         if (state.known > 0) {
-            state.trend = follow_misses(step_equation.V.data(), guess.data(), step_equation.stages * n, state.known,
-                                        state.miss.data());
+            state.trend = follow_misses(equation.V.data(), guess.data(), stages * n, state.known, state.miss.data());
+            state.impulse_trend = follow_misses(impulse.data(), state.past_impulse.data(), stages * m, state.known,
+                                                state.impulse_miss.data());
         }
+        std::copy(equation.V.begin(), equation.V.end(), state.past.begin());
+        state.past_impulse = impulse;
         std::copy(state.v.begin(), state.v.end(), state.past_end.begin());
         for (int c = 0; c < n; ++c) state.past_force[c] = constant(c);
         state.known = std::min(state.known + 1, PathState::most_misses + 1);

@@ -18,6 +18,9 @@ from varpin.model import Robot
 from varpin.support.checks import finite
 from varpin.support.frozen import Frozen
 
+# Scales of places and of joints without a finite range: a tenth of an arm's reach [m], or of a turn [rad].
+LENGTH = 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class Horizon(Frozen):
@@ -45,6 +48,11 @@ class Horizon(Frozen):
     def steps(self) -> int:
         """N."""
         return len(self.t) - 1
+
+    @property
+    def places(self) -> tuple[Integers, Floats]:
+        """All nodes but the first, whose state is given, and their times."""
+        return np.arange(1, self.steps + 1), self.t[1:]
 
 
 class Slopes(NamedTuple):
@@ -149,24 +157,9 @@ def _argument(value: object) -> str:
     return repr(value.tolist() if isinstance(value, np.ndarray) else value)
 
 
-def require_same(constraint: PlanConstraint, made_for: Robot, horizon: Horizon) -> None:
-    """Raise an InputError for a constraint that was made for another robot than the problem's."""
-    robot = horizon.robot
-    if made_for.joint_names != robot.joint_names or not made_for.built_like(robot):
-        raise InputError(
-            f"{constraint.label} is for robot {made_for.name!r} with {made_for.dof} coordinates, another one than the "
-            f"problem's {robot.name!r} with {robot.dof}, or one of other lengths; make it with scene.robot"
-        )
-
-
 def checked_margin(constraint: PlanConstraint, margin: object) -> float:
     """A margin in standard deviations as a float >= 0."""
     number = finite(f"{type(constraint).__name__} margin", margin)
     if number < 0.0:
         raise InputError(f"{type(constraint).__name__} margin must be >= 0 [standard deviations], got {number:g}")
     return number
-
-
-def nodes_after(horizon: Horizon) -> tuple[Integers, Floats]:
-    """All nodes but the first, whose state is given, and their times."""
-    return np.arange(1, horizon.steps + 1), horizon.t[1:]

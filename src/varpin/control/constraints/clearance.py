@@ -11,20 +11,17 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.control.constraints.base import (
+    LENGTH,
     BoundConstraint,
     Horizon,
     PlanConstraint,
     checked_margin,
-    nodes_after,
-    require_same,
 )
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
 from varpin.model.clearance import Clearance, Obstacle, clearance
+from varpin.model.kinematics import require_same
 from varpin.support.checks import finite, flag, path_like
-
-# Scale: a tenth of an arm's reach [m].
-_LENGTH = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +43,8 @@ class KeepClear(PlanConstraint):
     """distance(q) >= distance for every pair, at every node after the first: links stay clear of obstacles.
 
     Each link is modelled by the smallest capsule around its shapes, which is larger than the link; ``capsules`` gives
-    others. Distances between capsules and spheres are exact; coal computes those of boxes and
-    convex hulls. Derivatives are those of the
-    nearest points.
+    others. Distances between capsules and spheres are exact; coal computes those of boxes and convex hulls. Derivatives
+    are those of the nearest points.
     """
 
     robot: Robot
@@ -117,7 +113,6 @@ class KeepClear(PlanConstraint):
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
-        require_same(self, self.robot, horizon)
-        places, times = nodes_after(horizon)
-        of = self._of.over(times)
-        return _BoundClearance(self, places, times, self.pairs, "m", _LENGTH, of, self.distance)
+        require_same(self.label, self.robot, horizon.robot)
+        places, times = horizon.places
+        return _BoundClearance(self, places, times, self.pairs, "m", LENGTH, self._of.over(times), self.distance)

@@ -12,21 +12,20 @@ from numpy.typing import ArrayLike
 
 from varpin.arrays import Floats
 from varpin.control.constraints.base import (
+    LENGTH,
     BoundConstraint,
     Horizon,
     PlanConstraint,
     checked_margin,
-    nodes_after,
-    require_same,
 )
 from varpin.errors import InputError
 from varpin.model import Robot, require_robot
-from varpin.model.kinematics import FrameKinematics, frame_kinematics
-from varpin.support.checks import as_floats, checked_limits, finite, finite_array, over_time, positive, rotation_matrix
+from varpin.model.kinematics import frame_kinematics, require_same
+from varpin.support.checks import checked_limits, finite, finite_array, over_time, positive, rotation_matrix
 
 _XYZ = ("x", "y", "z")
-# Scales: a tenth of an arm's reach [m] and of a large rotation [rad].
-_LENGTH, _ANGLE = 0.1, 0.3
+# Scale: a tenth of a large rotation [rad].
+_ANGLE = 0.3
 
 
 class _OfFrame(PlanConstraint):
@@ -78,11 +77,11 @@ class ReachFrame(_OfFrame):
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
-        require_same(self, self.robot, horizon)
+        require_same(self.label, self.robot, horizon.robot)
         rows: tuple[str, ...] = () if self.position is None else tuple(f"position {axis}" for axis in _XYZ)
         rows += () if self.rotation is None else tuple(f"rotation {axis}" for axis in _XYZ)
         unit = "m and rad" if len(rows) == 6 else "m" if self.rotation is None else "rad"
-        scale = _LENGTH if self.position is not None else _ANGLE
+        scale = LENGTH if self.position is not None else _ANGLE
         return _BoundGoal(self, np.array([horizon.steps]), horizon.t[-1:], rows, unit, scale, self)
 
 
@@ -146,12 +145,7 @@ class _BoundRegion(BoundConstraint):
 
 
 class _Region(_OfFrame):
-    kinematics: FrameKinematics
-
-    @property
-    @abstractmethod
-    def _rows(self) -> tuple[str, ...]:
-        """Description of each row of c."""
+    _rows: tuple[str, ...]
 
     @abstractmethod
     def distances(self, p: Floats) -> Floats:
@@ -163,9 +157,9 @@ class _Region(_OfFrame):
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
-        require_same(self, self.robot, horizon)
-        places, times = nodes_after(horizon)
-        return _BoundRegion(self, places, times, self._rows, "m", _LENGTH, self, self.shifts(times))
+        require_same(self.label, self.robot, horizon.robot)
+        places, times = horizon.places
+        return _BoundRegion(self, places, times, self._rows, "m", LENGTH, self, self.shifts(times))
 
     def shifts(self, times: Floats) -> Floats:  # noqa: ARG002
         """Displacements of the region at given times (K,) [s]: (K, 3), or (1, 3) where it does not move [m].
@@ -176,8 +170,26 @@ class _Region(_OfFrame):
         return np.zeros((1, 3))
 
 
-class KeepInHalfSpace(_Region):
+class _WithinPlanes(_Region):
+    """outward . p <= most, with outward unit normals (rows, 3) and distances along them (rows,) [m]."""
+
+    _outward: Floats
+    _most: Floats
+
+    def distances(self, p: Floats) -> Floats:
+        """See the base."""
+        found: Floats = p @ self._outward.T - self._most
+        return found
+
+    def slopes(self, p: Floats) -> Floats:
+        """See the base."""
+        return np.broadcast_to(self._outward, (len(p), *self._outward.shape))
+
+
+class KeepInHalfSpace(_WithinPlanes):
     """normal . p(q) >= offset at every node after the first: a frame's origin stays on one side of a plane."""
+
+    _rows = ("the plane",)
 
     def __init__(self, robot: Robot, frame: str, normal: ArrayLike, offset: float, *, margin: float = 0.0) -> None:
         """Describe the constraint.
@@ -202,22 +214,10 @@ class KeepInHalfSpace(_Region):
         self.normal = given / length
         self.offset = finite("KeepInHalfSpace offset", offset) / length
         self.margin = checked_margin(self, margin)
-
-    @property
-    def _rows(self) -> tuple[str, ...]:
-        return ("the plane",)
-
-    def distances(self, p: Floats) -> Floats:
-        """See the base."""
-        found: Floats = self.offset - p @ self.normal[:, None]
-        return found
-
-    def slopes(self, p: Floats) -> Floats:
-        """See the base."""
-        return np.broadcast_to(-self.normal, (len(p), 1, 3))
+        self._outward, self._most = -self.normal[None], np.array([-self.offset])
 
 
-class KeepInBox(_Region):
+class KeepInBox(_WithinPlanes):
     """lower <= p(q) <= upper at every node after the first: a frame's origin stays in a box along the world's axes."""
 
     def __init__(self, robot: Robot, frame: str, lower: ArrayLike, upper: ArrayLike, *, margin: float = 0.0) -> None:
@@ -239,28 +239,18 @@ class KeepInBox(_Region):
         if not np.isfinite(self.limits).any():
             raise InputError("KeepInBox has no finite side")
         self.margin = checked_margin(self, margin)
-        self._sides = [(a, k) for k in (1, 0) for a in range(3) if np.isfinite(self.limits[k, a])]
-
-    @property
-    def _rows(self) -> tuple[str, ...]:
-        return tuple(f"{'upper' if k else 'lower'} side in {_XYZ[a]}" for a, k in self._sides)
-
-    def distances(self, p: Floats) -> Floats:
-        """See the base."""
-        sides = [p[:, a] - self.limits[1, a] if k else self.limits[0, a] - p[:, a] for a, k in self._sides]
-        return np.column_stack(sides)
-
-    def slopes(self, p: Floats) -> Floats:
-        """See the base."""
-        one = np.zeros((len(self._sides), 3))
-        for i, (a, k) in enumerate(self._sides):
-            one[i, a] = 1.0 if k else -1.0
-        return np.broadcast_to(one, (len(p), *one.shape))
+        # Upper sides, then lower ones.
+        sides, axes = np.nonzero(np.isfinite(self.limits[::-1]))
+        signs = np.where(sides == 0, 1.0, -1.0)
+        self._outward, self._most = signs[:, None] * np.eye(3)[axes], signs * self.limits[::-1][sides, axes]
+        names = ("upper", "lower")
+        self._rows = tuple(f"{names[side]} side in {_XYZ[axis]}" for side, axis in zip(sides, axes, strict=True))
 
 
 class _OfSphere(_Region):
     outside: bool
     center: Floats | Callable[[float], ArrayLike]
+    _rows = ("the sphere",)
 
     def __init__(
         self,
@@ -286,15 +276,9 @@ class _OfSphere(_Region):
         """
         self._take(robot, frame)
         name = type(self).__name__
-        self.center = (
-            center if callable(center) else finite_array(f"{name} center", as_floats(f"{name} center", center), (3,))
-        )
+        self.center = center if callable(center) else finite_array(f"{name} center", center, (3,))
         self.radius = positive(f"{name} radius", radius, "m")
         self.margin = checked_margin(self, margin)
-
-    @property
-    def _rows(self) -> tuple[str, ...]:
-        return ("the sphere",)
 
     def shifts(self, times: Floats) -> Floats:
         """See the base: positions are relative to the centre."""

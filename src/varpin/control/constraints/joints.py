@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from varpin.arrays import Floats, Integers
-from varpin.control.constraints.base import (
-    BoundConstraint,
-    Horizon,
-    PlanConstraint,
-    checked_margin,
-    nodes_after,
-    require_same,
-)
+from varpin.control.constraints.base import LENGTH, BoundConstraint, Horizon, PlanConstraint, checked_margin
 from varpin.errors import InputError
 from varpin.model import Robot, joint_unit, require_robot
-from varpin.support.checks import JointValues, as_floats, control_array, finite, finite_array, real, some_limits
+from varpin.model.kinematics import require_same
+from varpin.support.checks import JointValues, as_floats, control_array, control_values, real, some_limits
 
-# Scales of joints without a finite range [rad or m; rad/s or m/s].
-_POSITION, _SPEED = 0.1, 0.5
+# Scale of velocities without a finite range [rad/s or m/s].
+_SPEED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,37 +59,31 @@ class _WithinLimits(PlanConstraint):
         """
         self.robot = require_robot(robot, type(self).__name__)
         name = type(self).__name__
-        self.limits = some_limits(name, limits, self._limits_of(robot), robot.name, robot.joint_names)
+        own = (-robot.velocity_limit, robot.velocity_limit) if self.in_velocity else robot.position_limits
+        self.limits = some_limits(name, limits, own, robot.name, robot.joint_names)
         self.margin = checked_margin(self, margin)
-
-    @staticmethod
-    @abstractmethod
-    def _limits_of(robot: Robot) -> tuple[Floats, Floats]:
-        """The robot's limits."""
 
     def bind(self, horizon: Horizon) -> BoundConstraint:
         """See :meth:`PlanConstraint.bind`."""
-        require_same(self, self.robot, horizon)
-        columns, signs, bounds, rows = [], [], [], []
-        for sign, side, limits in ((1.0, "upper", self.limits[1]), (-1.0, "lower", self.limits[0])):
-            for c in np.flatnonzero(np.isfinite(limits)):
-                columns.append(int(c))
-                signs.append(sign)
-                bounds.append(sign * limits[c])
-                rows.append(f"{side} limit of {self.robot.joint_names[c]}")
+        require_same(self.label, self.robot, horizon.robot)
+        # Upper limits, then lower ones.
+        sides, columns = np.nonzero(np.isfinite(self.limits[::-1]))
+        signs = np.where(sides == 0, 1.0, -1.0)
+        names = ("upper", "lower")
         ranges = self.limits[1] - self.limits[0]
         whole = ranges[np.isfinite(ranges) & (ranges > 0.0)]
-        scale = 0.1 * float(np.median(whole)) if whole.size else (_SPEED if self.in_velocity else _POSITION)
         return _BoundBox(
             self,
-            *nodes_after(horizon),
-            tuple(rows),
-            joint_unit(self.robot, sorted(set(columns)), speed=self.in_velocity),
-            scale,
+            *horizon.places,
+            tuple(
+                f"{names[side]} limit of {self.robot.joint_names[c]}" for side, c in zip(sides, columns, strict=True)
+            ),
+            joint_unit(self.robot, sorted(set(columns.tolist())), speed=self.in_velocity),
+            0.1 * float(np.median(whole)) if whole.size else (_SPEED if self.in_velocity else LENGTH),
             self.in_velocity,
-            np.array(columns),
-            np.array(signs),
-            np.array(bounds),
+            columns,
+            signs,
+            signs * self.limits[::-1][sides, columns],
         )
 
 
@@ -108,10 +95,6 @@ class WithinJointLimits(_WithinLimits):
 
     in_velocity = False
 
-    @staticmethod
-    def _limits_of(robot: Robot) -> tuple[Floats, Floats]:
-        return robot.position_limits
-
 
 class WithinVelocityLimits(_WithinLimits):
     """lower <= v <= upper at every node after the first: joints stay within their velocity limits.
@@ -120,10 +103,6 @@ class WithinVelocityLimits(_WithinLimits):
     """
 
     in_velocity = True
-
-    @staticmethod
-    def _limits_of(robot: Robot) -> tuple[Floats, Floats]:
-        return -robot.velocity_limit, robot.velocity_limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,10 +129,7 @@ class BoundRate(BoundConstraint):
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:  # noqa: ARG002
         """See :meth:`BoundConstraint.value`."""
-        return self.of_decisions(u[..., :: self.hold, :])
-
-    def of_decisions(self, u: Floats) -> Floats:
-        """The values c (..., K, rows) for decisions u (..., R, m)."""
+        u = u[..., :: self.hold, :]
         first = u[..., :1, :] if self.before is None else np.broadcast_to(self.before, (*u.shape[:-2], 1, u.shape[-1]))
         rate = np.diff(u, axis=-2, prepend=first)[..., self.places, :] / self.period
         rates, most = rate[..., self.limited], self.limit[self.limited]
@@ -184,11 +160,11 @@ class WithinControlRate(PlanConstraint):
         Raises:
             InputError: A limit that is not positive, or NaN.
         """
-        self.limit = dict(limit) if isinstance(limit, Mapping) else as_floats("WithinControlRate limit", limit)
-        least = [real("WithinControlRate limit", x) for x in limit.values()] if isinstance(limit, Mapping) else None
-        values = np.array(least) if least is not None else np.asarray(self.limit)
-        if not (values > 0.0).all():
-            raise InputError(f"WithinControlRate limit must be > 0 [control/s], got {limit!r}")
+        name = "WithinControlRate limit"
+        self.limit = dict(limit) if isinstance(limit, Mapping) else as_floats(name, limit)
+        values = [real(name, x) for x in self.limit.values()] if isinstance(self.limit, dict) else self.limit
+        if not (np.asarray(values) > 0.0).all():
+            raise InputError(f"{name} must be > 0 [control/s], got {limit!r}")
         self.before = before
 
     def after(self, before: Floats) -> PlanConstraint:
@@ -209,16 +185,9 @@ class WithinControlRate(PlanConstraint):
             raise InputError(f"{name} limit must be finite for some control")
         before = horizon.before
         if self.before is not None:
-            given = self.before
-            if isinstance(given, Mapping):
-                command = control_array(f"{name} before", given, joints)
-            elif np.ndim(given) == 0:
-                command = np.full(m, finite(f"{name} before", given))
-            else:
-                command = finite_array(f"{name} before", given, (m,))
-            if before is not None and not np.array_equal(before, command):
+            before = control_values(f"{name} before", self.before, joints, m, uniform=True)
+            if horizon.before is not None and not np.array_equal(before, horizon.before):
                 raise InputError(f"{name} and ControlRateCost must have the same control before")
-            before = command
         names = joints if joints is not None else tuple(f"control {i}" for i in range(m))
         limited = np.flatnonzero(np.isfinite(limit))
         period = float(horizon.t[horizon.hold] - horizon.t[0])

@@ -1,8 +1,5 @@
 """Costs: integrals over time and terms at the end, which add up."""
 
-from varpin.control.costs.barriers import JointLimitBarrier as JointLimitBarrier
-from varpin.control.costs.barriers import VelocityLimitBarrier as VelocityLimitBarrier
-from varpin.control.costs.barriers import barriers_of as barriers_of
 from varpin.control.costs.base import BoundCost as BoundCost
 from varpin.control.costs.base import BoundSum as BoundSum
 from varpin.control.costs.base import Cost as Cost
@@ -12,13 +9,15 @@ from varpin.control.costs.base import Expansion as Expansion
 from varpin.control.costs.base import Points as Points
 from varpin.control.costs.base import Terminal as Terminal
 from varpin.control.costs.custom import CustomCost as CustomCost
-from varpin.control.costs.quadratic import ControlCost as ControlCost
-from varpin.control.costs.quadratic import TrackingCost as TrackingCost
-from varpin.control.costs.quadratic import VelocityCost as VelocityCost
+from varpin.control.costs.joints import ControlCost as ControlCost
+from varpin.control.costs.joints import JointLimitBarrier as JointLimitBarrier
+from varpin.control.costs.joints import TrackingCost as TrackingCost
+from varpin.control.costs.joints import VelocityCost as VelocityCost
+from varpin.control.costs.joints import VelocityLimitBarrier as VelocityLimitBarrier
+from varpin.control.costs.least_squares import weight_matrix as weight_matrix
 from varpin.control.costs.rate import ControlRate as ControlRate
 from varpin.control.costs.rate import ControlRateCost as ControlRateCost
 from varpin.control.costs.rate import control_rate as control_rate
-from varpin.control.costs.rate import is_control_rate as is_control_rate
 from varpin.control.costs.rate import with_control_before as with_control_before
 from varpin.control.costs.task import CenterOfMassCost as CenterOfMassCost
 from varpin.control.costs.task import FrameOrientationCost as FrameOrientationCost

@@ -7,26 +7,22 @@ own in the core, custom costs with NumPy, without compiled code.
 
 from __future__ import annotations
 
-import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from varpin.arrays import Floats
-from varpin.control.costs.terms import Terms
+from varpin.arrays import Floats, Integers
+from varpin.core import CostTerms, Subject
 from varpin.errors import InputError, VarpinError
 from varpin.model import Robot
-from varpin.support.checks import as_floats, finite_array, require_finite
+from varpin.model.kinematics import FrameKinematics, Links
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts
 from varpin.trajectory import Trajectory
-
-ReferenceValues = ArrayLike | Callable[[float], ArrayLike]
 
 
 class CostError(VarpinError, ValueError):
@@ -107,38 +103,28 @@ class BoundCost(Frozen, ABC):
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
         """Its expansion at q (N, n), v (N, n) and u (N, m)."""
 
-    def add_to(self, terms: Terms, factor: float) -> bool:  # noqa: ARG002
-        """Add ``factor`` times the cost to the terms that the core evaluates; False if the core does not know it."""
-        return False
-
-
-class CompiledCost(BoundCost):
-    """A cost that the core evaluates; a subclass implements ``add_to``."""
-
-    points: Points
-
-    @cached_property
-    def _alone(self) -> Terms:
-        terms = Terms(self.points.dof, self.points.controls)
-        self.add_to(terms, 1.0)
-        return terms
-
-    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        """See :meth:`BoundCost.value`."""
-        total: Floats = self._alone.values(q, v, u).sum(axis=-1)
-        return total
-
-    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
-        """See :meth:`BoundCost.expand`."""
-        return Expansion(*self._alone.expand(q, v, u))
-
 
 class Cost(Frozen, ABC):
-    """A cost. A subclass implements ``bind``; ``CustomCost`` takes a function instead."""
+    """A cost. A subclass implements ``bind``; ``CustomCost`` takes a function instead.
+
+    Attributes:
+        factor: What it is scaled by in a sum.
+        at_end: Whether it is a terminal cost instead of an integral over time.
+        of_controls: Whether it depends on the controls alone, which do not exist at the final time.
+    """
+
+    factor: float = 1.0
+    at_end: bool = False
+    of_controls: bool = False
+
+    @property
+    def timed(self) -> bool:
+        """Whether the result of :meth:`bind` depends on the points' times, not only on their number."""
+        return True
 
     @abstractmethod
     def bind(self, points: Points) -> BoundCost:
-        """Bind the cost to given points.
+        """Bind the cost to given points, without its ``factor``.
 
         Raises:
             InputError: Its parameters do not fit the robot or the problem's grid.
@@ -147,30 +133,15 @@ class Cost(Frozen, ABC):
 
     @property
     def terms(self) -> tuple[Cost, ...]:
-        """The terms of the sum."""
+        """The terms of the sum, each with its factor."""
         return (self,)
-
-    @property
-    def of_controls(self) -> bool:
-        """Whether it depends on the controls alone, which do not exist at the final time."""
-        return False
-
-    @property
-    def nonnegative(self) -> bool:
-        """Whether it is known to be nonnegative: a motion of cost zero is then an optimum."""
-        return False
-
-    @property
-    def timed(self) -> bool:
-        """Whether the result of :meth:`bind` depends on the points' times, not only on their number."""
-        return True
 
     def __add__(self, other: Cost) -> CostSum:
         if not isinstance(other, Cost):
             return NotImplemented
         return CostSum((*self.terms, *other.terms))
 
-    def __radd__(self, other: int) -> Cost:
+    def __radd__(self, other: int) -> Self:
         # The zero that sum() begins with.
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
@@ -180,18 +151,25 @@ class Cost(Frozen, ABC):
         factor = float(factor)
         if not 0.0 <= factor < np.inf:
             raise InputError(f"a cost can be scaled by a finite number that is not negative, got {factor:g}")
-        # Term by term, so that a terminal cost stays one.
-        scaled = [Terminal(factor * t.cost) if isinstance(t, Terminal) else Scaled(factor, t) for t in self.terms]
-        return scaled[0] if len(scaled) == 1 else CostSum(tuple(scaled))
+        return _sum([term.changed(factor=factor * term.factor) for term in self.terms])
 
     __mul__ = __rmul__
 
+    def __repr__(self) -> str:
+        text = f"Terminal({self._text()})" if self.at_end else self._text()
+        return text if self.factor == 1.0 else f"{self.factor:g} * {text}"
+
+    def _text(self) -> str:
+        """The cost in a line, without its factor."""
+        return type(self).__name__
+
     def _repr_html_(self) -> str:
-        rows = [("at the end", t.cost) if isinstance(t, Terminal) else ("along the motion", t) for t in self.terms]
+        places = ("along the motion", "at the end")
+        rows = [(places[term.at_end], term.changed(at_end=False)) for term in self.terms]
         return facts("Cost", rows)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CostSum(Cost):
     """A sum of costs, running and terminal ones."""
 
@@ -202,58 +180,125 @@ class CostSum(Cost):
         """See :attr:`Cost.terms`."""
         return self.parts
 
-    @cached_property
-    def nonnegative(self) -> bool:
-        """See :attr:`Cost.nonnegative`."""
-        return all(part.nonnegative for part in self.parts)
-
-    @property
-    def timed(self) -> bool:
-        """See :attr:`Cost.timed`."""
-        return any(part.timed for part in self.parts)
-
-    def bind(self, points: Points) -> BoundCost:
+    def bind(self, points: Points) -> BoundSum:
         """See :meth:`Cost.bind`."""
-        return BoundSum(tuple(part.bind(points) for part in self.parts), points)
+        return BoundSum(tuple((term.factor, term.bind(points)) for term in self.parts), points)
 
     def __repr__(self) -> str:
         return " + ".join(map(repr, self.parts))
 
 
+def _sum(terms: list[Cost]) -> Cost:
+    return terms[0] if len(terms) == 1 else CostSum(tuple(terms))
+
+
+def Terminal(cost: Cost) -> Cost:
+    """A cost at the final time instead of its integral: ``Terminal(TrackingCost(...))``.
+
+    Args:
+        cost: Any cost, a sum too, but no ``ControlCost`` or ``ControlRateCost``, since there is no control at the final
+            time.
+
+    Raises:
+        InputError: It is no cost, is terminal already, or holds a ``ControlCost`` or a ``ControlRateCost``.
+    """
+    if not isinstance(cost, Cost):
+        raise InputError(f"Terminal takes a cost, got {type(cost).__name__}")
+    for term in cost.terms:
+        if term.at_end:
+            raise InputError(f"{term!r} is a terminal cost already: leave the outer Terminal out")
+        if term.of_controls:
+            raise InputError(f"{term!r} cannot be a terminal cost: there is no control at the final time")
+    return _sum([term.changed(at_end=True) for term in cost.terms])
+
+
+class Terms:
+    """Costs weight . r^2 that the core evaluates all at once, at the same points."""
+
+    def __init__(self, dof: int, controls: int) -> None:
+        self.core = CostTerms.make(dof, controls)
+        self.count = 0
+        self._places: dict[bytes, int] = {}
+
+    def add(self, term: BoundTerm, factor: float) -> None:
+        """Add ``factor`` times a term. The frame of several terms is placed once."""
+        place = term.of
+        if not isinstance(place, int):
+            if place.key not in self._places:
+                added = (
+                    self.core.add_center(place.core)
+                    if isinstance(place, Links)
+                    else self.core.add_frame(place.links.core, place.rotation, place.translation)
+                )
+                self._places[place.key] = added
+            place = self._places[place.key]
+        self.core.add_term(term.subject, place, factor * term.weight, term.target, term.directions)
+        self.count += 1
+
+    def values(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """The value of each term (..., N, terms) at q (..., N, n), v (..., N, n) and u (..., N, m)."""
+        rows = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, v, u))
+        found = self.core.values(*rows)
+        return found.reshape(*q.shape[:-1], found.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class BoundTerm(BoundCost):
+    """weight . r^2 with r what a ``subject`` of the core is beside its target.
+
+    Attributes:
+        points: The points.
+        subject: What r is of.
+        of: Index of the first entry of z = (q, v, u), the frame, or the links whose centre of mass it is.
+        weight: (r, r).
+        target: (N, r), or (1, r) where it is constant; of an orientation (N, 9), of an excess (1, 2 r).
+        directions: Rows of the Jacobian in a manipulability.
+    """
+
+    points: Points
+    subject: Subject
+    of: int | FrameKinematics | Links
+    weight: Floats
+    target: Floats
+    directions: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    @cached_property
+    def _alone(self) -> BoundSum:
+        return BoundSum(((1.0, self),), self.points)
+
+    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
+        """See :meth:`BoundCost.value`."""
+        return self._alone.value(q, v, u)
+
+    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
+        """See :meth:`BoundCost.expand`; the Hessian is that of Gauss and Newton, 2 J' weight J with J of r."""
+        return self._alone.expand(q, v, u)
+
+
 @dataclass(frozen=True, eq=False)
 class BoundSum(BoundCost):
-    """A sum of bound costs; of none, zero."""
+    """A sum of bound costs, each with its factor; of none, zero."""
 
-    parts: tuple[BoundCost, ...]
+    parts: tuple[tuple[float, BoundCost], ...]
     points: Points
 
     @cached_property
-    def _sorted(self) -> tuple[Terms, tuple[BoundCost, ...]]:
-        """The parts that the core evaluates, and the others."""
-        terms = Terms(self.points.dof, self.points.controls)
-        return terms, tuple(part for part in self._flat() if not part.add_to(terms, 1.0))
-
-    @property
     def compiled(self) -> Terms:
         """The terms that the core evaluates."""
-        return self._sorted[0]
+        terms = Terms(self.points.dof, self.points.controls)
+        for factor, part in self.parts:
+            if isinstance(part, BoundTerm):
+                terms.add(part, factor)
+        return terms
 
-    @property
-    def others(self) -> tuple[BoundCost, ...]:
-        """The parts that it does not."""
-        return self._sorted[1]
-
-    def _flat(self) -> Iterator[BoundCost]:
-        for part in self.parts:
-            if isinstance(part, BoundSum):
-                yield from part._flat()
-            else:
-                yield part
+    @cached_property
+    def others(self) -> tuple[tuple[float, BoundCost], ...]:
+        """The parts that it does not, with their factors."""
+        return tuple(part for part in self.parts if not isinstance(part[1], BoundTerm))
 
     def shares(self, q: Floats, v: Floats, u: Floats) -> list[Floats]:
         """The values of all terms, which add up: arrays (..., N, terms) and (..., N)."""
-        terms, others = self._sorted
-        return [terms.values(q, v, u), *(part.value(q, v, u) for part in others)]
+        return [self.compiled.values(q, v, u), *(factor * part.value(q, v, u) for factor, part in self.others)]
 
     def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
         """See :meth:`BoundCost.value`."""
@@ -265,174 +310,14 @@ class BoundSum(BoundCost):
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
         """See :meth:`BoundCost.expand`."""
-        terms, others = self._sorted
-        gradient, hessian = terms.expand(q, v, u)
-        for part in others:
+        gradient, hessian = self.compiled.core.expand(q, v, u)
+        for factor, part in self.others:
             expansion = part.expand(q, v, u)
             # A cost of one's own may be anything, and NumPy would broadcast it.
             (N, size), found = gradient.shape, (np.shape(expansion.gradient), np.shape(expansion.hessian))
             if found not in [((N, size), (rows, size, size)) for rows in (1, N)]:
-                raise CostError(
-                    type(part).__name__,
-                    f"its expansion has shapes {found}, where {(N, size)} and {(N, size, size)} belong",
-                )
-            gradient += expansion.gradient
-            hessian = hessian + expansion.hessian
+                wanted = f"{(N, size)} and {(N, size, size)}"
+                raise CostError(type(part).__name__, f"its expansion has shapes {found}, where {wanted} belong")
+            gradient += factor * expansion.gradient
+            hessian = hessian + factor * expansion.hessian
         return Expansion(gradient, hessian)
-
-
-@dataclass(frozen=True)
-class Scaled(Cost):
-    """A number times a running cost: ``2.0 * cost``."""
-
-    factor: float
-    cost: Cost
-
-    @property
-    def of_controls(self) -> bool:
-        """See :attr:`Cost.of_controls`."""
-        return self.cost.of_controls
-
-    @property
-    def nonnegative(self) -> bool:
-        """See :attr:`Cost.nonnegative`."""
-        return self.cost.nonnegative
-
-    @property
-    def timed(self) -> bool:
-        """See :attr:`Cost.timed`."""
-        return self.cost.timed
-
-    def bind(self, points: Points) -> BoundCost:
-        """See :meth:`Cost.bind`."""
-        return _BoundScaled(self.factor, self.cost.bind(points))
-
-    def __repr__(self) -> str:
-        return f"{self.factor:g} * {self.cost!r}"
-
-
-@dataclass(frozen=True, eq=False)
-class _BoundScaled(BoundCost):
-    factor: float
-    cost: BoundCost
-
-    def value(self, q: Floats, v: Floats, u: Floats) -> Floats:
-        return self.factor * self.cost.value(q, v, u)
-
-    def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
-        expansion = self.cost.expand(q, v, u)
-        return Expansion(self.factor * expansion.gradient, self.factor * expansion.hessian)
-
-    def add_to(self, terms: Terms, factor: float) -> bool:
-        return self.cost.add_to(terms, self.factor * factor)
-
-
-@dataclass(frozen=True)
-class Terminal(Cost):
-    """A cost at the final time instead of its integral: ``Terminal(TrackingCost(...))``.
-
-    Attributes:
-        cost: The argument: any cost, a sum too, but no ``ControlCost`` or ``ControlRateCost``, since there is no
-            control at the final time.
-
-    Raises:
-        InputError: It is no cost, is terminal already, or holds a ``ControlCost`` or a ``ControlRateCost``.
-    """
-
-    cost: Cost
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.cost, Cost):
-            raise InputError(f"Terminal takes a cost, got {type(self.cost).__name__}")
-        for term in self.cost.terms:
-            if isinstance(term, Terminal):
-                raise InputError(f"{term!r} is a terminal cost already: leave the outer Terminal out")
-            if term.of_controls:
-                raise InputError(f"{term!r} cannot be a terminal cost: there is no control at the final time")
-
-    @property
-    def nonnegative(self) -> bool:
-        """See :attr:`Cost.nonnegative`."""
-        return self.cost.nonnegative
-
-    @property
-    def timed(self) -> bool:
-        """See :attr:`Cost.timed`."""
-        return self.cost.timed
-
-    def bind(self, points: Points) -> BoundCost:
-        """See :meth:`Cost.bind`; the points must be the one at the end."""
-        return self.cost.bind(points)
-
-
-def checked_weight(name: str, weight: object) -> Floats:
-    """A weight as given: one number, a vector or a symmetric matrix.
-
-    Raises:
-        InputError: Not finite, indefinite, or neither number, vector nor square matrix.
-    """
-    array = require_finite(f"{name} weight", as_floats(f"{name} weight", weight))
-    if array.ndim > 2 or (array.ndim == 2 and array.shape[0] != array.shape[1]):
-        raise InputError(f"{name} weight must be a number, a vector or a square matrix, got {array.shape}")
-    least = np.linalg.eigvalsh(0.5 * (array + array.T)).min() if array.ndim == 2 else array.min(initial=0.0)
-    if least < -1e-12 * np.abs(array).max(initial=0.0):
-        raise InputError(f"{name} weight must be positive semidefinite; its least value is {least:g}")
-    array = 0.5 * (array + array.T) if array.ndim == 2 else array
-    array.setflags(write=False)
-    return array
-
-
-def weight_matrix(name: str, weight: Floats, size: int) -> Floats:
-    """A weight as a matrix (size, size).
-
-    Raises:
-        InputError: It is for another size.
-    """
-    if weight.ndim > 0 and weight.shape[0] != size:
-        raise InputError(f"{name} weight must be one number or have {size} rows, got shape {weight.shape}")
-    return weight * np.eye(size) if weight.ndim < 2 else weight
-
-
-def sample(name: str, reference: ReferenceValues, points: Points, size: int, *, held: bool = False) -> Floats:
-    """A reference at the points, (N, size), or (1, size) where it is constant.
-
-    With ``held``, an array may also have one row for each step, constant over the step.
-
-    Raises:
-        InputError: Its shape does not fit.
-        CostError: A function that raises, or returns another shape or values that are not finite.
-    """
-    if callable(reference):
-        values = []
-        for time in points.t.tolist():
-            try:
-                values.append(reference(time))
-            except Exception as error:
-                raise CostError(name, f"the reference raised {error!r} at t = {time:.6g} s") from error
-        # All at once, as there may be many thousands; one by one only to say which of them is wrong.
-        with contextlib.suppress(ValueError, TypeError, OverflowError):
-            rows = np.array(values)
-            if rows.shape == (len(values), size) and rows.dtype.kind in "fiu" and np.isfinite(rows).all():
-                return np.ascontiguousarray(rows, dtype=np.float64)
-        for time, value in zip(points.t, values, strict=True):
-            try:
-                finite_array(f"the reference at t = {time:.6g} s", value, (size,))
-            except InputError as error:
-                raise CostError(name, str(error)) from None
-        return np.array(values, dtype=np.float64)
-    array = require_finite(f"{name} reference", as_floats(f"{name} reference", reference))
-    if array.ndim < 2 and array.shape in ((), (size,)):
-        return np.array(np.broadcast_to(array, (1, size)))
-    if held and array.shape == (points.steps, size):
-        # Rounding must not put a time at a node into the step before it; the end belongs to the last step.
-        step = np.floor(points.elapsed * (points.steps / points.duration) + 1e-6).astype(np.int64)
-        held_rows: Floats = array[np.minimum(step, points.steps - 1)]
-        return held_rows
-    if array.shape != (points.steps + 1, size):
-        steps = f", or ({points.steps}, {size}): one for each of its steps" if held else ""
-        raise InputError(
-            f"{name} reference must be a function of time, have shape ({size},), or ({points.steps + 1}, {size}): one "
-            f"row for each of the problem's nodes{steps}; got {array.shape}"
-        )
-    nodes = np.linspace(0.0, points.duration, points.steps + 1)
-    return np.column_stack([np.interp(points.elapsed, nodes, column) for column in array.T])

@@ -16,8 +16,15 @@ from varpin.support.checks import as_floats, finite_array
 Function = Callable[[Floats, Floats, Floats, Floats], ArrayLike]
 Derivatives = Callable[[Floats, Floats, Floats, Floats], tuple[ArrayLike, ArrayLike]]
 
+# Step of differences, by the size of what is moved: between 1e-4 and 1e-2 errors of rounding and of order balance.
+_STEP = 1e-3
+# Asymmetry of a Hessian, by its largest entry, that is no rounding.
+_SYMMETRY = 1e-8
+# Errors of differences, by the largest entry and by the function's size over the step, of gradients and of Hessians.
+_ERRORS = (1e-6, 1e-11), (1e-4, 1e-12)
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class CustomCost(Cost):
     """A cost of one's own, evaluated at many points at once.
 
@@ -26,11 +33,9 @@ class CustomCost(Cost):
     Attributes:
         function: Takes t (N,), q (N, n), v (N, n) and u (N, m); returns (N,).
         derivatives: Takes the same; returns gradient (N, 2n + m) and Hessian (N, 2n + m, 2n + m) in z = (q, v, u).
-            If left out, both are differenced.
-        step: Of the differences: None for 1e-3 rad or m in q, 1e-3 of the largest velocity (or of 1) in v and 1e-3 of
-            the largest control in u; or one number for each of z (2n + m,). The differences are right to about 1e-8 of
-            the function's size where it changes little over a step, so the second derivatives to 1e-5 of it by the
-            step's square.
+            If left out, both are differenced, in steps of 1e-3 rad or m in q, of 1e-3 of the largest velocity (or of 1)
+            in v and of 1e-3 of the largest control in u. The gradient is then right to about 1e-8 of the function's
+            size where it changes little over a step, the Hessian to 1e-5 of it.
         name: For messages.
         check: Hold ``derivatives`` against differences when the cost is first expanded.
 
@@ -40,19 +45,18 @@ class CustomCost(Cost):
 
     function: Function
     derivatives: Derivatives | None = None
-    step: ArrayLike | None = None
     name: str = "CustomCost"
     check: bool = False
-
-    def __repr__(self) -> str:
-        function = getattr(self.function, "__name__", type(self.function).__name__)
-        return f"CustomCost({function})" if self.name == "CustomCost" else f"CustomCost({self.name!r})"
 
     def __post_init__(self) -> None:
         for name in ("function", "derivatives"):
             value = getattr(self, name)
             if not callable(value) and (value is not None or name == "function"):
                 raise InputError(f"{self.name} {name} must be a function of (t, q, v, u), got {value!r}")
+
+    def _text(self) -> str:
+        function = getattr(self.function, "__name__", type(self.function).__name__)
+        return f"CustomCost({function})" if self.name == "CustomCost" else f"CustomCost({self.name!r})"
 
     def bind(self, points: Points) -> BoundCost:
         """See :meth:`Cost.bind`."""
@@ -81,9 +85,9 @@ class _BoundCustom(BoundCost):
         return self._call(t, *rows).reshape(lead)
 
     def expand(self, q: Floats, v: Floats, u: Floats) -> Expansion:
-        N, d = len(q), self.points.size
         if self.cost.derivatives is None:
             return self._differences(np.hstack([q, v, u]))
+        N, d = len(q), self.points.size
         try:
             first, second = self.cost.derivatives(self.points.t, q, v, u)
             gradient = finite_array("the gradient", first, (N, d))
@@ -91,39 +95,31 @@ class _BoundCustom(BoundCost):
             hessian = finite_array("the Hessian", hessian, (1, d, d) if hessian.shape == (1, d, d) else (N, d, d))
         except Exception as error:
             raise CostError(self.cost.name, f"derivatives(t, q, v, u) failed: {error}") from error
-        given = Expansion(gradient, hessian)
-        self._require_symmetry(hessian)
-        if self.unchecked:
-            self._check(given, np.hstack([q, v, u]))
-            self.unchecked = False
-        return given
-
-    def _require_symmetry(self, hessian: Floats) -> None:
         gap = np.abs(hessian - np.swapaxes(hessian, 1, 2))
-        off = gap > 1e-8 * np.abs(hessian).max(axis=(1, 2), initial=0.0, keepdims=True)
+        off = gap > _SYMMETRY * np.abs(hessian).max(axis=(1, 2), initial=0.0, keepdims=True)
         if off.any():
             j, a, b = np.argwhere(off)[0]
-            raise CostError(
-                self.cost.name,
-                f"the Hessian must be symmetric: Hessian[{j}, {a}, {b}] is {hessian[j, a, b]:.6g} and "
-                f"Hessian[{j}, {b}, {a}] is {hessian[j, b, a]:.6g}",
-            )
+            both = f"Hessian[{j}, {a}, {b}] is {hessian[j, a, b]:.6g} and Hessian[{j}, {b}, {a}] {hessian[j, b, a]:.6g}"
+            raise CostError(self.cost.name, f"the Hessian must be symmetric: {both}")
+        if self.unchecked:
+            self._check((gradient, hessian), np.hstack([q, v, u]))
+            self.unchecked = False
+        return Expansion(gradient, hessian)
 
-    def _check(self, given: Expansion, z: Floats) -> None:
+    def _check(self, given: tuple[Floats, Floats], z: Floats) -> None:
         """Hold the user's derivatives against differences; the first entry that is off is an error."""
         found, h = self._differences(z), self._steps(z)
-        first, second = np.abs(found.gradient), np.abs(found.hessian)
+        steps = h, h[:, None] * h
         # What is wrong with the differences themselves goes with the function's size, or with what it varies by where
         # it is zero, over lengths of 1000 steps.
         size = np.abs(self._call(self.points.t, *self._blocks(z))).max(initial=0.0)
-        size = max(size, 1e6 * float((second * h[:, None] * h).max(initial=0.0)))
-        for name, derivative, expected, tolerance in (
-            ("gradient", given.gradient, found.gradient, 1e-6 * first.max(axis=0) + 1e-11 * size / h),
-            ("Hessian", given.hessian, found.hessian, 1e-4 * second.max(axis=0) + 1e-12 * size / (h[:, None] * h)),
-        ):
-            claimed = np.broadcast_to(derivative, expected.shape)
+        size = max(size, float((np.abs(found.hessian) * steps[1]).max(initial=0.0)) / _STEP**2)
+        differences = found.gradient, found.hessian
+        for i, name in enumerate(("gradient", "Hessian")):
+            claimed, expected = np.broadcast_to(given[i], differences[i].shape), differences[i]
+            relative, absolute = _ERRORS[i]
             # Not "greater": differences that are NaN must not pass.
-            off = ~(np.abs(claimed - expected) <= tolerance)
+            off = ~(np.abs(claimed - expected) <= relative * np.abs(expected).max(axis=0) + absolute * size / steps[i])
             if off.any():
                 where = tuple(int(i) for i in np.argwhere(off)[0])
                 raise CostError(
@@ -132,45 +128,30 @@ class _BoundCustom(BoundCost):
                     f"function give {expected[where]:.6g}, at t = {self.points.t[where[0]]:.6g} s",
                 )
 
-    def _blocks(self, z: Floats) -> tuple[Floats, Floats, Floats]:
-        n = self.points.dof
-        return z[:, :n], z[:, n : 2 * n], z[:, 2 * n :]
+    def _blocks(self, z: Floats) -> list[Floats]:
+        return np.split(z, [self.points.dof, 2 * self.points.dof], axis=1)
 
     def _steps(self, z: Floats) -> Floats:
-        n, d = self.points.dof, self.points.size
-        if self.cost.step is not None:
-            steps = finite_array(f"{self.cost.name} step", self.cost.step, (d,))
-            if not (steps > 0.0).all():
-                raise InputError(f"{self.cost.name} step must be positive, got {steps}")
-            return steps
-        speed = max(1.0, np.abs(z[:, n : 2 * n]).max(initial=0.0))
-        control = np.abs(z[:, 2 * n :]).max(initial=0.0)
-        return np.repeat([1e-3, 1e-3 * speed, 1e-3 * (control if control > 0.0 else 1.0)], [n, n, d - 2 * n])
+        _, speed, control = (np.abs(block).max(initial=0.0) for block in self._blocks(z))
+        sizes = [1.0, max(1.0, speed), control or 1.0]
+        return _STEP * np.repeat(sizes, [self.points.dof, self.points.dof, self.points.controls])
 
     def _differences(self, z: Floats) -> Expansion:
         """Central differences: of fourth order for the gradient, of second for the Hessian."""
-        N, d = z.shape
+        (N, d), size = z.shape, self._steps(z)
+        steps = np.diag(size)
 
-        def at(moved: Floats) -> Floats:
-            return self._call(self.points.t, *self._blocks(moved))
+        def at(step: Floats) -> Floats:
+            return self._call(self.points.t, *self._blocks(z + step))
 
-        size = self._steps(z)
+        middle, ahead, behind = at(np.zeros(d)), [at(e) for e in steps], [at(-e) for e in steps]
         gradient, hessian = np.empty((N, d)), np.empty((N, d, d))
-        middle = at(z)
-        ahead, behind = [], []
-        for a in range(d):
-            e = np.zeros(d)
-            e[a] = size[a]
-            outer = at(z + 2.0 * e) - at(z - 2.0 * e)
-            gradient[:, a] = (8.0 * (at(z + e) - at(z - e)) - outer) / (12.0 * size[a])
-            e[a] = size[a]
-            ahead.append(at(z + e))
-            behind.append(at(z - e))
+        for a, e in enumerate(steps):
+            outer = at(2.0 * e) - at(-2.0 * e)
+            gradient[:, a] = (8.0 * (ahead[a] - behind[a]) - outer) / (12.0 * size[a])
             hessian[:, a, a] = (ahead[a] - 2.0 * middle + behind[a]) / size[a] ** 2
             for b in range(a):
-                e[b] = size[b]
-                both = at(z + e) + at(z - e)
-                e[b] = 0.0
+                both = at(e + steps[b]) + at(-e - steps[b])
                 mixed = both - ahead[a] - behind[a] - ahead[b] - behind[b] + 2.0 * middle
                 hessian[:, a, b] = hessian[:, b, a] = mixed / (2.0 * size[a] * size[b])
         return Expansion(gradient, hessian)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from varpin.arrays import Floats
-from varpin.control.costs.base import BoundCost, Cost, CostSum, Points, Scaled, checked_weight, weight_matrix
+from varpin.control.costs.base import BoundCost, Cost, CostSum, Points
+from varpin.control.costs.least_squares import LeastSquares, checked_weight, plain, weight_matrix
 from varpin.core import change_values, expand_changes
 from varpin.errors import InputError
-from varpin.support.checks import JointValues, as_floats, control_array, finite_array, require_finite
+from varpin.support.checks import JointValues, as_floats, control_array, control_values, require_finite
 from varpin.support.frozen import Frozen
 
 
-class ControlRateCost(Cost):
+class ControlRateCost(LeastSquares):
     """weight . (du/dt)^2: keep controls smooth.
 
     Controls are constant over a period T = hold dt and jump between periods. The cost is the integral of the squared
@@ -23,8 +24,8 @@ class ControlRateCost(Cost):
     smooth in time it is the same at every ``dt``, up to an error of order T.
     """
 
-    weight: Floats | Mapping[str, float]
     before: Floats | Mapping[str, float] | None
+    of_controls = True
 
     def __init__(self, weight: JointValues = 1.0, before: JointValues | None = None) -> None:
         """Describe the cost.
@@ -40,27 +41,11 @@ class ControlRateCost(Cost):
                 control that is neither number nor vector, or not finite.
         """
         self.weight = weight if isinstance(weight, Mapping) else checked_weight("ControlRateCost", weight)
-        self.before = before if isinstance(before, Mapping) else None
-        if before is not None and not isinstance(before, Mapping):
-            start = require_finite("ControlRateCost before", as_floats("ControlRateCost before", before))
-            if start.ndim > 1:
-                raise InputError(f"ControlRateCost before must be one number or a vector, got shape {start.shape}")
-            start.setflags(write=False)
-            self.before = start
+        self.before = before if before is None or isinstance(before, Mapping) else _number_or_vector(before)
 
-    def __repr__(self) -> str:
-        start = "" if self.before is None else f", before={_plain(self.before)}"
-        return f"ControlRateCost(weight={_plain(self.weight)}{start})"
-
-    @property
-    def of_controls(self) -> bool:
-        """See :attr:`Cost.of_controls`."""
-        return True
-
-    @property
-    def nonnegative(self) -> bool:
-        """See :attr:`Cost.nonnegative`."""
-        return True
+    def _text(self) -> str:
+        own = super()._text()
+        return own if self.before is None else f"{own[:-1]}, before={plain(self.before)})"
 
     def bind(self, points: Points) -> BoundCost:  # noqa: ARG002
         """Raise an error: the cost has no value at single points, and a problem takes it by :func:`control_rate`.
@@ -69,10 +54,6 @@ class ControlRateCost(Cost):
             InputError: Always: the cost is part of another cost than a sum.
         """
         raise InputError(f"{self!r} must be a term of a problem's cost, scaled or not, and no part of another")
-
-
-def _plain(values: Floats | Mapping[str, float]) -> object:
-    return dict(values) if isinstance(values, Mapping) else values.tolist()
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +88,14 @@ class ControlRate(Frozen):
         return np.zeros((0, len(self.weight))) if self.before is None else self.before[None]
 
 
+def _number_or_vector(before: JointValues) -> Floats:
+    start = require_finite("ControlRateCost before", as_floats("ControlRateCost before", before))
+    if start.ndim > 1:
+        raise InputError(f"ControlRateCost before must be one number or a vector, got shape {start.shape}")
+    start.setflags(write=False)
+    return start
+
+
 def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None) -> ControlRate | None:
     """The sum of a cost's terms on the rate of m controls; None if there is none.
 
@@ -119,51 +108,29 @@ def control_rate(cost: Cost, controls: int, joints: Sequence[str] | None = None)
         UnknownJoint: A name that is no driven joint's.
         InputError: Weights or controls of a wrong size, or terms with different controls before.
     """
-    terms = list(_terms(cost))
-    if not terms:
-        return None
     name = "ControlRateCost"
     weight = np.zeros((controls, controls))
-    for factor, term in terms:
+    starts: dict[object, Floats | None] = {}
+    for term in cost.terms:
+        if not isinstance(term, ControlRateCost):
+            continue
         entries = term.weight
         if isinstance(entries, Mapping):
             entries = checked_weight(name, control_array(f"{name} weight", entries, joints))
-        weight += factor * weight_matrix(name, entries, controls)
-    starts: list[Floats | None] = []
-    for _, term in terms:
+        weight += term.factor * weight_matrix(name, entries, controls)
         start = term.before
-        if isinstance(start, Mapping):
-            start = control_array(f"{name} before", start, joints)
-        if start is not None and start.ndim == 0:
-            start = np.full(controls, float(start))
-        starts.append(None if start is None else finite_array(f"{name} before", start, (controls,)))
-    if len({None if start is None else tuple(start.tolist()) for start in starts}) > 1:
+        if start is not None:
+            start = control_values(f"{name} before", start, joints, controls, uniform=True)
+        starts[None if start is None else tuple(start.tolist())] = start
+    if len(starts) > 1:
         raise InputError(f"{name} terms of one cost must have the same control before")
-    return ControlRate(weight, starts[0])
-
-
-def is_control_rate(term: Cost) -> bool:
-    """Whether a term is on the rate of controls, scaled or not."""
-    return any(True for _ in _terms(term))
+    return ControlRate(weight, *starts.values()) if starts else None
 
 
 def with_control_before(cost: Cost, before: JointValues) -> Cost:
     """The same cost with another control before the horizon."""
-    if isinstance(cost, ControlRateCost):
-        return ControlRateCost(cost.weight, before)
-    if isinstance(cost, Scaled):
-        return Scaled(cost.factor, with_control_before(cost.cost, before))
-    if isinstance(cost, CostSum):
-        return CostSum(tuple(with_control_before(part, before) for part in cost.parts))
-    return cost
-
-
-def _terms(cost: Cost) -> Iterator[tuple[float, ControlRateCost]]:
-    """The terms on the rate of controls, each with what it is scaled by."""
-    if isinstance(cost, ControlRateCost):
-        yield 1.0, cost
-    elif isinstance(cost, Scaled):
-        yield from ((cost.factor * factor, term) for factor, term in _terms(cost.cost))
-    elif isinstance(cost, CostSum):
-        for part in cost.parts:
-            yield from _terms(part)
+    terms = [
+        ControlRateCost(term.weight, before).changed(factor=term.factor) if isinstance(term, ControlRateCost) else term
+        for term in cost.terms
+    ]
+    return CostSum(tuple(terms))

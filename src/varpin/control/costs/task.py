@@ -2,198 +2,141 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike
 
-from varpin.arrays import Floats, Integers
-from varpin.control.costs.base import BoundCost, CompiledCost, CostError, Points, ReferenceValues, sample
-from varpin.control.costs.residual import TaskCost
-from varpin.control.costs.terms import Terms
+from varpin.arrays import Floats
+from varpin.control.costs.base import BoundTerm, CostError, Points
+from varpin.control.costs.least_squares import (
+    LeastSquares,
+    ReferenceValues,
+    checked_reference,
+    checked_weight,
+    sample,
+    weight_matrix,
+)
 from varpin.core import Subject
 from varpin.errors import InputError
-from varpin.model import Robot
-from varpin.model.kinematics import (
-    FrameKinematics,
-    Links,
-    frame_kinematics,
-    mass_carriers,
-)
-from varpin.support.checks import as_floats, positive, require_finite
+from varpin.model import Robot, require_robot
+from varpin.model.kinematics import FrameKinematics, Links, frame_kinematics, mass_carriers, require_same
+from varpin.support.checks import positive, rotation_matrix
 
 
-class _FrameCost(TaskCost):
+class _TaskCost(LeastSquares):
+    """weight . r^2 with r what a ``subject`` of the core is beside a target."""
+
+    robot: Robot
     frame: str
+    weight: Floats
+    target: ReferenceValues
+    subject = Subject.position
+    shape: tuple[int, ...] = (3,)  # of a constant target
+    _of: FrameKinematics | Links
 
-    def __init__(self, robot: Robot, frame: str, weight: ArrayLike) -> None:
-        if not isinstance(frame, str):
-            raise InputError(f"{type(self).__name__} frame must be the name of a frame, got {frame!r}")
-        super().__init__(robot, weight)
-        self.frame = frame
-        self._kinematics = frame_kinematics(robot, frame)
+    def _take(self, robot: Robot, frame: str | None, target: ReferenceValues, weight: ArrayLike) -> None:
+        name = type(self).__name__
+        self.robot = require_robot(robot, name)
+        if frame is None:
+            self._of = mass_carriers(robot)
+        elif isinstance(frame, str):
+            self.frame = frame
+            self._of = frame_kinematics(robot, frame)
+        else:
+            raise InputError(f"{name} frame must be the name of a frame, got {frame!r}")
+        self.weight = checked_weight(name, weight)
+        weight_matrix(name, self.weight, self.shape[0])
+        self.target = checked_reference(name, target)
 
-    def _subject(self) -> str:
-        return f"{self.frame!r}, "
+    @property
+    def timed(self) -> bool:
+        """See :attr:`Cost.timed`."""
+        return callable(self.target) or np.ndim(self.target) > len(self.shape)
+
+    def bind(self, points: Points) -> BoundTerm:
+        """See :meth:`Cost.bind`."""
+        name = type(self).__name__
+        require_same(name, self.robot, points.robot)
+        target = sample(name, self.target, points, self.shape)
+        return BoundTerm(points, self.subject, self._of, weight_matrix(name, self.weight, self.shape[0]), target)
 
 
-@dataclass(frozen=True, eq=False)
-class _BoundFrame(CompiledCost):
-    subject: Subject
-    of: FrameKinematics
-    weight: Floats  # (r, r)
-    target: Floats  # (N, r) or (1, r); of orientations (N, 9) or (1, 9)
-    points: Points
-
-    def add_to(self, terms: Terms, factor: float) -> bool:
-        terms.add_frame(self.subject, self.of, factor * self.weight, self.target)
-        return True
-
-
-class FramePositionCost(_FrameCost):
-    """weight . (p(q) - p_r(t))^2: bring the origin of a frame to a place, or along a path."""
-
-    size = 3
-
+class _FrameCost(_TaskCost):
     def __init__(self, robot: Robot, frame: str, target: ReferenceValues, weight: ArrayLike = 1.0) -> None:
         """Describe the cost.
 
         Args:
             robot: The robot.
             frame: Name of the frame.
-            target: p_r in the world [m]: a constant (3,), a function of the time [s] that returns (3,), or an array
-                (N + 1, 3) of its values at the problem's nodes, between which it is linear.
-            weight: One number, (3,), or a matrix (3, 3), positive semidefinite [cost / m^2].
+            target: A constant, a function of the time [s] that returns one, or an array of one for each of the
+                problem's N + 1 nodes. Between nodes it is linear; rotations turn evenly.
+            weight: One number, a vector or a matrix, positive semidefinite; zeros leave directions out.
 
         Raises:
             UnknownFrame: The robot has no such frame.
             InputError: The frame is fixed to the base, or a weight is no such weight.
         """
-        super().__init__(robot, frame, weight)
-        self.target = target if callable(target) else as_floats("FramePositionCost target", target)
+        self._take(robot, frame, target, weight)
 
-    def _bound(self, points: Points, weight: Floats) -> BoundCost:
-        target = sample("FramePositionCost", self.target, points, 3)
-        return _BoundFrame(Subject.position, self._kinematics, weight, target, points)
+
+class FramePositionCost(_FrameCost):
+    """weight . (p(q) - p_r(t))^2: bring the origin of a frame to a place, or along a path.
+
+    The target p_r is a place (3,) in the world [m], the weight one number, (3,) or (3, 3) [cost / m^2].
+    """
 
 
 class FrameOrientationCost(_FrameCost):
     """weight . log(R_r(t)' R(q))^2: turn a frame.
 
-    The residual is the rotation vector [rad] from target to frame, in the frame's own axes. It is at most pi long, and
-    jumps there: a target half a turn away has no direction to turn in.
+    The target R_r is a rotation matrix (3, 3) from the frame's axes to the world's, the weight one number, (3,) or
+    (3, 3) [cost / rad^2]. The residual is the rotation vector [rad] from target to frame, in the frame's own axes. It
+    is at most pi long, and jumps there: a target half a turn away has no direction to turn in.
     """
 
-    size = 3
-    _rank = 2
+    subject = Subject.orientation
+    shape = (3, 3)
 
-    def __init__(
-        self, robot: Robot, frame: str, target: ArrayLike | Callable[[float], ArrayLike], weight: ArrayLike = 1.0
-    ) -> None:
-        """Describe the cost.
+    def bind(self, points: Points) -> BoundTerm:
+        """See :meth:`Cost.bind`."""
+        bound = super().bind(points)
+        try:
+            _require_rotations(bound.target)
+        except InputError as error:
+            if callable(self.target):
+                raise CostError("FrameOrientationCost", str(error)) from error
+            raise
+        return replace(bound, target=bound.target.reshape(-1, 9))
 
-        Args:
-            robot: The robot.
-            frame: Name of the frame.
-            target: R_r from the frame's axes to the world's: a rotation matrix (3, 3), a function of the time [s]
-                that returns one, or an array (N + 1, 3, 3) of them at the problem's nodes, between which it turns
-                evenly.
-            weight: One number, (3,), or a matrix (3, 3), positive semidefinite [cost / rad^2].
-
-        Raises:
-            UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, or a weight is no such weight.
-        """
-        super().__init__(robot, frame, weight)
-        self.target = target if callable(target) else as_floats("FrameOrientationCost target", target)
-
-    def _bound(self, points: Points, weight: Floats) -> BoundCost:
-        target = _sample_rotations(self.target, points).reshape(-1, 9)
-        return _BoundFrame(Subject.orientation, self._kinematics, weight, target, points)
+    def _take(self, robot: Robot, frame: str | None, target: ReferenceValues, weight: ArrayLike) -> None:
+        super()._take(robot, frame, target, weight)
+        if isinstance(self.target, np.ndarray) and self.target.shape[-2:] == (3, 3):
+            _require_rotations(self.target.reshape(-1, 3, 3))
 
 
-def _sample_rotations(target: Floats | Callable[[float], ArrayLike], points: Points) -> Floats:
-    """Rotation matrices at the points, (N, 3, 3), or (1, 3, 3) where they are constant."""
-    name = "FrameOrientationCost"
-    if callable(target):
-        found = []
-        for time in points.t.tolist():
-            try:
-                found.append(as_floats("the target", target(time)))
-                _require_rotations("the target", found[-1][None])
-            except Exception as error:
-                raise CostError(name, f"at t = {time:.6g} s: {error}") from error
-        return np.array(found)
-    if target.shape == (3, 3):
-        return _require_rotations(f"{name} target", target[None])
-    if target.shape != (points.steps + 1, 3, 3):
-        raise InputError(
-            f"{name} target must be a function of time, have shape (3, 3), or ({points.steps + 1}, 3, 3): one matrix "
-            f"for each of the problem's nodes; got {target.shape}"
-        )
-    nodes = np.linspace(0.0, points.duration, points.steps + 1)
-    rotations = scipy.spatial.transform.Rotation.from_matrix(_require_rotations(f"{name} target", target))
-    turns = scipy.spatial.transform.Slerp(nodes, rotations)
-    between: Floats = turns(np.clip(points.elapsed, 0.0, points.duration)).as_matrix()
-    return between
-
-
-def _require_rotations(name: str, R: Floats) -> Floats:
-    if R.shape[1:] != (3, 3):
-        raise InputError(f"{name} must have shape (3, 3), got {R.shape[1:]}")
-    require_finite(name, R)
-    off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-    wrong = (off > 1e-6) | (np.linalg.det(R) < 0.0)
-    if wrong.any():
-        which = "" if len(R) == 1 else f" number {int(np.argmax(wrong))}"
-        raise InputError(f"{name}{which} is no rotation matrix: R'R is {off.max():.3g} from 1, or R mirrors")
-    return R
+def _require_rotations(target: Floats) -> None:
+    for k, R in enumerate(target):
+        rotation_matrix(f"FrameOrientationCost target{f' number {k}' if len(target) > 1 else ''}", R)
 
 
 class FrameVelocityCost(_FrameCost):
-    """weight . (J(q) v - V_r(t))^2: the velocity of a frame's origin, and its angular velocity, in world axes."""
+    """weight . (J(q) v - V_r(t))^2: the velocity of a frame's origin, and its angular velocity, in world axes.
 
-    size = 6
+    The target V_r is linear [m/s] over angular [rad/s] velocity (6,), the weight one number, (6,) or (6, 6).
+    """
+
+    subject = Subject.twist
+    shape = (6,)
 
     def __init__(self, robot: Robot, frame: str, target: ReferenceValues = 0.0, weight: ArrayLike = 1.0) -> None:
-        """Describe the cost.
-
-        Args:
-            robot: The robot.
-            frame: Name of the frame.
-            target: V_r, linear [m/s] over angular [rad/s] velocity (6,), as for :class:`FramePositionCost`.
-            weight: One number, (6,), or a matrix (6, 6), positive semidefinite; zeros leave directions out.
-
-        Raises:
-            UnknownFrame: The robot has no such frame.
-            InputError: The frame is fixed to the base, or a weight is no such weight.
-        """
-        super().__init__(robot, frame, weight)
-        self.target = target if callable(target) else as_floats("FrameVelocityCost target", target)
-
-    def _bound(self, points: Points, weight: Floats) -> BoundCost:
-        target = sample("FrameVelocityCost", self.target, points, 6)
-        return _BoundFrame(Subject.twist, self._kinematics, weight, target, points)
+        """Describe the cost; see :class:`FramePositionCost`."""
+        super().__init__(robot, frame, target, weight)
 
 
-@dataclass(frozen=True, eq=False)
-class _BoundCenter(CompiledCost):
-    of: Links
-    weight: Floats  # (3, 3)
-    target: Floats  # (N, 3) or (1, 3)
-    points: Points
-
-    def add_to(self, terms: Terms, factor: float) -> bool:
-        terms.add_center(self.of, factor * self.weight, self.target)
-        return True
-
-
-class CenterOfMassCost(TaskCost):
+class CenterOfMassCost(_TaskCost):
     """weight . (c(q) - c_r(t))^2 with c the centre of mass of the links that joints move."""
-
-    size = 3
 
     def __init__(self, robot: Robot, target: ReferenceValues, weight: ArrayLike = 1.0) -> None:
         """Describe the cost; see :class:`FramePositionCost`.
@@ -201,40 +144,22 @@ class CenterOfMassCost(TaskCost):
         Raises:
             InputError: The links have no mass, or a weight is no such weight.
         """
-        super().__init__(robot, weight)
-        self._links = mass_carriers(robot)
-        self.target = target if callable(target) else as_floats("CenterOfMassCost target", target)
-
-    def _bound(self, points: Points, weight: Floats) -> BoundCost:
-        target = sample("CenterOfMassCost", self.target, points, 3)
-        return _BoundCenter(self._links, weight, target, points)
+        self._take(robot, None, target, weight)
 
 
 _DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 _SETS = {"all": _DIRECTIONS, "linear": _DIRECTIONS[:3], "angular": _DIRECTIONS[3:]}
 
 
-@dataclass(frozen=True, eq=False)
-class _BoundManipulability(CompiledCost):
-    of: FrameKinematics
-    directions: Integers  # rows of the Jacobian
-    weight: Floats  # (1, 1)
-    least: float
-    points: Points
-
-    def add_to(self, terms: Terms, factor: float) -> bool:
-        terms.add_manipulability(self.of, self.directions, factor * self.weight, self.least)
-        return True
-
-
-class ManipulabilityCost(_FrameCost):
+class ManipulabilityCost(_TaskCost):
     """weight (least - w(q))^2 where w < least: keep away from singular configurations.
 
     w = sqrt(det(J J')) of the frame's Jacobian (Yoshikawa, "Manipulability of robotic mechanisms", 1985), zero where
     the frame cannot move in some direction.
     """
 
-    size = 1
+    subject = Subject.manipulability
+    shape = (1,)
 
     def __init__(
         self,
@@ -258,7 +183,8 @@ class ManipulabilityCost(_FrameCost):
             UnknownFrame: The robot has no such frame.
             InputError: More directions than coordinates, of which one is always impossible; or as for the others.
         """
-        super().__init__(robot, frame, weight)
+        self.least = positive("ManipulabilityCost least", least, "m or rad for each direction")
+        self._take(robot, frame, self.least, weight)
         if self.weight.ndim:
             raise InputError(f"ManipulabilityCost weight must be one number, got shape {self.weight.shape}")
         chosen = _SETS.get(directions, ()) if isinstance(directions, str) else tuple(directions)
@@ -271,8 +197,8 @@ class ManipulabilityCost(_FrameCost):
             raise InputError(
                 f"ManipulabilityCost: with {robot.dof} coordinates no frame moves freely in {len(chosen)} directions"
             )
-        self.least = positive("ManipulabilityCost least", least, "m or rad for each direction")
-        self.rows = [_DIRECTIONS.index(name) for name in chosen]
+        self._rows = np.array([_DIRECTIONS.index(name) for name in chosen], dtype=np.int64)
 
-    def _bound(self, points: Points, weight: Floats) -> BoundCost:
-        return _BoundManipulability(self._kinematics, np.array(self.rows, dtype=np.int64), weight, self.least, points)
+    def bind(self, points: Points) -> BoundTerm:
+        """See :meth:`Cost.bind`."""
+        return replace(super().bind(points), directions=self._rows)

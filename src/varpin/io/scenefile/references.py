@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import scipy
@@ -17,23 +15,12 @@ from numpy.typing import NDArray
 from varpin.arrays import Floats
 from varpin.errors import FileError, InputError
 from varpin.io.archive import read_npz
-from varpin.io.scenefile.reading import (
-    TEXT,
-    ByName,
-    Rule,
-    Where,
-    checked,
-    entries,
-    existing,
-    number,
-    rules_of,
-    shown,
-    suggestion,
-    table,
-    values,
-    word,
-)
+from varpin.io.scenefile.reading import Where
 from varpin.model import Robot
+from varpin.support.checks import as_floats, finite, positive, require_finite
+
+# Share by which the first and the last time of a file may miss the ends of the horizon: rounding.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +33,7 @@ class Timeline:
     """
 
     at: Callable[[Floats], Floats]
-    constant: bool
+    constant: bool = False
 
     def __call__(self, time: float) -> Floats:
         """Values (c,) at one time [s]."""
@@ -60,18 +47,10 @@ class Timeline:
 
 def constant(values: Floats) -> Timeline:
     """The same values at all times."""
-    return Timeline(_Constant(values), True)
+    return Timeline(_Sines(values), True)
 
 
 # Functions of time are classes, because closures cannot be pickled.
-
-
-@dataclass(frozen=True, eq=False)
-class _Constant:
-    values: Floats
-
-    def __call__(self, t: Floats) -> Floats:
-        return np.tile(self.values, (len(t), 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,198 +65,165 @@ class _Columns:
 @dataclass(frozen=True, eq=False)
 class _Sines:
     offset: Floats
-    sines: tuple[Sine, ...]
-    columns: tuple[int, ...]
+    sines: tuple[tuple[int, Sine], ...] = ()
 
     def __call__(self, t: Floats) -> Floats:
         total = np.tile(self.offset, (len(t), 1))
-        for column, sine in zip(self.columns, self.sines, strict=True):
+        for column, sine in self.sines:
             total[:, column] += sine.amplitude * np.sin(2.0 * math.pi * sine.frequency * t + sine.phase)
         return total
 
 
 @dataclass(frozen=True, eq=False)
-class _Smooth:
-    curve: scipy.interpolate.PchipInterpolator
-    first: float
-    last: float
+class _Rows:
+    """Rows over time, by straight lines or a curve; outside the first and the last row."""
 
-    def __call__(self, t: Floats) -> Floats:
-        return np.asarray(self.curve(np.clip(t, self.first, self.last)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Linear:
     times: Floats
     rows: Floats
+    curve: scipy.interpolate.PchipInterpolator | None = None
 
     def __call__(self, t: Floats) -> Floats:
+        if self.curve is not None:
+            return np.asarray(self.curve(np.clip(t, self.times[0], self.times[-1])))
         return np.column_stack([np.interp(t, self.times, column) for column in self.rows.T])
 
 
 @dataclass(frozen=True)
 class Sine:
-    """amplitude sin(2 pi frequency t + phase), added to one component."""
+    """amplitude sin(2 pi frequency t + phase), added to the component ``of``."""
 
-    of: Annotated[str, TEXT]
-    amplitude: Annotated[float, number()]
-    frequency: Annotated[float, number("Hz", above=0.0)]
-    phase: Annotated[float, number("rad")] = 0.0
+    of: str
+    amplitude: float
+    frequency: float
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        finite("amplitude", self.amplitude)
+        finite("phase", self.phase)
+        positive("frequency", self.frequency, "Hz")
 
 
 @dataclass(frozen=True)
 class Sines:
     """A reference of sines."""
 
-    sines: Annotated[tuple[Sine, ...], entries(table(Sine))]
-    offset: Annotated[ByName, values()] = 0.0
+    sines: Any = ()
+    offset: Any = 0.0
+
+    def timeline(self, where: Where, names: Sequence[str], what: str, horizon: tuple[float, float]) -> Timeline:
+        """The sines about their offset; the horizon is the step and the duration [s]."""
+        offset, found, (dt, _) = where.at("offset").numbers(self.offset, names, what), [], horizon
+        for place, given in where.at("sines").tables(self.sines):
+            sine = place.call(Sine, given)
+            place.at("of").one_of(sine.of, names)
+            if sine.frequency > 0.5 / dt:
+                most = f"<= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves"
+                raise place.at("frequency").error(f"must be {most}, got {sine.frequency:g}")
+            found.append((names.index(sine.of), sine))
+        return Timeline(_Sines(offset, tuple(found)), not found)
 
 
 @dataclass(frozen=True)
 class Waypoints:
     """A reference of waypoints: straight lines, or a monotone cubic, between them."""
 
-    times: Annotated[tuple[float, ...], entries(number("s"))]
-    values: Annotated[tuple[tuple[float, ...], ...], entries(entries(number()))]
-    between: Annotated[str, word("lines", "smooth")] = "lines"
+    times: Any
+    values: Any
+    between: str = "lines"
 
-    def __post_init__(self) -> None:
-        if len(self.times) < 2 or not all(b > a for a, b in itertools.pairwise(self.times)):
-            raise InputError(f"must be two or more, and increase [s], got {list(self.times)}", "times")
-        if len(self.values) != len(self.times):
-            raise InputError(
-                f"must have {len(self.times)} rows, one for each of times; got {len(self.values)}", "values"
-            )
-
-
-def _values_file(text: str, where: Where) -> Path:
-    if Path(text).suffix not in (".csv", ".npz"):
-        raise where.error(f"must be a .csv or .npz file, got {text!r}")
-    return existing(text, where)
+    def timeline(self, where: Where, names: Sequence[str], what: str, _: tuple[float, float]) -> Timeline:
+        """The rows at their times."""
+        times = where.at("times").check(lambda name, given: require_finite(name, as_floats(name, given)), self.times)
+        if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0.0).all():
+            raise where.at("times").error(f"must be two or more, and increase [s], got {self.times}")
+        if not isinstance(self.values, list) or len(self.values) != len(times):
+            raise where.at("values").error(f"must be {len(times)} rows, one for each of times")
+        rows = np.array([where.at("values", k).numbers(row, names, what) for k, row in enumerate(self.values)])
+        if where.at("between").one_of(self.between, ("lines", "smooth")) == "lines":
+            return Timeline(_Rows(times, rows))
+        try:
+            with np.errstate(all="ignore"):
+                return Timeline(_Rows(times, rows, scipy.interpolate.PchipInterpolator(times, rows)))
+        except ValueError as error:
+            raise where.at("values").error(f"no smooth curve goes through them: {error}") from None
 
 
 @dataclass(frozen=True)
 class Samples:
-    """A reference in a file."""
+    """A reference in a CSV or npz file."""
 
-    file: Annotated[Path, checked(TEXT, _values_file)]
+    file: Any
+
+    def timeline(self, where: Where, names: Sequence[str], what: str, horizon: tuple[float, float]) -> Timeline:
+        """The columns of the components over the column t."""
+        place = where.at("file")
+        path = place.file(self.file)
+        try:
+            columns = _npz(path) if path.suffix == ".npz" else _csv(path)
+            for name in ("t", *names):
+                if name not in columns:
+                    owner = "times [s]" if name == "t" else f"the {what} {name!r}"
+                    raise InputError(f"it has no column {name!r} of {owner}; columns: {', '.join(columns)}")
+            t, rows = columns["t"], np.column_stack([columns[name] for name in names])
+            if len(t) < 2 or not (np.diff(t) > 0.0).all():
+                raise InputError("it must have two or more increasing times")
+            end = horizon[1]
+            if t[0] > _ROUNDING * end or t[-1] < end * (1.0 - _ROUNDING):
+                raise InputError(f"its times go from {t[0]:g} to {t[-1]:g} s, the scene lasts from 0 to {end:g} s")
+        except (InputError, FileError) as error:
+            raise place.error(f"{path.name}: {error}") from None
+        return Timeline(_Rows(t, rows))
 
 
-REFERENCES: tuple[Any, ...] = (Samples, Waypoints, Sines)
-
-
-def reference(**others: Any) -> Rule:
-    """A reference: constant values, one of ``REFERENCES``, or one of ``others`` by type."""
-    constants = values(**others)
-
-    def read(value: Any, where: Where) -> Any:
-        given = set(value) if isinstance(value, dict) else set()
-        if any(isinstance(value[key], list | dict) for key in given & {"constant", "value"}):
-            raise where.error("constant values are given without a table, as in target = [0.4, 0.2, 0.3]")
-        kind = next((kind for kind in REFERENCES if given & set(rules_of(kind))), None)
-        return constants.read(value, where) if kind is None else table(kind).read(value, where)
-
-    return Rule("a number for all, a list, a table by name, sines, waypoints or a file", read)
+KINDS: tuple[Any, ...] = (Samples, Waypoints, Sines)
 
 
 def timeline(
-    given: Any, where: Where, names: Sequence[str], what: str, robot: Robot, dt: float, duration: float
+    given: Any, where: Where, names: Sequence[str], what: str, robot: Robot, horizon: tuple[float, float]
 ) -> Timeline:
-    """The values over time of a reference that was read at ``where``, for the components ``names``.
+    """The values over time of a reference, for the components ``names``; a posture for joints.
 
-    Raises:
-        SceneFileError: It has other components or another length, or does not last for the horizon.
+    Args:
+        given: The value of the key.
+        where: Its place.
+        names: Names of the components.
+        what: What one of them is.
+        robot: The robot.
+        horizon: The time step and the duration [s].
     """
-    if isinstance(given, Samples):
-        return _of_file(given.file, where.at("file"), names, duration, what)
-    if isinstance(given, Waypoints):
-        for index, row in enumerate(given.values):
-            where.at("values").at(index).spread(row, names)
-        try:
-            with np.errstate(all="ignore"):
-                return _between(np.array(given.times), np.array(given.values), smooth=given.between == "smooth")
-        except ValueError as error:
-            raise where.at("values").error(f"no smooth curve goes through them: {error}") from None
-    if not isinstance(given, Sines):
-        is_posture = isinstance(given, str)
-        return constant(where.positions(given, robot) if is_posture else where.spread(given, names, what))
-    offset = where.at("offset").spread(given.offset, names, what)
-    for index, sine in enumerate(given.sines):
-        place = where.at("sines").at(index)
-        if sine.of not in names:
-            raise place.at("of").error(f"there is no {what} {sine.of!r}; {suggestion(sine.of, names, what + 's')}")
-        if sine.frequency > 0.5 / dt:
-            most = f"<= {0.5 / dt:g} [Hz], the most that dt = {dt:g} s resolves"
-            raise place.at("frequency").error(f"must be {most}, got {sine.frequency:g}")
-    if not given.sines:
-        return constant(offset)
-    return Timeline(_Sines(offset, given.sines, tuple(names.index(sine.of) for sine in given.sines)), constant=False)
+    for kind in KINDS:
+        if isinstance(given, Mapping) and given.keys() & {item.name for item in fields(kind)}:
+            found: Timeline = where.call(kind, given).timeline(where, names, what, horizon)
+            return found
+    if isinstance(given, str) and tuple(names) == robot.joint_names:
+        return constant(where.positions(given, robot))
+    return constant(where.numbers(given, names, what))
 
 
-def _of_file(path: Path, where: Where, names: Sequence[str], duration: float, what: str) -> Timeline:
-    def wrong(problem: str) -> Exception:
-        return where.error(f"{path.name}: {problem}")
-
-    columns = _npz(path, wrong) if path.suffix == ".npz" else _csv(path, wrong)
-    if "t" not in columns:
-        raise wrong(f"it has no column t of times [s]; it has {', '.join(columns)}")
-    missing = [name for name in names if name not in columns]
-    if missing:
-        raise wrong(f"it has no column {missing[0]!r}; {what}s: {', '.join(names)}; columns: {', '.join(columns)}")
-    t = columns["t"]
-    rows = np.column_stack([columns[name] for name in names])
-    if len(t) < 2 or not (np.diff(t) > 0.0).all():
-        raise wrong("it must have two or more increasing times")
-    if t[0] > 1e-9 * duration or t[-1] < duration * (1.0 - 1e-9):
-        raise wrong(f"its times go from {t[0]:g} to {t[-1]:g} s, but the scene lasts from 0 to {duration:g} s")
-    return _between(t, rows, smooth=False)
-
-
-def _between(times: Floats, rows: Floats, *, smooth: bool) -> Timeline:
-    """Rows over time; before the first time and after the last, the first and the last row."""
-    if smooth:
-        return Timeline(_Smooth(scipy.interpolate.PchipInterpolator(times, rows), times[0], times[-1]), constant=False)
-    return Timeline(_Linear(times, rows), constant=False)
-
-
-def _csv(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
+def _csv(path: Path) -> dict[str, Floats]:
     """The columns of a CSV file: a line of names, then lines of numbers."""
     try:
         head, *lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()] or [""]
         names = [name.strip(' "\t') for name in head.split(",")]
-        numbers = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2) if lines else np.zeros((0, 0))
+        rows = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2) if lines else np.zeros((0, len(names)))
     except (OSError, ValueError) as error:
         told = getattr(error, "strerror", None) or f"{str(error).partition(';')[0]} (row 0 is the first of numbers)"
-        raise wrong(f"cannot be read: {told}") from None
-    if twice := [name for name, times in Counter(names).items() if times > 1]:
-        raise wrong(f"it has two columns {shown(twice[0])}")
-    if not numbers.size:
-        raise wrong("it must have a line of column names and lines of numbers")
-    if numbers.shape[1] != len(names):
-        raise wrong(f"its rows have {numbers.shape[1]} entries, but there are {len(names)} columns")
-    if not np.isfinite(numbers).all():
-        row, column = np.argwhere(~np.isfinite(numbers))[0].tolist()
-        raise wrong(f"row {row + 2}, column {shown(names[column])} is not finite")
-    return dict(zip(names, numbers.T, strict=True))
+        raise InputError(f"cannot be read: {told}") from None
+    if len(set(names)) < len(names) or rows.shape[1] != len(names):
+        raise InputError(f"its rows have {rows.shape[1]} entries, for the columns {', '.join(names)}, each once")
+    return dict(zip(names, require_finite("its numbers", rows).T, strict=True))
 
 
-def _npz(path: Path, wrong: Callable[[str], Exception]) -> dict[str, Floats]:
+def _npz(path: Path) -> dict[str, Floats]:
     """The columns of an npz file: arrays of one length, or the joint positions of a saved trajectory."""
-    try:
-        arrays = read_npz(path)
-        found: dict[str, Any] = dict(arrays.entries)
-        if {"t", "q", "joint_names"} <= found.keys() and len(found["q"].shape) == 2:
-            joints = [str(name) for name in arrays["joint_names"].reshape(-1)]
-            if len(joints) == found["q"].shape[1]:
-                found = {"t": found["t"]} | dict(zip(joints, arrays["q"].T, strict=True))
-        length = found["t"].shape if "t" in found else ()
-        for name, column in found.items():
-            if column.dtype.kind not in "fi" or len(column.shape) != 1 or column.shape != length:
-                raise wrong(f"its array {shown(name)} must have the shape of t, {length}, got {column.shape}")
-        columns = {name: np.asarray(column, dtype=np.float64) for name, column in found.items()}
-    except FileError as error:
-        raise wrong(f"cannot be read: {error}") from None
-    for name, column in columns.items():
-        if not np.isfinite(column).all():
-            raise wrong(f"its array {shown(name)} is not finite")
-    return columns
+    arrays = read_npz(path)
+    found: dict[str, Any] = dict(arrays.entries)
+    if {"t", "q", "joint_names"} <= found.keys():
+        joints = [str(name) for name in arrays["joint_names"].reshape(-1)]
+        if len(found["q"].shape) == 2 and found["q"].shape[1] == len(joints):
+            found = {"t": found["t"]} | dict(zip(joints, arrays["q"].T, strict=True))
+    length = found["t"].shape if "t" in found else ()
+    for name, column in found.items():
+        if column.dtype.kind not in "fi" or len(column.shape) != 1 or column.shape != length:
+            raise InputError(f"its array {name!r} must have the shape of t, {length}, got {column.shape}")
+    return {name: require_finite(f"its array {name!r}", np.asarray(a, dtype=np.float64)) for name, a in found.items()}

@@ -7,38 +7,107 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from varpin.arrays import Floats, Integers, Mask
+from varpin.arrays import Floats, Mask
+from varpin.control.constraints import PlanConstraint
 from varpin.control.costs import Cost, CostSum, Terminal
-from varpin.errors import InputError, RobotError, RobotNotFound, UnknownFrame, UnknownJoint, VarpinError
-from varpin.io.scenefile.reading import SceneFileError, Where, suggestion
+from varpin.errors import InputError, RobotNotFound, UnknownFrame, VarpinError
+from varpin.io.scenefile import kinds
+from varpin.io.scenefile.reading import SceneFileError, Where
 from varpin.io.scenefile.references import Timeline, constant, timeline
-from varpin.io.scenefile.tables import NoiseTable, RobotTable, SceneTables
-from varpin.io.scenefile.terms import CostTable
 from varpin.mechanics.description import description_constraints
-from varpin.mechanics.forces import CoulombFriction, Force, PositionServo
-from varpin.mechanics.noise import AdditiveNoise, ControlNoise, Noise, StateNoise
-from varpin.mechanics.reduction import Required, driving, idle_joints, joints_with, report
-from varpin.mechanics.scene import Scene, closest_controls
-from varpin.model import Robot, combine, load_robot, looks_like_degrees
+from varpin.mechanics.forces import Force, PositionServo
+from varpin.mechanics.noise import Noise
+from varpin.mechanics.reduction import Required, driving, idle_joints, report
+from varpin.mechanics.scene import Scene, closest_controls, joints_with
+from varpin.model import Robot, combine, load_robot
+from varpin.model.clearance import Obstacle
+from varpin.model.payload import Payload
 from varpin.model.tree import frame_index
-from varpin.simulation.start import on_constraints
+from varpin.simulation.start import on_constraints, time_steps
+from varpin.support.checks import count
 
+# Largest number of steps; with costs a tenth of it by their number, as each evaluates its reference at each step.
+_MOST_STEPS, _PER_COST = 10**7, 10
 # Largest number of times at which controls and references are sampled for checks.
 _SAMPLES = 2000
 # Controls may pass a torque limit by rounding.
 _ROUNDING = 1e-9
+TABLES = (
+    *("title", "gravity", "damping", "friction", "springs", "robot", "force", "constraint", "plan_constraint"),
+    *("actuation", "noise", "initial", "horizon", "integrator", "cost", "simulate", "solve", "outputs"),
+)
 
 
 @dataclass(frozen=True, eq=False)
-class CostTerm:
-    """A term of the cost with the weights (c,) and the target of its components."""
+class Term:
+    """A term of the cost.
 
-    table: CostTable
+    Attributes:
+        where: Its place.
+        kind: Its type in the file.
+        options: Other keys than these.
+        terminal: Whether it is a cost at the end instead of an integral over time.
+        weight: Weights of its components (c,).
+        target: Their target over time, if there is one.
+        hold: Configuration (n,) that its reference is to hold [rad or m].
+        names: The joints of its components; None for components that are not joints.
+    """
+
     where: Where
+    kind: str
+    options: Mapping[str, Any]
+    terminal: bool
     weight: Floats
     target: Timeline | None
-    holding_q: Floats | None
+    hold: Floats | None
+    names: tuple[str, ...] | None
+
+    @property
+    def frame(self) -> str:
+        """The name of its frame; empty if it has none."""
+        return str(self.options.get("frame", ""))
+
+    def limits(self, robot: Robot) -> tuple[Floats, Floats] | None:
+        """The limits (n,), (n,) of a barrier."""
+        velocity = robot.velocity_limit
+        return {"joint_limits": robot.position_limits, "velocity_limits": (-velocity, velocity)}.get(self.kind)
+
+    def make(self, scene: Scene, joints: Sequence[str], driven: Sequence[str]) -> Cost | None:
+        """The cost of a scene with these joints and these driven joints; None if it weighs nothing of it."""
+        weight, target, robot = self.weight, self.target, scene.robot
+        if self.names is not None:
+            keep = [self.names.index(name) for name in (driven if self.kind in kinds.OF_CONTROLS else joints)]
+            weight, target = weight[keep], None if target is None else target.columns(keep)
+        if self.hold is not None:
+            target = constant(closest_controls(scene, self.hold))
+        limits = self.limits(robot)
+        if not weight.any() or (limits is not None and not np.isfinite(limits).any()):
+            return None
+        own = dict(self.options)
+        own["weight"] = float(weight[0]) if self.kind == "manipulability" else weight
+        if target is not None:
+            turned = self.kind == "frame_orientation"
+            value: Any = _Turning(target) if turned else target
+            own[kinds.target_key(self.kind)] = value(0.0) if target.constant else value
+        if self.names is None or limits is not None:
+            own["robot"] = robot
+        try:
+            cost = kinds.COSTS[self.kind](**own)
+        except VarpinError as error:
+            raise self.where.of(error, {**self.options, "weight": 0.0, "target": 0.0}) from None
+        return Terminal(cost) if self.terminal else cost
+
+
+@dataclass(frozen=True, eq=False)
+class _Turning:
+    """Rotation matrices over time, Rz(yaw) Ry(pitch) Rx(roll) as in a URDF; a class, so that it can be pickled."""
+
+    angles: Timeline
+
+    def __call__(self, time: float) -> Floats:
+        return np.asarray(Rotation.from_euler("xyz", self.angles(time)).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,38 +115,40 @@ class Task:
     """A scene file on a robot, complete or without some of its joints.
 
     Attributes:
-        tables: The file.
+        where: The file.
+        tables: Its content.
         scene: The scene.
         q0: Initial configuration (n,) [rad or m].
         v0: Initial velocity (n,) [rad/s or m/s].
+        dt: Time step [s].
+        steps: N.
         driven: Names of the driven joints (m).
         gear: Generalized force per control (m,).
         torque_limit: Bounds (m,) [N m or N], infinite where there is none.
-        costs: Terms of the cost.
+        terms: Terms of the cost.
         controls: Controls of a simulation over time; None for none, ``"hold"`` for those that hold the robot at q0.
     """
 
-    tables: SceneTables
+    where: Where
+    tables: Mapping[str, Any]
     scene: Scene
     q0: Floats
     v0: Floats
+    dt: float
+    steps: int
     driven: tuple[str, ...]
     gear: Floats
     torque_limit: Floats
-    costs: tuple[CostTerm, ...]
-    controls: Timeline | str | None
+    terms: tuple[Term, ...] = ()
+    controls: Timeline | str | None = None
 
     def require_start(self) -> None:
-        """Refuse a start off the constraints.
-
-        Raises:
-            SceneFileError: It misses them by too much.
-        """
+        """Refuse a start off the constraints."""
         if self.scene.constraints:
             try:
                 on_constraints(self.scene, self.q0, self.v0)
             except VarpinError as error:
-                raise self.tables.where.at("initial").at("q").error(str(error)) from None
+                raise self.where.at("initial", "q").error(str(error)) from None
 
     def without(self, joints: Sequence[str]) -> Task:
         """The same task with ``joints`` held at their initial positions, and without what acts on them alone."""
@@ -86,22 +157,22 @@ class Task:
         names = self.scene.robot.joint_names
         held = {name: float(self.q0[names.index(name)]) for name in joints}
         keep, columns = np.flatnonzero([name not in held for name in names]), driving(self.scene, held)
-        costs = []
-        for term in self.costs:
-            kind = term.table.term
-            if kind.space == "frame" and not joints_of_frame(self.scene.robot, term.table.frame)[keep].any():
-                continue
-            costs.append(_columns(term, columns if kind.space == "u" else keep, keep) if kind.of_joints else term)
-        return Task(
-            tables=self.tables,
+        moving = [not term.frame or joints_of_frame(self.scene.robot, term.frame)[keep].any() for term in self.terms]
+        controls = self.controls
+        return replace(
+            self,
             scene=self.scene.without(held),
             q0=self.q0[keep],
             v0=self.v0[keep],
             driven=tuple(self.driven[column] for column in columns),
             gear=self.gear[columns],
             torque_limit=self.torque_limit[columns],
-            costs=tuple(costs),
-            controls=self.controls.columns(columns.tolist()) if isinstance(self.controls, Timeline) else self.controls,
+            terms=tuple(
+                replace(term, hold=None if term.hold is None else term.hold[keep])
+                for term, moves in zip(self.terms, moving, strict=True)
+                if moves
+            ),
+            controls=controls.columns(columns.tolist()) if isinstance(controls, Timeline) else controls,
         )
 
     @property
@@ -117,31 +188,40 @@ class Task:
         limit[: len(self.driven)] = np.where(self.positions, np.inf, self.torque_limit / np.abs(self.gear))
         return limit
 
+    @property
+    def times(self) -> Floats:
+        """Times over the horizon [s] at which controls and references are sampled for checks."""
+        return np.linspace(0.0, self.steps * self.dt, min(self.steps, _SAMPLES) + 1)
+
     def cost(self) -> Cost:
         """The cost as an object."""
-        made = []
-        for term in self.costs:
-            table, target, robot = term.table, term.target, self.scene.robot
-            if term.holding_q is not None:
-                target = constant(closest_controls(self.scene, term.holding_q))
-            limits = table.term.limits
-            if not term.weight.any() or (limits and not np.isfinite(limits(robot)).any()):
-                continue
-            try:
-                cost = table.term.make(robot, term.weight, target, table.given)
-            except VarpinError as error:
-                raise term.where.of(error, table.given) from None
-            made.append(Terminal(cost) if table.terminal else cost)
-        return CostSum(tuple(made))
+        made = [term.make(self.scene, self.scene.robot.joint_names, self.driven) for term in self.terms]
+        return CostSum(tuple(cost for cost in made if cost is not None))
+
+    def plan_constraints(self) -> list[PlanConstraint]:
+        """The constraints of a plan."""
+        found, robot = [], self.scene.robot
+        for where, given in self.where.at("plan_constraint").tables(self.tables.get("plan_constraint", [])):
+            word, kind, own = where.kind(given, kinds.PLAN_CONSTRAINTS)
+            others: dict[str, Any] = {} if word == "control_rate" else {"robot": robot}
+            if word == "clearance":
+                bodies = where.at("obstacles").tables(own.pop("obstacles", []))
+                others |= {"obstacles": [_obstacle(*body) for body in bodies], "capsules": None}
+                own |= {"srdf": where.at("srdf").file(own["srdf"])} if "srdf" in own else {}
+            elif word.endswith("_limits") and own.keys() & {"lower", "upper"}:
+                others["limits"] = own.pop("lower", -np.inf), own.pop("upper", np.inf)
+            elif "rotation" in own:
+                angles = where.at("rotation").numbers(own["rotation"], kinds.ANGLES, "angle")
+                own["rotation"] = Rotation.from_euler("xyz", angles).as_matrix()
+            found.append(where.call(kind, own, **others))
+        return found
 
 
-def _columns(term: CostTerm, index: Integers, joints: Integers) -> CostTerm:
-    return replace(
-        term,
-        weight=term.weight[index],
-        target=None if term.target is None else term.target.columns(index.tolist()),
-        holding_q=None if term.holding_q is None else term.holding_q[joints],
-    )
+def _obstacle(where: Where, given: Any) -> Obstacle:
+    word, make, own = where.kind(given, kinds.OBSTACLES)
+    if word == "mesh" and "path" in own:
+        own["path"] = where.at("path").file(own["path"])
+    return where.call(make, own)
 
 
 def joints_of_frame(robot: Robot, frame: str) -> Mask:
@@ -153,116 +233,80 @@ def joints_of_frame(robot: Robot, frame: str) -> Mask:
     return moving
 
 
-def times_of(tables: SceneTables) -> Floats:
-    """Times over the horizon [s] at which controls and references are sampled for checks."""
-    return np.linspace(0.0, tables.duration, min(tables.steps, _SAMPLES) + 1)
-
-
 def required_of(task: Task, *, idle: bool) -> tuple[Task, Required]:
     """The task without idle joints, unless they stay, and the report on it."""
-    scene, tables = task.scene, task.tables
+    scene, kept = task.scene, task.where.at("plan_constraint").tables(task.tables.get("plan_constraint", []))
     out: Mapping[str, float] = {}
-    if idle and not (tables.plan_constraint or scene.constraints):
-        touched = np.any([_touched(term, task) for term in task.costs], axis=0) if task.costs else []
-        busy = [name for name, acts in zip(scene.robot.joint_names, touched, strict=False) if acts]
-        controls: Any = task.controls
+    if idle and not (kept or scene.constraints):
+        touched = np.any([np.zeros(scene.robot.dof), *(_touched(term, task) for term in task.terms)], axis=0)
+        busy = [name for name, acts in zip(scene.robot.joint_names, touched, strict=True) if acts]
+        controls: Any = np.zeros(scene.controls) if task.controls is None else task.controls
         if isinstance(controls, Timeline):
-            controls = controls.at(times_of(tables))
-        elif controls == "hold":
+            controls = controls.at(task.times)
+        elif task.controls == "hold":
             controls = closest_controls(scene, task.q0)
-        elif scene.controls:
-            controls = np.zeros(scene.controls)
-        out = idle_joints(scene, task.q0, task.v0, controls, busy)
+        out = idle_joints(scene, task.q0, task.v0, controls if scene.controls else None, busy)
     part = task.without(list(out))
     told = report(part.scene, scene, out)
-    whole = ", ".join(sorted({term.table.kind for term in part.costs if term.table.term.space == "robot"}))
-    if whole and len(told.parts) > 1:
-        told = replace(told, parts=(told.joints,), coupled=f"the cost has a term on the whole robot ({whole})")
-    terms = {**told.terms, **_terms(part)}
-    if any(constraint.kind == "clearance" for constraint in tables.plan_constraint):
+    if any(term.kind == "center_of_mass" for term in part.terms) and len(told.parts) > 1:
+        told = replace(told, parts=(told.joints,), coupled="the cost has a term on the whole robot (center_of_mass)")
+    costs = [term.kind + (" at the end" if term.terminal else "") for term in part.terms]
+    words = dict.fromkeys(place.kind(given, kinds.PLAN_CONSTRAINTS)[0] for place, given in kept)
+    terms = {
+        **told.terms,
+        "torque limits": joints_with(np.isfinite(part.torque_limit), part.driven),
+        "cost": ", ".join(costs) or "none",
+    }
+    if words:
+        terms["the plan keeps"] = ", ".join(words).replace("_", " ")
+    if "clearance" in words:
         terms["not modelled"] = terms["not modelled"].replace("a replay", "replays and clearance")
     return part, replace(told, terms=terms)
 
 
-def _touched(term: CostTerm, task: Task) -> Mask:
+def _touched(term: Term, task: Task) -> Mask:
     """Joints (n,) that a term of the cost would move, or that it charges in the initial configuration."""
-    scene, kind = task.scene, term.table.term
-    robot, rest_u = scene.robot, scene.command_at(task.q0)
-    if kind.space == "frame":
-        return joints_of_frame(robot, term.table.frame)
-    if kind.space == "robot":
-        return np.ones(robot.dof, dtype=np.bool_)
-    rest = {"q": task.q0, "v": np.zeros(robot.dof), "u": rest_u}[kind.space]
-    if kind.limits is not None:
-        lower, upper = kind.limits(robot)
-        margin = term.table.given.get("margin", 0.0)
-        return np.asarray((term.weight != 0.0) & ((rest > upper - margin) | (rest < lower + margin)))
-    if term.holding_q is not None:
-        wanted = closest_controls(scene, term.holding_q)[None]
-    else:
-        wanted = rest[None] if term.target is None else term.target.at(times_of(task.tables))
+    scene, robot = task.scene, task.scene.robot
+    if term.names is None:
+        return joints_of_frame(robot, term.frame) if term.frame else np.ones(robot.dof, dtype=np.bool_)
+    if (limits := term.limits(robot)) is not None:
+        rest = task.q0 if term.kind == "joint_limits" else np.zeros(robot.dof)
+        margin = term.options.get("margin", 0.0)
+        return np.asarray((term.weight != 0.0) & ((rest > limits[1] - margin) | (rest < limits[0] + margin)))
+    rest = task.q0 if term.kind == "tracking" else np.zeros(robot.dof)
+    if term.kind in kinds.OF_CONTROLS:
+        rest = scene.command_at(task.q0)
+    wanted = rest[None] if term.target is None else term.target.at(task.times)
+    if term.hold is not None:
+        wanted = closest_controls(scene, term.hold)[None]
     moves = ((wanted != rest) & (term.weight != 0.0)).any(axis=0)
-    return np.asarray((scene.actuation != 0.0)[:, moves].any(axis=1) if kind.space == "u" else moves)
+    of_controls = term.kind in kinds.OF_CONTROLS
+    return np.asarray((scene.actuation != 0.0)[:, moves].any(axis=1) if of_controls else moves)
 
 
-def _terms(task: Task) -> dict[str, str]:
-    """What a report says of the file beside its scene."""
-    tables = task.tables
-    costs = [term.table.kind + (" at the end" if term.table.terminal else "") for term in task.costs]
-    kept = dict.fromkeys(constraint.kind.replace("_", " ") for constraint in tables.plan_constraint)
-    payloads = [
-        f"{payload.mass:g} kg at {word}{payload.frame}"
-        for word, robot in zip(tables.prefixes or ("",), tables.robot, strict=True)
-        for payload in robot.payload
-    ]
-    terms = {
-        "payload": ", ".join(payloads) or "none",
-        "torque limits": joints_with(np.isfinite(task.torque_limit), task.driven),
-        "cost": ", ".join(costs) or "none",
-    }
-    if kept:
-        terms["the plan keeps"] = ", ".join(kept)
-    return terms
-
-
-def _robot(tables: SceneTables) -> Robot:
-    place = tables.where.at("robot")
-    if not tables.prefixes:
-        return _one(tables.robot[0], place)
-    robots = [_one(given, place.at(index)) for index, given in enumerate(tables.robot)]
-    try:
-        return combine(*robots, prefixes=tables.prefixes)
-    except InputError as error:
-        raise place.at(len(robots) - 1).at("prefix").error(str(error)) from None
-
-
-def _one(given: RobotTable, place: Where) -> Robot:
-    for joint, value in given.lock.items():
-        if isinstance(value, float) and looks_like_degrees(value):
-            raise place.at("lock").at(joint).error(f"{value:g} looks like degrees: positions are in rad or m")
-    options = {name: value for name, value in vars(given).items() if name not in ("source", "prefix")}
-    try:
-        return load_robot(given.source, **options)
-    except RobotNotFound as error:
-        raise place.at("source").error(str(error)) from None
-    except UnknownFrame as error:
-        index = [load.frame for load in given.payload].index(error.frame)
-        raise place.at("payload").at(index).at("frame").error(str(error)) from None
-    except UnknownJoint as error:
-        raise place.of(error, options) from None
-    except (RobotError, InputError) as error:
-        raise place.error(str(error)) from None
-
-
-def task_of(tables: SceneTables) -> Task:
-    """Load the robot and apply the file to it.
+def task_of(root: Where, tables: dict[str, Any]) -> Task:
+    """Load the robot of a file and apply the file to it.
 
     Raises:
-        SceneFileError: Names, lengths or values do not fit the robot.
+        SceneFileError: There is a mistake in it, or names, lengths or values do not fit the robot.
     """
-    robot = _robot(tables)
+    root.table(tables, TABLES, ("robot", "horizon"))
+    at = root.at("horizon")
+    keys = ("dt", "steps", "duration", "hold", "sampling", "controls", "between_nodes")
+    horizon = at.table(tables["horizon"], keys, ("dt",))
+    costs = len(root.at("cost").tables(tables.get("cost", [])))
+    if ("steps" in horizon) == ("duration" in horizon):
+        raise at.error("a horizon has steps, or a duration [s]: give one of them")
     try:
-        return _on_robot(tables, robot)
+        dt, steps = time_steps(horizon["dt"], horizon.get("steps"), horizon.get("duration"))
+        count("steps", steps, 1)
+    except InputError as error:
+        raise at.of(error, horizon) from None
+    if steps * max(1, _PER_COST * costs) > _MOST_STEPS:
+        raise at.error(f"{steps} steps are more than {_MOST_STEPS}, or a tenth of that divided by the number of costs")
+    robot = _robot(root.at("robot"), tables["robot"])
+    try:
+        return _on_robot(root, tables, robot, dt, steps)
     except SceneFileError as error:
         name = error.key.rpartition(".")[2]
         if name not in robot.locked:
@@ -270,178 +314,245 @@ def task_of(tables: SceneTables) -> Task:
         raise SceneFileError(error.source, error.key, f"the joint is locked at {robot.locked[name]}") from None
 
 
-def _on_robot(tables: SceneTables, robot: Robot) -> Task:
-    names, root = robot.joint_names, tables.where
-    springs, initial, actuation = root.at("springs"), root.at("initial"), root.at("actuation")
-    rest = springs.at("rest").positions(tables.springs.rest, robot)
-    stiffness = springs.at("stiffness").spread(tables.springs.stiffness, names)
-    q0 = initial.at("q").positions(tables.initial.q, robot)
-    _refuse_degrees(springs.at("rest"), rest, robot)
-    _refuse_degrees(initial.at("q"), q0, robot)
-    driven = names if tables.actuation.joints is None else tables.actuation.joints
-    for index, joint in enumerate(driven):
-        if joint not in names:
-            told = f"there is no joint {joint!r}; {suggestion(joint, names, 'joints')}"
-            raise actuation.at("joints").at(index).error(told)
-    gear = actuation.at("gear").spread(tables.actuation.gear, driven, "driven joint")
-    if not gear.all():
-        raise actuation.at("gear").error(f"must not be 0, and is for {driven[int(np.argmin(np.abs(gear)))]!r}")
-    limit = _torque_limit(tables, robot, driven)
-    joints = [names.index(joint) for joint in driven]
-    matrix = np.zeros((robot.dof, len(driven)))
-    matrix[joints, np.arange(len(driven))] = gear
-    effort = np.full(robot.dof, np.inf)
-    effort[joints] = limit
-    given = {
-        name: value if value is None or isinstance(value, str) else root.at(name).spread(value, names)
-        for name, value in (("damping", tables.damping), ("friction", tables.friction))
-    }
-    noise = [_noise(model, root.at("noise").at(k), matrix, driven, robot) for k, model in enumerate(tables.noise)]
+def _robot(where: Where, given: Any) -> Robot:
+    """The robot of a file, or several in one."""
+    if not isinstance(given, list):
+        return _one(where, given)
+    if len(given) < 2:
+        raise where.error(f"[[robot]] is for two robots or more, got {len(given)}; one is written [robot]")
+    members = [(place, dict(place.table(own))) for place, own in where.tables(given)]
+    prefixes = [place.at("prefix").text(own.pop("prefix")) if "prefix" in own else "" for place, own in members]
+    robots = [_one(place, own) for place, own in members]
     try:
-        scene = Scene(
-            robot,
-            gravity=tables.gravity,
-            damping=given["damping"],
-            friction=given["friction"],
-            stiffness=stiffness,
-            rest=rest,
-            forces=_forces(tables, robot, effort),
-            constraints=tables.constraint or None,
-            actuation=matrix,
-            noise=[model for model in noise if model is not None] or None,
-        )
+        return combine(*robots, prefixes=prefixes)
+    except InputError as error:
+        raise where.at(len(robots) - 1, "prefix").error(str(error)) from None
+
+
+def _one(where: Where, given: Any) -> Robot:
+    """The robot of one table."""
+    own = dict(where.table(given, None, ("source",)))
+    source = where.at("source").text(own["source"])
+    if "." in source or "/" in source or "\\" in source:
+        own["source"] = where.at("source").file(source)
+    for key, read in (("srdf", where.at("srdf").file), ("base", _placement(where.at("base")))):
+        own |= {key: read(own[key])} if key in own else {}
+    folders = own.get("package_dirs", [])
+    if isinstance(folders, list) and folders:
+        own["package_dirs"] = [where.at("package_dirs", k).beside(folder) for k, folder in enumerate(folders)]
+    payloads = where.at("payload").tables(own.get("payload", []))
+    for place, load in payloads:
+        place.at("frame").text(place.table(load).get("frame", "?"))
+    own["payload"] = [place.call(Payload, load) for place, load in payloads]
+    lock = own.get("lock", {})
+    for joint, value in lock.items() if isinstance(lock, dict) else ():
+        if isinstance(value, int | float):
+            where.at("lock", joint).refuse_degrees(np.array([value]), [joint], [False])
+    try:
+        return where.call(load_robot, own)
+    except SceneFileError as error:
+        if isinstance(error.__context__, RobotNotFound):
+            raise where.at("source").error(error.problem) from None
+        if isinstance(error.__context__, UnknownFrame):
+            index = [load.frame for load in own["payload"]].index(error.__context__.frame)
+            raise where.at("payload", index, "frame").error(error.problem) from None
+        raise
+
+
+def _placement(where: Where) -> Any:
+    """Function that reads the placement of a base: a word, or its place and its angles."""
+
+    def read(given: Any) -> Any:
+        if not isinstance(given, dict):
+            return where.one_of(given, ("planar",))
+        where.table(given, ("xyz", "rpy"))
+        still, transform = [0.0, 0.0, 0.0], np.eye(4)
+        angles = where.at("rpy").numbers(given.get("rpy", still), kinds.ANGLES, "angle")
+        transform[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+        transform[:3, 3] = where.at("xyz").numbers(given.get("xyz", still), ("x", "y", "z"), "axis")
+        return transform
+
+    return read
+
+
+def _on_robot(root: Where, tables: Mapping[str, Any], robot: Robot, dt: float, steps: int) -> Task:
+    names = robot.joint_names
+    initial, springs = (tables.get(name, {}) for name in ("initial", "springs"))
+    root.at("initial").table(initial, ("q", "v"))
+    root.at("springs").table(springs, ("stiffness", "rest"))
+    q0 = root.at("initial", "q").positions(initial.get("q", 0.0), robot)
+    driven, gear, limit = _actuation(root.at("actuation"), tables.get("actuation", {}), robot)
+    matrix = np.zeros((robot.dof, len(driven)))
+    matrix[[robot.coordinate(joint) for joint in driven], np.arange(len(driven))] = gear
+    constraints: list[Any] = []
+    for where, given in root.at("constraint").tables(tables.get("constraint", [])):
+        _, kind, own = where.kind(given, kinds.CONSTRAINTS)
+        constraints.append(_bound(where, kind, own, robot))
+    given = {
+        "gravity": tables.get("gravity", True),
+        "damping": tables.get("damping"),
+        "friction": tables.get("friction"),
+        "stiffness": springs.get("stiffness", 0.0),
+        "rest": root.at("springs", "rest").positions(springs.get("rest", 0.0), robot),
+        "forces": _forces(root.at("force"), tables.get("force", []), robot, matrix.any(axis=1), driven, limit),
+        "actuation": matrix,
+        "noise": _noise(root.at("noise"), tables.get("noise", []), robot, matrix, driven) or None,
+        "constraints": constraints or None,
+    }
+    try:
+        scene = Scene(robot, **given)
     except VarpinError as error:
-        raise _located(error, tables, robot) from None
-    controls = tables.simulate.controls
-    if controls is not None and controls != "hold":
-        controls = timeline(
-            controls, root.at("simulate").at("controls"), driven, "driven joint", robot, tables.dt, tables.duration
-        )
+        words = {"stiffness": "springs.stiffness", "Noise": "noise", "control": "actuation", "servo": "force"}
+        key = next((key for word, key in words.items() if word in str(error)), root.of(error, given).key)
+        raise SceneFileError(root.path.name, key, str(error)) from None
     task = Task(
-        tables=tables,
-        scene=scene,
-        q0=q0,
-        v0=initial.at("v").spread(tables.initial.v, names),
-        driven=tuple(driven),
-        gear=gear,
-        torque_limit=limit,
-        costs=tuple(
-            _term(cost, root.at("cost").at(k), robot, driven, q0, tables) for k, cost in enumerate(tables.cost)
-        ),
-        controls=controls,
+        root,
+        tables,
+        scene,
+        q0,
+        root.at("initial", "v").numbers(initial.get("v", 0.0), names),
+        dt,
+        steps,
+        driven,
+        gear,
+        limit,
     )
+    horizon = dt, dt * steps
+    terms = [_term(where, cost, task, horizon) for where, cost in root.at("cost").tables(tables.get("cost", []))]
+    where = root.at("simulate")
+    controls = where.table(tables.get("simulate", {}), ("controls", "seed")).get("controls")
+    if controls is not None and controls != "hold":
+        controls = timeline(controls, where.at("controls"), driven, "driven joint", robot, horizon)
+    task = replace(task, terms=tuple(terms), controls=controls)
     _require_controls(task)
     return task
 
 
-def _refuse_degrees(place: Where, values: Floats, robot: Robot) -> None:
-    for joint, value, slide in zip(robot.joint_names, values.tolist(), robot.slides.tolist(), strict=True):
-        if not slide and looks_like_degrees(value):
-            raise place.error(f"{value:g} of {joint!r} looks like degrees: angles are in rad")
+def _actuation(where: Where, given: Any, robot: Robot) -> tuple[tuple[str, ...], Floats, Floats]:
+    """The driven joints (m), their gears (m,), and the limits (m,) of the torques at the joints [N m or N]."""
+    where.table(given, ("joints", "gear", "torque_limit"))
+    driven = given.get("joints", list(robot.joint_names))
+    if not isinstance(driven, list) or not driven:
+        raise where.at("joints").error("must be a list of at least one joint; leave it out to drive all of them")
+    for index, joint in enumerate(driven):
+        where.at("joints", index).one_of(joint, [name for name in robot.joint_names if name not in driven[:index]])
+    gear = where.at("gear").numbers(given.get("gear", 1.0), driven, "driven joint")
+    if not gear.all():
+        raise where.at("gear").error(f"must not be 0, and is for {driven[int(np.argmin(np.abs(gear)))]!r}")
+    at, value = where.at("torque_limit"), given.get("torque_limit")
+    if value is None:
+        return tuple(driven), gear, np.full(len(driven), np.inf)
+    own = robot.effort_limit[[robot.coordinate(joint) for joint in driven]]
+    limit = own if value == "robot" else at.numbers(value, driven, "driven joint")
+    if not ((limit > 0.0) & np.isfinite(limit)).all():
+        joint = driven[int(np.argmin((limit > 0.0) & np.isfinite(limit)))]
+        raise at.error(f"must be > 0 and finite [N m or N] for {joint!r}")
+    return tuple(driven), gear, limit
 
 
-def _torque_limit(tables: SceneTables, robot: Robot, driven: Sequence[str]) -> Floats:
-    given, place = tables.actuation.torque_limit, tables.where.at("actuation").at("torque_limit")
-    if given is None:
-        return np.full(len(driven), np.inf)
-    if isinstance(given, str):
-        limit = robot.effort_limit[[robot.coordinate(joint) for joint in driven]]
-        if not np.isfinite(limit).all():
-            joint = driven[int(np.argmax(~np.isfinite(limit)))]
-            raise place.error(f"the robot description gives {joint!r} none: write numbers [N m or N]")
-        return limit
-    limit = place.spread(given, driven, "driven joint")
-    if not (limit > 0.0).all():
-        k = int(np.argmax(~(limit > 0.0)))
-        raise place.error(f"must be > 0 [N m or N], and is {limit[k]:g} for {driven[k]!r}")
-    return limit
+def _bound(where: Where, kind: Any, own: dict[str, Any], robot: Robot) -> Any:
+    """A force or a constraint of the keys of a table, which fits the robot."""
+    points = {
+        name: (value["frame"], value["place"])
+        for name, value in own.items()
+        if isinstance(value, dict) and value.keys() == {"frame", "place"}
+    }
+    made = where.call(kind, own | points)
+    try:
+        description_constraints(robot) if made == "robot" else made.bind(robot)
+    except VarpinError as error:
+        raise where.of(error, own | points) from None
+    return made
 
 
-def _forces(tables: SceneTables, robot: Robot, limit: Floats) -> list[Force]:
-    """The forces of a file. Torque limits (n,) bound the effort of servos."""
+def _forces(where: Where, given: Any, robot: Robot, *effort: Any) -> list[Force]:
+    """The forces of a file. Torque limits of driven joints bound the effort of servos."""
+    _, driven, limit = effort
+    most = np.full(robot.dof, np.inf)
+    most[[robot.coordinate(joint) for joint in driven]] = limit
     found: list[Force] = []
-    for force in tables.force:
-        if isinstance(force, CoulombFriction) and isinstance(force.level, str):
-            found.append(replace(force, level=robot.friction))
-        elif isinstance(force, PositionServo) and np.isfinite(limit).any():
-            effort = np.full(robot.dof, np.inf)
+    for place, table in where.tables(given):
+        word, kind, own = place.kind(table, kinds.FORCES)
+        if word == "friction" and own.get("level") == "robot":
+            own["level"] = robot.friction
+        force = _bound(place, kind, own, robot)
+        if isinstance(force, PositionServo) and np.isfinite(most).any():
+            bounds = np.full(robot.dof, np.inf)
             for servo in force.bind(robot):
-                effort[servo.coordinate] = servo.values[2]
-            found.append(replace(force, effort=np.minimum(effort, limit)))
-        else:
-            found.append(force)
+                bounds[servo.coordinate] = servo.values[2]
+            force = replace(force, effort=np.minimum(bounds, most))
+        found.append(force)
     return found
 
 
-def _located(error: VarpinError, tables: SceneTables, robot: Robot) -> SceneFileError:
-    """An error of the scene with its place in the file."""
-    for key, parts in (("force", tables.force), ("constraint", tables.constraint)):
-        for index, part in enumerate(parts):
-            try:
-                description_constraints(robot) if isinstance(part, str) else part.bind(robot)
-            except VarpinError as wrong:
-                place = tables.where.at(key).at(index)
-                return place.of(wrong, {} if isinstance(part, str) else vars(part))
-    words = {"Noise": "noise", "control": "actuation", "servo": "force"}
-    key = next((key for word, key in words.items() if word in str(error)), "")
-    return tables.where.at(key).error(str(error))
+def _noise(where: Where, given: Any, robot: Robot, actuation: Floats, driven: Sequence[str]) -> list[Noise]:
+    """The noise models of a file, with their nonzero processes alone."""
+    found: list[Noise] = []
+    for place, table in where.tables(given):
+        word, kind, own = place.kind(table, kinds.NOISE)
+        of_control, at = word == "control", place.at("intensity")
+        place.table(own, ("intensity", "center") if word == "state" else ("intensity",), ("intensity",))
+        whose, what = (driven, "driven joint") if of_control else (robot.joint_names, "joint")
+        intensity: Floats = at.weights(own["intensity"], whose, what)
+        act = np.flatnonzero(intensity)
+        if not len(act):
+            continue
+        if "center" in own:
+            own["center"] = place.at("center").positions(own["center"], robot)
+        own["intensity"] = intensity
+        if of_control:
+            own["intensity"] = np.zeros((robot.dof, len(act), len(driven)))
+            own["intensity"][:, np.arange(len(act)), act] = (actuation * intensity)[:, act]
+        elif word == "additive":
+            own["intensity"] = np.diag(intensity)[:, act]
+        found.append(place.call(kind, own))
+    return found
 
 
-def _noise(given: NoiseTable, place: Where, actuation: Floats, driven: Sequence[str], robot: Robot) -> Noise | None:
-    """A noise model with its nonzero processes alone; None if there are none."""
-    of_control = given.type == "control"
-    whose, what = (driven, "driven joint") if of_control else (robot.joint_names, "joint")
-    intensity = place.at("intensity").spread(given.intensity, whose, what)
-    center = None if given.center is None else place.at("center").positions(given.center, robot)
-    act = np.flatnonzero(intensity)
-    if not len(act):
-        return None
-    if given.type == "state":
-        return StateNoise(intensity, center)
-    if not of_control:
-        return AdditiveNoise(np.diag(intensity)[:, act])
-    field = np.zeros((robot.dof, len(act), len(driven)))
-    field[:, np.arange(len(act)), act] = (actuation * intensity)[:, act]
-    return ControlNoise(field)
-
-
-def _term(
-    table: CostTable, place: Where, robot: Robot, driven: Sequence[str], q0: Floats, tables: SceneTables
-) -> CostTerm:
-    term, given = table.term, table.given
-    if term.space == "frame":
-        try:
-            frame_index(robot.free_model, table.frame, robot.name)
-        except UnknownFrame as error:
-            raise place.at("frame").error(str(error)) from None
-    if term.limits and not np.isfinite(term.limits(robot)).any():
-        raise place.at("type").error(f"robot {robot.name!r} has no such limits")
-    joints, what = (tuple(driven), "driven joint") if term.space == "u" else (robot.joint_names, "joint")
-    axes, kind = (joints, what) if term.of_joints else (term.axes or ("weight",), "axis")
-    weight = place.at("weight").spread(given.get("weight", 1.0), axes, kind)
-    target = None
-    if term.target and "hold" not in given and (term.target in given or term.target != "before"):
-        components, kind = (joints, what) if term.of_joints else (term.components, "component")
-        at = place.at(term.target)
-        target = timeline(given.get(term.target, 0.0), at, components, kind, robot, tables.dt, tables.duration)
-        if term.space == "q" and target.constant:
-            _refuse_degrees(at, target(0.0), robot)
-    holding_q = None
-    if "hold" in given:
-        holding_q = q0 if given["hold"] is True else place.at("hold").positions(given["hold"], robot)
-    return CostTerm(table, place, weight, target, holding_q)
+def _term(where: Where, table: Any, task: Task, horizon: tuple[float, float]) -> Term:
+    """A term of the cost; ``horizon`` is the step and the duration [s]."""
+    kind, _, own = where.kind(table, kinds.COSTS)
+    robot, target_key = task.scene.robot, kinds.target_key(kind)
+    keys = kinds.cost_keys(kind)
+    where.table(own, keys, [key for key, needed in keys.items() if needed])
+    names: tuple[str, ...] | None = None
+    if kind in kinds.OF_JOINTS + kinds.OF_CONTROLS:
+        names = task.driven if kind in kinds.OF_CONTROLS else robot.joint_names
+    what = "joint" if names is not None else "component"
+    if "frame" in own and not robot.free_model.existFrame(own["frame"]):
+        where.at("frame").one_of(own["frame"], [frame.name for frame in robot.free_model.frames])
+    axes = names if names is not None else kinds.AXES.get(kind, ("weight",))
+    weight = where.at("weight").weights(own.pop("weight", 1.0), axes, what)
+    hold, terminal, given = own.pop("hold", None), own.pop("terminal", False), own.pop(target_key, None)
+    if not isinstance(terminal, bool):
+        raise where.at("terminal").error("must be true or false")
+    if hold is not None and given is not None:
+        raise where.error(f"hold and {target_key} exclude each other: give one of them")
+    at, target = where.at(target_key), None
+    if kind == "control_rate" and given is not None:
+        target = constant(at.numbers(given, axes, what))
+    elif target_key and hold is None and kind != "control_rate":
+        axes = kinds.ANGLES if kind == "frame_orientation" else axes
+        target = timeline(0.0 if given is None else given, at, axes, what, robot, horizon)
+        if kind == "tracking" and target.constant:
+            at.refuse_degrees(target(0.0), robot.joint_names, robot.slides.tolist())
+    if hold is not None:
+        hold = task.q0 if hold is True else where.at("hold").positions(hold, robot)
+    term = Term(where, kind, own, terminal, weight, target, hold, names)
+    if (limits := term.limits(robot)) is not None and not np.isfinite(limits).any():
+        raise where.at("type").error(f"robot {robot.name!r} has no such limits")
+    return term
 
 
 def _require_controls(task: Task) -> None:
     """Refuse controls of a simulation that are positions in degrees, or beyond limits."""
     if not isinstance(task.controls, Timeline):
         return
-    place, robot = task.tables.where.at("simulate").at("controls"), task.scene.robot
-    given = task.controls.at(times_of(task.tables))
-    for k in np.flatnonzero(task.positions).tolist():
-        worst = float(given[np.argmax(np.abs(given[:, k])), k])
-        if not robot.slides[robot.coordinate(task.driven[k])] and looks_like_degrees(worst):
-            raise place.error(f"{worst:g} of {task.driven[k]!r} looks like degrees: positions are in rad")
+    place, robot = task.where.at("simulate", "controls"), task.scene.robot
+    given = task.controls.at(task.times)
+    worst = given[np.abs(given).argmax(axis=0), np.arange(given.shape[1])]
+    free = ~task.positions | robot.slides[[robot.coordinate(joint) for joint in task.driven]]
+    place.refuse_degrees(worst, task.driven, free.tolist())
     force, limit = np.abs(given * task.gear), np.where(task.positions, np.inf, task.torque_limit)
     if (force > limit * (1.0 + _ROUNDING)).any():
         k = int(np.argmax((force - limit).max(axis=0)))

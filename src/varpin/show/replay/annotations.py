@@ -19,7 +19,7 @@ from varpin.model import Robot
 from varpin.show.given import motion_of, problem_of
 from varpin.show.replay.marks import Beads, Path, Target
 from varpin.show.replay.script import rows_at
-from varpin.support.checks import as_floats, joint_array, require_finite
+from varpin.support.checks import as_floats, require_finite
 from varpin.trajectory import Trajectory, kinematic_input_rows
 
 if TYPE_CHECKING:
@@ -180,12 +180,10 @@ def torque_shares(robot: Robot, given: object, marks: Marks) -> Floats | None:
         marks: What to show.
 
     Raises:
-        InputError: The motion does not have torques of all joints, they are not (N, n), or a limit is not positive.
+        InputError: The motion does not have torques of all joints, or they are not (N, n).
     """
-    torques, limit, own = marks.torques, marks.torque_limit, isinstance(marks.torques, bool | np.bool_)
+    torques, own = marks.torques, isinstance(marks.torques, bool | np.bool_)
     if own and not torques:
-        if limit is not None:
-            raise InputError("torque_limit needs torques")
         return None
     if own:
         motion = motion_of(given)
@@ -210,11 +208,4 @@ def torque_shares(robot: Robot, given: object, marks: Marks) -> Floats | None:
     if own and problem is not None:
         bounds.append(np.abs(problem.control_limits).max(axis=0))
     bound = functools.reduce(lambda before, more: np.where(np.isfinite(more), more, before), bounds)
-    if limit is not None:
-        numbers = joint_array("torque_limit", limit, robot.joint_names, uniform=True)
-        # Joints that are not named keep the limit of the robot.
-        named = [not isinstance(limit, Mapping) or name in limit for name in robot.joint_names]
-        bound = np.where(named, numbers, bound)
-        if not (bound > 0.0).all():
-            raise InputError(f"torque_limit must be positive [N m or N], got {limit}")
     return np.minimum(size / np.where(bound > 0.0, bound, 1.0), 1.0)

@@ -70,19 +70,14 @@ class _Drawing:
 
     def draw(self) -> Stage:
         stage, places = self._stage()
-        shown = set()
         for k, (actor, figure, place) in enumerate(zip(self.script.actors, stage.figures, places, strict=True)):
             number = f" {k + 1}" if k else ""
             self._robot(actor, figure.picture, number, place)
             self.viewer[f"notes{number}"].set_transform(translation(place))
             for i, mark in enumerate(actor.marks):
-                # Robots in the same place share marks.
-                if (key := (id(mark), place.tobytes())) not in shown:
-                    self._mark(mark, mark_name(i, mark), figure, number)
-                shown.add(key)
+                self._mark(mark, mark_name(i, mark), figure, number)
         if len(self.script.times) > 1:
-            repetitions = math.inf if self.script.loop else 1
-            self.viewer.set_animation(Animation(self.clips), play=True, repetitions=repetitions)
+            self.viewer.set_animation(Animation(self.clips), play=True, repetitions=math.inf)
         return stage
 
     def _stage(self) -> tuple[Stage, list[Floats]]:
@@ -106,8 +101,7 @@ class _Drawing:
         extents = [self._extent(actor, figure) for actor, figure in zip(self.script.actors, figures, strict=True)]
         if not np.abs(np.concatenate(extents)).max() < _FARTHEST:
             raise InputError(f"the replay has sizes or positions beyond {_FARTHEST:g} m, which no viewer draws")
-        offset = self.script.offset
-        places = side_by_side(extents, toward) if offset is None else [k * offset for k in range(len(extents))]
+        places = side_by_side(extents, toward)
         points = np.concatenate([points + place for points, place in zip(extents, places, strict=True)])
         set_view(self.viewer, points, toward, size)
         return Stage(size, points, toward, figures), places

@@ -26,7 +26,7 @@ from varpin.show.replay.page import Inline, inline_page, open_viewer, write_page
 from varpin.show.replay.script import Actor, Script, rows_at, tree_positions
 from varpin.show.replay.surroundings import goals, parts_of, regions, ties
 from varpin.show.replay.video import check_film, frame_size, frame_times, write_film
-from varpin.support.checks import as_floats, finite_array, flag, positive, require_finite, writable
+from varpin.support.checks import as_floats, flag, positive, require_finite, writable
 from varpin.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -52,12 +52,9 @@ def replay(
     html: str | os.PathLike[str] | None = None,
     open: bool = False,
     video: str | os.PathLike[str] | None = None,
-    inline: bool = False,
     dt: float | None = None,
     marks: Marks | None = None,
-    offset: ArrayLike | None = None,
     speed: float = 1.0,
-    loop: bool = True,
     fps: float = 30.0,
     size: tuple[int, int] = (800, 600),
 ) -> Path | meshcat.Visualizer | Inline:
@@ -71,15 +68,13 @@ def replay(
             (N + 1, n) [rad or m] with ``dt``, of which a single row shows a pose.
         html: Write one self-contained HTML file here. It needs neither a server nor a network.
         video: Write a film here, as ``.gif`` or ``.mp4``; with or without ``html``.
-        open: Open a live window instead.
-        inline: Return the page instead, which a notebook shows as the value of a cell.
+        open: Open a live window instead. With none of these three, the page is returned, which a notebook shows as the
+            value of a cell.
         marks: What to show beside the robot.
 
     Other Args:
         dt: Time between the rows of an array [s].
-        offset: Translation from each of several robots to the next (3,) [m]; if left out, so that none hides another.
         speed: Playback speed; 1 is true speed, 0.1 ten times slower.
-        loop: Start again at the end; otherwise stop there.
         fps: Keyframes a second of playback, 10,000 at most, and frames of a film. Between keyframes the page
             interpolates q linearly and draws at the screen's own rate; the log warns if joints are off by 0.02 rad or
             m there.
@@ -101,30 +96,25 @@ def replay(
         as an object that notebooks show.
 
     Raises:
-        InputError: Neither a file nor ``open`` is given, or both; a motion or a ghost has another shape, is of another
-            robot, or is not finite; ``dt`` is missing or superfluous; a frame does not exist; or another mark or
-            ``offset`` is invalid or of another robot.
+        InputError: Both a file and ``open`` are given; a motion or a ghost has another shape, is of another robot, or
+            is not finite; ``dt`` is missing or superfluous; a frame does not exist; or another mark is invalid or of
+            another robot.
         FileError: The file cannot be written.
         MissingDependency: A film needs imageio, selenium, Chromium or its driver, and one of them is not installed.
     """
-    open, inline, loop = flag("open", open), flag("inline", inline), flag("loop", loop)
-    if (html is not None or video is not None) + open + inline != 1:
-        raise InputError(
-            "give either html=path, for a file, or open=True, for a window; or video=path, for a film; or inline=True, "
-            "for a notebook"
-        )
+    if flag("open", open) and not (html is None and video is None):
+        raise InputError("give either open=True, for a window, or html=path and video=path, for files")
     figures = _figures(robot, motion, dt, require_marks(marks))
     speed, fps = positive("speed", speed, "1"), positive("fps", fps, "1/s")
-    step = None if offset is None else finite_array("offset", offset, (3,))
     page = None if html is None else writable(html)
     film = None if video is None else writable(video)
     if film is not None:
         check_film(film, size)
-    script = Script(*_keyframes(figures, fps, speed), step, loop, speed, _error(figures))
-    if inline:
-        return inline_page(script, frame_size(size))
-    if page is None and film is None:
+    script = Script(*_keyframes(figures, fps, speed), speed, _error(figures))
+    if open:
         return open_viewer(script)
+    if page is None and film is None:
+        return inline_page(script, frame_size(size))
     with tempfile.TemporaryDirectory() as folder:
         written = write_page(page or Path(folder, "page.html"), script)
         if film is None:
@@ -227,11 +217,6 @@ def _keyframes(figures: Sequence[_Figure], fps: float, speed: float) -> tuple[Fl
     moving += [second[0] for second in ghosts if second is not None]
     times = _times([*(figure.t for figure in figures), *moving], end, fps / speed)
     _warn_if_thinned(figures, times)
-    # Robots with the same marks share them, so that they are drawn once in one place.
-    shared = {
-        key: (references(marks.reference), tuple(target(name, track, times) for name, track in tracks[key].items()))
-        for key, marks in records.items()
-    }
     actors = []
     for figure, second in zip(figures, ghosts, strict=True):
         robot, marks, t = figure.robot, figure.marks, figure.t
@@ -241,8 +226,8 @@ def _keyframes(figures: Sequence[_Figure], fps: float, speed: float) -> tuple[Fl
         robots, place = [other.robot for other in group], group.index(figure)
         traced = frame_names("trace", robots, marks.trace)[place]
         clock = times if marks.growing else None
-        reference, targets = shared[id(marks)]
-        own: list[Mark] = [*reference, *paths("motion", robot, traced, t, figure.q, end, clock)]
+        targets = tuple(target(name, track, times) for name, track in tracks[id(marks)].items())
+        own: list[Mark] = [*references(marks.reference), *paths("motion", robot, traced, t, figure.q, end, clock)]
         positions = {"robot": tree_positions(robot, rows_at(times, t, figure.q))}
         if second is not None:
             positions["ghost"] = tree_positions(robot, rows_at(times, *second))

@@ -64,7 +64,7 @@ function joinBar() {
         play: '<svg viewBox="0 0 14 14"><path d="M2 1l11 6-11 6z"/></svg>',
         pause: '<svg viewBox="0 0 14 14"><path d="M2 1h4v12H2zM8 1h4v12H8z"/></svg>',
     };
-    let playing, shown, over = false;
+    let playing, shown;
 
     const now = () => Math.max(...animator.actions.map(action => action.time));
     function seek(time) {
@@ -75,15 +75,10 @@ function joinBar() {
         if (resume) animator.play();
     }
     function toggle() {
-        if (animator.playing) return animator.pause();
-        // At the end of a motion that does not repeat: from the start again.
-        if (now() >= end) seek(0);
-        animator.play();
+        if (animator.playing) animator.pause();
+        else animator.play();
     }
     function refresh() {
-        // The viewer sets the clock of a motion that is over to 0, and leaves its end in view.
-        if (over && !animator.playing) seek(end);
-        over = over && animator.playing;
         if (playing !== animator.playing) {
             playing = animator.playing;
             button.innerHTML = playing ? icons.pause : icons.play;
@@ -98,7 +93,6 @@ function joinBar() {
     }
 
     slider.max = end;
-    animator.mixer.addEventListener("finished", () => { over = true; });
     slider.addEventListener("input", () => seek(Number(slider.value)));
     button.addEventListener("click", toggle);
     speed.addEventListener("change", () => { animator.mixer.timeScale = Number(speed.value) / first; });

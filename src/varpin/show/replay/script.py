@@ -41,16 +41,12 @@ class Script:
         times: Times of the keyframes (K,) [s of playback]. All tracks share them: each track loops on its own, and
             tracks of unequal length would drift apart.
         actors: The robots.
-        offset: Translation from one robot to the next (3,) [m]; None to place them side by side.
-        loop: Start again at the end.
         speed: Seconds of motion in a second of playback.
         error: The estimated error of the motions in words; empty where it is not known.
     """
 
     times: Floats
     actors: tuple[Actor, ...]
-    offset: Floats | None = None
-    loop: bool = True
     speed: float = 1.0
     error: str = ""
 

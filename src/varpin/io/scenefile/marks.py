@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from varpin.arrays import Floats
-from varpin.io.scenefile.task import CostTerm, Task
+from varpin.io.scenefile.task import Task, Term
 from varpin.marks import Marks
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _POINTS = 400
 
 
-def marks_of(task: Task, duration: float, constraints: bool | Scene | OptimalControlProblem) -> Marks:
+def marks_of(task: Task, duration: float, constraints: Scene | OptimalControlProblem) -> Marks:
     """Marks from the cost: traces, targets, references and a ghost.
 
     Args:
@@ -27,14 +27,14 @@ def marks_of(task: Task, duration: float, constraints: bool | Scene | OptimalCon
         duration: Duration of the motion [s].
         constraints: What draws its constraints.
     """
-    wanted = [term for term in task.costs if term.target is not None and term.weight.all()]
-    positions = [term for term in wanted if term.table.kind == "frame_position"]
-    orientations = [term for term in wanted if term.table.kind == "frame_orientation"]
+    wanted = [term for term in task.terms if term.target is not None and term.weight.all()]
+    positions = [term for term in wanted if term.kind == "frame_position"]
+    orientations = [term for term in wanted if term.kind == "frame_orientation"]
     targets: dict[str, Floats] = {}
     references: dict[str, Floats] = {}
     for term in positions:
         orientation = next((other for other in orientations if _of_one_frame(term, other)), None)
-        name = "target" if len(positions) == 1 else f"target of {term.table.frame}"
+        name = "target" if len(positions) == 1 else f"target of {term.frame}"
         while name in targets:
             name += "'"
         targets[name] = _target(term, orientation, duration)
@@ -42,27 +42,26 @@ def marks_of(task: Task, duration: float, constraints: bool | Scene | OptimalCon
         if len(path) > 1 and np.ptp(path, axis=0).any():
             references[f"path of {name}"] = path
     ghost = _ghost(task, duration)
-    frames = list(dict.fromkeys(term.table.frame for term in positions))
+    frames = list(dict.fromkeys(term.frame for term in positions))
     trace = frames or ghost is not None
     return Marks(trace=trace, targets=targets, reference=references or None, ghost=ghost, constraints=constraints)
 
 
-def _of_one_frame(position: CostTerm, orientation: CostTerm) -> bool:
+def _of_one_frame(position: Term, orientation: Term) -> bool:
     """Whether two terms have the same frame, both over time or both at the end."""
-    one, other = position.table, orientation.table
-    return one.frame == other.frame and one.terminal == other.terminal
+    return position.frame == orientation.frame and position.terminal == orientation.terminal
 
 
-def _values(term: CostTerm, duration: float) -> Floats:
+def _values(term: Term, duration: float) -> Floats:
     """A target over time (K, c), or (1, c) if it is constant or the target of a terminal term."""
     assert term.target is not None
-    if term.table.terminal:
+    if term.terminal:
         return term.target.at(np.array([duration]))
     t = np.linspace(0.0, duration, _POINTS if duration > 0.0 else 1)
     return term.target.at(t[:1] if term.target.constant else t)
 
 
-def _target(position: CostTerm, orientation: CostTerm | None, duration: float) -> Floats:
+def _target(position: Term, orientation: Term | None, duration: float) -> Floats:
     """Target positions (K, 3) of a frame, or poses (K, 4, 4) with a target of its orientation."""
     points = _values(position, duration)
     if orientation is None:
@@ -78,9 +77,11 @@ def _target(position: CostTerm, orientation: CostTerm | None, duration: float) -
 
 def _ghost(task: Task, duration: float) -> Floats | None:
     """Configurations (K, n) that the joints should follow or reach; None if there is no such cost."""
-    terms = [term for term in task.costs if term.table.kind == "tracking" and term.weight.any()]
+    terms = [term for term in task.terms if term.kind == "tracking" and term.weight.any()]
     if not terms:
         return None
-    term = next((term for term in terms if not term.table.terminal), terms[0])
+    term = next((term for term in terms if not term.terminal), terms[0])
     # Joints without weight are drawn where they start.
-    return np.asarray(np.where(term.weight != 0.0, _values(term, duration), task.q0))
+    assert term.names is not None
+    keep = [term.names.index(name) for name in task.scene.robot.joint_names]
+    return np.asarray(np.where(term.weight[keep] != 0.0, _values(term, duration)[:, keep], task.q0))

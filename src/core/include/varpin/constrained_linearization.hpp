@@ -1,0 +1,273 @@
+// First derivatives of steps under constraints. docs/constraints.md, "Steps".
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <span>
+#include <vector>
+
+#include "varpin/constrained.hpp"
+#include "varpin/substeps.hpp"
+
+namespace varpin {
+
+// Derivatives of the steps of a trajectory; as VariationalLinearization. They are those of a map on all of R^2n, which
+// does not require g(q0) = 0 and absorbs the part of p0 normal to the constraints.
+class ConstrainedLinearization {
+  public:
+    ConstrainedLinearization(const Mechanism& mechanism, const Tableau& tableau, const std::vector<double>& places,
+                             double tolerance, const Guards& guards, const Kernels& kernels = kernels_for<>)
+        : stepper(mechanism, tableau, places, tolerance, guards, kernels),
+          inputs(stepper.inputs),
+          here(stepper.here),
+          n(stepper.n),
+          m(stepper.m),
+          stages(stepper.stages),
+          state(mechanism, stages),
+          chained(n, inputs.count()),
+          y(n) {}
+
+    // With `ramp` those in the force are in one that grows linearly from 0; `rates` are those of kinematic inputs at
+    // their goals, and Jr (2n, driven rows) the derivatives in them, zero for linear ones.
+    Outcome first(double h, const double* q, const double* p, const double* guess, const double* force,
+                  const double* rates, std::span<const std::uint8_t> halvings, double* Jx, double* Jf, double* Jr) {
+        stepper.take_force(force, varies, rates);
+        if (!stepper.begin_at(q, p, state, false)) return Outcome::singular;
+        if (halvings.empty()) {
+            Outcome outcome = stepper.from_guess(h, guess, state);
+            if (outcome != Outcome::solved) outcome = stepper.part(h, 0, 0.0, state);
+            if (outcome == Outcome::solved) derivatives(h, 0.0, 1.0, Jx, Jf, Jr);
+            if (outcome == Outcome::solved || !stepper.guards.active) return outcome;
+        }
+        chained.begin(Jx, Jf);
+        std::fill(Jr, Jr + chained.part_rate.size(), 0.0);
+        return parts_again(halvings, stepper.guards.halvings_again(), [&](int level, double begin) {
+            const Outcome outcome = stepper.part(h, level, begin, state);
+            if (outcome != Outcome::solved) return outcome;
+            derivatives(length_of(h, level), begin, length_of(1.0, level), chained.part.data(), chained.part_f.data(),
+                        chained.part_rate.data());
+            chained.follow(Jx, Jf);
+            chained.follow_rates(Jr);
+            return outcome;
+        });
+    }
+
+    bool varies = false, ramp = false;
+    void take_external() { stepper.equation.by_external = true; }
+
+  private:
+    // Parameters of a kinematic input's motion: the goal, or the rates at both ends of a cubic.
+    enum class Goal { position, begin, end };
+
+    ConstrainedStepper stepper;
+    KinematicInputs& inputs;
+    ConstraintBasis& here;
+    int n, m, stages;
+    PathState state;
+    ChainedDerivatives chained;
+    std::array<std::vector<double>, 2> by_rates;  // (2n, 2n) and (2n, n), derivatives in rates at both ends
+    std::vector<double> dV, columns, bends, y;
+
+    // Derivatives of the last substep, from (q0, p0) under the force f: of (q1, p1) in (q0, p0), Jx, in f, Jf, and in
+    // the rates of kinematic inputs at their goals, Jr. It is the part of the step at `begin` with length `share`.
+    void derivatives(double h, double begin, double share, double* Jx, double* Jf, double* Jr) {
+        if (ramp) stepper.equation.weigh_ramp(begin, share);
+        exchange(here, stepper.origin);
+        stepper.assemble(h);
+        factor_lu_pivoting(stepper.saddle.data(), stages * (n + here.rank()), stepper.rows.data());
+        bend_points();
+        state_columns(h);
+        end_columns(h, Jx, Jf);
+        for (int end = 0; end < 2 && inputs.cubic; ++end) {
+            rate_columns(end);
+            by_rates[end].resize(6 * n * n);
+            end_columns(h, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
+        }
+        exchange(here, stepper.origin);
+        project(h, Goal::position, Jx, Jf);
+        if (!inputs.cubic) return;
+        for (int end = 0; end < 2; ++end)
+            project(h, end == 0 ? Goal::begin : Goal::end, by_rates[end].data(), by_rates[end].data() + 4 * n * n);
+        join_rates(Jx, Jr);
+    }
+
+    // Lam_k . g_qq (s, n, n) at the Lobatto points but the last.
+    void bend_points() {
+        bends.assign(entries(stages * n, n), 0.0);
+        for (int k = 0; k < stages; ++k)
+            stepper.mechanism.constraints.add_curvature(&stepper.impulse[k * m], 1.0,
+                                                        k == 0 ? here.jet : stepper.point[k - 1], &bends[k * n * n]);
+    }
+
+    // Row a of the border at Lobatto point k.
+    double* border(int k, int a) { return &columns[entries(stages * n + k * here.rank() + a, 3 * n)]; }
+
+    // Right sides for derivatives in (q0, p0) and in the goals of kinematic inputs.
+    void state_columns(double h) {
+        StepEquation& equation = stepper.equation;
+        const int r = here.rank(), wide = stages * n, w = 3 * n;
+        dV.resize(entries(wide, w));
+        equation.right_sides(n, stages, h, {0, n}, dV);
+        for (int row = 0; equation.kinds() == 2 && row < n; ++row) {
+            for (int c = 0; c < n; ++c) dV[row * w + 2 * n + c] = equation.by_momentum(h, c) * dV[row * w + n + c];
+        }
+        for (const DrivenRow& own : inputs.driven) {
+            for (int i = 0; i < wide; ++i) dV[i * w + 2 * n + own.coordinate] = 0.0;
+        }
+        columns.assign(entries(stages * (n + r), w), 0.0);
+        for (int i = 0; i < wide; ++i) {
+            for (int c = 0; c < w; ++c) {
+                double entry = dV[i * w + c];
+                for (int k = 0; k < stages && c < n; ++k)
+                    entry -= stepper.weight[(i / n) * stages + k] * bends[(k * n + i % n) * n + c];
+                columns[i * w + c] = stepper.scaled[i % n] * entry;
+            }
+        }
+        for (int k = 0; k < stages; ++k) {
+            for (int a = 0; a < r; ++a) {
+                const int row = here.order[a];
+                double* own = border(k, a);
+                for (int c = 0; c < n; ++c) own[c] = -stepper.row_scale[row] * stepper.point[k].C[row * n + c] / h;
+                const int d = inputs.of_row(row);
+                if (d < 0) continue;
+                const int c = inputs.driven[d].coordinate;
+                const KinematicInputs::Way way = inputs.way_at(d, stepper.way_to(k + 1));
+                own[2 * n + c] = stepper.row_scale[row] * way.ahead / h;
+                own[c] += stepper.row_scale[row] * (1.0 - way.ahead) / h;
+            }
+        }
+    }
+
+    // Right sides for derivatives in the rate of each cubic input at the beginning (`end` 0) or at its goal (1), in the
+    // column of the goal.
+    void rate_columns(int end) {
+        const int r = here.rank();
+        columns.assign(entries(stages * (n + r), 3 * n), 0.0);
+        for (int k = 0; k < stages; ++k) {
+            for (int a = 0; a < r; ++a) {
+                const int d = inputs.of_row(here.order[a]);
+                if (d < 0) continue;
+                const auto& [row, coordinate, control] = inputs.driven[d];
+                const KinematicInputs::Way way = inputs.way_at(d, stepper.way_to(k + 1));
+                border(k, a)[2 * n + coordinate] =
+                    stepper.row_scale[row] * (end == 0 ? way.begin : way.end) / inputs.share;
+            }
+        }
+    }
+
+    // Derivatives of the end of a substep without its last impulse, from the right sides in `columns` and the factors
+    // of the bordered matrix.
+    void end_columns(double h, double* Jx, double* Jf) {
+        const int r = here.rank(), wide = stages * n, size = stages * (n + r), w = 3 * n;
+        std::vector<double> sorted(columns.size());
+        for (int i = 0; i < size; ++i) std::copy_n(&columns[stepper.rows[i] * w], w, &sorted[i * w]);
+        solve_lu_rows(stepper.saddle.data(), size, {0, size}, sorted.data(), w, w);
+        for (int i = 0; i < wide; ++i) {
+            for (int c = 0; c < w; ++c) dV[i * w + c] = stepper.scaled[i % n] * sorted[i * w + c];
+        }
+        stepper.equation.end_derivatives(n, stages, h, {0, n}, dV, Jx, Jf);
+        // The impulses up to the last one contribute C_k' dLam_k + Lam_k . g_qq dQ~_k.
+        std::vector<double> dQ(n);
+        for (int c = 0; c < w; ++c) {
+            for (int k = 0; k < stages; ++k) {
+                for (int i = 0; i < n; ++i) {
+                    double sum = 0.0;
+                    for (int j = 0; j < stages; ++j) sum += stepper.places[k * stages + j] * dV[(j * n + i) * w + c];
+                    dQ[i] = h * sum + (c == i ? 1.0 : 0.0);
+                }
+                for (int i = 0; i < n; ++i) {
+                    double sum = detail::inner(n, &bends[(k * n + i) * n], dQ.data());
+                    for (int a = 0; a < r; ++a) {
+                        const int row = here.order[a];
+                        sum += stepper.jet_at(k).C[row * n + i] * stepper.row_scale[row] *
+                               sorted[(wide + k * r + a) * w + c];
+                    }
+                    entry(Jx, Jf, n + i, c) -= sum;
+                }
+            }
+        }
+    }
+
+    double& entry(double* Jx, double* Jf, int row, int c) const {
+        return c < 2 * n ? Jx[row * 2 * n + c] : Jf[row * n + c - 2 * n];
+    }
+
+    // The last impulse: M dv1 + C1' dLam = dp - (L_vq + Lam . g_qq) dq1, C1 dv1 = -(g_qq v1) dq1, and dp1 = M dv1 +
+    // L_vq dq1.
+    void project(double h, Goal what, double* Jx, double* Jf) {
+        const int r = here.rank();
+        std::vector<double> at(n), bend(m * n), curvature(n * n), z(n), along(r), dq(n), turned(n);
+        for (int i = 0; i < n; ++i) at[i] = state.position[i].value.high;
+        Jet<double>& jet = stepper.equation.stage[0];
+        stepper.equation.kernels.jet(stepper.mechanism, at.data(), state.v.data(), jet);
+        stepper.mechanism.constraints.bend(state.v.data(), here.jet, bend.data());
+        stepper.mechanism.constraints.add_curvature(stepper.last.data(), 1.0, here.jet, curvature.data());
+        for (int c = 0; c < 3 * n; ++c) {
+            for (int i = 0; i < n; ++i) dq[i] = entry(Jx, Jf, i, c);
+            for (int i = 0; i < n; ++i) {
+                turned[i] = detail::inner(n, &jet.A[i * n], dq.data());
+                z[i] = entry(Jx, Jf, n + i, c) - turned[i] - detail::inner(n, &curvature[i * n], dq.data());
+            }
+            here.whiten(z.data(), z.data());
+            for (int k = 0; k < r; ++k) {
+                double own =
+                    -detail::inner(n, &bend[here.order[k] * n], dq.data()) + goal_rate(here.order[k], what, h, c);
+                for (int j = 0; j < k; ++j) own -= here.R[j * r + k] * along[j];
+                along[k] = own / here.R[k * r + k];
+            }
+            const std::vector<double> before = z;
+            for (int k = 0; k < r; ++k) {
+                const double change = along[k] - detail::inner(n, &here.Q[k * n], before.data());
+                for (int i = 0; i < n; ++i) z[i] += change * here.Q[k * n + i];
+            }
+            for (int i = 0; i < n; ++i) z[i] *= std::sqrt(here.ldl[i * n + i]);
+            for (int i = n - 1; i >= 0; --i) {
+                double sum = z[i];
+                for (int j = 0; j < i; ++j) sum += here.ldl[i * n + j] * z[j];
+                entry(Jx, Jf, n + i, c) = sum + turned[i];
+            }
+        }
+    }
+
+    // The derivative of a row's rate at the end in parameter c; 0 for rows that are no kinematic input's.
+    double goal_rate(int row, Goal what, double h, int c) const {
+        const int d = inputs.of_row(row);
+        if (d < 0) return 0.0;
+        const int moved = inputs.driven[d].coordinate;
+        const KinematicInputs::Way pace = inputs.pace_at(d, inputs.share);
+        if (what == Goal::position) return pace.ahead * inputs.share / h * ((c == 2 * n + moved) - (c == moved));
+        if (c != 2 * n + moved) return 0.0;
+        return what == Goal::begin ? pace.begin : pace.end;
+    }
+
+    // Write the derivatives in the rates at the goals, and add those by way of the rates at the beginning, which follow
+    // from the momentum: v = M^-1 p, M dv = dp - L_vq dq.
+    void join_rates(double* Jx, double* Jr) {
+        const std::vector<DrivenRow>& driven = inputs.driven;
+        Jet<double>& jet = stepper.equation.stage[0];
+        stepper.equation.kernels.jet(stepper.mechanism, stepper.from_q.data(), stepper.from_v.data(), jet);
+        const double *at_begin = by_rates[0].data() + 4 * n * n, *at_end = by_rates[1].data() + 4 * n * n;
+        for (std::size_t d = 0; d < driven.size(); ++d) {
+            const int moved = driven[d].coordinate;
+            for (int i = 0; i < 2 * n; ++i)
+                Jr[i * driven.size() + d] = driven[d].rate < 0 ? 0.0 : at_end[i * n + moved];
+            if (driven[d].rate < 0) continue;
+            std::fill(y.begin(), y.end(), 0.0);
+            y[moved] = 1.0;
+            stepper.origin.whiten(y.data(), y.data());
+            stepper.origin.colour(y.data());
+            for (int c = 0; c < n; ++c) {
+                double by_q = 0.0;
+                for (int j = 0; j < n; ++j) by_q -= y[j] * jet.A[j * n + c];
+                for (int i = 0; i < 2 * n; ++i) {
+                    Jx[i * 2 * n + c] += at_begin[i * n + moved] * by_q;
+                    Jx[i * 2 * n + n + c] += at_begin[i * n + moved] * y[c];
+                }
+            }
+        }
+    }
+};
+
+}  // namespace varpin
