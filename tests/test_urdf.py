@@ -410,21 +410,6 @@ class TestMany:
         assert np.isfinite(motion.q).all()
         assert abs(motion.energy[-1] - motion.energy[0]) < 1e-9
 
-    def test_joints_of_a_file(self, tmp_path):
-        parts = [link(f"l{k}") + joint(f"j{k}", f"l{k - 1}" if k else "base", f"l{k}") for k in range(300)]
-        path = write_urdf(tmp_path, *parts)
-        robot = vp.load_robot(path)
-        assert robot.dof == 300
-        assert_same(robot.free_model, pin.buildModelFromUrdf(str(path)))
-
-    def test_links_without_number(self, tmp_path):
-        parts = [f'<link name="l{k}"/>' for k in range(12_000)]
-        fixed = [
-            f'<joint name="f{k}" type="fixed"><parent link="base"/><child link="l{k}"/></joint>' for k in range(12_000)
-        ]
-        path = write_urdf(tmp_path, *parts, *fixed, link("end"), joint("j1", "base", "end"))
-        assert vp.load_robot(path).dof == 1
-
     def test_threads_that_load_at_once_keep_stderr(self, tmp_path, capfd):
         path = arm(tmp_path)
         workers = [threading.Thread(target=lambda: [vp.load_robot(path) for _ in range(10)]) for _ in range(4)]

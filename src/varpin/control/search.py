@@ -1,8 +1,8 @@
 """The search for a plan: stages along the motion, feedback, a quadratic program, and a line search on true motions.
 
-Sequential quadratic programming in the form of differential dynamic programming, (O10), (O11) of docs/mathematics.md:
-feedback is that of the costs alone, and within limits and rows the changes of the controls come from one quadratic
-program over the horizon. Merit is the expected cost plus an l1 penalty of the rows.
+Sequential quadratic programming in the form of differential dynamic programming, (O10) and (O11) of
+docs/mathematics.md: feedback is that of the costs alone, and within limits and rows the changes of the controls come
+from one quadratic program over the horizon. Merit is the expected cost plus an l1 penalty of the rows.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <optional>
+#include <memory>
 #include <vector>
 
 #include "varpin/compensated.hpp"
@@ -27,7 +27,6 @@
 #include "varpin/kernels.hpp"
 #include "varpin/nodes.hpp"
 #include "varpin/size.hpp"
-#include "varpin/stage_elimination.hpp"
 #include "varpin/tableau.hpp"
 
 namespace varpin {
@@ -82,17 +81,13 @@ class Collocation {
             coupled_q.resize(entries(stages * n, n));
             coupled_v.resize(stages * n * n);
         }
-        if (dense || stages > StageElimination::most_stages || !eliminates(mechanism, stages)) {
+        if (dense || stages > StepElimination::most_stages || !eliminates(mechanism, stages)) {
             allocate();
             return;
         }
         element_curvature.resize(stages * n);
         diagonal.resize(stages * stages * n);
-        if (stages == 1 && mechanism.tree.size() == n) {
-            elimination.emplace(mechanism);
-        } else {
-            stage_elimination.emplace(mechanism, tableau);
-        }
+        elimination = elimination_of(mechanism, tableau);
     }
 
     const Mechanism& mechanism;
@@ -100,17 +95,16 @@ class Collocation {
     const Kernels& kernels;
     int n;
     int stages;
-    std::vector<Jet<double>> stage;          // without matrices if there is an elimination
-    std::optional<Elimination> elimination;  // at the iterate of the last factors; for one stage without ties
-    std::optional<StageElimination> stage_elimination;
-    std::vector<double> V;                   // (s, n) stage velocities: the guess, then the root
-    std::vector<double> Q;                   // (s, n)
-    std::vector<double> slope;               // (s, n) L_q + F
-    std::vector<double> slope_rest;          // (s, n) of correct_slopes; less than the last digit of `slope`
-    std::vector<JointForce<double>> acting;  // (s, n) of elements and couplings; derivatives of elements only
-    std::vector<double> coupled_q;           // (s, n, n) dF/dq of couplings, if there are such forces
-    std::vector<double> coupled_v;           // (s, n, n) dF/dv
-    bool by_external = false;                // whether derivatives in f are those in the external force
+    std::vector<Jet<double>> stage;                // without matrices if there is an elimination
+    std::unique_ptr<StepElimination> elimination;  // at the iterate of the last factors; null where there are matrices
+    std::vector<double> V;                         // (s, n) stage velocities: the guess, then the root
+    std::vector<double> Q;                         // (s, n)
+    std::vector<double> slope;                     // (s, n) L_q + F
+    std::vector<double> slope_rest;                // (s, n) of correct_slopes; less than the last digit of `slope`
+    std::vector<JointForce<double>> acting;        // (s, n) of elements and couplings; derivatives of elements only
+    std::vector<double> coupled_q;                 // (s, n, n) dF/dq of couplings, if there are such forces
+    std::vector<double> coupled_v;                 // (s, n, n) dF/dv
+    bool by_external = false;                      // whether derivatives in f are those in the external force
 
     // Solve the step equation from the guess in V.
     //
@@ -137,14 +131,13 @@ class Collocation {
         return outcome;
     }
 
-    bool eliminated() const { return elimination || stage_elimination; }
+    bool eliminated() const { return elimination != nullptr; }
 
     // Factor N from the stages' jets; false where its determinant is not positive.
     bool factor(double h) {
         if (!eliminated()) return factor_blocks(h);
         write_diagonal(h);
-        if (stage_elimination) return stage_elimination->factor(h, diagonal.data());
-        return elimination->factor(h * tableau.a[0], h * tableau.gradient[0], diagonal.data());
+        return elimination->factor(h, diagonal.data());
     }
 
     // The contribution of elements to the pivot of coordinate c: -(by_rate F_v + by_position F_q) averaged over the
@@ -191,7 +184,7 @@ class Collocation {
 
     // x with N x = right (s, n), from the factors of `factor`.
     void solve_factored(const double* right, double* x) {
-        if (eliminated()) return elimination ? elimination->solve(right, x) : stage_elimination->solve(right, x);
+        if (eliminated()) return elimination->solve(right, x);
         if (stages == 1) return kernels.solve(*this, right, x);
         solve_blocks(right, x, [](const double* matrix, int size, const int* rows, double* b, double* y) {
             solve_lu_pivoting(matrix, size, rows, b, y);
@@ -376,8 +369,7 @@ class Collocation {
     }
 
     void take_over() {
-        if (elimination) elimination->take(stage[0]);
-        for (int i = 0; i < stages && stage_elimination; ++i) stage_elimination->take(i, stage[i]);
+        for (int i = 0; i < stages && elimination; ++i) elimination->take(i, stage[i]);
     }
 
     [[gnu::always_inline]] inline void move_stages(const int stages, double h, const Start& start) {
@@ -567,7 +559,7 @@ class Collocation {
 
     // The square of x (s, n) in the metric of the kinetic energy, averaged over the step.
     double kinetic_size(const double* x) {
-        if (eliminated()) return elimination ? elimination->kinetic_size(x) : stage_elimination->kinetic_size(x);
+        if (eliminated()) return elimination->kinetic_size(x);
         if (stages == 1) return kernels.kinetic_size(*this, x);
         double total = 0.0;
         for (int i = 0; i < stages; ++i) {
@@ -579,11 +571,7 @@ class Collocation {
 
     // (A_i' + F_v,i) x_i + (L_qq,i + F_q,i) h sum_j a_ij x_j into `change`, for x in `delta`, the last solution.
     void change_of_slope(double h, std::vector<double>& change) {
-        if (elimination) {
-            elimination->change_of_slope(delta.data(), change.data());
-        } else {
-            stage_elimination->change_of_slope(delta.data(), change.data());
-        }
+        elimination->change_of_slope(delta.data(), change.data());
         if (!mechanism.forces.any()) return;
         for (int i = 0; i < stages; ++i) {
             for (int c = 0; c < n; ++c) {
