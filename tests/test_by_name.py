@@ -113,11 +113,6 @@ def test_gravity_as_a_number_is_answered_with_the_vector_meant(value):
         vp.Scene(UR5, gravity=value)
 
 
-def test_gravity_of_zero_is_answered_with_false():
-    with refused(vp.InputError, "gravity", "False"):
-        vp.Scene(UR5, gravity=0.0)
-
-
 def test_noise_costs_and_barriers_take_names():
     named = vp.Scene(UR5, noise=vp.AdditiveNoise({"elbow_joint": 0.2}) + vp.StateNoise({"wrist_1_joint": 0.3}, POSE))
     rows = vp.Scene(UR5, noise=vp.AdditiveNoise([0, 0, 0.2, 0, 0, 0]) + vp.StateNoise([0, 0, 0, 0.3, 0, 0], ROW))
@@ -231,15 +226,6 @@ def test_names_of_controls_that_have_none_are_refused(use):
         use(vp.Scene(UR5, actuation=["wrist_1_joint"]), {"elbow_joint": 1.0})
     with refused(vp.InputError, "'elbow_joint'", "'a'"):
         use(vp.Scene(UR5), {"elbow_joint": "a"})
-
-
-def test_weights_by_name_are_not_negative():
-    cost = vp.VelocityCost({"elbow_joint": -1.0}) + vp.ControlCost()
-    with refused(vp.InputError, "VelocityCost"):
-        vp.OptimalControlProblem(vp.Scene(UR5), cost, ROW, ROW, dt=1e-2, steps=1)
-    cost = vp.ControlCost({"elbow_joint": -1.0})
-    with refused(vp.InputError, "ControlCost"):
-        vp.OptimalControlProblem(vp.Scene(UR5), cost, ROW, ROW, dt=1e-2, steps=1)
 
 
 def test_a_posture_by_its_name_is_told_how_to_be_given():

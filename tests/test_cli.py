@@ -177,7 +177,7 @@ def test_mistakes_are_one_line_and_status_2(arm, capsys, options, facts):
         (["simulat", "finger"], ("varpin: error", "'simulat'", "'simulate'")),
         (["--frobnicate"], "varpin: error"),
         (["simulate"], ("varpin simulate: error", "ROBOT")),
-        (["simulate", "finger", "--v0", "a"], ("--v0", "'a'", "JOINT=VALUE")),
+        (["simulate", "finger", "--v0", "elbow=a"], ("--v0", "'elbow=a'", "JOINT=VALUE")),
         (["simulate", "finger", "--lock", "elbow"], ("--lock", "'elbow'", "JOINT=VALUE")),
         (["simulate", "finger", "--lock", "elbow=x"], ("--lock", "'elbow=x'", "JOINT=VALUE")),
         (["simulate", "finger", "--steps", "1.5"], ("--steps", "'1.5'")),

@@ -6,7 +6,6 @@ import pytest
 from mechanisms import joint, link, mimic, random_inertia, random_rotation, random_tree, write_urdf
 
 import varpin as vp
-from varpin.model.tree import block_ends, independent_groups
 
 INTEGRATORS = [vp.Midpoint(), vp.Midpoint(0.3), vp.Gauss(2), vp.SemiImplicitEuler(), vp.RungeKutta4()]
 SIZES = (3, 1, 4)
@@ -50,21 +49,6 @@ def state(robot):
 
 
 class TestCuts:
-    @pytest.mark.parametrize(
-        ("group", "ends"),
-        [
-            ([0], [1]),
-            ([0, 0, 0], [3]),
-            ([0, 1, 2], [1, 2, 3]),
-            ([1, 1, 0, 2, 2], [2, 3, 5]),
-            ([0, 1, 0, 2], [3, 4]),
-            ([0, 1, 2, 0], [4]),
-            ([0, 1, 0, 1, 2, 3, 2], [4, 7]),
-        ],
-    )
-    def test_by_hand(self, group, ends):
-        assert list(block_ends(np.array(group))) == ends
-
     def test_on_random_trees_no_group_lies_across_one_and_none_is_missing(self):
         seen = set()
         for seed in range(60):
@@ -76,12 +60,6 @@ class TestCuts:
             # Joints come subtree by subtree: no group stands within another.
             assert tree.groups == len(tree.ends)
         assert {1, 2, 3} <= seen
-
-    def test_a_mimic_joint_ties_what_lies_between(self):
-        # Body 3, a root, follows the coordinate of body 0: coordinate 1, between them, stays a group of its own.
-        group = independent_groups(np.array([-1, -1, 0, -1, 3]), np.array([0, 1, 2, 0, 3]), 4)
-        assert group[0] == group[2] == group[3] != group[1]
-        assert list(block_ends(group)) == [4]
 
     @pytest.mark.parametrize(("name", "ends"), [("ur5", [6]), ("allegro_right_hand", [4, 8, 12, 16])])
     def test_of_named_robots(self, load, name, ends):

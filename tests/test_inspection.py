@@ -57,14 +57,6 @@ def test_sound_arm_gives_no_warning_and_its_figures(tmp_path):
     np.testing.assert_allclose(link.moments, [0.001, 0.083, 0.083])
 
 
-def test_report_and_its_joints_are_frozen(tmp_path):
-    report = inspect_robot(write_arm(tmp_path, ROD))
-    with pytest.raises(AttributeError):
-        report.total_mass = 3.0
-    with pytest.raises(AttributeError):
-        report.joints[0].name = "other"
-
-
 @pytest.mark.parametrize(
     ("links", "facts"),
     [

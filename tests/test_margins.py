@@ -8,7 +8,8 @@ from findings import about
 from scipy.special import ndtr
 
 import varpin as vp
-from varpin.control.spread import Feedback, deviations
+from varpin.control.noise import deviations
+from varpin.control.stages import Feedback, Steps
 
 ROBOT = vp.planar_chain(2)
 HANGING = np.array([np.pi / 2 - 0.3, 0.0])
@@ -96,6 +97,6 @@ def test_a_warning_of_a_small_margin_counts():
     often = 100.0 * (c > 0.0).mean()
     assert abs(often - share) < 3.5 * error
     planned = bound.value(plan.trajectory.q, plan.trajectory.v, plan.controls)[place, 0]
-    own = deviations(problem, plan.trajectory, Feedback(plan.gains, plan.previous_gains), [bound])[0][place, 0]
+    own = deviations(Steps(problem, plan.trajectory), Feedback(plan.gains, plan.previous_gains), [bound])[0][place, 0]
     # Farther away by as much as the margin is larger, as if motions about the plan stayed the same.
     assert (c - planned > margin * own).mean() < 0.03

@@ -286,12 +286,6 @@ class TestKeeping:
         same = vp.load_robot("panda", lock={k: v for k, v in nearest.items() if k not in robot.joint_names})
         assert_same_jet(jet_at(robot, [0.1, 0.2], [1.0, 2.0]), jet_at(same, [0.1, 0.2], [1.0, 2.0]), rtol=0)
 
-    def test_keeps_joints_of_any_iterable_and_the_base(self):
-        names = vp.load_robot("ur5", keep=iter(["elbow_joint"]), base="planar").joint_names
-        assert names == ("base_x", "base_y", "base_turn", "elbow_joint")
-        with refused(vp.InputError, "keep", "3"):
-            vp.load_robot("ur5", keep=3)
-
     def test_keeps_followers_with_their_leader(self):
         robot = vp.load_robot("panda", keep=["panda_finger_joint1"])
         assert robot.joint_names == ("panda_finger_joint1",)
@@ -649,21 +643,6 @@ class TestJoints:
 
 
 class TestArmature:
-    def test_adds_to_the_diagonal_and_is_not_counted_twice(self):
-        model = random_tree(4, branching=False, armature=False)
-        bare = vp.load_robot(model)
-        model.armature = np.arange(1.0, 8.0)
-        robot = vp.load_robot(model)
-        q, v = np.random.default_rng(0).normal(size=(2, 7))
-        for backend in ("compiled", "pinocchio"):
-            with_it = vp.lagrangian_jet(vp.Scene(robot), q, v, backend=backend)
-            without = vp.lagrangian_jet(vp.Scene(bare), q, v, backend=backend)
-            np.testing.assert_allclose(with_it.Lvv - without.Lvv, np.diag(model.armature), atol=1e-13)
-            np.testing.assert_allclose(with_it.Lv - without.Lv, model.armature * v, atol=1e-13)
-            assert pytest.approx(0.5 * model.armature @ v**2, rel=1e-12) == with_it.L - without.L
-        # crba is Pinocchio's own mass matrix, armature and all.
-        np.testing.assert_allclose(with_it.Lvv, full_crba(model, robot.configuration(q)), rtol=0, atol=1e-13)
-
     def test_of_talos_is_its_rotors_through_its_gears(self, load):
         robot = load("talos_arm")
         srdf = ET.parse(example_robot_data.locate(example_robot_data.SRDF["talos_arm"])).getroot()

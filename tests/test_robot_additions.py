@@ -41,14 +41,6 @@ class TestPlaced:
             expected = PLACE * b.placement if b.parentJoint == 0 else b.placement
             np.testing.assert_allclose(a.placement.homogeneous, expected.homogeneous, atol=1e-12)
 
-    def test_of_a_model_in_memory(self):
-        model = vp.load_robot("ur5").model
-        q = RNG.normal(size=6)
-        there = vp.load_robot(model, base=PLACE)
-        np.testing.assert_allclose(
-            there.frame_positions(q), vp.load_robot("ur5", base=PLACE).frame_positions(q), atol=1e-12
-        )
-
     @pytest.mark.parametrize(
         ("base", "facts"),
         [
@@ -100,20 +92,6 @@ class TestPlanar:
         np.testing.assert_allclose(own.Lvv[3:, 3:], other.Lvv, rtol=0, atol=1e-10)
         held = vp.load_robot("panda", base="planar", lock={"base_x": 0.5, "base_y": 0.0, "base_turn": 0.2})
         assert held.dof == vp.load_robot("panda").dof
-
-    def test_shapes_of_the_base_move(self):
-        robot = vp.load_robot("ur5", base="planar")
-        joints = {shape.parentJoint for shape in geometry(robot).geometryObjects}
-        assert 0 not in joints
-        assert robot.free_model.getJointId("base_turn") in joints
-
-    def test_a_motion_keeps_its_momentum(self):
-        """Nothing holds the base: linear and angular momentum stay, but for what gravity does to neither."""
-        robot = vp.load_robot("ur5", base="planar")
-        motion = vp.simulate(
-            vp.Scene(robot), np.zeros(9), {"elbow_joint": 1.0, "base_x": 0.3}, dt=1e-3, steps=100, check=False
-        )
-        np.testing.assert_allclose(motion.p[-1, :2], motion.p[0, :2], rtol=0, atol=1e-11)
 
     def test_a_name_that_is_taken(self):
         with refused(vp.InputError, "base_turn"):
@@ -206,10 +184,6 @@ class TestMeshInertias:
         robot = vp.load_robot(written(tmp_path, inertial=inertial), inertia="meshes")
         assert robot.free_model.inertias[1].mass == 3.0
         assert robot.free_model.inertias[2].mass == pytest.approx(1000.0 * 0.1 * 0.4 * 0.3)
-
-    def test_without_it_nothing_moves(self, tmp_path):
-        with pytest.raises(vp.SingularMassMatrix):
-            vp.load_robot(written(tmp_path))
 
     def test_open_and_missing_meshes_are_named(self, tmp_path):
         with refused(vp.RobotError, "'lower'", "box.obj"):

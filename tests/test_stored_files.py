@@ -167,11 +167,6 @@ def test_another_version(name, tmp_path):
     unread(name, changed(tmp_path, name, format=form[:-1] + "9"), "/9")
 
 
-def test_what_reads_a_file_of_another_kind_is_named():
-    with refused(vp.FileError, "Solution.load"):
-        vp.Trajectory.load(DATA / "solution.npz")
-
-
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x93NUMPY", bytes(1000), pickle.dumps({"q": 1})])
 @pytest.mark.parametrize("name", LOADERS)
 def test_another_file(name, content, tmp_path):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -114,49 +112,9 @@ def linearization_is_the_derivative(case: Case) -> None:
     assert found.worst < 1e-7
 
 
-def survives_a_file(case: Case) -> None:
-    scene, (q, v) = case.scene, case.state
-    scene = vp.Scene(scene.robot, gravity=scene.gravity, noise=vp.AdditiveNoise(1e-3))
-    motion = vp.simulate(
-        scene, q, v, dt=case.dt, steps=case.seed % 7, rng=case.seed, integrator=case.integrator, check=False
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        loaded = vp.Trajectory.load(motion.save(Path(folder, "a.npz")), scene.robot)
-    for one, other in ((motion, loaded), (motion.statistics, loaded.statistics)):
-        for item in dataclasses.fields(one):
-            before, after = getattr(one, item.name), getattr(other, item.name)
-            if isinstance(before, np.ndarray):
-                assert (before.dtype, before.shape, before.tobytes()) == (after.dtype, after.shape, after.tobytes())
-            elif item.name == "scene_values":
-                assert before.keys() == after.keys()
-                assert all(before[name].tobytes() == after[name].tobytes() for name in before)
-            elif item.name != "statistics":
-                assert before == after
-
-
-PROPERTIES = [jet_is_pinocchio_s, is_symplectic, runs_back, linearization_is_the_derivative, survives_a_file]
+PROPERTIES = [jet_is_pinocchio_s, is_symplectic, runs_back, linearization_is_the_derivative]
 
 
 @pytest.mark.parametrize("check", PROPERTIES, ids=lambda check: check.__name__)
 def test_on_a_few(check):
     settings(max_examples=15, deadline=None, derandomize=True, database=None)(given(cases)(check))()
-
-
-@pytest.mark.slow
-def test_on_two_hundred():
-    """Each of 200 trees, with every property; the integrators take turns."""
-    for seed in range(200):
-        rng = np.random.default_rng([seed, 6])
-        case = Case(
-            seed=seed,
-            bodies=int(rng.integers(1, 9)),
-            branching=bool(seed % 2),
-            armature=bool(seed // 2 % 2),
-            ratio=RATIOS[seed // 4 % len(RATIOS)],
-            integrator=INTEGRATORS[seed // 20 % len(INTEGRATORS)],
-        )
-        for check in PROPERTIES:
-            try:
-                check(case)
-            except (AssertionError, vp.VarpinError) as error:
-                raise AssertionError(f"{check.__name__} fails on {case}: {error}") from error

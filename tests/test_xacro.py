@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import pickle
 import re
 import sys
 
@@ -14,7 +13,6 @@ from mechanisms import INERTIAL, arm, joint, link
 from refusals import refused
 
 import varpin as vp
-from varpin.model import geometry
 
 HEAD = '<?xml version="1.0"?>\n<robot name="made_up" xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
 BALL = '<visual><geometry><sphere radius="0.1"/></geometry></visual>'
@@ -77,13 +75,6 @@ def test_arguments(workspace):
     assert robot.model.inertias[2].mass == 0.5
     with refused(vp.InputError, "arm.urdf.xacro", "'prefx'", "prefix, tool"):
         vp.load_robot(workspace, xacro_args={"prefx": "left_"})
-
-
-def test_geometry_and_report_of_a_robot_that_travelled(workspace, monkeypatch):
-    robot = pickle.loads(pickle.dumps(vp.load_robot(workspace, xacro_args={"tool": True})))
-    monkeypatch.setitem(sys.modules, "xacro", None)
-    assert geometry(robot).ngeoms == 2
-    assert len(vp.inspect_robot(robot).joints) == 2
 
 
 def test_packages_are_those_around_the_file_each_time(workspace, tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,15 +71,15 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     """Add the initial state of a motion, and the forces on it."""
     start = parser.add_argument_group("start")
     text = "initial configuration [rad or m], or the name of a posture of the robot's SRDF file (home); default: 0"
-    add_vector(start, "q0", text, _position)
+    add_vector(start, "q0", text)
     start.add_argument("--srdf", metavar="FILE", help="SRDF file of the postures; default: that of the robot's file")
     add_vector(start, "v0", "initial velocity [rad/s or m/s]; default: 0")
     surroundings = parser.add_argument_group("surroundings")
     add_gravity(surroundings)
     text = "viscous damping [N m s/rad or N s/m], or 'robot' for that of the robot's description; default: 0"
-    add_vector(surroundings, "damping", text, _number_or_robot)
+    add_vector(surroundings, "damping", text)
     text = "dry friction [N m or N], or 'robot' for that of the robot's description; default: 0"
-    add_vector(surroundings, "friction", text, _number_or_robot)
+    add_vector(surroundings, "friction", text)
     add_vector(surroundings, "stiffness", "joint springs [N m/rad or N/m]; default: 0")
     add_vector(surroundings, "rest", "rest positions of the springs [rad or m]; default: 0")
     text = "'robot' for the equality constraints of the robot's MJCF file; default: none"
@@ -87,18 +87,9 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     add_vector(surroundings, "torque", "constant generalized forces [N m or N]; default: 0")
 
 
-def add_vector(
-    group: argparse._ActionsContainer, name: str, text: str, read: Callable[[str], object] | None = None
-) -> None:
-    """Add an option: one number for all joints, one for each, or some by name.
-
-    Args:
-        group: Where to add it.
-        name: Name of the option.
-        text: Its help.
-        read: Conversion of a word, if others than numbers are allowed.
-    """
-    group.add_argument(f"--{name}", type=read or _number, nargs="+", metavar="X", help=text)
+def add_vector(group: argparse._ActionsContainer, name: str, text: str) -> None:
+    """Add an option: one number for all joints, one for each, some by name, or a word."""
+    group.add_argument(f"--{name}", type=_value, nargs="+", metavar="X", help=text)
 
 
 def add_integrator(parser: argparse.ArgumentParser) -> None:
@@ -149,27 +140,18 @@ def _lock(word: str) -> tuple[str, ArrayLike]:
     return name, numbers[0] if len(numbers) == 1 else numbers
 
 
-def _number(word: str) -> float | tuple[str, float]:
-    """A number, or a joint and its number."""
-    name, equals, value = word.strip().rpartition("=")
+def _value(word: str) -> float | tuple[str, float] | str:
+    """A number, a joint and its number, or a word, which begins with a letter."""
+    text = word.strip()
+    name, equals, value = text.rpartition("=")
+    if text[:1].isalpha() and not equals:
+        return text
     try:
-        number = float(value)
+        return (name, float(value)) if equals else float(value)
     except ValueError:
         raise argparse.ArgumentTypeError(
-            f"{word.strip()!r} is neither a number nor of the form JOINT=VALUE, for example elbow=0.5"
+            f"{text!r} is neither a number nor of the form JOINT=VALUE, for example elbow=0.5"
         ) from None
-    return (name, number) if equals else number
-
-
-def _position(word: str) -> float | tuple[str, float] | str:
-    """As :func:`_number`, or the name of a posture, which begins with a letter."""
-    text = word.strip()
-    return text if text[:1].isalpha() and "=" not in text else _number(word)
-
-
-def _number_or_robot(word: str) -> float | tuple[str, float] | str:
-    """As :func:`_number`, or the word ``robot``."""
-    return "robot" if word.strip() == "robot" else _number(word)
 
 
 def values_of(option: str, given: Sequence[float | tuple[str, float] | str] | None) -> JointValues | str | None:

@@ -182,32 +182,6 @@ def middles(problem: OptimalControlProblem) -> Instants:
     return Instants(rows, np.full(entries, _MIDDLE), cubic=True)
 
 
-def seen(problem: OptimalControlProblem, motion: Trajectory) -> list[Floats | None] | None:
-    """The values of each constraint at the ends of the parts of a motion's steps (N, parts + 1, rows).
-
-    None for constraints on controls, and for those that hold at some nodes only. Rows that the start violates are -inf
-    in the first step. None, too, where there is no other constraint, or a step cannot be integrated in parts.
-    """
-    N, n = motion.steps, problem.scene.robot.dof
-    looks = watched(problem)
-    parts, u = _parts(problem), problem.control_rows(motion)
-    controls = parts.controls(u, np.arange(N))
-    parted = parts.states(motion.q[:-1], motion.v[:-1], controls) if any(looks) else None
-    if parted is None:
-        return None
-    q, v = (np.concatenate([x[0, :1], x.reshape(-1, n)]) for x in parted)
-    steps, samples = np.divmod(np.arange(N * (_PARTS + 1)), _PARTS + 1)
-    times = _times(problem, steps, samples)
-    u = np.zeros((len(q), problem.scene.controls))
-    found: list[Floats | None] = [None] * len(looks)
-    for i, item in enumerate(problem.bound_constraints):
-        if looks[i]:
-            c = at_times(problem, item.source, times).value(q, v, u).reshape(N, _PARTS + 1, -1)
-            c[0][:, c[0, 0] > _OUTSIDE] = -np.inf
-            found[i] = c
-    return found
-
-
 def followed(problem: OptimalControlProblem, instants: Instants, motion: Trajectory, backoff: list[Floats]) -> Instants:
     """The instants, and those at peaks of a motion that violates constraints between its nodes; itself if none does.
 
@@ -219,81 +193,64 @@ def followed(problem: OptimalControlProblem, instants: Instants, motion: Traject
     """
     if not any(watched(problem)) or not (problem.linear or problem.between_nodes):
         return instants
-    values = seen(problem, motion)
-    if values is None:
+    rows, moments, violated = [], [], False
+    former = _of_constraints(problem, instants)
+    for i, near in _seen(problem, motion).items():
+        scale, peaks = problem.bound_constraints[i].scale, _peaks(near)
+        beyond = np.where(peaks.there, peaks.values + backoff[i][:, None], -np.inf)
+        violated |= bool((beyond > (_BETWEEN if problem.between_nodes else _SHARE * scale)).any())
+        wanted = beyond > -_NEAR * scale
+        known = instants.of(i)[:, 0]
+        old = former.get(i, np.zeros((0, near.shape[2])))
+        for step in np.union1d(np.flatnonzero(wanted.any(axis=(1, 2))), known):
+            new = _with_places(old[known == step], np.where(wanted[step], peaks.places[step], UNUSED))
+            rows += [(i, int(step), number) for number in range(len(new))]
+            moments.append(new.ravel())
+    if not violated:
         return instants
-    most = [_BETWEEN if problem.between_nodes else _SHARE * item.scale for item in problem.bound_constraints]
-    if not (beyond(values, backoff) > np.array(most)).any():
-        return instants
-    made = extended(problem, instants, values, backoff)
+    made = Instants(np.array(rows), np.concatenate(moments))
     same = np.array_equal(made.rows, instants.rows) and np.array_equal(made.moments, instants.moments)
     return instants if same else made
 
 
-def extended(
-    problem: OptimalControlProblem, instants: Instants, values: list[Floats | None], backoff: list[Floats]
-) -> Instants:
-    """The instants and further ones at peaks where a motion violates a constraint or is close to its bound.
+def _seen(problem: OptimalControlProblem, motion: Trajectory) -> dict[int, Floats]:
+    """The values (N, parts + 1, rows) of watched constraints at the ends of the parts of a motion's steps.
 
-    Args:
-        problem: The problem, without rows between nodes.
-        instants: Those so far.
-        values: Values of the motion of :func:`seen`.
-        backoff: Margins of all constraints at the nodes (K, rows).
+    Rows that the start violates are -inf in the first step. Empty where a step cannot be integrated in parts.
     """
-    rows, moments = [], []
-    former = _of_constraints(problem, instants)
-    for i, (near, margin) in enumerate(zip(values, backoff, strict=True)):
-        if near is None:
-            continue
-        peaks = _peaks(near)
-        close = -_NEAR * problem.bound_constraints[i].scale
-        wanted = peaks.there & (peaks.values + margin[:, None] > close)
-        known = instants.of(i)
-        old = former.get(i, np.zeros((0, near.shape[2])))
-        for step in np.union1d(np.flatnonzero(wanted.any(axis=(1, 2))), known[:, 0]):
-            places = np.where(wanted[step], peaks.places[step], UNUSED)
-            new = _with_places(old[known[:, 0] == step], places, peaks.values[step])
-            rows += [(i, int(step), number) for number in range(len(new))]
-            moments.append(new.ravel())
-    return Instants(np.array(rows), np.concatenate(moments)) if rows else NOWHERE
+    N, n = motion.steps, problem.scene.robot.dof
+    parts = _parts(problem)
+    controls = parts.controls(problem.control_rows(motion), np.arange(N))
+    parted = parts.states(motion.q[:-1], motion.v[:-1], controls)
+    if parted is None:
+        return {}
+    q, v = (np.concatenate([x[0, :1], x.reshape(-1, n)]) for x in parted)
+    times = _times(problem, *np.divmod(np.arange(N * (_PARTS + 1)), _PARTS + 1))
+    u, found = np.zeros((len(q), problem.scene.controls)), {}
+    for i, (item, looks) in enumerate(zip(problem.bound_constraints, watched(problem), strict=True)):
+        if looks:
+            found[i] = at_times(problem, item.source, times).value(q, v, u).reshape(N, _PARTS + 1, -1)
+            found[i][0][:, found[i][0, 0] > _OUTSIDE] = -np.inf
+    return found
 
 
-def _with_places(moments: Floats, places: Floats, values: Floats) -> Floats:
+def _with_places(moments: Floats, places: Floats) -> Floats:
     """The moments (s, rows) of one step's instants, and new ones at places (parts - 1, rows), negative for none.
 
-    Where there are as many as there may be, a new one, the highest first, takes the place of the nearest.
+    Known ones stay: the search could go on for ever between some that moved.
     """
     found = [*moments.copy()]
-    for row in range(places.shape[1]):
-        for k in np.argsort(-values[:, row]):
-            place = places[k, row]
-            used = [own for own in found if own[row] >= 0.0]
-            if place < 0.0 or any(abs(own[row] - place) <= _SAME for own in used):
+    for row, wanted in enumerate(places.T):
+        for place in wanted[wanted >= 0.0]:
+            if any(own[row] >= 0.0 and abs(own[row] - place) <= _SAME for own in found):
                 continue
-            free = next((own for own in found if own[row] < 0.0), None)
-            if free is None and len(found) < MOST_INSTANTS:
-                free = np.full(places.shape[1], UNUSED)
-                found.append(free)
-            if free is None:
-                free = min(used, key=lambda own: abs(own[row] - place))
-            free[row] = place
+            own = next((own for own in found if own[row] < 0.0), None)
+            if own is None and len(found) < MOST_INSTANTS:
+                own = np.full(places.shape[1], UNUSED)
+                found.append(own)
+            if own is not None:
+                own[row] = place
     return np.array(found)
-
-
-def beyond(values: list[Floats | None], backoff: list[Floats]) -> Floats:
-    """By how much a motion violates each constraint between its nodes, zero where it holds.
-
-    Args:
-        values: Values of the motion of :func:`seen`.
-        backoff: Margins of all constraints at the nodes (K, rows).
-    """
-    found = np.zeros(len(values))
-    for i, (near, margin) in enumerate(zip(values, backoff, strict=True)):
-        if near is not None:
-            peaks = _peaks(near)
-            found[i] = np.where(peaks.there, peaks.values + margin[:, None], 0.0).max(initial=0.0)
-    return found
 
 
 class _Peaks(NamedTuple):

@@ -13,11 +13,11 @@ from varpin.control.chatter import alternation, restlessness
 from varpin.control.hints import UNITS, hints
 from varpin.control.history import ITERATIONS, Status
 from varpin.control.margins import too_small
-from varpin.control.moments import noise_cost, noise_cost_in_halves
 from varpin.control.multipliers import FEASIBLE, REPORTED, at_nodes
+from varpin.control.noise import covariances, noise_cost
 from varpin.control.problem import OptimalControlProblem, integrator_for
 from varpin.control.solution import Solution
-from varpin.control.spread import Feedback, covariances, state_slopes
+from varpin.control.stages import Feedback, Steps
 from varpin.control.verification import accurate_cost, at_start, percent
 from varpin.core.arrays import Commands
 from varpin.errors import LinearizationError, VarpinError
@@ -221,8 +221,8 @@ def _friction_under_noise(solution: Solution) -> list[Finding]:
     if not (problem.scene.processes and rubbing):
         return []
     try:
-        P = covariances(problem, motion, Feedback(solution.gains, solution.previous_gains))
-        slopes = state_slopes(problem, motion)
+        steps = Steps(problem, motion)
+        P, slopes = covariances(steps, Feedback(solution.gains, solution.previous_gains)), steps.slopes
     except LinearizationError:
         return []
     n = problem.scene.robot.dof
@@ -266,11 +266,8 @@ def _noise_in_halves(solution: Solution) -> list[Finding]:
         if failure is not None:
             return []
         in_halves = problem.at(dt=dt, hold=hold, integrator=problem.integrator)
-        planned = noise_cost(problem, solution.trajectory, feedback)
-        if problem.linear:
-            fine = noise_cost_in_halves(problem, in_halves, finer, feedback)
-        else:
-            fine = noise_cost(in_halves, finer, feedback)
+        planned = noise_cost(Steps(problem, solution.trajectory), feedback)
+        fine = noise_cost(Steps(in_halves, finer), feedback, halves=problem.linear)
     except VarpinError:
         # A custom noise or cost, or the linearization, may fail off the plan.
         return []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,16 +15,14 @@ from scipy.special import ndtr
 from varpin.arrays import Floats, Mask
 from varpin.control.constraints import BoundConstraint
 from varpin.control.history import Status
-from varpin.control.linear_controls import in_step
 from varpin.control.multipliers import at_nodes, split
+from varpin.control.noise import deviations
 from varpin.control.paths import Chunk, chunks_of, sent, shared_by
-from varpin.control.problem import OptimalControlProblem
 from varpin.control.solution import Solution
-from varpin.control.spread import Feedback, decided, of_values, propagated, state_slopes
+from varpin.control.stages import Feedback, Steps
 from varpin.ensemble.paths import simulate_paths
 from varpin.errors import VarpinError
 from varpin.finding import Finding
-from varpin.linearization import linearize_steps
 from varpin.mechanics.wiener import Children, children, wiener_increments
 from varpin.simulation.failures import NoiseError, StepFailure
 from varpin.support.executors import executing, in_order
@@ -242,15 +241,11 @@ class _Model(Frozen):
     """The linear model along a plan under feedback.
 
     Attributes:
-        J: Derivatives of the steps in their variables (N, 2n, Z).
-        G: Derivatives in the noise (N, 2n, k).
-        gz: Derivatives of G in the variables (N, 2n, k, Z).
+        steps: The steps.
         feedback: The gains.
     """
 
-    J: Floats
-    G: Floats
-    gz: Floats
+    steps: Steps
     feedback: Feedback
 
     @classmethod
@@ -260,19 +255,16 @@ class _Model(Frozen):
         Raises:
             LinearizationError: A step has no derivatives.
         """
-        problem = plan.problem
-        lin = linearize_steps(problem.scene, plan.trajectory, problem.integrator, problem.q0, ramps=problem.linear)
-        J, gz = in_step(lin)
-        return cls(J, lin.G, gz, Feedback(plan.gains, plan.previous_gains))
+        return cls(Steps(plan.problem, plan.trajectory), Feedback(plan.gains, plan.previous_gains))
 
-    def deviations(self, problem: OptimalControlProblem, dw: Floats) -> Floats:
+    def deviations(self, dw: Floats) -> Floats:
         """Deviations of the state from the plan (P, N + 1, 2n) under increments (P, N, k), to first order."""
-        x, m = self.J.shape[1], problem.scene.controls
-        found, y = np.zeros((len(dw), len(self.J) + 1, x)), np.zeros((len(dw), x + m))
-        for k in range(len(self.J)):
-            T = decided(problem, self.feedback, k, x)
-            z = y if T is None else y @ T.T
-            y = np.hstack([z @ self.J[k].T + dw[:, k] @ self.G[k].T, z[:, -m:]])
+        J, G, T = self.steps.J, self.steps.lin.G, self.steps.closed(self.feedback)
+        N, x, Z = J.shape
+        found, y = np.zeros((len(dw), N + 1, x)), np.zeros((len(dw), Z))
+        for k in range(N):
+            z = y @ T[k].T
+            y = np.hstack([z @ J[k].T + dw[:, k] @ G[k].T, z[:, x:]])
             found[:, k + 1] = y[:, :x]
         return found
 
@@ -285,20 +277,16 @@ def _chosen(plan: Solution, model: _Model, seed: tuple[int, ...]) -> list[_Row]:
     """
     problem, motion, known = plan.problem, plan.trajectory, plan.multipliers
     assert known is not None
-    x = model.J.shape[1]
-    spreads = [
-        propagated(model.J, model.G, part, problem, model.feedback)[:, :x, :x]
-        for part in (model.gz, np.zeros_like(model.gz))
-    ]
-    to_state, u = state_slopes(problem, motion), problem.control_rows(motion)
+    u, constant = problem.control_rows(motion), copy(model.steps)
+    vars(constant)["_in_step"] = model.steps.J, np.zeros_like(model.steps.Gz)
     rows = []
     bounds, margins = problem.bound_constraints, at_nodes(problem, known, known.backoff)
     added = [np.zeros(bound.shape) for bound in bounds] if known.added is None else split(bounds, known.added)
     for bound, margin, more in zip(bounds, margins, added, strict=True):
         if not bound.source.margin > 0.0:
             continue
-        slopes = bound.jacobian(motion.q, motion.v) @ to_state[bound.places]
-        own, simple = (of_values(slopes, part[bound.places]) for part in spreads)
+        slopes = bound.jacobian(motion.q, motion.v) @ model.steps.slopes[bound.places]
+        own, simple = (deviations(steps, model.feedback, [bound])[0] for steps in (model.steps, constant))
         planned = bound.value(motion.q, motion.v, u)
         rows.append(_Row(bound, np.ones(bound.shape, dtype=bool), planned, slopes, own, simple, margin, more))
     found = []
@@ -356,7 +344,7 @@ def _played(plan: Solution, model: _Model, rows: list[_Row], seeds: Children, fi
 
     def of_motions(q: Floats, v: Floats, dw: Floats) -> list[_Counted]:
         no_controls = np.zeros((len(q), problem.decisions, problem.scene.controls))
-        x, found = model.deviations(problem, dw), []
+        x, found = model.deviations(dw), []
         for row in rows:
             linear = np.einsum("krx,Pkx->Pkr", row.slopes, x[:, row.bound.places])[:, row.near]
             moves, limit = row.simple[row.near] > 0.0, row.bound.source.margin * row.simple[row.near]

@@ -26,7 +26,7 @@ from varpin.signals.policy import LinearPolicy
 from varpin.simulation.check import check
 from varpin.simulation.failures import NoiseError, StepFailure
 from varpin.simulation.loop import unstable_loop
-from varpin.support.checks import count, counting
+from varpin.support.checks import count, told_motion
 from varpin.support.executors import executing, in_order, take_all
 from varpin.support.frozen import Frozen
 from varpin.support.markup import facts, warning_count
@@ -180,7 +180,7 @@ def monte_carlo(
 ) -> MonteCarlo:
     """See :meth:`Solution.monte_carlo`; for any policy. ``within`` is what no path shows of the noise within steps."""
     paths = count("paths", paths, least=2)
-    counting("progress", progress, "paths done, paths in all")
+    told_motion("progress", progress, "paths done, paths in all")
     costs: list[Floats] = []
     found: tuple[Finding, ...] = ()
     extremes: Extremes = {}

@@ -27,12 +27,12 @@ from varpin.support.checks import (
     JointValues,
     as_floats,
     count,
-    counting,
     finite_array,
     flag,
     joint_array,
     require_finite,
     require_memory,
+    told_motion,
 )
 from varpin.support.executors import executing, in_order, take_all
 
@@ -103,7 +103,7 @@ def simulate_ensemble(
     require_scene(scene)
     dt, steps = time_steps(dt, steps, duration)
     paths, store = count("paths", paths, least=1), flag("store", store)
-    counting("progress", progress, "paths done, paths in all")
+    told_motion("progress", progress, "paths done, paths in all")
     _require_memory(scene, steps, paths, store=store)
     start = [_per_path(name, value, paths, scene.robot.joint_names) for name, value in (("q0", q0), ("v0", v0))]
     if scene.noise.diffusion is None:

@@ -278,6 +278,7 @@ class Variational(Compiled):
         n, N = scene.robot.dof, trajectory.steps
         rates, cubic = _rates(scene, trajectory)
         wide = 3 * n + len(cubic)
+        steps, places = self._steps(scene, trajectory), self._places(scene)
         M, _ = scene.core.jets(np.ascontiguousarray(trajectory.q[:-1]), np.ascontiguousarray(trajectory.v[:-1]))
         S = np.zeros((N, wide, wide))
         S[:] = np.eye(wide)
@@ -287,14 +288,12 @@ class Variational(Compiled):
             # The control of a kinematic input is a position, not a force.
             S[:, 2 * n + c, 2 * n : 3 * n] = S[:, 2 * n : 3 * n, 2 * n + c] = 0.0
             S[:, 2 * n + c, 2 * n + c] = 1.0
-        steps, places = self._steps(scene, trajectory), self._places(scene)
 
         def gradients(y: Floats) -> Floats:
             shift, by = S @ y, rates.copy()
             by[:, cubic] += shift[:, 3 * n :]
             at = {"q": steps["q"] + shift[:, :n], "p": steps["p"] + shift[:, n : 2 * n]}
-            force = shift[:, 2 * n : 3 * n]
-            at["force"] = steps["force"] + (force if steps["force"].ndim == 2 else force[:, None])
+            at["force"] = steps["force"] + shift[:, None, 2 * n : 3 * n]
             Jx, Jf, Jr, outcome, done = constrained_derivatives(Steps(**(steps | at)), places=places, rates=by)
             _require_solved(trajectory, outcome, done)
             J = np.concatenate([Jx, Jf, Jr[:, :, cubic]], axis=2)

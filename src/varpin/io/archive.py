@@ -169,20 +169,7 @@ def _opened(source: Path) -> Iterator[zipfile.ZipFile]:
 def _require_format(source: Path, found: object, form: str) -> None:
     if str(found) != form:
         what = "it has no format" if found is None else f"its format is {reprlib.repr(str(found))}"
-        raise FileError(
-            f"{source} is not a varpin {_noun(form)}: {what} instead of {form!r}{_reader(str(found), form)}"
-        )
-
-
-def _reader(found: str, form: str) -> str:
-    """A hint for messages: the function that reads files of the format ``found``, if that is not ``form``'s."""
-    readers = {"trajectory": "varpin.Trajectory.load(path)", "solution": "varpin.Solution.load(path, problem)"}
-    name = None if _noun(found) == _noun(form) else readers.get(_noun(found))
-    return f"; {name} reads such files" if name else ""
-
-
-def _noun(form: str) -> str:
-    return form.removeprefix("varpin.").partition("/")[0]
+        raise FileError(f"{source} is another kind of file: {what} instead of {form!r}")
 
 
 def members_of(record: Any, prefix: str = "") -> dict[str, Any]:

@@ -372,30 +372,23 @@ def constraints_of(given: Constraint | Sequence[Constraint]) -> tuple[Constraint
 def joined(bound: Sequence[Bound]) -> tuple[Bound, NDArray[np.int64]]:
     """All constraints as one with its rows in the core's order, and the position there of each row as given (c,)."""
     vectors: list[tuple[Carried, ...]] = []
-    products: list[tuple[int, Product]] = []
-    ties: list[tuple[int, Tied]] = []
-    customs: list[tuple[int, CustomRows]] = []
+    products: list[Product] = []
     labels: list[str] = []
     aligned: list[tuple[int, int]] = []
+    kinds: list[int] = []
     for constraint in bound:
-        first, rows, row = len(vectors), constraint.rows, len(labels)
+        first, rows = len(vectors), constraint.rows
         vectors += rows.vectors
-        moved = [product._replace(x=product.x + first, y=product.y + first) for product in rows.products]
-        products += [(row + k, product) for k, product in enumerate(moved)]
-        ties += [(row + k, tie) for k, tie in enumerate(rows.ties)]
-        customs += [(row, custom) for custom in rows.customs]
+        products += [product._replace(x=product.x + first, y=product.y + first) for product in rows.products]
         labels += constraint.labels
         aligned += [(x + first, y + first) for x, y in constraint.aligned]
-    core = [row for row, _ in products] + [row for row, _ in ties]
-    core += [row + k for row, custom in customs for k in range(custom.rows)]
-    together = ConstraintRows(
-        tuple(vectors),
-        tuple(product for _, product in products),
-        tuple(tie for _, tie in ties),
-        tuple(custom for _, custom in customs),
-    )
-    order = np.argsort(np.array(core, dtype=np.int64))
-    return Bound(together, tuple(labels[row] for row in core), tuple(aligned)), order
+        counts = len(rows.products), len(rows.ties), sum(custom.rows for custom in rows.customs)
+        kinds += np.repeat([0, 1, 2], counts).tolist()
+    core = np.argsort(np.array(kinds, dtype=np.int64), kind="stable")
+    ties = tuple(tie for constraint in bound for tie in constraint.rows.ties)
+    customs = tuple(custom for constraint in bound for custom in constraint.rows.customs)
+    together = ConstraintRows(tuple(vectors), tuple(products), ties, customs)
+    return Bound(together, tuple(labels[row] for row in core), tuple(aligned)), np.argsort(core)
 
 
 def _row(values: Floats) -> tuple[float, float, float]:

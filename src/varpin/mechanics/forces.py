@@ -25,15 +25,20 @@ from varpin.core.arrays import Coupling, Element
 from varpin.errors import InputError, UnknownJoint
 from varpin.model import Robot
 from varpin.model.tree import place_of_frame
-from varpin.support.checks import JointValues, as_floats, finite_array, is_one_of, joint_array, tuple_of
+from varpin.support.checks import (
+    JointValues,
+    as_floats,
+    finite_array,
+    is_one_of,
+    joint_array,
+    rotation_matrix,
+    tuple_of,
+)
 from varpin.support.frozen import Frozen
 
 # A frame name or (frame name, point in the frame's axes); a Point may also be a point in world axes.
 FramePoint: TypeAlias = str | tuple[str, ArrayLike]
 Point: TypeAlias = FramePoint | ArrayLike
-
-# Tolerance of R' R = 1 for rotation matrices.
-_ROTATION = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -366,9 +371,7 @@ class FrameSpring(Force):
 
     def _of_turning(self, robot: Robot) -> tuple[Coupling, ...]:
         """One spring between each axis of frame a and its rest direction in b."""
-        rest = np.eye(3) if self.rest_rotation is None else finite_array("rest_rotation", self.rest_rotation, (3, 3))
-        if not (np.abs(rest.T @ rest - np.eye(3)).max() <= _ROTATION and np.linalg.det(rest) > 0.0):
-            raise InputError(f"rest_rotation must be a rotation matrix, got {shown(rest)}")
+        rest = np.eye(3) if self.rest_rotation is None else rotation_matrix("rest_rotation", self.rest_rotation)
         if self.rotational_stiffness is None:
             if self.rest_rotation is not None:
                 raise InputError("rest_rotation is of a rotational_stiffness, and there is none")

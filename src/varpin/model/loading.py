@@ -174,7 +174,7 @@ def transform(base: ArrayLike | pin.SE3, what: str, otherwise: str = "") -> pin.
 
 
 def _with_rotors(robot: Robot, armature: JointValues) -> Robot:
-    """The robot with another armature of its coordinates: a number, (n,) or by joint name; locked joints have none."""
+    """The robot with another armature of its coordinates, a number, (n,) or by joint name; locked joints have none."""
     model, names = robot.free_model, robot.joint_names
     indices = [model.joints[model.getJointId(name)].idx_v for name in names]
     armatures = np.array(model.armature)[indices]

@@ -50,8 +50,7 @@ class ToleranceError(VarpinError, RuntimeError):
         known = f"is still {error:.1e} rad or m" if np.isfinite(error) else "is unknown"
         super().__init__(
             f"tolerance = {tolerance:g} cannot be met over {duration:g} s: with {steps} steps the error in q "
-            f"{known}. No method computes a chaotic motion to its end, and stiff or discontinuous forces may need more "
-            "steps; give a shorter duration, or dt and steps"
+            f"{known}. Give a shorter duration, as no method follows a chaotic motion to its end, or dt and steps"
         )
 
 

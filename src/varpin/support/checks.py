@@ -313,12 +313,6 @@ def finite(name: str, value: Any) -> float:
     return number
 
 
-def counting(name: str, function: Any, arguments: str) -> None:
-    """Raise an InputError that names a progress function unless it is None or can be called with ``arguments``."""
-    if function is not None and not (callable(function) and takes(function, arguments.count(",") + 1)):
-        raise InputError(f"{name} must be a function of ({arguments}), got {reprlib.repr(function)}")
-
-
 def fraction(name: str, value: float) -> float:
     """``value`` as a float in [0, 1]; raises an InputError that names it otherwise."""
     number = real(name, value)
@@ -413,25 +407,23 @@ def takes(function: Callable[..., object], arguments: int) -> bool:
     return True
 
 
-def told_motion(name: str, function: object, arguments: str, motion: str) -> bool:
+def told_motion(name: str, function: object, arguments: str, motion: str = "") -> bool:
     """Whether a progress function takes the motion, too, as one argument more.
 
     Args:
         name: Name of the option, for the error.
         function: The function, or None.
         arguments: Its first arguments in words, separated by commas.
-        motion: The last argument in words.
+        motion: The last argument in words; empty if there is none.
 
     Raises:
         InputError: The function can be called with neither number of arguments.
     """
-    if function is None:
-        return False
+    # A function of any number of arguments, such as print, gets the fewer ones.
     least = arguments.count(",") + 1
-    if callable(function):
-        # A function of any number of arguments, such as print, gets the fewer ones.
-        if takes(function, least):
-            return False
-        if takes(function, least + 1):
-            return True
-    raise InputError(f"{name} must be a function of ({arguments}), or of ({arguments}, {motion}); got {function!r}")
+    if function is None or (callable(function) and takes(function, least)):
+        return False
+    if motion and callable(function) and takes(function, least + 1):
+        return True
+    more = f", or of ({arguments}, {motion})" if motion else ""
+    raise InputError(f"{name} must be a function of ({arguments}){more}; got {function!r}")

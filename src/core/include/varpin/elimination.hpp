@@ -15,29 +15,43 @@
 //
 // The symmetric part M + c (A + A') - k L_qq is eliminated in the same way with rows and columns (S, W) of twelve
 // entries, and M alone with S: the articulated body algorithm (Featherstone 2008).
-// Equations (E1), (E2) and (E3) of docs/mathematics.md.
+//
+// For collocation with s stages a joint has one unknown for each stage, and
+//
+//     N_im = delta_im M_i + h (a_im A_i - abar_im A_m') - h^2 sum_c abar_ic a_cm L_qq,c + diag(d_im)
+//
+// is a sum over stages c of this form, with
+//
+//     row_i = (delta_ic S - h abar_ic W, h abar_ic S(angular))_c      u0_m = h a_cm (S x* H, g x (Y S)(linear))_c
+//     column_m = (delta_cm S + h a_cm W, h a_cm S(angular))_c         l0_i = -h abar_ic (S x* H, -g x (Y S)(linear))_c
+//
+// each with nine entries for each c; D is a matrix (s, s).
+// Equations (E1), (E2), (E3) and (E4) of docs/mathematics.md.
 #pragma once
 
 #include <algorithm>
 #include <limits>
 #include <memory>
-#include <optional>
+#include <type_traits>
 #include <vector>
 
-#include "varpin/gathering.hpp"
+#include "varpin/dense.hpp"
+#include "varpin/elimination_rows.hpp"
 #include "varpin/jet.hpp"
-#include "varpin/pair.hpp"
 #include "varpin/spatial.hpp"
+#include "varpin/subtree_sums.hpp"
 #include "varpin/symmetric_elimination.hpp"
+#include "varpin/tableau.hpp"
 #include "varpin/tree.hpp"
 
 namespace varpin {
 
 // Model of computing times, in units of the time to eliminate a body in a step with one stage. A dense step takes
 // body_cost for each body, pair_cost for each pair of a body and itself or an ancestor, and block_cost times the cubed
-// size of each block. Elimination of a body takes stages_cost with more stages, tied_cost with one stage and ties, and
-// a share of slot_cost more for each slot of ties. Measured on chains with and without ties, on hands and on arms.
-inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3, tied_cost = 1.45,
+// size of each block. Elimination of a body takes stages_cost with more stages, mimic_cost with one stage and mimic
+// joints, and a share of slot_cost more for each slot of mimic joints. Measured on chains with and without mimic
+// joints, on hands and on arms.
+inline constexpr double body_cost = 0.6, pair_cost = 0.033, block_cost = 0.0004, stages_cost = 1.3, mimic_cost = 1.45,
                         slot_cost = 0.1;
 
 // Whether solves with M, or with the matrix of a step of so many stages, are faster without forming the matrix.
@@ -52,8 +66,8 @@ inline bool eliminates(const Tree& tree, int stages = 1) {
         const double size = block.end - block.begin;
         dense += block_cost * size * size * size;
     }
-    const int slots = Ties(tree).slots;
-    const double cost = stages > 1 ? stages_cost : slots > 0 ? tied_cost : 1.0;
+    const int slots = Mimics(tree).slots;
+    const double cost = stages > 1 ? stages_cost : slots > 0 ? mimic_cost : 1.0;
     return cost * (1.0 + slot_cost * slots) * tree.size() < dense;
 }
 
@@ -61,255 +75,6 @@ inline bool eliminates(const Tree& tree, int stages = 1) {
 inline bool eliminates(const Mechanism& mechanism, int stages) {
     return !mechanism.couplings.any() && eliminates(mechanism.tree, stages);
 }
-
-namespace detail {
-
-// Numbers that are read in pairs are also written in pairs: a load of a pair stalls after stores of single numbers.
-template <class Six>
-void write(const Six& a, double* x) {
-    put_pair(Pair{a.linear.x, a.linear.y}, x);
-    put_pair(Pair{a.linear.z, a.angular.x}, x + 2);
-    put_pair(Pair{a.angular.y, a.angular.z}, x + 4);
-}
-// Writes nine entries.
-template <class Six>
-void write(const Six& a, const Vec3<double>& b, double* x) {
-    write(a, x);
-    put_pair(Pair{b.x, b.y}, x + 6);
-    x[8] = b.z;
-}
-// Writes nine entries and a zero.
-template <class Six>
-void write_padded(const Six& a, const Vec3<double>& b, double* x) {
-    write(a, x);
-    put_pair(Pair{b.x, b.y}, x + 6);
-    put_pair(Pair{b.z, 0.0}, x + 8);
-}
-inline Motion<double> motion_at(const double* x) { return {{x[0], x[1], x[2]}, {x[3], x[4], x[5]}}; }
-
-// Functions of vectors (size) and row-major matrices (size, size) of even size. Sums add even and odd terms apart.
-template <int size>
-double product(const double* a, const double* b) {
-    Pair sum = pair_at(a) * pair_at(b);
-    for (int c = 2; c < size; c += 2) sum = sum + pair_at(a + c) * pair_at(b + c);
-    return sum[0] + sum[1];
-}
-template <int size>
-struct Pairs {
-    explicit Pairs(const double* x) {
-        for (int c = 0; c < size; c += 2) at[c / 2] = pair_at(x + c);
-    }
-    Pair at[size / 2];
-};
-// y = a + s b
-template <int size>
-void write_sum(const double* a, double s, const double* b, double* y) {
-    const Pair factor{s, s};
-    for (int c = 0; c < size; c += 2) put_pair(pair_at(a + c) + factor * pair_at(b + c), y + c);
-}
-// y += X x
-template <int size>
-void add_product(const double* X, const double* x, double* y) {
-    const Pairs<size> factor(x);
-    for (int r = 0; r < size; r += 2, X += 2 * size) {
-        Pair first = pair_at(X) * factor.at[0], second = pair_at(X + size) * factor.at[0];
-        for (int c = 2; c < size; c += 2) {
-            first = first + pair_at(X + c) * factor.at[c / 2];
-            second = second + pair_at(X + size + c) * factor.at[c / 2];
-        }
-        put_pair(pair_at(y + r) + (Pair{first[0], second[0]} + Pair{first[1], second[1]}), y + r);
-    }
-}
-// y += X' x
-template <int size>
-void add_transposed_product(const double* X, const double* x, double* y) {
-    Pairs<size> sum(y);
-    for (int r = 0; r < size; ++r, X += size) {
-        const Pair factor{x[r], x[r]};
-        for (int c = 0; c < size; c += 2) sum.at[c / 2] = sum.at[c / 2] + factor * pair_at(X + c);
-    }
-    for (int c = 0; c < size; c += 2) put_pair(sum.at[c / 2], y + c);
-}
-// y += X x with a symmetric X, of which each row holds the pairs from the diagonal on.
-template <int size>
-void add_symmetric_product(const double* X, const double* x, double* y) {
-    const Pairs<size> factor(x);
-    Pairs<size> sum(y);
-    for (int r = 0; r < size; r += 2) {
-        const double *above = X + r * size, *below = above + size;
-        const Pair first{x[r], x[r]}, second{x[r + 1], x[r + 1]};
-        Pair along = first * pair_at(above + r), beside = second * pair_at(below + r);
-        sum.at[r / 2] = sum.at[r / 2] + (along + beside);
-        if (r + 2 == size) break;
-        along = beside = Pair{0.0, 0.0};
-        for (int c = r + 2; c < size; c += 2) {
-            const Pair upper = pair_at(above + c), lower = pair_at(below + c);
-            sum.at[c / 2] = sum.at[c / 2] + (first * upper + second * lower);
-            along = along + upper * factor.at[c / 2];
-            beside = beside + lower * factor.at[c / 2];
-        }
-        sum.at[r / 2] = sum.at[r / 2] + (Pair{along[0], beside[0]} + Pair{along[1], beside[1]});
-    }
-    for (int c = 0; c < size; c += 2) put_pair(sum.at[c / 2], y + c);
-}
-
-// The matrix of an inertia, in pairs along its rows.
-struct InertiaRows {
-    explicit InertiaRows(const Inertia<double>& I)
-        : at{{{I.mass, 0.0}, {0.0, 0.0}, {I.moment.z, -I.moment.y}},
-             {{0.0, I.mass}, {0.0, -I.moment.z}, {0.0, I.moment.x}},
-             {{0.0, 0.0}, {I.mass, I.moment.y}, {-I.moment.x, 0.0}},
-             {{0.0, -I.moment.z}, {I.moment.y, I.second.xx}, {I.second.xy, I.second.xz}},
-             {{I.moment.z, 0.0}, {-I.moment.x, I.second.xy}, {I.second.yy, I.second.yz}},
-             {{-I.moment.y, I.moment.x}, {0.0, I.second.xz}, {I.second.yz, I.second.zz}}} {}
-    Pair at[6][3];
-};
-
-// The pairs that a matrix holds: all, or those from the diagonal on if it is symmetric.
-enum class Kept { all, upper };
-
-// Overwrites X by X - u l', with each pair (r, c) mapped by `finished`, in one pass, since the next body needs it.
-template <int size, Kept kept, int r = 0, class Finished>
-void replace(const double* u, const Pairs<size>& l, const Finished& finished, double* X) {
-    if constexpr (r < size) {
-        const Pair factor{u[r], u[r]};
-        for (int c = kept == Kept::upper ? r & ~1 : 0; c < size; c += 2)
-            put_pair(finished(pair_at(X + c) - factor * l.at[c / 2], r, c), X + c);
-        replace<size, kept, r + 1>(u, l, finished, X + size);
-    }
-}
-
-// Adds s I to a part of a matrix with rows of length `stride`.
-inline void add_inertia(double s, const InertiaRows& I, int stride, double* x) {
-    const Pair scale{s, s};
-    for (int r = 0; r < 6; ++r, x += stride) {
-        for (int c = 0; c < 3; ++c) put_pair(pair_at(x + 2 * c) + scale * I.at[r][c], x + 2 * c);
-    }
-}
-
-// Joints above an origin are prismatic: they need only linear parts, which are independent of the reference point.
-// `linear` tells whether an entry is a linear part.
-template <int size>
-constexpr bool linear(int entry) {
-    return entry < 9 ? entry % 6 < 3 && (size == 12 || entry < 6) : false;
-}
-template <int size>
-void keep_linear(double* z) {
-    for (int r = 0; r < size; ++r) {
-        if (!linear<size>(r)) z[r] = 0.0;
-    }
-}
-template <int size>
-void keep_linear_rows(double* X) {
-    for (int r = 0; r < size; ++r) {
-        if (linear<size>(r)) {
-            keep_linear<size>(X + r * size);
-        } else {
-            std::fill(X + r * size, X + (r + 1) * size, 0.0);
-        }
-    }
-}
-
-}  // namespace detail
-
-// The factors of M + diag(armature) at consecutive configurations.
-class ArticulatedBodies {
-  public:
-    explicit ArticulatedBodies(const Tree& tree) : ArticulatedBodies(tree, std::make_shared<Gathering>(tree)) {}
-    ArticulatedBodies(const Tree& tree, const std::shared_ptr<const Gathering>& order)
-        : tree_(&tree), body_(tree.size()), inertia_(order, 36), force_(order, 6), motion_(6 * (tree.size() + 1)) {
-        if (order->ties.slots > 0) tied_.emplace(tree, order, 6);
-    }
-
-    // Factor M at q, with potential energies in `jet`; false at a pivot that is not positive.
-    bool at(const Mechanism& mechanism, const double* q, Jet<double>& jet) {
-        const auto visit = [&](int j) { set_body(j, tree_->bodies[j].ratio * jet.body[j].axis, jet.body[j].inertia); };
-        inertias(mechanism, q, jet, visit, [](int) {});
-        for (int j = tree_->size() - 1; j >= 0; --j) {
-            if (!eliminate(j)) return false;
-        }
-        return true;
-    }
-
-    // Set the axis and the inertia of body j alone.
-    void set_body(int j, const Motion<double>& axis, const Inertia<double>& inertia) {
-        detail::write(axis, body_[j].axis);
-        body_[j].inertia = inertia;
-        if (!tied_) return;
-        detail::write(axis, tied_->row(j));
-    }
-
-    // Eliminate body j, from the last body to the first; false at a pivot that is not positive. Here and below, the
-    // attribute `flatten` inlines all calls in the loop over bodies, which saves a tenth of a step.
-    [[gnu::flatten]] bool eliminate(int j) {
-        const Body& link = tree_->bodies[j];
-        State& state = body_[j];
-        if (tied_) {
-            detail::write(state.inertia * detail::motion_at(state.axis), tied_->u());
-            return tied_->eliminate(j, tree_->armature.data(), [&state](double* X, int width) {
-                detail::add_inertia(1.0, detail::InertiaRows(state.inertia), width, X);
-            });
-        }
-        double* X = inertia_.of(j);
-        detail::write(state.inertia * detail::motion_at(state.axis), state.u);
-        detail::add_symmetric_product<6>(X, state.axis, state.u);
-        state.pivot = tree_->armature[link.coordinate] + detail::product<6>(state.axis, state.u);
-        if (!(state.pivot > 0.0)) return false;
-        const double inverse = 1.0 / state.pivot;
-        for (int r = 0; r < 6; ++r) state.answer[r] = state.u[r] * inverse;
-        if (link.parent < 0) return true;
-        const detail::InertiaRows inertia(state.inertia);
-        detail::replace<6, detail::Kept::upper>(
-            state.answer, detail::Pairs<6>(state.u),
-            [&](Pair rest, int r, int c) { return rest + inertia.at[r][c / 2]; }, X);
-        if (link.origin) detail::keep_linear_rows<6>(X);
-        inertia_.hand_on(j, link.parent);
-        return true;
-    }
-
-    // The inertia of a body's coordinate with its subtree free [kg m^2 or kg].
-    double pivot(int body) const { return body_[body].pivot; }
-
-    // x with (M + diag(armature)) x = b; x may be b. `share`, unless null, receives the terms of 1/2 b . x, which are
-    // not negative: left^2 / (2 pivot), with `left` the remainder of b_i when the subtree of coordinate i is free.
-    void solve(const double* b, double* x, double* share) {
-        if (tied_) return tied_->solve(b, x, share);
-        for (int j = tree_->size() - 1; j >= 0; --j) {
-            const Body& link = tree_->bodies[j];
-            const State& state = body_[j];
-            double* z = force_.of(j);
-            const int c = link.coordinate;
-            const double left = b[c] - detail::product<6>(state.axis, z);
-            x[c] = left / state.pivot;
-            if (share) share[c] = 0.5 * left * x[c];
-            if (link.parent < 0) continue;
-            detail::write_sum<6>(z, left, state.answer, z);
-            if (link.origin) detail::keep_linear<6>(z);
-            force_.hand_on(j, link.parent);
-        }
-        for (int j = 0; j < tree_->size(); ++j) {
-            const Body& link = tree_->bodies[j];
-            const State& state = body_[j];
-            const double* above = &motion_[6 * (link.parent + 1)];  // zero for a root
-            x[link.coordinate] -= detail::product<6>(state.answer, above);
-            detail::write_sum<6>(above, x[link.coordinate], state.axis, &motion_[6 * (j + 1)]);
-        }
-    }
-
-  private:
-    struct State {
-        double axis[6] = {};  // S
-        Inertia<double> inertia{};
-        double u[6] = {}, answer[6] = {};  // X S, and X S / pivot
-        double pivot = 0.0;
-    };
-
-    const Tree* tree_;
-    std::vector<State> body_;
-    detail::Gathered inertia_, force_;
-    std::vector<double> motion_;                // (b + 1, 6) of each body, after a zero for the base
-    std::optional<SymmetricElimination> tied_;  // for coordinates that move several bodies
-};
 
 // The data of a body that elimination needs from a sweep of first order.
 struct EliminatedBody {
@@ -334,7 +99,7 @@ struct EliminatedBody {
 
     // The body's entry of (A' + ha L_qq) x. `rate_of_x` is ha x of its coordinate, `moved` and `above` are the motions
     // of the body and its parent, nine entries each, and z is the sum of its children, to which the body is added.
-    double change_of_slope(double rate_of_x, const double* moved, const double* above, double* z) const {
+    double change_of_force(double rate_of_x, const double* moved, const double* above, double* z) const {
         double added[10];
         detail::write_padded(inertia * detail::motion_at(moved) + rate_of_x * turned, rate_of_x * lifted, added);
         for (int r = 0; r < 9; ++r) z[r] += added[r];
@@ -344,166 +109,364 @@ struct EliminatedBody {
     }
 };
 
-// The matrix of a midpoint step, (E1) and (E2), and its symmetric part, at consecutive (q, v): factored and solved with
-// by (E3).
-class Elimination {
+// The matrix of a step, the sum over stages of (E1) and (E2): factored and solved with by (E3), at consecutive (q, v).
+class StepElimination {
   public:
-    explicit Elimination(const Mechanism& mechanism)
-        : Elimination(mechanism, std::make_shared<Gathering>(mechanism.tree)) {}
+    static constexpr int most_stages = 16;
 
-    // Set the state from a sweep of first order.
-    void take(const Jet<double>& jet) {
-        for (int j = 0; j < tree_->size(); ++j) body_[j] = EliminatedBody::of(*mechanism_, j, jet);
+    virtual ~StepElimination() = default;
+    // Set the state of stage c from its sweep of first order.
+    virtual void take(int c, const Jet<double>& jet) = 0;
+    // Factor N with diagonals d (s, s, n), armature included; false if its determinant, or with one stage a pivot, is
+    // not positive.
+    virtual bool factor(double h, const double* diagonal) = 0;
+    // x with N x = b, both (s, n).
+    virtual void solve(const double* b, double* x) = 0;
+    // y_c = A_c' x_c + L_qq,c h sum_m a_cm x_m, (s, n), for the x of the last `solve`.
+    virtual void change_of_force(const double* x, double* y) = 0;
+    // sum_c b_c x_c' M_c x_c, armature included.
+    virtual double kinetic_size(const double* x) = 0;
+    // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same pivot of M, armature included, all
+    // averaged over the stages with b; 0 if one is not positive. The factors of `factor` are kept.
+    virtual double least_pivot_ratio(double coupling, double k, const double* diagonal) = 0;
+};
+
+// The same for numbers that the compiler knows, one stage without mimic joints, or does not.
+template <class Stages, class Width, class Mass, class Curved>
+class SizedElimination final : public StepElimination {
+  public:
+    SizedElimination(const Mechanism& mechanism, const Tableau& tableau,
+                     const std::shared_ptr<const SubtreeOrder>& order)
+        : mechanism_(&mechanism),
+          tree_(&mechanism.tree),
+          tableau_(&tableau),
+          stages_(tableau.stages),
+          order_(order),
+          bodies_(9 * stages_),
+          width_(detail::even(bodies_ + stages_ * order->mimics.slots)),
+          state_(tree_->size() * stages_),
+          factors_(tree_->size() * factor_size()),
+          matrix_(order, width_ * width_),
+          force_(order, width_),
+          motion_(width_ * (tree_->size() + 1)),
+          twist_(tree_->size()),
+          lu_(stages_ * stages_),
+          rows_(stages_),
+          curved_(*tree_, order, 12 * stages_),
+          masses_(*tree_, order, 6 * stages_) {}
+
+    void take(int c, const Jet<double>& jet) override {
+        for (int j = 0; j < tree_->size(); ++j) state_[j * stages_ + c] = EliminatedBody::of(*mechanism_, j, jet);
     }
 
-    // Factor N; false at a pivot that is not positive.
-    [[gnu::flatten]] bool factor(double ahead, double behind, const double* diagonal) {
-        ahead_ = ahead;
+    [[gnu::flatten]] bool factor(double h, const double* diagonal) override {
+        h_ = h;
+        diagonal_ = diagonal;
+        sign_ = 1;
+        for (int j = tree_->size() - 1; j >= 0 && sign_ != 0; --j) eliminate(j);
+        if (slots() > 0) eliminate_mimics(-1, matrix_.of_ground());
+        return sign_ > 0;
+    }
+
+    [[gnu::flatten]] void solve(const double* b, double* x) override {
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
-            const EliminatedBody& state = body_[j];
-            Factors& factors = factors_[j];
-            const Motion<double> row = state.axis + (-behind) * state.rate, column = state.axis + ahead * state.rate;
-            detail::write_padded(row, behind * state.axis.angular, factors.row);
-            detail::write_padded(column, ahead * state.axis.angular, factors.column);
-            detail::write_padded(state.inertia * column + ahead * state.turned, ahead * state.lifted, factors.u);
-            detail::write_padded(state.inertia * row + (-behind) * state.turned, behind * state.lifted, factors.l);
-            double* X = matrix_.of(j);
-            detail::add_product<width>(X, factors.column, factors.u);
-            factors.pivot = diagonal[link.coordinate] + detail::product<width>(factors.row, factors.u);
-            if (!(factors.pivot > 0.0)) return false;
-            if (link.parent < 0) {
-                std::fill(factors.l, factors.l + width, 0.0);
-                continue;
+            double* z = force_.of(j);
+            const int c = link.coordinate, slot = slot_of(c);
+            double along[most_stages];
+            for (int i = 0; i < stages_; ++i) along[i] = detail::product(width_, factors(j).row + i * width_, z);
+            if (slot < 0) {
+                substitute(c, j, b, along, z, x);
+            } else {
+                for (int i = 0; i < stages_; ++i) z[at(slot) + i] += along[i];
             }
-            detail::add_transposed_product<width>(X, factors.row, factors.l);
-            const double inverse = 1.0 / factors.pivot;
-            for (double& entry : factors.l) entry *= inverse;
-            const detail::InertiaRows inertia(state.inertia);
-            detail::replace<width, detail::Kept::all>(
-                factors.u, detail::Pairs<width>(factors.l),
-                [&](Pair rest, int r, int c) { return r < 6 && c < 6 ? rest + inertia.at[r][c / 2] : rest; }, X);
-            if (link.origin) detail::keep_linear_rows<width>(X);
-            matrix_.hand_on(j, link.parent);
-        }
-        return true;
-    }
-
-    // x with N x = b.
-    void solve(const double* b, double* x) {
-        for (int j = tree_->size() - 1; j >= 0; --j) {
-            const Body& link = tree_->bodies[j];
-            const Factors& factors = factors_[j];
-            double* z = force_.of(j);
-            const double t = (b[link.coordinate] - detail::product<width>(factors.row, z)) / factors.pivot;
-            x[link.coordinate] = t;
-            if (link.parent < 0) continue;
-            detail::write_sum<width>(z, t, factors.u, z);
-            if (link.origin) detail::keep_linear<width>(z);
+            if (link.parent < 0 && slots() == 0) continue;
+            if (slots() > 0) substitute_mimics(j, b, z, x);
+            if (link.origin) detail::keep_linear(bodies_, 9, z);
             force_.hand_on(j, link.parent);
         }
+        if (slots() > 0) substitute_mimics(-1, b, force_.of_ground(), x), move_mimics(-1, x);
         for (int j = 0; j < tree_->size(); ++j) {
             const Body& link = tree_->bodies[j];
-            const Factors& factors = factors_[j];
-            const double* above = motion_above(j);
-            x[link.coordinate] -= detail::product<width>(factors.l, above);
-            detail::write_sum<width>(above, x[link.coordinate], factors.column, &motion_[width * (j + 1)]);
+            const double* above = motion(link.parent);
+            double* moved = motion(j);
+            if (slots() > 0) {
+                std::copy(above, above + width_, moved);
+                move_mimics(j, x);
+                above = moved;
+            }
+            if (slot_of(link.coordinate) < 0) find(link.coordinate, j, above, x);
+            for (int m = 0; m < stages_; ++m)
+                detail::write_sum(width_, m == 0 ? above : moved, x[m * tree_->dof() + link.coordinate],
+                                  factors(j).column + m * width_, moved);
         }
     }
 
-    // y = (A' + ha L_qq) x for the x of the last `solve`.
-    void change_of_slope(const double* x, double* y) {
+    void change_of_force(const double* x, double* y) override {
+        const int n = tree_->dof();
+        std::fill(y, y + stages_ * n, 0.0);
         for (int j = tree_->size() - 1; j >= 0; --j) {
             const Body& link = tree_->bodies[j];
             double* z = force_.of(j);
-            const double* moved = motion_.data() + width * (j + 1);
-            const double rate_of_x = ahead_ * x[link.coordinate];
-            y[link.coordinate] = body_[j].change_of_slope(rate_of_x, moved, motion_above(j), z);
+            for (int c = 0; c < stages_; ++c) {
+                const EliminatedBody& state = state_[j * stages_ + c];
+                const double *moved = motion(j) + 9 * c, *above = motion(link.parent) + 9 * c;
+                double rate_of_x = 0.0;
+                for (int m = 0; m < stages_; ++m)
+                    rate_of_x += h_ * tableau_->a[c * stages_ + m] * x[m * n + link.coordinate];
+                y[c * n + link.coordinate] += state.change_of_force(rate_of_x, moved, above, z + 9 * c);
+            }
             if (link.parent < 0) continue;
-            if (link.origin) detail::keep_linear<width>(z);
+            if (link.origin) detail::keep_linear(bodies_, 9, z);
             force_.hand_on(j, link.parent);
         }
     }
 
-    // x' M x, armature included.
-    double kinetic_size(const double* x) {
+    double kinetic_size(const double* x) override {
         double total = 0.0;
-        for (int j = 0; j < tree_->size(); ++j) {
-            const Body& link = tree_->bodies[j];
-            moved_[j] = x[link.coordinate] * body_[j].axis;
-            if (link.parent >= 0) moved_[j] += moved_[link.parent];
-            total += dot(moved_[j], body_[j].inertia * moved_[j]);
+        for (int c = 0; c < stages_; ++c) {
+            const double* x_stage = x + c * tree_->dof();
+            double size = 0.0;
+            for (int j = 0; j < tree_->size(); ++j) {
+                const Body& link = tree_->bodies[j];
+                const EliminatedBody& state = state_[j * stages_ + c];
+                twist_[j] = x_stage[link.coordinate] * state.axis;
+                if (link.parent >= 0) twist_[j] += twist_[link.parent];
+                size += dot(twist_[j], state.inertia * twist_[j]);
+            }
+            for (int k = 0; k < tree_->dof(); ++k) size += tree_->armature[k] * x_stage[k] * x_stage[k];
+            total += tableau_->b[c] * size;
         }
-        for (int c = 0; c < tree_->dof(); ++c) total += tree_->armature[c] * x[c] * x[c];
         return total;
     }
 
-    // The smallest ratio of a pivot of M + c (A + A') - k L_qq + diag(d) to the same pivot of M, armature included; 0
-    // if one is not positive. The factors of `factor` are kept.
-    [[gnu::flatten]] double least_pivot_ratio(double c, double k, const double* diagonal) {
-        double least = std::numeric_limits<double>::infinity();
+    [[gnu::flatten]] double least_pivot_ratio(double coupling, double k, const double* diagonal) override {
         for (int j = tree_->size() - 1; j >= 0; --j) {
-            const Body& link = tree_->bodies[j];
-            const EliminatedBody& state = body_[j];
-            double row[12], u[12], answer[12];
-            detail::write(state.axis, row);
-            detail::write(state.rate, row + 6);
-            const Force<double> by_axis = state.inertia * state.axis,
-                                by_rate = state.inertia * state.rate + state.turned;
-            detail::write(by_axis + c * by_rate + Force<double>{{}, k * state.lifted}, u);
-            detail::write(c * by_axis + (-k) * by_rate, u + 6);
-            double* X = symmetric_.of(j);
-            detail::add_symmetric_product<12>(X, row, u);
-            const double pivot = diagonal[link.coordinate] + detail::product<12>(row, u);
-            masses_.set_body(j, state.axis, state.inertia);
-            if (!(pivot > 0.0) || !masses_.eliminate(j)) return 0.0;
-            least = std::min(least, pivot / masses_.pivot(j));
-            if (link.parent < 0) continue;
-            const double inverse = 1.0 / pivot;
-            for (int r = 0; r < 12; ++r) answer[r] = u[r] * inverse;
-            const detail::InertiaRows inertia(state.inertia);
-            const Pair scale[2][2] = {{{1.0, 1.0}, {c, c}}, {{c, c}, {-k, -k}}};
-            detail::replace<12, detail::Kept::upper>(
-                answer, detail::Pairs<12>(u),
-                [&](Pair rest, int r, int e) { return rest + scale[r / 6][e / 6] * inertia.at[r % 6][e % 6 / 2]; }, X);
-            if (link.origin) detail::keep_linear_rows<12>(X);
-            symmetric_.hand_on(j, link.parent);
+            for (int c = 0; c < stages_; ++c) {
+                const EliminatedBody& state = state_[j * stages_ + c];
+                const double b = tableau_->b[c];
+                const Force<double> by_axis = state.inertia * state.axis,
+                                    by_rate = state.inertia * state.rate + state.turned;
+                detail::write(state.axis, masses_.row(j) + 6 * c);
+                detail::write(b * by_axis, masses_.u() + 6 * c);
+                detail::write(state.axis, curved_.row(j) + 12 * c);
+                detail::write(state.rate, curved_.row(j) + 12 * c + 6);
+                detail::write(b * (by_axis + coupling * by_rate + Force<double>{{}, k * state.lifted}),
+                              curved_.u() + 12 * c);
+                detail::write(b * (coupling * by_axis + (-k) * by_rate), curved_.u() + 12 * c + 6);
+            }
+            const auto inertia = [&](int c) { return detail::InertiaRows(state_[j * stages_ + c].inertia); };
+            const double* b = tableau_->b.data();
+            if (!masses_.eliminate(j, tree_->armature.data(), detail::OwnInertia{inertia, stages_, b, 6, 0.0, 0.0}))
+                return 0.0;
+            if (!curved_.eliminate(j, diagonal, detail::OwnInertia{inertia, stages_, b, 12, coupling, k})) return 0.0;
         }
+        double least = std::numeric_limits<double>::infinity();
+        for (int c = 0; c < tree_->dof(); ++c) least = std::min(least, curved_.pivot(c) / masses_.pivot(c));
         return least;
     }
 
   private:
-    Elimination(const Mechanism& mechanism, const std::shared_ptr<const Gathering>& order)
-        : mechanism_(&mechanism),
-          tree_(&mechanism.tree),
-          body_(mechanism.tree.size()),
-          moved_(mechanism.tree.size()),
-          factors_(mechanism.tree.size()),
-          matrix_(order, width * width),
-          symmetric_(order, 144),
-          force_(order, width),
-          motion_(width * (mechanism.tree.size() + 1)),
-          masses_(mechanism.tree, order) {}
-
-    static constexpr int width = 10;  // nine entries and a zero
-
+    // Factors of one body: (s, width), and the inverse of D (s, s), or D itself with one stage. l is multiplied by this
+    // inverse. u, l and D of a mimic coordinate are stored with the first body that it moves.
     struct Factors {
-        double row[width] = {}, column[width] = {};
-        double u[width] = {}, l[width] = {};  // l divided by the pivot
-        double pivot = 0.0;
+        double *row, *column, *u, *l, *inverse;
     };
 
-    const double* motion_above(int j) const { return motion_.data() + width * (tree_->bodies[j].parent + 1); }
+    int factor_size() const { return 4 * stages_ * width_ + stages_ * stages_; }
+    Factors factors(int j) {
+        double* at = factors_.data() + j * factor_size();
+        const int size = stages_ * width_;
+        return {at, at + size, at + 2 * size, at + 3 * size, at + 4 * size};
+    }
+    double* motion(int j) { return motion_.data() + width_ * (j + 1); }
+
+    int slots() const { return std::is_same_v<Width, int> ? order_->mimics.slots : 0; }
+    int slot_of(int coordinate) const { return std::is_same_v<Width, int> ? order_->mimics.slot[coordinate] : -1; }
+    int at(int slot) const { return bodies_ + slot * stages_; }
+
+    void eliminate(int j) {
+        const Body& link = tree_->bodies[j];
+        const Factors factors_here = factors(j);
+        write_rows(j, factors_here);
+        double* X = matrix_.of(j);
+        for (int m = 0; m < stages_; ++m) {
+            detail::add_product(width_, X, factors_here.column + m * width_, factors_here.u + m * width_);
+            detail::add_transposed_product(width_, X, factors_here.row + m * width_, factors_here.l + m * width_);
+        }
+        for (int i = 0; i < stages_; ++i) {
+            for (int m = 0; m < stages_; ++m)
+                lu_[i * stages_ + m] =
+                    detail::product(width_, factors_here.row + i * width_, factors_here.u + m * width_);
+        }
+        const int slot = slot_of(link.coordinate);
+        const auto inertia = [&](int c) { return detail::InertiaRows(state_[j * stages_ + c].inertia); };
+        const detail::OwnInertia own{inertia, stages_, nullptr, 9, 0.0, 0.0};
+        if (slot < 0) {
+            const bool last = link.parent < 0 && slots() == 0;
+            take_out(link.coordinate, factors_here, own, last ? nullptr : X);
+            if (sign_ == 0 || last) return;
+        } else {
+            for (int m = 0; m < stages_; ++m) {
+                for (int r = 0; r < width_; ++r) X[r * width_ + at(slot) + m] += factors_here.u[m * width_ + r];
+            }
+            for (int i = 0; i < stages_; ++i) {
+                double* line = X + (at(slot) + i) * width_;
+                detail::write_sum(width_, line, 1.0, factors_here.l + i * width_, line);
+                for (int m = 0; m < stages_; ++m) line[at(slot) + m] += lu_[i * stages_ + m];
+            }
+        }
+        if constexpr (std::is_same_v<Width, int>) own.add(X, width_);
+        if (slots() > 0) eliminate_mimics(j, X);
+        if (link.origin) detail::keep_linear_rows(bodies_, 9, width_, X);
+        matrix_.hand_on(j, link.parent);
+    }
+
+    // Add the bodies of mimic joints that end at body j to X, and eliminate their coordinates, (E4).
+    void eliminate_mimics(int j, double* X) {
+        for (const Mimics::Mimic& mimic : order_->mimics.ending(j)) {
+            if (sign_ == 0) return;
+            const Factors factors_here = factors(mimic.body);
+            const int slot = at(mimic.slot);
+            for (int i = 0; i < stages_; ++i) {
+                const double* line = X + (slot + i) * width_;
+                std::copy(line + slot, line + slot + stages_, &lu_[i * stages_]);
+                std::copy(line, line + width_, factors_here.l + i * width_);
+                for (int r = 0; r < width_; ++r) factors_here.u[i * width_ + r] = X[r * width_ + slot + i];
+            }
+            for (int i = 0; i < stages_; ++i) {
+                for (double* x : {factors_here.u, factors_here.l}) std::fill_n(x + i * width_ + slot, stages_, 0.0);
+            }
+            take_out(mimic.coordinate, factors_here, detail::NoInertia{}, X);
+            detail::clear_slot(slot, stages_, width_, X);
+        }
+    }
+
+    // Eliminate coordinate c with its u, l and D, to which its diagonal is added; updates sign_ by that of det D.
+    template <class Own>
+    void take_out(int c, const Factors& factors_here, const Own& own, double* X) {
+        for (int k = 0; k < stages_ * stages_; ++k) lu_[k] += diagonal_[k * tree_->dof() + c];
+        if (stages_ == 1) {
+            sign_ = lu_[0] > 0.0;
+            if (sign_ == 0) return;
+            factors_here.inverse[0] = lu_[0];
+            const double inverse = 1.0 / lu_[0];
+            for (int r = 0; r < width_; ++r) factors_here.l[r] *= inverse;
+        } else {
+            sign_ *= factor_lu_pivoting(lu_.data(), stages_, rows_.data());
+            if (sign_ == 0) return;
+            invert(factors_here.inverse);
+            for (int r = 0; r < width_; ++r) {
+                double small[most_stages];
+                for (int i = 0; i < stages_; ++i) small[i] = factors_here.l[i * width_ + r];
+                for (int m = 0; m < stages_; ++m) {
+                    double total = 0.0;
+                    for (int i = 0; i < stages_; ++i) total += factors_here.inverse[m * stages_ + i] * small[i];
+                    factors_here.l[m * width_ + r] = total;
+                }
+            }
+        }
+        for (int m = 0; m < stages_ && X; ++m)
+            detail::subtract_outer<detail::Kept::all>(width_, factors_here.u + m * width_, factors_here.l + m * width_,
+                                                      own, X);
+    }
+
+    // t = D^-1 (b - along) of coordinate c into x; adds u t to z.
+    void substitute(int c, int body, const double* b, const double* along, double* z, double* x) {
+        const int n = tree_->dof();
+        const Factors own = factors(body);
+        double left[most_stages];
+        for (int i = 0; i < stages_; ++i) left[i] = b[i * n + c] - along[i];
+        for (int m = 0; m < stages_; ++m) {
+            double t = 0.0;
+            for (int i = 0; i < stages_; ++i) t += own.inverse[m * stages_ + i] * left[i];
+            if (stages_ == 1) t = left[0] / own.inverse[0];
+            x[m * n + c] = t;
+            detail::write_sum(width_, z, t, own.u + m * width_, z);
+        }
+    }
+    void substitute_mimics(int j, const double* b, double* z, double* x) {
+        for (const Mimics::Mimic& mimic : order_->mimics.ending(j)) {
+            double* kept = z + at(mimic.slot);
+            double along[most_stages];
+            std::copy(kept, kept + stages_, along);
+            substitute(mimic.coordinate, mimic.body, b, along, z, x);
+            std::fill(kept, kept + stages_, 0.0);
+        }
+    }
+
+    // x = t - l . w_parent
+    void find(int c, int body, const double* above, double* x) {
+        for (int m = 0; m < stages_; ++m)
+            x[m * tree_->dof() + c] -= detail::product(width_, factors(body).l + m * width_, above);
+    }
+    // In the order opposite to elimination.
+    void move_mimics(int j, double* x) {
+        const std::vector<Mimics::Mimic>& ending = order_->mimics.ending(j);
+        for (auto mimic = ending.rbegin(); mimic != ending.rend(); ++mimic) {
+            find(mimic->coordinate, mimic->body, motion(j), x);
+            for (int m = 0; m < stages_; ++m) motion(j)[at(mimic->slot) + m] = x[m * tree_->dof() + mimic->coordinate];
+        }
+    }
+
+    // Rows and columns of body j, and the parts of u and l from its own inertia.
+    void write_rows(int j, const Factors& factors_here) const {
+        for (int i = 0; i < stages_; ++i) {
+            for (int c = 0; c < stages_; ++c) {
+                const EliminatedBody& state = state_[j * stages_ + c];
+                const double there = i == c ? 1.0 : 0.0;
+                const double ahead = h_ * tableau_->a[c * stages_ + i];
+                const double behind = h_ * tableau_->gradient[i * stages_ + c];
+                const int at = i * width_ + 9 * c;
+                const Motion<double> row = there * state.axis + (-behind) * state.rate;
+                const Motion<double> column = there * state.axis + ahead * state.rate;
+                detail::write(row, behind * state.axis.angular, factors_here.row + at);
+                detail::write(column, ahead * state.axis.angular, factors_here.column + at);
+                detail::write(state.inertia * column + ahead * state.turned, ahead * state.lifted, factors_here.u + at);
+                detail::write(state.inertia * row + (-behind) * state.turned, behind * state.lifted,
+                              factors_here.l + at);
+            }
+            for (double* x : {factors_here.row, factors_here.column, factors_here.u, factors_here.l})
+                std::fill(x + i * width_ + bodies_, x + (i + 1) * width_, 0.0);
+        }
+    }
+
+    // The inverse (s, s) of the matrix whose factors are in lu_.
+    void invert(double* inverse) {
+        for (int m = 0; m < stages_; ++m) {
+            double column[most_stages], unit[most_stages] = {};
+            unit[m] = 1.0;
+            solve_lu_pivoting(lu_.data(), stages_, rows_.data(), unit, column);
+            for (int i = 0; i < stages_; ++i) inverse[i * stages_ + m] = column[i];
+        }
+    }
 
     const Mechanism* mechanism_;
     const Tree* tree_;
-    std::vector<EliminatedBody> body_;
-    std::vector<Motion<double>> moved_;  // of each body, for some x
-    std::vector<Factors> factors_;
-    detail::Gathered matrix_, symmetric_, force_;
-    std::vector<double> motion_;  // (b + 1, 10) of each body for the x of `solve`, after a zero for the base
-    double ahead_ = 0.0;
-    ArticulatedBodies masses_;
+    const Tableau* tableau_;
+    Stages stages_;
+    std::shared_ptr<const SubtreeOrder> order_;
+    int bodies_;   // nine entries for each stage
+    Width width_;  // plus one for each stage and slot of mimic joints, rounded up to an even number
+    std::vector<EliminatedBody> state_;  // (b, s)
+    std::vector<double> factors_;
+    detail::SubtreeSums matrix_, force_;
+    std::vector<double> motion_;  // (b + 1, width) for the x of `solve`, after a zero for the base
+    std::vector<Motion<double>> twist_;
+    std::vector<double> lu_;
+    std::vector<int> rows_;
+    SymmetricElimination<Curved> curved_;
+    SymmetricElimination<Mass> masses_;
+    double h_ = 0.0;
+    int sign_ = 0;
+    const double* diagonal_ = nullptr;
 };
+
+inline std::unique_ptr<StepElimination> elimination_of(const Mechanism& mechanism, const Tableau& tableau) {
+    const auto order = std::make_shared<const SubtreeOrder>(mechanism.tree);
+    if (tableau.stages == 1 && order->mimics.slots == 0)
+        return std::make_unique<SizedElimination<Known<1>, Known<10>, Known<6>, Known<12>>>(mechanism, tableau, order);
+    return std::make_unique<SizedElimination<int, int, int, int>>(mechanism, tableau, order);
+}
 
 }  // namespace varpin

@@ -196,8 +196,7 @@ class EnergyGuard {
             for (int i = 0; i < n; ++i)
                 diagonal[i] = mechanism.tree.armature[i] + step.stiffening(i, 0.5 * h, exaggerated);
             const double coupling = h * tableau.skew;
-            if (step.elimination) return step.elimination->least_pivot_ratio(coupling, exaggerated, diagonal.data());
-            return step.stage_elimination->least_pivot_ratio(coupling, exaggerated, diagonal.data());
+            return step.elimination->least_pivot_ratio(coupling, exaggerated, diagonal.data());
         }
         if (step.stages == 1) return kernels.branch_margin(*this, h, guards, step);
         return branch_margin_of(n, step.stages, h, guards, step);

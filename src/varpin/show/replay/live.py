@@ -50,9 +50,9 @@ _ANSWER_LIMIT, _BROWSER_LIMIT = 20.0, 20.0
 _SLACK = 0.1
 # Shortest time between two changes of the text beside the robot [s].
 _TEXT_INTERVAL = 0.1
-# A path is sent in pieces, as meshcat sends a changed object whole: points of a piece, number of pieces that stay, and
-# largest number of points between two pictures.
-_PIECE, _PIECES, _BETWEEN = 60, 100, 50
+# Points of a path that stay: 100 kB a picture, as meshcat sends a changed object whole; and the largest number of new
+# ones in a picture.
+_TRACE, _BETWEEN = 400, 50
 # Shortest distance of points of a path, and how far bodies may leave the view, relative to the size of the robot.
 _APART, _EDGE = 0.004, 0.1
 # Random postures that give the reach of a robot for the view, and their largest angle from the start [rad].
@@ -238,7 +238,6 @@ class LiveView:
         """Reset the view to the start of a motion."""
         self._shown = -math.inf  # time of the last picture [s of motion]
         self._anchor = time.monotonic()  # wall time at which playback of the motion began [s]
-        self._pieces = dict.fromkeys(self._path, 0)
         for path in self._path.values():
             path.clear()
         self._viewer["notes/live"].delete()
@@ -299,18 +298,16 @@ class LiveView:
         set_view(self._viewer, self._in_view, self._stage.toward, self._stage.size)
 
     def _draw_path(self, q: Floats) -> None:
-        """Extend the paths of the traced frames over configurations (k, n); the oldest piece gives way to a new one."""
+        """Extend the paths of the traced frames over configurations (k, n)."""
         size = self._stage.size
         for name, path in self._path.items():
             for point in self.robot.frame_positions(q, name):
                 if not path or np.linalg.norm(point - path[-1]) > _APART * size:
                     path.append(point)
+            del path[:-_TRACE]
             if len(path) > 1:
-                node = f"notes/live/{self._pieces[name] % _PIECES} {label(name)}"
-                self._viewer[node].set_object(forms.tube(np.array(path), TUBE * size, KINDS["motion"][1]))
-            if len(path) > _PIECE:
-                del path[:-1]
-                self._pieces[name] += 1
+                tube = forms.tube(np.array(path), TUBE * size, KINDS["motion"][1])
+                self._viewer[f"notes/live/{label(name)}"].set_object(tube)
 
     def _set_caption(self, words: str, *, last: bool = False) -> None:
         """Show a text above the robot, not more often than every ``_TEXT_INTERVAL`` unless it is the last."""
